@@ -1,0 +1,59 @@
+"""The one error hierarchy: every error names the thing, what came and what was wanted."""
+
+from __future__ import annotations
+
+
+class LightpageError(Exception):
+    """Base of every error that Lightpage raises on purpose.
+
+    Args:
+        thing: what the error is about, e.g. ``"recording R.h5: dataset 'in_phase'"``.
+        got: what came.
+        wanted: what would have been right.
+    """
+
+    def __init__(self, thing: str, got: object, wanted: object) -> None:
+        self.thing = thing
+        self.got = str(got)
+        self.wanted = str(wanted)
+        super().__init__(f"{thing}: got {self.got}, wanted {self.wanted}")
+
+
+class InvalidInputError(LightpageError):
+    """The caller's data are wrong: fix the input and call again."""
+
+
+class ProfileError(InvalidInputError):
+    """A device profile or device state that is malformed or unphysical."""
+
+
+class RecordingError(InvalidInputError):
+    """A recording that is truncated, foreign or inconsistent."""
+
+
+class FrameError(InvalidInputError):
+    """A camera frame of the wrong size, type or bit depth, or without usable light."""
+
+
+class PageError(InvalidInputError):
+    """Symbols of the wrong shape, type or range."""
+
+
+class BundleError(LightpageError):
+    """A bundle that is damaged, incomplete, foreign, or newer than this program."""
+
+
+class CalibrationError(LightpageError):
+    """The known pages do not fit any geometry within the capture range."""
+
+
+class RecalibrationRefusedError(LightpageError):
+    """The re-fitted geometry would decode worse than the one in use; nothing was changed."""
+
+
+class BusyError(LightpageError):
+    """The resource is taken by another call; try again later."""
+
+
+class LimitError(LightpageError):
+    """A request is larger than the service accepts."""

@@ -1,0 +1,188 @@
+"""Device profiles: the nominal numbers of a storage device, read from TOML and checked on load."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from optics.errors import ProfileError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(gt=0)]
+
+SHIPPED = ("bench", "paper")
+
+
+class Table(BaseModel):
+    """A checked TOML table: frozen, no unknown keys, no NaN or infinity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+T = TypeVar("T", bound=Table)
+
+
+class Light(Table):
+    """The laser."""
+
+    wavelength_m: Positive
+
+
+class Lens(Table):
+    """The launch and the de-launch lens, both in a 2f arrangement."""
+
+    focal_length_m: Positive
+
+
+class Pipe(Table):
+    """The light-pipe: a glass prism whose cross-section is a rhombus of height `width_m`, sheared by `angle_deg`."""
+
+    length_m: Positive
+    width_m: Positive
+    refractive_index: Annotated[float, Field(ge=1, le=4)]
+    angle_deg: Annotated[float, Field(ge=-5, le=5)] = 0.0
+
+
+class Slm(Table):
+    """The spatial light modulator."""
+
+    pitch_m: Positive
+
+
+class PageLayout(Table):
+    """How symbols lie on the SLM, and which of them are pilots."""
+
+    columns: Count
+    rows: Count
+    symbol_size_px: Count
+    pilot_fraction: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
+    pilot_seed: Annotated[int, Field(ge=0)] = 0
+
+
+class Camera(Table):
+    """The sensor of both cameras."""
+
+    columns_px: Count
+    rows_px: Count
+    pitch_m: Positive
+
+
+class Profile(Table):
+    """What the data sheet of a device says. Lengths in metres, angles in degrees, pixels where the key says so."""
+
+    schema_version: Literal[1]
+    name: Annotated[str, Field(min_length=1)]
+    light: Light
+    lens: Lens
+    pipe: Pipe
+    slm: Slm
+    page: PageLayout
+    camera: Camera
+
+    @model_validator(mode="after")
+    def _page_fits_the_optics(self) -> Self:
+        numerical_aperture = max(self.page_width_m, self.page_height_m) / 2 / self.lens.focal_length_m
+        if numerical_aperture >= 0.5:
+            raise ValueError(
+                f"page.columns, page.rows: the page's edge enters at {numerical_aperture:.2f} of the focal length, "
+                "wanted below 0.5"
+            )
+        return self
+
+    @property
+    def page_width_m(self) -> float:
+        """Width of the page on the SLM, metres."""
+        return self.page.columns * self.page.symbol_size_px * self.slm.pitch_m
+
+    @property
+    def page_height_m(self) -> float:
+        """Height of the page on the SLM, metres."""
+        return self.page.rows * self.page.symbol_size_px * self.slm.pitch_m
+
+    @property
+    def symbol_pitch_m(self) -> float:
+        """Edge of one symbol on the SLM, metres."""
+        return self.page.symbol_size_px * self.slm.pitch_m
+
+    @property
+    def page_shape(self) -> tuple[int, int]:
+        """Symbols as (rows, columns)."""
+        return self.page.rows, self.page.columns
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """Camera pixels as (rows, columns)."""
+        return self.camera.rows_px, self.camera.columns_px
+
+    def to_toml(self) -> str:
+        """The profile as TOML text; `parse_profile` reads it back to an equal profile."""
+        return to_toml(self)
+
+
+def to_toml(table: Table) -> str:
+    """Write a checked table (scalars first, then its sub-tables one level down) as TOML text."""
+    scalars: list[str] = []
+    tables: list[str] = []
+    for key, value in table.model_dump().items():
+        if isinstance(value, dict):
+            tables += ["", f"[{key}]", *(f"{k} = {_toml_value(v)}" for k, v in value.items())]
+        else:
+            scalars.append(f"{key} = {_toml_value(value)}")
+    return "\n".join([*scalars, *tables]) + "\n"
+
+
+def _toml_value(value: object) -> str:
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value)
+
+
+def validate(model: type[T], data: dict[str, Any], source: str) -> T:
+    """Check `data` against `model`; a `ProfileError` lists every offending key with what came and what was wanted."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        problems = "; ".join(
+            f"{'.'.join(str(part) for part in e['loc']) or 'document'} = {e['input']!r} ({e['msg']})"
+            for e in error.errors()
+        )
+        raise ProfileError(source, problems, f"a valid {model.__name__.lower()}") from None
+
+
+def parse_profile(text: str, source: str = "profile") -> Profile:
+    """Read a profile from TOML text.
+
+    Raises:
+        ProfileError: not TOML, a missing, unknown or unphysical key.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ProfileError(source, f"text that is not TOML ({error})", "a TOML document") from None
+    return validate(Profile, data, source)
+
+
+def load_profile(name_or_path: str | Path) -> Profile:
+    """Load a shipped profile by name (`bench`, `paper`) or any profile by path.
+
+    Raises:
+        ProfileError: no such profile, or it does not validate.
+    """
+    if str(name_or_path) in SHIPPED:
+        text = resources.files("optics").joinpath("profiles", f"{name_or_path}.toml").read_text("utf-8")
+        return parse_profile(text, f"profile {name_or_path}")
+    path = Path(name_or_path)
+    try:
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ProfileError(
+            f"profile {name_or_path}", error, f"a readable TOML file or one of {', '.join(SHIPPED)}"
+        ) from None
+    return parse_profile(text, f"profile {path}")

@@ -1,0 +1,1 @@
+"""Measuring a device against known pages and fitting its geometry with a twin."""

@@ -1,0 +1,1 @@
+"""No torch: bundle, decoder, frame sources, recalibration, gRPC service, client, command line."""

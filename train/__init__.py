@@ -1,0 +1,1 @@
+"""Torch: the differentiable twins, localizers, networks, loss and fitting."""
