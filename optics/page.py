@@ -66,9 +66,9 @@ def symbol_phases(symbols: ArrayLike, levels: int) -> NDArray[np.float64]:
 def pilot_mask(profile: Profile) -> NDArray[np.bool_]:
     """Default pilot positions, [ny, nx]: True where the symbol is known beforehand.
 
-    One pilot in each cell of an even lattice, at a seeded random place within its cell, so that the pilots cover the page
-    without sharing its period. Their number is about `page.pilot_fraction` of the symbols, and at least four where the page
-    has that many.
+    One pilot in each cell of an even lattice, at a seeded random place within its cell, so that the pilots cover the
+    page without sharing its period. Their number is about `page.pilot_fraction` of the symbols, and at least four
+    where the page has that many.
     """
     ny, nx = profile.page_shape
     rows, columns = _lattice(ny, nx, profile.page.pilot_fraction)
