@@ -1,0 +1,282 @@
+"""How much a decoded page carries and how honest its confidence is: decisions, rates, calibration of beliefs.
+
+A decoder believes of every symbol that its phase follows a von Mises density with mean phase `mu` (radians) and
+concentration `kappa`. All figures are computed in float64. `levels` is M: symbol s stands for the phase 2 pi s / M.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import i0e, i1e, logsumexp
+
+from optics.errors import PageError
+
+Floats = NDArray[np.float64]
+
+MIN_LEVELS, MAX_LEVELS = 2, 256
+CONCENTRATION_CAP = 1e9
+"""Beyond this the float64 difference kappa I1/I0 - log I0 loses digits; one symbol of 256 levels needs about 1e5."""
+
+ECE_BINS = 15
+_WINDOW = 12
+_ALIASING = 60.0
+_CHUNK = 8192
+
+
+def check_levels(levels: int) -> int:
+    """Return `levels` if it is a level count that a page can have.
+
+    Raises:
+        PageError: not within 2..256.
+    """
+    if not MIN_LEVELS <= levels <= MAX_LEVELS:
+        raise PageError("levels", levels, f"{MIN_LEVELS}..{MAX_LEVELS}")
+    return int(levels)
+
+
+def log_i0(kappa: Floats) -> Floats:
+    """Natural logarithm of the modified Bessel function I0, safe for any kappa."""
+    return np.asarray(np.log(i0e(kappa)) + kappa, np.float64)
+
+
+def mean_resultant(kappa: Floats) -> Floats:
+    """I1(kappa) / I0(kappa): the mean cosine of the error that a concentration promises."""
+    return np.asarray(i1e(kappa) / i0e(kappa), np.float64)
+
+
+def own_information(kappa: NDArray[np.floating], levels: int | None = None) -> Floats:
+    """Bits that a belief of concentration `kappa` claims to know about a phase, same shape as `kappa`.
+
+    kappa I1(kappa) / (I0(kappa) ln 2) - log2 I0(kappa). With `levels`, capped at log2 of it: a symbol of M levels has
+    no more to know. It is the model's own claim and bounds nothing; see `achievable_rate`.
+
+    Raises:
+        PageError: a concentration that is negative or not a number.
+    """
+    k = _concentration(kappa)
+    bits = (k * ((i1e(k) - i0e(k)) / i0e(k)) - np.log(i0e(k))) / np.log(2)
+    return np.minimum(bits, np.log2(check_levels(levels))) if levels is not None else np.asarray(bits)
+
+
+def decide(mu: NDArray[np.floating], levels: int) -> NDArray[np.uint8]:
+    """The level nearest to each phase `mu` (radians, any winding); same shape, uint8."""
+    m = check_levels(levels)
+    return np.asarray(np.rint(np.asarray(mu, np.float64) * (m / (2 * np.pi))) % m, np.uint8)
+
+
+def log_posterior(
+    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
+) -> Floats:
+    """Natural log of the posterior probability of level `symbols` among M equally likely levels, same shape.
+
+    log softmax_k(kappa cos(theta_k - mu)) at k = symbols.
+
+    Raises:
+        PageError: shapes differ, a symbol outside 0..M-1, a phase or concentration that is not finite.
+    """
+    m, phase, k, s = _checked(mu, kappa, symbols, levels)
+    error = s * (2 * np.pi / m) - phase
+    return np.asarray(k * (np.cos(error) - 1) - _log_partition(phase, k, m))
+
+
+def decide_with_confidence(
+    mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Nearest levels (uint8) and the posterior of each among the M levels (float32, 1/M..1); shapes as `mu`."""
+    symbols = decide(mu, levels)
+    confidence = np.exp(log_posterior(mu, kappa, symbols, levels))
+    return symbols, np.clip(confidence, 1 / levels, 1).astype(np.float32)
+
+
+def achievable_rate(
+    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
+) -> Floats:
+    """Contribution of each symbol to the AIR, bits: log2 M + log2 of the true level's posterior. The mean is the AIR.
+
+    Its mean over held-out symbols is a lower bound on what a code can carry (mismatched decoding); it can be negative.
+    """
+    return np.asarray(np.log2(levels) + log_posterior(mu, kappa, symbols, levels) / np.log(2), np.float64)
+
+
+def gray_rate(
+    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
+) -> Floats:
+    """Contribution of each symbol to the GMI of Gray-labelled bits (bit-metric decoding at scale 1), bits, 1-D.
+
+    Sum over the log2 M bits of 1 + log2 posterior of the true bit.
+
+    Raises:
+        PageError: as `log_posterior`, or M is no power of two and has no Gray labels.
+    """
+    m, phase, k, s = _checked(mu, kappa, symbols, levels)
+    if m & (m - 1):
+        raise PageError("levels of a Gray-labelled page", m, "a power of two")
+    bits = m.bit_length() - 1
+    labels = np.arange(m) ^ (np.arange(m) >> 1)
+    total = np.full(phase.size, float(bits))
+    for rows in _chunks(phase.size):
+        logits = _logits(phase.ravel()[rows], k.ravel()[rows], m)
+        everything = logsumexp(logits, axis=1)
+        sent = labels[s.ravel()[rows]]
+        for bit in range(bits):
+            alike = (labels[None, :] >> bit & 1) == (sent[:, None] >> bit & 1)
+            total[rows] += (logsumexp(np.where(alike, logits, -np.inf), axis=1) - everything) / np.log(2)
+    return total
+
+
+def expected_calibration_error(
+    confidence: NDArray[np.floating], correct: NDArray[np.bool_], bins: int = ECE_BINS
+) -> float:
+    """ECE: mean over symbols of |accuracy - mean confidence| of their bin, `bins` bins of equal width on 0..1.
+
+    Args:
+        confidence: posterior of each decided symbol, any shape.
+        correct: whether the decision was right, same shape.
+        bins: number of bins.
+    """
+    c = np.asarray(confidence, np.float64).ravel()
+    if c.size == 0:
+        raise PageError("confidences", "none", "at least one")
+    index = np.clip((c * bins).astype(int), 0, bins - 1)
+    hits = np.bincount(index, np.asarray(correct, np.float64).ravel(), bins)
+    claims = np.bincount(index, c, bins)
+    return float(np.abs(hits - claims).sum() / c.size)
+
+
+@dataclass(frozen=True)
+class ConcentrationBin:
+    """Symbols of similar concentration: what they promised against what happened."""
+
+    low: float
+    high: float
+    count: int
+    promised: float
+    """Mean of I1/I0 over the bin."""
+    observed: float
+    """Mean cosine of the phase error."""
+
+
+def concentration_calibration(
+    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int, bins: int = 10
+) -> list[ConcentrationBin]:
+    """Promise and outcome in `bins` bins of equal count, ordered by concentration; empty bins are left out."""
+    m, phase, k, s = _checked(mu, kappa, symbols, levels)
+    order = np.argsort(k, axis=None, kind="stable")
+    cosine, ranked = np.cos(s * (2 * np.pi / m) - phase).ravel()[order], k.ravel()[order]
+    return [
+        ConcentrationBin(
+            float(ranked[part[0]]),
+            float(ranked[part[-1]]),
+            part.size,
+            float(mean_resultant(ranked[part]).mean()),
+            float(cosine[part].mean()),
+        )
+        for part in np.array_split(np.arange(ranked.size), bins)
+        if part.size
+    ]
+
+
+@dataclass(frozen=True)
+class PageMeasures:
+    """The figures of one set of symbols whose truth is known."""
+
+    count: int
+    levels: int
+    air_bits_per_symbol: float
+    own_mi_bits_per_symbol: float
+    gmi_bits_per_symbol: float | None
+    """None where M is no power of two."""
+    symbol_error_rate: float
+    ece: float
+
+    @property
+    def over_claim_bits_per_symbol(self) -> float:
+        """Own-MI minus AIR: what the decoder claims beyond what a code could carry."""
+        return self.own_mi_bits_per_symbol - self.air_bits_per_symbol
+
+
+def measure(
+    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
+) -> PageMeasures:
+    """All figures of the symbols given, which should be data symbols only (pilots carry nothing).
+
+    Args:
+        mu: decoded phase, radians, piston already removed; any shape.
+        kappa: concentration, same shape.
+        symbols: the true symbols, same shape.
+        levels: M.
+    """
+    truth = np.asarray(symbols)
+    if truth.size == 0:
+        raise PageError("symbols to measure", "none", "at least one")
+    decided, confidence = decide_with_confidence(mu, kappa, levels)
+    correct = decided == truth
+    return PageMeasures(
+        count=int(truth.size),
+        levels=levels,
+        air_bits_per_symbol=float(achievable_rate(mu, kappa, truth, levels).mean()),
+        own_mi_bits_per_symbol=float(own_information(kappa, levels).mean()),
+        gmi_bits_per_symbol=None if levels & (levels - 1) else float(gray_rate(mu, kappa, truth, levels).mean()),
+        symbol_error_rate=float(1 - correct.mean()),
+        ece=expected_calibration_error(confidence, correct),
+    )
+
+
+def _log_partition(phase: Floats, kappa: Floats, levels: int) -> Floats:
+    """log sum_k exp(kappa (cos(theta_k - mu) - 1)) without M terms a symbol; agrees with the plain sum to 1e-9.
+
+    The sum is M (I0 + 2 sum_n I_nM cos(n M mu)) exp(-kappa): for kappa << M^2 only I0 counts. For a larger kappa only
+    the levels near mu count.
+    """
+    if levels <= 2 * _WINDOW + 1:
+        return _window_sum(phase, kappa, levels, np.arange(levels))
+    smooth = kappa <= levels**2 / _ALIASING
+    result = np.log(levels) + np.log(i0e(kappa))
+    if not smooth.all():
+        result[~smooth] = _window_sum(phase[~smooth], kappa[~smooth], levels, np.arange(-_WINDOW, _WINDOW + 1))
+    return np.asarray(result)
+
+
+def _window_sum(phase: Floats, kappa: Floats, levels: int, offsets: NDArray[np.int_]) -> Floats:
+    step = 2 * np.pi / levels
+    nearest = np.rint(phase / step) * step
+    total = np.zeros_like(phase)
+    top = kappa * (np.cos(nearest - phase) - 1)
+    for offset in offsets:
+        total += np.exp(kappa * (np.cos(nearest + offset * step - phase) - 1) - top)
+    return np.asarray(np.log(total) + top)
+
+
+def _logits(phase: Floats, kappa: Floats, levels: int) -> Floats:
+    theta = np.arange(levels) * (2 * np.pi / levels)
+    return np.asarray(kappa[:, None] * (np.cos(theta[None, :] - phase[:, None]) - 1))
+
+
+def _chunks(size: int) -> Iterator[slice]:
+    return (slice(start, start + _CHUNK) for start in range(0, size, _CHUNK))
+
+
+def _concentration(kappa: NDArray[np.floating]) -> Floats:
+    k = np.atleast_1d(np.asarray(kappa, np.float64))
+    if not (k >= 0).all():
+        raise PageError("concentration", "a negative value or NaN", "numbers of at least 0")
+    return np.minimum(k, CONCENTRATION_CAP)
+
+
+def _checked(
+    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
+) -> tuple[int, Floats, Floats, NDArray[np.int64]]:
+    m = check_levels(levels)
+    phase, k = np.atleast_1d(np.asarray(mu, np.float64)), _concentration(kappa)
+    s = np.atleast_1d(np.asarray(symbols))
+    if not phase.shape == k.shape == s.shape:
+        raise PageError("phase, concentration, symbols", (phase.shape, k.shape, s.shape), "three equal shapes")
+    if not np.isfinite(phase).all():
+        raise PageError("decoded phase", "NaN or infinity", "finite radians")
+    if s.size and (int(s.min()) < 0 or int(s.max()) >= m):
+        raise PageError("symbols", f"{s.min()}..{s.max()}", f"0..{m - 1}")
+    return m, phase, k, s.astype(np.int64)
