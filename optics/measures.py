@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.special import i0e, i1e, logsumexp
 
 from optics.errors import PageError
+from optics.page import check_levels
 
 Floats = NDArray[np.float64]
 
-MIN_LEVELS, MAX_LEVELS = 2, 256
 CONCENTRATION_CAP = 1e9
 """Beyond this the float64 difference kappa I1/I0 - log I0 loses digits; one symbol of 256 levels needs about 1e5."""
 
@@ -25,17 +25,6 @@ ECE_BINS = 15
 _WINDOW = 12
 _ALIASING = 60.0
 _CHUNK = 8192
-
-
-def check_levels(levels: int) -> int:
-    """Return `levels` if it is a level count that a page can have.
-
-    Raises:
-        PageError: not within 2..256.
-    """
-    if not MIN_LEVELS <= levels <= MAX_LEVELS:
-        raise PageError("levels", levels, f"{MIN_LEVELS}..{MAX_LEVELS}")
-    return int(levels)
 
 
 def log_i0(kappa: Floats) -> Floats:
@@ -59,13 +48,16 @@ def own_information(kappa: NDArray[np.floating], levels: int | None = None) -> F
     """
     k = _concentration(kappa)
     bits = (k * ((i1e(k) - i0e(k)) / i0e(k)) - np.log(i0e(k))) / np.log(2)
-    return np.minimum(bits, np.log2(check_levels(levels))) if levels is not None else np.asarray(bits)
+    if levels is None:
+        return np.asarray(bits)
+    check_levels(levels)
+    return np.minimum(bits, np.log2(levels))
 
 
 def decide(mu: NDArray[np.floating], levels: int) -> NDArray[np.uint8]:
     """The level nearest to each phase `mu` (radians, any winding); same shape, uint8."""
-    m = check_levels(levels)
-    return np.asarray(np.rint(np.asarray(mu, np.float64) * (m / (2 * np.pi))) % m, np.uint8)
+    check_levels(levels)
+    return np.asarray(np.rint(np.asarray(mu, np.float64) * (levels / (2 * np.pi))) % levels, np.uint8)
 
 
 def log_posterior(
@@ -270,13 +262,13 @@ def _concentration(kappa: NDArray[np.floating]) -> Floats:
 def _checked(
     mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
 ) -> tuple[int, Floats, Floats, NDArray[np.int64]]:
-    m = check_levels(levels)
+    check_levels(levels)
     phase, k = np.atleast_1d(np.asarray(mu, np.float64)), _concentration(kappa)
     s = np.atleast_1d(np.asarray(symbols))
     if not phase.shape == k.shape == s.shape:
         raise PageError("phase, concentration, symbols", (phase.shape, k.shape, s.shape), "three equal shapes")
     if not np.isfinite(phase).all():
         raise PageError("decoded phase", "NaN or infinity", "finite radians")
-    if s.size and (int(s.min()) < 0 or int(s.max()) >= m):
-        raise PageError("symbols", f"{s.min()}..{s.max()}", f"0..{m - 1}")
-    return m, phase, k, s.astype(np.int64)
+    if s.size and (int(s.min()) < 0 or int(s.max()) >= levels):
+        raise PageError("symbols", f"{s.min()}..{s.max()}", f"0..{levels - 1}")
+    return levels, phase, k, s.astype(np.int64)
