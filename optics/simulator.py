@@ -1,0 +1,270 @@
+"""The simulated device: pages in, frame pairs out, with every imperfection of its state and drift from page to page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optics.cameras import CameraView, expose, in_phase_intensity, quadrature_intensity, resample, to_counts
+from optics.device import CameraPose, Device
+from optics.page import check_symbols, symbol_phases
+from optics.profile import Profile
+from optics.recording import FramePair
+from optics.waves import WaveChannel, WaveGeometry, modes_for
+
+Real = NDArray[np.floating]
+Complex = NDArray[np.complexfloating]
+
+_CLIPPING_AMPLITUDE = 2.4
+"""Signal amplitude over its root mean square that, in phase with the reference, just fills the well: a Rayleigh
+amplitude exceeds it in 0.3% of the samples."""
+_GRID_MARGIN = 1.04
+"""Computed camera plane over the sensor, so that rotated and shifted pixels still look inside."""
+
+
+@dataclass(frozen=True)
+class SimulatedPage:
+    """One page as recorded, with what only the simulator knows.
+
+    Attributes:
+        pair: the frames.
+        exit_field: signal on the exit facet's grid, complex64 [cells_y - 1, cells_x - 1], before piston.
+        piston: phase of the signal against the reference, radians.
+        shift_px: drift of the image (x, y), camera pixels.
+    """
+
+    pair: FramePair
+    exit_field: Complex
+    piston: float
+    shift_px: tuple[float, float]
+
+
+class TrueOptics:
+    """The noise-free optics of one device: what a simulator, or an oracle that may know the truth, computes with."""
+
+    def __init__(self, profile: Profile, device: Device, steps: int = 64) -> None:
+        self.profile = profile
+        self.device = device
+        self._steps = steps
+
+    @cached_property
+    def geometry(self) -> WaveGeometry:
+        """The true geometry."""
+        truth, nominal = self.device.geometry, self.profile
+        return WaveGeometry(
+            wavelength_m=nominal.light.wavelength_m,
+            focal_length_m=nominal.lens.focal_length_m * (1 + truth.focal_length_relative_error),
+            pipe_length_m=nominal.pipe.length_m * (1 + truth.pipe_length_relative_error),
+            pipe_width_m=nominal.pipe.width_m * (1 + truth.pipe_width_relative_error),
+            refractive_index=nominal.pipe.refractive_index,
+            pipe_angle=np.deg2rad(truth.pipe_angle_deg),
+            pipe_roll=np.deg2rad(truth.pipe_roll_deg),
+        )
+
+    @cached_property
+    def page_axes_m(self) -> tuple[Real, Real]:
+        """Centres of the SLM pixels (x, y) against the optical axis."""
+        page, pitch = self.profile.page, self.profile.slm.pitch_m
+        columns, rows = page.columns * page.symbol_size_px, page.rows * page.symbol_size_px
+        x = (np.arange(columns) - (columns - 1) / 2 + self.device.geometry.page_shift_x_px) * pitch
+        y = (np.arange(rows) - (rows - 1) / 2 + self.device.geometry.page_shift_y_px) * pitch
+        return x, y
+
+    @cached_property
+    def corner_m(self) -> float:
+        """Distance of the page's corner from its centre."""
+        return float(np.hypot(self.profile.page_width_m, self.profile.page_height_m) / 2)
+
+    @cached_property
+    def camera_axes_m(self) -> tuple[Real, Real]:
+        """Uniform axes (x, y) of the computed camera plane, at the cameras' pitch."""
+        camera = self.profile.camera
+
+        def axis(pixels: int) -> Real:
+            count = int(pixels * _GRID_MARGIN) + 48
+            return np.asarray((np.arange(count) - (count - 1) / 2) * camera.pitch_m)
+
+        return axis(camera.columns_px), axis(camera.rows_px)
+
+    @cached_property
+    def channel(self) -> WaveChannel:
+        """SLM to camera plane."""
+        page_x, page_y = self.page_axes_m
+        roll = abs(self.geometry.pipe_roll)
+        reach_x, reach_y = float(np.abs(page_x).max()), float(np.abs(page_y).max())
+        shear = roll + 2 * abs(self.geometry.pipe_angle)
+        cells = (
+            modes_for(reach_y + shear * reach_x, self.geometry, margin=1.04),
+            modes_for(reach_x + shear * reach_y, self.geometry, margin=1.04),
+        )
+        pitch = self.profile.slm.pitch_m
+        return WaveChannel(
+            self.geometry,
+            page_x,
+            page_y,
+            *self.camera_axes_m,
+            cells=cells,
+            steps=self._steps,
+            envelope_m=pitch,
+            blur_m=self.device.slm.blur_px * pitch,
+        )
+
+    @cached_property
+    def slm_factor(self) -> Complex:
+        """Illumination and the launch side's aberrations on the SLM's pixels [ny, nx], complex."""
+        page_x, page_y = self.page_axes_m
+        x = (page_x - page_x.mean())[None, :] / self.corner_m
+        y = (page_y - page_y.mean())[:, None] / self.corner_m
+        radius2 = x**2 + y**2
+        aberration = self.device.aberration
+        phase = (
+            aberration.defocus_rad * radius2
+            + aberration.astigmatism_rad * (x**2 - y**2)
+            + aberration.coma_rad * radius2 * x
+        )
+        amplitude = 1 - self.device.slm.falloff_relative * radius2
+        return np.asarray(amplitude * np.exp(1j * phase))
+
+    @cached_property
+    def signal_scale(self) -> float:
+        """Factor that makes the signal's mean power over the page's image one."""
+        size = self.profile.page.symbol_size_px
+        symbols = np.exp(2j * np.pi * np.random.default_rng(0).random(self.profile.page_shape))
+        field = self.channel.exit_field(self.slm_factor * np.kron(symbols, np.ones((size, size))))
+        # the de-launch is unitary on samples of the camera's pitch, and the page is imaged at its own size
+        samples = self.profile.page_width_m * self.profile.page_height_m / self.profile.camera.pitch_m**2
+        return float(np.sqrt(samples) / np.linalg.norm(field))
+
+    def exit_field(self, page_phase: Real) -> Complex:
+        """Phase written on the SLM [ny, nx], radians, to the field on the exit facet."""
+        return self.signal_scale * self.channel.exit_field(self.slm_factor * np.exp(1j * page_phase))
+
+    def camera_field(self, exit_field: Complex) -> Complex:
+        """Field on the exit facet to the computed camera plane."""
+        return self.channel.delaunch_lens.to_plane(exit_field)
+
+    def reference(self, seed: int) -> Complex:
+        """Reference beam on the computed camera plane; the seed draws its ripple."""
+        knobs = self.device.reference
+        axis_x, axis_y = self.camera_axes_m
+        half_width, half_height = self.profile.page_width_m / 2, self.profile.page_height_m / 2
+        x, y = axis_x[None, :], axis_y[:, None]
+        phase = (
+            knobs.tilt_x_rad * x / half_width
+            + knobs.tilt_y_rad * y / half_height
+            + knobs.curvature_rad * (x**2 + y**2) / self.corner_m**2
+        )
+        rng = np.random.default_rng([seed, 1])
+        ripple = np.zeros((len(axis_y), len(axis_x)))
+        for _ in range(6):
+            turns_x, turns_y = rng.uniform(-3, 3, 2)
+            ripple += np.cos(2 * np.pi * (turns_x * x / half_width + turns_y * y / half_height + rng.random()))
+        ripple *= knobs.ripple_relative / np.sqrt(3)
+        return np.asarray(knobs.amplitude_ratio * (1 + ripple) * np.exp(1j * phase), dtype=np.complex64)
+
+    def view(self, pose: CameraPose, shift_px: tuple[float, float] = (0.0, 0.0)) -> tuple[Real, Real]:
+        """Camera-plane points (x, y) of one camera's pixels, with the drift's shift added to its pose."""
+        moved = pose.model_copy(
+            update={"shift_x_px": pose.shift_x_px + shift_px[0], "shift_y_px": pose.shift_y_px + shift_px[1]}
+        )
+        distortion = self.device.aberration.distortion_relative
+        return CameraView(self.profile.camera, moved, distortion, self.corner_m).positions_m()
+
+    @property
+    def electrons_per_unit(self) -> float:
+        """Electrons per unit intensity (mean signal power is one)."""
+        brightest = (self.device.reference.amplitude_ratio + _CLIPPING_AMPLITUDE) ** 2
+        return self.device.sensor.full_well_e / brightest / max(1.0, self.device.homodyne.quadrature_gain)
+
+
+class Simulator:
+    """A device with a memory: its piston and image shift walk from page to page.
+
+    Args:
+        profile: nominal device.
+        device: true state.
+        levels: levels M of the symbols it will be given.
+        seed: everything random comes from it; the same seed and calls give the same frames.
+        steps: splitting steps of a sheared pipe.
+    """
+
+    def __init__(self, profile: Profile, device: Device, levels: int = 256, seed: int = 0, steps: int = 64) -> None:
+        self.optics = TrueOptics(profile, device, steps)
+        self.levels = levels
+        self.seed = seed
+        self._rng = np.random.default_rng([seed, 0])
+        self._piston = float(self._rng.uniform(-np.pi, np.pi))
+        self._shift = np.zeros(2)
+
+    @property
+    def profile(self) -> Profile:
+        """The nominal device."""
+        return self.optics.profile
+
+    @property
+    def device(self) -> Device:
+        """The true state."""
+        return self.optics.device
+
+    def set_device(self, device: Device) -> None:
+        """Move the device to another true state (slow drift); piston and shift go on from where they are."""
+        self.optics = TrueOptics(self.profile, device, self.optics.channel.steps)
+        self.__dict__.pop("_reference", None)
+
+    @cached_property
+    def _reference(self) -> Complex:
+        return self.optics.reference(self.seed)
+
+    def skip(self, pages: int) -> None:
+        """Let `pages` pages pass unseen, as after a resume: the noise of later pages then differs, not their law."""
+        self._rng = np.random.default_rng([self.seed, 2, pages])
+
+    def page(self, symbols: NDArray[np.uint8]) -> FramePair:
+        """Write a page of symbols [ny, nx] and record its frame pair."""
+        return self.simulate(symbols).pair
+
+    def simulate(self, symbols: NDArray[np.uint8]) -> SimulatedPage:
+        """Write a page of symbols [ny, nx]; the frames together with the truth.
+
+        Raises:
+            PageError: symbols of the wrong shape, type or range.
+        """
+        check_symbols(symbols, self.profile.page_shape, self.levels, "symbols to simulate")
+        device, rng = self.device, self._rng
+        self._piston += device.drift.piston_rad * rng.standard_normal()
+        self._shift = self._shift + device.drift.shift_px * rng.standard_normal(2)
+        shift = (float(self._shift[0]), float(self._shift[1]))
+        size = self.profile.page.symbol_size_px
+        phase = np.kron(symbol_phases(symbols, self.levels), np.ones((size, size)))
+        phase = phase + device.slm.phase_noise_rad * rng.standard_normal(phase.shape)
+        exit_field = self.optics.exit_field(phase)
+        field = self.optics.camera_field(exit_field) * np.complex64(np.exp(1j * self._piston))
+        frames = self._frames(field, shift, noisy=True)
+        return SimulatedPage(frames, exit_field, self._piston, shift)
+
+    def references(self) -> FramePair:
+        """Reference-only frames, the mean of so many exposures that only quantisation is left."""
+        return self._frames(np.zeros_like(self._reference), (0.0, 0.0), noisy=False)
+
+    def _frames(self, field: Complex, shift: tuple[float, float], *, noisy: bool) -> FramePair:
+        device = self.device
+        homodyne = device.homodyne
+        intensities = (
+            in_phase_intensity(field, self._reference),
+            homodyne.quadrature_gain
+            * quadrature_intensity(
+                field, self._reference, np.deg2rad(homodyne.quadrature_error_deg), homodyne.quadrature_sign
+            ),
+        )
+        frames = []
+        for intensity, pose in zip(intensities, (device.in_phase_camera, device.quadrature_camera), strict=True):
+            seen = resample(intensity, *self.optics.camera_axes_m, *self.optics.view(pose, shift))
+            if noisy:
+                counts = expose(seen, self.optics.electrons_per_unit, device.sensor, self._rng)
+            else:
+                counts = to_counts(seen * self.optics.electrons_per_unit, device.sensor)
+            frames.append(counts.astype(np.uint8 if device.sensor.bit_depth == 8 else np.uint16))
+        return FramePair(*frames)

@@ -1,0 +1,288 @@
+"""Scalar wave optics of the device: lens, light-pipe, lens, on sampled planes, forward and adjoint.
+
+Conventions: time dependence exp(-i omega t), so a wave travels as exp(+i kz z). The pipe's walls are x = +-w/2 and
+y' = +-w/2 with y' = x sin t + y cos t, and the field vanishes on them. The common factor exp(i n k L) is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Complex = NDArray[np.complexfloating]
+Real = NDArray[np.floating]
+
+_RANK_TOLERANCE = 1e-7
+"""Singular values of the roll's coupling below this share of the largest are dropped (field error of the same size)."""
+
+
+@dataclass(frozen=True)
+class WaveGeometry:
+    """Everything that the field depends on between SLM and cameras. Metres and radians."""
+
+    wavelength_m: float
+    focal_length_m: float
+    pipe_length_m: float
+    pipe_width_m: float
+    refractive_index: float
+    pipe_angle: float = 0.0
+    """Shear t of the cross-section."""
+    pipe_roll: float = 0.0
+    """Rotation of the pipe about the optical axis, from x towards y, against page and cameras."""
+
+    @property
+    def wave_number(self) -> float:
+        """Free-space k, rad/m."""
+        return 2 * np.pi / self.wavelength_m
+
+
+def modes_for(half_extent_m: float, geometry: WaveGeometry, margin: float = 1.03) -> int:
+    """Cells per pipe axis such that the sine modes reach the plane wave of an SLM point at `half_extent_m`."""
+    cells = 2 * half_extent_m * geometry.pipe_width_m / (geometry.wavelength_m * geometry.focal_length_m)
+    return int(np.ceil(cells * margin))
+
+
+def sine_matrix(cells: int) -> Real:
+    """Orthonormal DST-I matrix [cells-1, cells-1]: mode m = row + 1 sampled at j/cells, j = column + 1."""
+    index = np.arange(1, cells)
+    return np.asarray(np.sqrt(2 / cells) * np.sin(np.pi * np.outer(index, index) / cells))
+
+
+class FourierLens:
+    """A 2f lens between a Cartesian plane (SLM or camera) and the oblique sample grid on a pipe facet.
+
+    The kernel exp(-i k/f (x X + y Y)) is a product of four couplings of (x, y) with the facet's (X, Y'). Three of them
+    factor into matrix products; the fourth, x with Y', is there only when the pipe is rolled, varies by a few radians
+    and is expanded in its leading singular vectors.
+
+    Args:
+        geometry: the device.
+        x_m, y_m: sample positions on the plane, uniform, [nx] and [ny].
+        cells: sample intervals of the pipe along (y', x).
+    """
+
+    def __init__(self, geometry: WaveGeometry, x_m: Real, y_m: Real, cells: tuple[int, int]) -> None:
+        w = geometry.pipe_width_m
+        t, roll = geometry.pipe_angle, geometry.pipe_roll
+        facet_y = (np.arange(1, cells[0]) / cells[0] - 0.5) * w
+        facet_x = (np.arange(1, cells[1]) / cells[1] - 0.5) * w
+        scale = geometry.wave_number / geometry.focal_length_m
+        sin, cos, tan = np.sin, np.cos, np.tan
+
+        def kernel(coefficient: float, rows: Real, columns: Real) -> Complex:
+            return np.asarray(np.exp(-1j * scale * coefficient * np.outer(rows, columns)))
+
+        area = (x_m[1] - x_m[0]) * (y_m[1] - y_m[0]) * (w / cells[0]) * (w / cells[1]) / cos(t)
+        unitary = np.sqrt(area) / (geometry.wavelength_m * geometry.focal_length_m)
+        self._x_to_x = (unitary * kernel(cos(roll) + tan(t) * sin(roll), x_m, facet_x)).astype(np.complex64)
+        self._y_and_x = kernel(sin(roll) - tan(t) * cos(roll), y_m, facet_x).astype(np.complex64)
+        self._y_to_y = kernel(cos(roll) / cos(t), facet_y, y_m).astype(np.complex64)
+        left, weights, right = np.linalg.svd(kernel(-sin(roll) / cos(t), facet_y, x_m), full_matrices=False)
+        rank = int(np.sum(weights > _RANK_TOLERANCE * weights[0]))
+        self._facet_terms = (left[:, :rank] * weights[:rank]).T.astype(np.complex64)
+        self._plane_terms = right[:rank].astype(np.complex64)
+
+    def to_facet(self, field: Complex) -> Complex:
+        """Field on the plane [ny, nx] to the facet's grid [cells_y - 1, cells_x - 1]."""
+        field = field.astype(np.complex64)
+        total: Complex | None = None
+        for on_facet, on_plane in zip(self._facet_terms, self._plane_terms, strict=True):
+            term = self._y_to_y @ (((field * on_plane) @ self._x_to_x) * self._y_and_x)
+            term *= on_facet[:, None]
+            total = term if total is None else total + term
+        assert total is not None
+        return total
+
+    def to_plane(self, field: Complex) -> Complex:
+        """The adjoint of `to_facet`: a field on the facet's grid to the plane [ny, nx], kernel exp(+i ...)."""
+        field = field.astype(np.complex64)
+        total: Complex | None = None
+        for on_facet, on_plane in zip(self._facet_terms, self._plane_terms, strict=True):
+            inner = (self._y_to_y.conj().T @ (field * on_facet.conj()[:, None])) * self._y_and_x.conj()
+            term = (inner @ self._x_to_x.conj().T) * on_plane.conj()
+            total = term if total is None else total + term
+        assert total is not None
+        return total
+
+
+class PipePropagator:
+    """Takes a field on the entrance facet's grid to the exit facet's, unitarily.
+
+    The sine modes of the cell carry exp(i (kz - nk) L) with the exact kz. In a sheared pipe the transverse Laplacian in
+    (x, y') has the cross term 2 sin t d_x d_y'. It is applied between half steps of the diagonal part (Strang
+    splitting), paraxially, as an exact exponential: the derivative couples odd with even sine modes only, and in the
+    singular basis of that coupling the exponential is a rotation of pairs. So power is kept to rounding for any step.
+
+    Args:
+        geometry: the device.
+        cells: sample intervals along (y', x).
+        steps: splitting steps over the whole pipe; 1 suffices without shear.
+    """
+
+    def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], steps: int) -> None:
+        self._geometry = geometry
+        self._cells = cells
+        self._sheared = abs(geometry.pipe_angle) > 0
+        self._steps = steps if self._sheared else 1
+        self._bases = [_ParityBasis(n) for n in cells]
+        w, k = geometry.pipe_width_m, geometry.wave_number
+        nk = geometry.refractive_index * k
+        k_y = np.pi * self._bases[0].mode_numbers / w
+        k_x = np.pi * self._bases[1].mode_numbers / w
+        transverse = k_y[:, None, :, None] ** 2 + k_x[None, :, None, :] ** 2
+        if transverse.max() >= nk**2:
+            raise ValueError(f"modes: got transverse wave number {np.sqrt(transverse.max()):.3g}, wanted below {nk:.3g}")
+        dz = geometry.pipe_length_m / self._steps
+        # kz - nk without cancellation
+        detuning = -transverse / (np.sqrt(nk**2 - transverse) + nk)
+        self._half = np.exp(0.5j * dz * detuning).astype(np.complex64)
+        coupling = np.outer(self._bases[0].couplings, self._bases[1].couplings) / w**2
+        angle = dz / nk * np.sin(geometry.pipe_angle) * coupling
+        self._cos = np.cos(angle).astype(np.float32)
+        self._sin = np.sin(angle).astype(np.float32)
+
+    def forward(self, field: Complex) -> Complex:
+        """Entrance facet [cells_y - 1, cells_x - 1] to exit facet."""
+        return self._run(field, adjoint=False)
+
+    def adjoint(self, field: Complex) -> Complex:
+        """Exit facet back to entrance facet: the exact inverse, since the pipe is unitary."""
+        return self._run(field, adjoint=True)
+
+    def _run(self, field: Complex, *, adjoint: bool) -> Complex:
+        y, x = self._bases
+        modes = _split(y.sine_by_parity, field, x.sine_by_parity)
+        half = self._half.conj() if adjoint else self._half
+        full = half * half
+        sine = -self._sin if adjoint else self._sin
+        modes = modes * half
+        for step in range(self._steps):
+            if self._sheared:
+                modes = _rotate(modes, y.singular, x.singular, self._cos, sine)
+            modes = modes * (full if step < self._steps - 1 else half)
+        return _join(y.sine_by_parity, modes, x.sine_by_parity)
+
+
+class _ParityBasis:
+    """Sine modes of one axis ordered by parity, [2, K], with the singular basis of the derivative between them."""
+
+    def __init__(self, cells: int) -> None:
+        count = cells - 1
+        size = (count + 1) // 2
+        odd = np.arange(1, count + 1, 2)
+        even = np.arange(2, count + 1, 2)
+        coupling = np.zeros((size, size))
+        m, n = odd[:, None].astype(float), even[None, :].astype(float)
+        # (2/w) integral of sin(m pi x/w) d/dx sin(n pi x/w), times w
+        coupling[: len(odd), : len(even)] = 4 * m * n / (m**2 - n**2)
+        left, self.couplings, right = np.linalg.svd(coupling)
+        self.singular = np.stack([left, right.T]).astype(np.float32)
+        self.mode_numbers = np.zeros((2, size))
+        self.mode_numbers[0, : len(odd)] = odd
+        self.mode_numbers[1, : len(even)] = even
+        sine = sine_matrix(cells)
+        self.sine_by_parity = np.zeros((2, size, count), dtype=np.float32)
+        self.sine_by_parity[0, : len(odd)] = sine[odd - 1]
+        self.sine_by_parity[1, : len(even)] = sine[even - 1]
+
+
+def _real_products(left: Real, stack: Complex, right: Real) -> Complex:
+    """left @ stack @ right with real factors, as products of the real and the imaginary part."""
+    return np.asarray((left @ stack.real @ right) + 1j * (left @ stack.imag @ right), dtype=np.complex64)
+
+
+def _split(y: Real, field: Complex, x: Real) -> Complex:
+    """Field [Ny, Nx] to modes [2, 2, Ky, Kx] by parity."""
+    return _real_products(y[:, None], field[None, None], x.transpose(0, 2, 1)[None])
+
+
+def _join(y: Real, modes: Complex, x: Real) -> Complex:
+    """Modes [2, 2, Ky, Kx] to field [Ny, Nx]."""
+    return np.asarray(_real_products(y.transpose(0, 2, 1)[:, None], modes, x[None]).sum(axis=(0, 1)))
+
+
+def _rotate(modes: Complex, y: Real, x: Real, cos: Real, sin: Real) -> Complex:
+    """Apply exp(i angle d_x d_y') to modes [2, 2, Ky, Kx]."""
+    inner = _real_products(y.transpose(0, 2, 1)[:, None], modes, x[None])
+    turned = np.empty_like(inner)
+    for (p, q), sign in (((0, 0), 1), ((1, 1), 1), ((0, 1), -1), ((1, 0), -1)):
+        turned[p, q] = cos * inner[p, q] + (1j * sign) * (sin * inner[1 - p, 1 - q])
+    return _real_products(y[:, None], turned, x.transpose(0, 2, 1)[None])
+
+
+@dataclass(frozen=True)
+class WaveChannel:
+    """SLM to camera plane: launch lens, light-pipe, de-launch lens.
+
+    Args:
+        geometry: the device.
+        page_x_m, page_y_m: SLM sample positions against the optical axis, uniform.
+        camera_x_m, camera_y_m: camera-plane sample positions against the optical axis, uniform.
+        cells: sample intervals of the pipe along (y', x).
+        steps: splitting steps of a sheared pipe.
+        envelope_m: edge of the SLM pixel, whose sinc is applied on the entrance facet; 0 for point samples.
+        blur_m: standard deviation of the SLM's blur.
+    """
+
+    geometry: WaveGeometry
+    page_x_m: Real
+    page_y_m: Real
+    camera_x_m: Real
+    camera_y_m: Real
+    cells: tuple[int, int]
+    steps: int = 64
+    envelope_m: float = 0.0
+    blur_m: float = 0.0
+
+    @cached_property
+    def launch_lens(self) -> FourierLens:
+        """SLM plane to entrance facet."""
+        return FourierLens(self.geometry, self.page_x_m, self.page_y_m, self.cells)
+
+    @cached_property
+    def delaunch_lens(self) -> FourierLens:
+        """Camera plane to exit facet (its `to_plane` is the de-launch)."""
+        return FourierLens(self.geometry, self.camera_x_m, self.camera_y_m, self.cells)
+
+    @cached_property
+    def pipe(self) -> PipePropagator:
+        """The light-pipe."""
+        return PipePropagator(self.geometry, self.cells, self.steps)
+
+    @cached_property
+    def entrance_window(self) -> Real:
+        """Transmission of the SLM's pixel shape and blur at the entrance facet, [cells_y - 1, cells_x - 1]."""
+        g = self.geometry
+        facet_y = (np.arange(1, self.cells[0]) / self.cells[0] - 0.5) * g.pipe_width_m
+        facet_x = (np.arange(1, self.cells[1]) / self.cells[1] - 0.5) * g.pipe_width_m
+        along_y = facet_y[:, None] / np.cos(g.pipe_angle) - facet_x[None, :] * np.tan(g.pipe_angle)
+        along_x = np.broadcast_to(facet_x[None, :], along_y.shape)
+        per_metre = 1 / (g.wavelength_m * g.focal_length_m)
+        fx, fy = along_x * per_metre, along_y * per_metre
+        pixel = np.sinc(fx * self.envelope_m) * np.sinc(fy * self.envelope_m)
+        blur = np.exp(-2 * (np.pi * self.blur_m) ** 2 * (fx**2 + fy**2))
+        return np.asarray(pixel * blur, dtype=np.float32)
+
+    def forward(self, field: Complex) -> Complex:
+        """Field on the SLM [ny, nx] to the field on the camera plane."""
+        return self.delaunch_lens.to_plane(self.exit_field(field))
+
+    def exit_field(self, field: Complex) -> Complex:
+        """Field on the SLM [ny, nx] to the field on the exit facet's grid."""
+        return self.pipe.forward(self.launch_lens.to_facet(field) * self.entrance_window)
+
+    def adjoint(self, field: Complex) -> Complex:
+        """Field on the camera plane back to the SLM: undoes the pipe exactly, the chain inside the pipe's band."""
+        at_entrance = self.pipe.adjoint(self.delaunch_lens.to_facet(field))
+        return self.launch_lens.to_plane(at_entrance * self.entrance_window)
+
+    def with_steps(self, steps: int) -> WaveChannel:
+        """The same channel at another number of splitting steps."""
+        return replace(self, steps=steps)
+
+    def with_camera_grid(self, x_m: Real, y_m: Real) -> WaveChannel:
+        """The same channel seen on another camera-plane grid."""
+        return replace(self, camera_x_m=x_m, camera_y_m=y_m)
