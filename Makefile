@@ -1,0 +1,60 @@
+# Sets up, tests, demonstrates and packages Lightpage. A fresh machine needs Python 3.11, pip and make, nothing else.
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+STAMP := $(VENV)/.installed
+# Two test processes, one arithmetic thread each: more threads than cores only make the tests wait for each other.
+WORKERS ?= 2
+PYTEST_ARGS ?=
+IMAGE_TARGET ?= runtime
+IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
+
+# onnxruntime reports home unless told not to.
+export ORT_DISABLE_TELEMETRY = 1
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
+
+.PHONY: help setup demo test bench image proto lint format clean
+.DELETE_ON_ERROR:
+
+help:  ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+
+setup: $(STAMP)  ## make the virtual environment with everything in it
+
+# Debian splits ensurepip off into a package of its own; there the machine's pip puts a pip into the environment.
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "make: no python3 found; install Python 3.11 or newer" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit("make: Python 3.11 or newer wanted, got " + sys.version if sys.version_info < (3, 11) else 0)'
+	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) 2>/dev/null || \
+	  { $(PYTHON) -m venv --clear --without-pip $(VENV) && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; }
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[train,dev]'
+	@touch $@
+
+demo: $(STAMP)  ## run the whole main job on a simulated device, into out/demo
+	$(BIN)/lightpage demo --out out/demo
+
+test: lint  ## lint, then every test
+	$(ONE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+
+lint: $(STAMP)  ## ruff, mypy --strict, hadolint
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/hadolint Dockerfile
+
+format: $(STAMP)  ## let ruff put the code in order
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP)  ## measure the figures that the README reports
+	$(BIN)/lightpage bench
+
+proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
+	$(BIN)/python -m runtime.generate_stubs
+
+image:  ## build the container image (IMAGE_TARGET=runtime or deep)
+	packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
+
+clean:  ## remove what was built and measured, and leave the environment
+	rm -rf build out .pytest_cache .mypy_cache .ruff_cache
