@@ -1,4 +1,4 @@
-"""Asks the service for its health, exit code the answer: the HEALTHCHECK of the image, `python -m runtime.healthcheck`."""
+"""Asks the service for its health, exit code the answer: the image's HEALTHCHECK, `python -m runtime.healthcheck`."""
 
 from __future__ import annotations
 
