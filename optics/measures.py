@@ -51,7 +51,7 @@ def own_information(kappa: NDArray[np.floating], levels: int | None = None) -> F
     if levels is None:
         return np.asarray(bits)
     check_levels(levels)
-    return np.minimum(bits, np.log2(levels))
+    return np.asarray(np.minimum(bits, np.log2(levels)))
 
 
 def decide(mu: NDArray[np.floating], levels: int) -> NDArray[np.uint8]:

@@ -1,0 +1,285 @@
+"""Decodes frame pairs with a bundle: checks, one ONNX run, piston from the pilots, decision with confidence."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optics.errors import BundleError, FrameError, InvalidInputError
+from optics.measures import decide_with_confidence
+from optics.page import check_levels
+from optics.recording import FramePair
+from runtime.bundle import Bundle, Table
+from runtime.frames import check_pair
+from runtime.manifest import DECODER, GOLDEN
+from runtime.ort import Node, Session, open_session
+from runtime.pilots import Pilots, estimate_piston, remove_piston
+
+OUTPUTS = ("p", "phase", "concentration")
+GOLDEN_TOLERANCE = 1e-3
+"""Largest error of p on the golden page, relative to its norm: room for another CPU's rounding, not for another net."""
+
+_TYPES = {
+    "tensor(float)": "float32",
+    "tensor(double)": "float64",
+    "tensor(int32)": "int32",
+    "tensor(int64)": "int64",
+    "tensor(uint8)": "uint8",
+    "tensor(uint16)": "uint16",
+}
+
+
+@dataclass(frozen=True)
+class Inference:
+    """What the graph says of a page: p float32 [2, ny, nx], its angle and its length [ny, nx]; piston still in it."""
+
+    p: NDArray[np.float32]
+    phase: NDArray[np.float32]
+    concentration: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Wall-clock seconds of one decode."""
+
+    check_s: float
+    inference_s: float
+    decision_s: float
+
+    @property
+    def total_s(self) -> float:
+        """All of it."""
+        return self.check_s + self.inference_s + self.decision_s
+
+
+@dataclass(frozen=True)
+class DecodedPage:
+    """A page of symbols with what is known about each.
+
+    Attributes:
+        symbols: uint8 [ny, nx], 0..levels-1.
+        confidence: float32 [ny, nx], posterior probability of each symbol among the levels.
+        concentration: float32 [ny, nx], von Mises kappa.
+        phase: float32 [ny, nx], radians, piston removed.
+        levels: M.
+        piston_rad: what was removed.
+        pilot_coherence: how far the pilots agree on it, 0..1.
+        timings: seconds.
+    """
+
+    symbols: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    concentration: NDArray[np.float32]
+    phase: NDArray[np.float32]
+    levels: int
+    piston_rad: float
+    pilot_coherence: float
+    timings: Timings
+
+
+@dataclass(frozen=True)
+class _Port:
+    """Name, numpy type and shape of a graph's input or output; None stands for a free dimension."""
+
+    dtype: str
+    shape: tuple[int | None, ...]
+
+    @classmethod
+    def of(cls, node: Node) -> _Port:
+        shape = tuple(size if isinstance(size, int) else None for size in node.shape)
+        return cls(_TYPES.get(node.type, node.type), shape)
+
+    def admits(self, dtype: str, shape: tuple[int, ...]) -> bool:
+        return (
+            self.dtype == dtype
+            and len(self.shape) == len(shape)
+            and all(own in (None, other) for own, other in zip(self.shape, shape, strict=True))
+        )
+
+
+class Decoder:
+    """The decoder of one bundle. Its methods may be called from many threads at once.
+
+    Args:
+        bundle: an opened bundle.
+        threads: threads of one inference; by default the cores that this process may use.
+
+    Raises:
+        BundleError: the graph is not a decoder of this profile, the table does not fit it, or the golden page comes
+            out differently.
+    """
+
+    def __init__(self, bundle: Bundle, threads: int | None = None) -> None:
+        self.bundle = bundle
+        self._thing = f"{bundle.thing}: {DECODER}"
+        self._session = open_session(bundle.files[DECODER], self._thing, threads)
+        self._ports = self._check_graph(self._session)
+        residual = bundle.manifest.residual_output
+        self._outputs = [*OUTPUTS, *([residual] if residual else [])]
+        self._table = self._checked_defaults(bundle.table)
+        self._pilots: dict[int, Pilots] = {}
+        self._check_golden()
+
+    @classmethod
+    def load(cls, path: str | Path, threads: int | None = None) -> Decoder:
+        """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
+        return cls(Bundle.open(path), threads)
+
+    @property
+    def version(self) -> str:
+        """The bundle's version."""
+        return self.bundle.version
+
+    @property
+    def table_shapes(self) -> dict[str, tuple[int | None, ...]]:
+        """Shape of every tensor that may be fed instead of its default."""
+        return {name: port.shape for name, port in self._ports.items()}
+
+    def pilots(self, levels: int) -> Pilots:
+        """The pilots that this device's pages carry at `levels` levels."""
+        if levels not in self._pilots:
+            # Two threads may both do this; the results are equal and either may stay.
+            self._pilots[levels] = Pilots.of_profile(self.bundle.profile, levels, self.bundle.pilot_mask)
+        return self._pilots[levels]
+
+    def check(self, pair: FramePair) -> None:
+        """Check a frame pair against the camera of this bundle.
+
+        Raises:
+            FrameError: wrong size, type or bit depth, black or saturated.
+        """
+        manifest = self.bundle.manifest
+        check_pair(pair, self.bundle.profile.frame_shape, manifest.frame_dtype, manifest.camera_bit_depth)
+
+    def check_table(self, table: Table) -> None:
+        """Check tensors that are to be fed instead of defaults.
+
+        Raises:
+            InvalidInputError: an unknown name, a wrong type or shape, or values that are not finite.
+        """
+        for name, value in table.items():
+            port = self._ports.get(name)
+            if port is None:
+                raise InvalidInputError("table", repr(name), f"one of {sorted(self._ports)}")
+            if not port.admits(str(value.dtype), value.shape):
+                raise InvalidInputError(f"table {name}", f"{value.dtype} {value.shape}", f"{port.dtype} {port.shape}")
+            if not np.isfinite(value).all():
+                raise InvalidInputError(f"table {name}", "NaN or infinity", "finite numbers")
+
+    def infer(self, pair: FramePair, table: Table | None = None) -> Inference:
+        """Run the graph on a checked pair.
+
+        Args:
+            pair: both frames, as `check` accepts them.
+            table: tensors fed instead of the bundle's, by name; those left out stay as they are.
+
+        Raises:
+            InvalidInputError: a table that does not fit.
+            FrameError: the frames contradict the homodyne equations beyond the bundle's limit.
+        """
+        if table:
+            self.check_table(table)
+        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **self._table, **(table or {})}
+        p, phase, concentration, *rest = self._session.run(self._outputs, feeds)
+        limit = self.bundle.manifest.residual_limit
+        if rest and limit is not None and not (residual := float(np.max(rest[0]))) <= limit:
+            raise FrameError(
+                "frame pair",
+                f"frames that contradict each other (residual {residual:.3g})",
+                f"an in-phase and a quadrature frame of one shot, not swapped (residual up to {limit:.3g})",
+            )
+        return Inference(p, phase, concentration)
+
+    def decode(
+        self, pair: FramePair, levels: int = 256, table: Table | None = None, pilots: Pilots | None = None
+    ) -> DecodedPage:
+        """Decode a frame pair into symbols of `levels` levels.
+
+        Args:
+            pair: both frames.
+            levels: M, 2..256.
+            table: as for `infer`.
+            pilots: the known symbols of this page, where they differ from this device's pattern.
+
+        Raises:
+            FrameError, PageError, InvalidInputError: see `check`, `check_levels` and `infer`.
+        """
+        start = time.perf_counter()
+        check_levels(levels)
+        self.check(pair)
+        checked = time.perf_counter()
+        inference = self.infer(pair, table)
+        inferred = time.perf_counter()
+        page = self.settle(inference, levels, pilots)
+        return _timed(page, Timings(checked - start, inferred - checked, time.perf_counter() - inferred))
+
+    def settle(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        """Take the piston out and decide: everything behind the graph, timings left at zero."""
+        piston = estimate_piston(inference.p, pilots or self.pilots(levels))
+        phase = remove_piston(inference.phase, piston.angle_rad)
+        symbols, confidence = decide_with_confidence(phase, inference.concentration, levels)
+        return DecodedPage(
+            symbols=symbols,
+            confidence=confidence,
+            concentration=inference.concentration,
+            phase=phase,
+            levels=levels,
+            piston_rad=piston.angle_rad,
+            pilot_coherence=piston.coherence,
+            timings=Timings(0.0, 0.0, 0.0),
+        )
+
+    def _check_graph(self, session: Session) -> dict[str, _Port]:
+        """The overridable inputs by name, after checking names, types and shapes of everything."""
+        manifest, profile = self.bundle.manifest, self.bundle.profile
+        inputs = {node.name: _Port.of(node) for node in session.get_inputs()}
+        if set(inputs) != {"in_phase", "quadrature"}:
+            raise BundleError(f"{self._thing}: inputs", sorted(inputs), "in_phase and quadrature")
+        for name, port in inputs.items():
+            if not port.admits(manifest.frame_dtype, profile.frame_shape):
+                wanted = f"{manifest.frame_dtype} {profile.frame_shape}"
+                raise BundleError(f"{self._thing}: input {name}", f"{port.dtype} {port.shape}", wanted)
+        table = {node.name: _Port.of(node) for node in session.get_overridable_initializers()}
+        if set(table) != set(manifest.table_inputs):
+            raise BundleError(f"{self._thing}: table inputs", sorted(table), sorted(manifest.table_inputs))
+        outputs = {node.name: _Port.of(node) for node in session.get_outputs()}
+        shapes = {"p": (2, *profile.page_shape), "phase": profile.page_shape, "concentration": profile.page_shape}
+        for name, shape in shapes.items():
+            if name not in outputs or not outputs[name].admits("float32", shape):
+                got = f"{outputs[name].dtype} {outputs[name].shape}" if name in outputs else "nothing"
+                raise BundleError(f"{self._thing}: output {name}", got, f"float32 {shape}")
+        if manifest.residual_output is not None and manifest.residual_output not in outputs:
+            raise BundleError(f"{self._thing}: output {manifest.residual_output}", "nothing", "a scalar residual")
+        return table
+
+    def _checked_defaults(self, table: Table) -> Table:
+        try:
+            self.check_table(table)
+        except InvalidInputError as error:
+            raise BundleError(f"{self.bundle.thing}: {error.thing}", error.got, error.wanted) from None
+        return table
+
+    def _check_golden(self) -> None:
+        golden, thing = self.bundle.golden, f"{self.bundle.thing}: {GOLDEN}"
+        try:
+            self.check(golden.pair)
+            p = self.infer(golden.pair).p
+        except BundleError:
+            raise
+        except Exception as error:  # onnxruntime's errors share no base class
+            raise BundleError(thing, error, "a golden page that decodes") from None
+        if golden.p.shape != p.shape:
+            raise BundleError(f"{thing}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
+        error_norm = float(np.linalg.norm(p - golden.p) / max(float(np.linalg.norm(golden.p)), 1e-30))
+        if not error_norm <= GOLDEN_TOLERANCE:
+            raise BundleError(
+                thing, f"an answer off by {error_norm:.3g} of its norm", f"the expected p within {GOLDEN_TOLERANCE:g}"
+            )
+
+
+def _timed(page: DecodedPage, timings: Timings) -> DecodedPage:
+    return DecodedPage(**{**page.__dict__, "timings": timings})

@@ -1,0 +1,105 @@
+"""Follows the slow shift of the cameras from page to page, so that small drift needs no recalibration."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Protocol
+
+from optics.recording import FramePair
+from runtime.bundle import Table
+from runtime.decoder import DecodedPage
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Movement of the image on both cameras since calibration, camera pixels; y grows with the row index."""
+
+    x_px: float = 0.0
+    y_px: float = 0.0
+
+
+class MeasureShift(Protocol):
+    """Measures from one decoded page how far the image lies from where the table in use looks for it."""
+
+    def __call__(self, pair: FramePair, page: DecodedPage, table: Table) -> Shift | None:
+        """The remaining shift, or None where the page does not show it reliably."""
+
+
+class MoveTable(Protocol):
+    """Turns a total shift into the tensors that are fed instead of the bundle's."""
+
+    def __call__(self, shift: Shift) -> Table:
+        """Tensors by input name; empty for no change."""
+
+
+class Tracker(Protocol):
+    """What the service asks of a tracker; calls come from many threads."""
+
+    def table(self) -> Table:
+        """Tensors for the next page, empty for the bundle's own."""
+
+    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> Table:
+        """Learn from a decoded page and the table that it was decoded with; returns the next page's table."""
+
+
+class NoTracker:
+    """Tracks nothing: the bundle's own table for every page."""
+
+    def table(self) -> Table:
+        """Always empty."""
+        return {}
+
+    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> Table:
+        """Learns nothing."""
+        return {}
+
+
+class ShiftTracker:
+    """Exponential average of the measured shift, applied to the table of the next page.
+
+    Args:
+        measure: how one page shows the remaining shift.
+        move: how a shift changes the table.
+        gain: share of a measured remainder that is believed at once, 0..1.
+        limit_px: the average is held within this distance per axis; drift beyond it needs a recalibration.
+    """
+
+    def __init__(self, measure: MeasureShift, move: MoveTable, gain: float = 0.3, limit_px: float = 3.0) -> None:
+        self._measure, self._move = measure, move
+        self._gain, self._limit = gain, limit_px
+        self._lock = threading.Lock()
+        """Guards the two below; taken by table() and update(), never held while measuring or moving."""
+        self._shift = Shift()
+        self._table: Table = {}
+
+    @property
+    def shift(self) -> Shift:
+        """The present estimate."""
+        with self._lock:
+            return self._shift
+
+    def table(self) -> Table:
+        """Tensors for the next page."""
+        with self._lock:
+            return self._table
+
+    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> Table:
+        """Take in the shift that `page`, decoded with `table`, still shows.
+
+        A page decoded with a table that has been replaced since is left out: its remainder is already accounted for.
+        """
+        rest = self._measure(pair, page, table)
+        with self._lock:
+            if rest is None or table is not self._table:
+                return self._table
+            before = self._shift
+        after = Shift(self._step(before.x_px, rest.x_px), self._step(before.y_px, rest.y_px))
+        moved = self._move(after)
+        with self._lock:
+            if self._shift == before:
+                self._shift, self._table = after, moved
+            return self._table
+
+    def _step(self, old: float, rest: float) -> float:
+        return min(self._limit, max(-self._limit, old + self._gain * rest))

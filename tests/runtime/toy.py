@@ -1,0 +1,224 @@
+"""A tiny device and its ONNX decoder, for tests of the runtime: every symbol is the mean of a 4x4 block of pixels.
+
+in-phase = 128 + 70 cos(theta), quadrature = 80 + 70 sin(theta), so that swapped frames contradict the references.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from optics.page import random_symbols, symbol_phases
+from optics.profile import Profile, parse_profile
+from optics.recording import FramePair, RecordingWriter
+from runtime.bundle import npz, write_bundle
+from runtime.manifest import DECODER, GOLDEN, TWIN, Manifest
+
+PROFILE_TOML = """
+schema_version = 1
+name = "toy"
+[light]
+wavelength_m = 532e-9
+[lens]
+focal_length_m = 20e-3
+[pipe]
+length_m = 18.75e-3
+width_m = 0.9e-3
+refractive_index = 1.46
+[slm]
+pitch_m = 9.2e-6
+[page]
+columns = 24
+rows = 16
+symbol_size_px = 4
+pilot_fraction = 0.05
+[camera]
+columns_px = 96
+rows_px = 64
+pitch_m = 2.4e-6
+"""
+PROFILE: Profile = parse_profile(PROFILE_TOML)
+SHAPE = PROFILE.frame_shape
+PAGE = PROFILE.page_shape
+OFFSETS = (128.0, 80.0)
+AMPLITUDE = 70.0
+TABLE_INPUTS = ("reference_in_phase", "reference_quadrature", "homodyne")
+
+
+@dataclass
+class ToyDevice:
+    """What may drift: the offsets of both cameras, the noise of a pixel."""
+
+    offsets: tuple[float, float] = OFFSETS
+    noise: float = 12.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.rng = np.random.default_rng(self.seed)
+
+    def page(self, symbols: np.ndarray, levels: int, piston: float = 0.0) -> FramePair:
+        phase = np.kron(symbol_phases(symbols, levels) + piston, np.ones((4, 4)))
+        frames = []
+        for offset, wave in zip(self.offsets, (np.cos(phase), np.sin(phase)), strict=True):
+            counts = offset + AMPLITUDE * wave + self.noise * self.rng.standard_normal(SHAPE)
+            frames.append(np.clip(np.rint(counts), 0, 254).astype(np.uint8))
+        return FramePair(*frames)
+
+    def references(self) -> FramePair:
+        return FramePair(*(np.full(SHAPE, offset, np.uint8) for offset in self.offsets))
+
+
+def symbols_of(levels: int, seed: int, pages: int = 1) -> np.ndarray:
+    """[page, ny, nx] with the pilots in place."""
+    return random_symbols(PROFILE, levels, pages, np.random.default_rng(seed))
+
+
+def decoder_onnx(kappa: float = 400.0, shape: tuple[int, int] = SHAPE, frame_type: int = TensorProto.UINT8) -> bytes:
+    """The toy decoder; `kappa` is the concentration it claims at full amplitude."""
+    h, w = shape
+    f = TensorProto.FLOAT
+    tables = {
+        "reference_in_phase": np.full(shape, OFFSETS[0], np.float32),
+        "reference_quadrature": np.full(shape, OFFSETS[1], np.float32),
+        "homodyne": np.array([kappa / AMPLITUDE, 1.0], np.float32),
+    }
+    nodes, parts = [], []
+    for index, name in enumerate(("in_phase", "quadrature")):
+        nodes += [
+            helper.make_node("Cast", [name], [f"{name}_f"], to=f),
+            helper.make_node("Sub", [f"{name}_f", f"reference_{name}"], [f"{name}_s"]),
+            helper.make_node("Unsqueeze", [f"{name}_s", "axes01"], [f"{name}_4"]),
+            helper.make_node("AveragePool", [f"{name}_4"], [f"{name}_a"], kernel_shape=[4, 4], strides=[4, 4]),
+            helper.make_node("Squeeze", [f"{name}_a", "axis0"], [f"{name}_m"]),
+            helper.make_node("Gather", ["homodyne", f"gain_index{index}"], [f"{name}_gain"]),
+        ]
+        parts.append(f"{name}_m")
+    nodes += [
+        helper.make_node("Mul", ["quadrature_m", "quadrature_gain"], ["q_scaled"]),
+        helper.make_node("Concat", ["in_phase_m", "q_scaled"], ["both"], axis=0),
+        helper.make_node("Mul", ["both", "in_phase_gain"], ["p"]),
+        helper.make_node("Split", ["p"], ["px1", "py1"], axis=0, num_outputs=2),
+        helper.make_node("Squeeze", ["px1", "axis0"], ["px"]),
+        helper.make_node("Squeeze", ["py1", "axis0"], ["py"]),
+        helper.make_node("Mul", ["px", "px"], ["px2"]),
+        helper.make_node("Mul", ["py", "py"], ["py2"]),
+        helper.make_node("Add", ["px2", "py2"], ["sum2"]),
+        helper.make_node("Sqrt", ["sum2"], ["concentration"]),
+        # atan2(y, x) = 2 atan(y / (|p| + x)), with y kept off zero, where x < 0 would give 0 / 0.
+        helper.make_node("Abs", ["py"], ["size"]),
+        helper.make_node("Less", ["size", "small"], ["vanishes"]),
+        helper.make_node("Where", ["vanishes", "small", "py"], ["rise"]),
+        helper.make_node("Add", ["concentration", "px"], ["along"]),
+        helper.make_node("Max", ["along", "tiny"], ["safe"]),
+        helper.make_node("Div", ["rise", "safe"], ["half_tangent"]),
+        helper.make_node("Atan", ["half_tangent"], ["half_angle"]),
+        helper.make_node("Add", ["half_angle", "half_angle"], ["phase"]),
+        helper.make_node("ReduceMean", ["concentration"], ["mean"], keepdims=0),
+        helper.make_node("Sub", ["concentration", "mean"], ["deviation"]),
+        helper.make_node("Mul", ["deviation", "deviation"], ["deviation2"]),
+        helper.make_node("ReduceMean", ["deviation2"], ["variance"], keepdims=0),
+        helper.make_node("Sqrt", ["variance"], ["spread"]),
+        helper.make_node("Div", ["spread", "mean"], ["residual"]),
+    ]
+    constants = {
+        "axes01": np.array([0, 1], np.int64),
+        "axis0": np.array([0], np.int64),
+        "gain_index0": np.array(0, np.int64),
+        "gain_index1": np.array(1, np.int64),
+        "tiny": np.array(1e-9, np.float32),
+        "small": np.array(1e-3, np.float32),
+    }
+    ny, nx = h // 4, w // 4
+    graph = helper.make_graph(
+        nodes,
+        "toy",
+        [
+            helper.make_tensor_value_info("in_phase", frame_type, [h, w]),
+            helper.make_tensor_value_info("quadrature", frame_type, [h, w]),
+            *(helper.make_tensor_value_info(name, f, value.shape) for name, value in tables.items()),
+        ],
+        [
+            helper.make_tensor_value_info("p", f, [2, ny, nx]),
+            helper.make_tensor_value_info("phase", f, [ny, nx]),
+            helper.make_tensor_value_info("concentration", f, [ny, nx]),
+            helper.make_tensor_value_info("residual", f, []),
+        ],
+        [numpy_helper.from_array(value, name) for name, value in {**tables, **constants}.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    onnx.checker.check_model(model, full_check=True)
+    return model.SerializeToString()
+
+
+def twin_onnx() -> bytes:
+    """places = points + the first two parameters."""
+    double = TensorProto.DOUBLE
+    graph = helper.make_graph(
+        [
+            helper.make_node("Gather", ["parameters", "indices"], ["shift"]),
+            helper.make_node("Add", ["points", "shift"], ["places"]),
+        ],
+        "twin",
+        [
+            helper.make_tensor_value_info("parameters", double, [3]),
+            helper.make_tensor_value_info("points", double, ["n", 2]),
+        ],
+        [helper.make_tensor_value_info("places", double, ["n", 2])],
+        [numpy_helper.from_array(np.array([0, 1], np.int64), "indices")],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9).SerializeToString()
+
+
+def expected_p(pair: FramePair, kappa: float = 400.0, offsets: tuple[float, float] = OFFSETS) -> np.ndarray:
+    """What the toy decoder must answer, by numpy."""
+    ny, nx = PAGE
+    return np.stack(
+        [
+            (frame.astype(np.float64) - offset).reshape(ny, 4, nx, 4).mean((1, 3)) * kappa / AMPLITUDE
+            for frame, offset in zip((pair.in_phase, pair.quadrature), offsets, strict=True)
+        ]
+    ).astype(np.float32)
+
+
+def manifest(**changes: object) -> Manifest:
+    return Manifest(
+        **{
+            "name": "toy",
+            "version": "toy-1",
+            "created": "2026-01-01T00:00:00Z",
+            "profile": PROFILE.to_toml(),
+            "calibration": "angle_deg = 0.0\n",
+            "camera_bit_depth": 8,
+            "frame_dtype": "uint8",
+            "table_inputs": TABLE_INPUTS,
+            "residual_output": "residual",
+            "residual_limit": 0.4,
+            **changes,
+        }
+    )
+
+
+def files(kappa: float = 400.0) -> dict[str, bytes]:
+    """The files of a sound toy bundle."""
+    pair = ToyDevice(seed=99).page(symbols_of(16, 99)[0], 16)
+    golden = npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected_p(pair, kappa))
+    return {DECODER: decoder_onnx(kappa), TWIN: twin_onnx(), GOLDEN: golden}
+
+
+def write_toy_bundle(path: Path, kappa: float = 400.0, **changes: object) -> Path:
+    return write_bundle(path, manifest(**changes), files(kappa))
+
+
+def write_toy_recording(
+    path: Path, device: ToyDevice, levels: int, pages: int, seed: int = 7, piston: float = 0.4
+) -> np.ndarray:
+    """Write a recording and return its symbols."""
+    symbols = symbols_of(levels, seed, pages)
+    with RecordingWriter(path, PROFILE, levels, 8, device.references()) as writer:
+        for index, page in enumerate(symbols):
+            writer.append(page, device.page(page, levels, piston * index))
+    return symbols
