@@ -4,7 +4,10 @@
 #   docker run --read-only --tmpfs /tmp -v bundles:/bundles -v state:/state -p 50051:50051 lightpage:runtime
 #
 # Two optional build secrets carry the builder's own package settings in without leaving them in a layer:
-# `pip_conf` (a pip configuration file) and `ca_bundle` (trusted certificates, where the registry needs its own).
+# `pip_conf` (a pip configuration file) and `ca_bundle` (trusted certificates, where the registry needs its own). A build
+# context `packages` takes the place of the empty stage of that name where packages come from a folder.
+
+FROM scratch AS packages
 
 FROM debian:bookworm-slim AS base
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
@@ -29,6 +32,7 @@ COPY export export
 COPY runtime runtime
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
+    --mount=type=bind,from=packages,target=/run/packages \
     /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt .
 
 FROM base AS runtime
@@ -53,6 +57,7 @@ CMD ["--source", "simulator:bench", "--address", "0.0.0.0:50051"]
 FROM build AS build-deep
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
+    --mount=type=bind,from=packages,target=/run/packages \
     /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[train]'
 
 FROM runtime AS deep

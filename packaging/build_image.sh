@@ -8,7 +8,7 @@
 #   LIGHTPAGE_STORAGE   where buildah keeps images (default build/containers)
 #
 # Where buildah has no debian:bookworm-slim, mmdebstrap makes one from the machine's own apt sources. The machine's own
-# pip settings, certificates and package folders are lent to the build as secrets and mounts; none of them stays in the image.
+# pip settings, certificates and package folders are lent to the build as secrets and as a build context; none of them stays in the image.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -31,6 +31,16 @@ lend_pip_settings() {
   "$pip_python" -m pip config list 2>/dev/null | "$pip_python" packaging/lend_pip_settings.py "$scratch"
 }
 
+# The folders as one tree, numbered: hard links where the file system allows, since they may be large.
+lend_packages() {
+  mkdir "$scratch/packages"
+  local number=0
+  for folder in "${folders[@]}"; do
+    cp -al "$folder" "$scratch/packages/$number" 2>/dev/null || cp -aT "$folder" "$scratch/packages/$number"
+    number=$((number + 1))
+  done
+}
+
 choose_builder() {
   if [ -n "${LIGHTPAGE_BUILDER:-}" ]; then
     echo "$LIGHTPAGE_BUILDER"
@@ -48,7 +58,7 @@ in_buildah() {
   buildah --storage-driver vfs --root "$storage" --runroot "$scratch/run" "$@"
 }
 
-# A slim Debian as the registry has it, made on the spot: no documentation, no manuals, no translations.
+# A slim Debian as the registry has it, made on the spot: no documentation, no manuals, no translations, no trace of its maker.
 provide_base() {
   if in_buildah inspect --type image "$base" >/dev/null 2>&1; then
     return
@@ -64,6 +74,7 @@ provide_base() {
   mmdebstrap --quiet --variant=minbase \
     --dpkgopt='path-exclude=/usr/share/doc/*' --dpkgopt='path-include=/usr/share/doc/*/copyright' \
     --dpkgopt='path-exclude=/usr/share/man/*' --dpkgopt='path-exclude=/usr/share/locale/*' \
+    --customize-hook='rm -f "$1/etc/resolv.conf" "$1/etc/hostname"' \
     bookworm "$scratch/base.tar"
   local container
   container="$(in_buildah from scratch)"
@@ -87,13 +98,10 @@ case "$builder" in
     storage="$(realpath -m "${LIGHTPAGE_STORAGE:-build/containers}")"
     mkdir -p "$storage"
     provide_base
-    mounts=()
-    for folder in "${folders[@]}"; do
-      mounts+=(--volume "$folder:$folder:ro")
-    done
+    lend_packages
     # The Docker format, since the OCI one has no place for a health check.
     in_buildah bud --isolation chroot --format docker --pull-never --target "$target" --tag "$tag" \
-      "${secrets[@]}" "${mounts[@]}" .
+      "${secrets[@]}" --build-context "packages=$scratch/packages" .
     in_buildah images "$tag"
     ;;
   *)

@@ -3,7 +3,8 @@
     python3 -m pip config list | python3 packaging/lend_pip_settings.py FOLDER
 
 Writes FOLDER/pip.conf and, where certificates are named, FOLDER/ca_bundle; prints the local folders that the settings
-lean on, one a line, for the builder to mount. Standard library only: it runs before anything is installed.
+lean on, one a line: the build sees the first as /run/packages/0, the second as /run/packages/1. Standard library only:
+it runs before anything is installed.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from urllib.parse import unquote, urlparse
 SOURCES = ("index-url", "extra-index-url", "find-links")
 LENT = (*SOURCES, "trusted-host", "proxy", "timeout", "default-timeout")
 CERTIFICATES_IN_BUILD = "/run/secrets/ca_bundle"
+PACKAGES_IN_BUILD = "/run/packages"
 
 
 def parse(listing: str) -> dict[str, str]:
@@ -36,25 +38,44 @@ def parse(listing: str) -> dict[str, str]:
     return {option: value for option, (_, value) in found.items()}
 
 
-def local_folders(settings: dict[str, str]) -> list[str]:
-    """The folders of this machine that the settings find packages in, existing ones only, none inside another."""
+def local_folders(settings: dict[str, str]) -> list[Path]:
+    """The folders of this machine that the settings find packages in: existing ones only, none inside another.
+
+    An index kept as files has its links in a folder `simple` that points to files beside it; there the parent is lent.
+    """
     words = " ".join(settings.get(option, "") for option in SOURCES).split()
     paths = [Path(unquote(urlparse(word).path)) for word in words if urlparse(word).scheme in ("", "file")]
-    folders = sorted({path for path in paths if path.is_absolute() and path.is_dir()})
-    return [str(folder) for folder in folders if not any(other in folder.parents for other in folders)]
+    roots = [path.parent if path.name == "simple" else path for path in paths]
+    folders = sorted({root for root in roots if root.is_absolute() and root.is_dir()})
+    return [folder for folder in folders if not any(other in folder.parents for other in folders)]
+
+
+def moved(value: str, folders: list[Path]) -> str:
+    """The words of `value` with every lent folder at its place in the build, PACKAGES_IN_BUILD/its number."""
+    words = []
+    for word in value.split():
+        for number, folder in enumerate(folders):
+            place = f"{PACKAGES_IN_BUILD}/{number}"
+            for start in (folder.as_uri(), str(folder)):
+                if word == start or word.startswith(f"{start}/"):
+                    word = word.replace(start, f"file://{place}" if start.startswith("file:") else place, 1)
+        words.append(word)
+    return " ".join(words)
 
 
 def main() -> None:
     """Do what the head of the file says."""
     out = Path(sys.argv[1])
     settings = parse(sys.stdin.read())
-    lines = ["[global]", *(f"{option} = {' '.join(settings[option].split())}" for option in LENT if option in settings)]
+    folders = local_folders(settings)
+    lines = ["[global]", *(f"{option} = {moved(settings[option], folders)}" for option in LENT if option in settings)]
     certificates = Path(settings.get("cert", ""))
     if certificates.is_file():
         shutil.copyfile(certificates, out / "ca_bundle")
         lines.append(f"cert = {CERTIFICATES_IN_BUILD}")
     (out / "pip.conf").write_text("\n".join(lines) + "\n")
-    print("\n".join(local_folders(settings)))
+    for folder in folders:
+        print(folder)
 
 
 if __name__ == "__main__":

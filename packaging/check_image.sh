@@ -1,0 +1,112 @@
+#!/usr/bin/env bash
+# Starts an image that buildah built, as it is meant to run, and sees whether it keeps its promises: not root, root file
+# system read-only, no torch (unless deep), healthy only while it serves, gone soon after SIGTERM.
+#
+#   packaging/check_image.sh [TAG]        TAG: lightpage:runtime; needs root, since it makes a mount namespace of its own
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+tag="${1:-lightpage:runtime}"
+port="${LIGHTPAGE_CHECK_PORT:-50951}"
+storage="$(realpath -m "${LIGHTPAGE_STORAGE:-build/containers}")"
+export storage tag port
+
+if [ "${1:-}" != --inside ]; then
+  exec unshare --mount --pid --fork --kill-child --propagation private "$0" --inside "$tag"
+fi
+
+# ---- inside a mount and process namespace of its own: whatever is mounted or left running here ends with it ---------------
+tag="$2"
+scratch="$(mktemp -d)"
+store=(buildah --storage-driver vfs --root "$storage" --runroot "$scratch/run")
+container="$("${store[@]}" from --pull-never "$tag")"
+trap '"${store[@]}" rm "$container" >/dev/null 2>&1; rm -rf "$scratch"' EXIT
+tree="$("${store[@]}" mount "$container")"
+
+root="$scratch/root"
+mkdir "$root"
+mount --bind "$tree" "$root"
+mount --types proc proc "$root/proc"
+mount --types tmpfs -o mode=755 tmpfs "$root/dev"
+for device in null zero random urandom; do
+  touch "$root/dev/$device"
+  mount --bind "/dev/$device" "$root/dev/$device"
+done
+mount --types tmpfs -o mode=1777 tmpfs "$root/tmp"
+for volume in bundles state; do
+  mount --types tmpfs -o uid=10001,gid=10001,mode=755 tmpfs "$root/$volume"
+done
+mount -o remount,bind,ro "$root"
+
+field() {
+  "${store[@]}" inspect --type image --format "$1" "$tag"
+}
+mapfile -t environment < <(field '{{range .Docker.Config.Env}}{{println .}}{{end}}' | sed '/^$/d')
+mapfile -t entrypoint < <(field '{{range .Docker.Config.Entrypoint}}{{println .}}{{end}}' | sed '/^$/d')
+mapfile -t arguments < <(field '{{range .Docker.Config.Cmd}}{{println .}}{{end}}' | sed '/^$/d')
+mapfile -t health < <(field '{{range .Docker.Config.Healthcheck.Test}}{{println .}}{{end}}' | sed '/^$/d;1d')
+user="$(field '{{.Docker.Config.User}}')"
+
+in_image() {
+  env --ignore-environment "${environment[@]}" chroot --userspec="$user" "$root" "$@"
+}
+failures=0
+claim() { # claim WORDS COMMAND...: the command must succeed
+  local words="$1"
+  shift
+  if "$@" >"$scratch/said" 2>&1; then
+    echo "ok      $words"
+  else
+    echo "FAILED  $words"
+    sed 's/^/        /' "$scratch/said" | tail -20
+    failures=$((failures + 1))
+  fi
+}
+not() { ! "$@"; }
+import_torch() { in_image python -c 'import torch'; }
+probe() { in_image env LIGHTPAGE_HEALTH_TARGET="127.0.0.1:$port" "${health[@]}"; }
+probe_until_healthy() {
+  for _ in $(seq 60); do
+    if probe; then return 0; fi
+    if ! kill -0 "$service" 2>/dev/null; then
+      cat "$scratch/service.log"
+      return 1
+    fi
+    sleep 1
+  done
+  cat "$scratch/service.log"
+  return 1
+}
+
+claim "runs as 10001:10001" test "$user $(in_image id -u):$(in_image id -g)" = "10001:10001 10001:10001"
+claim "cannot write to its root" not in_image sh -c "touch /opt/lightpage/written || touch /etc/written || touch /written || touch /usr/bin/written"
+claim "can write to its state and bundles" in_image touch /state/written /bundles/written
+case "$tag" in
+  *deep*) claim "has torch" import_torch ;;
+  *) claim "has no torch" not import_torch ;;
+esac
+claim "keeps onnxruntime's telemetry off" test "$(in_image printenv ORT_DISABLE_TELEMETRY)" = 1
+claim "has no trace of the builder's packages" test -z "$(ls -A "$root/run/packages" "$root/run/secrets" 2>/dev/null)"
+claim "has the command" in_image "${entrypoint[0]}" --help
+claim "is not healthy before it serves" not probe
+
+# What the image itself starts, on loopback and a port of the check's own.
+for index in "${!arguments[@]}"; do
+  [ "${arguments[index]}" != "0.0.0.0:50051" ] || arguments[index]="127.0.0.1:$port"
+done
+in_image "${entrypoint[@]}" "${arguments[@]}" >"$scratch/service.log" 2>&1 &
+service=$!
+claim "is healthy once it serves" probe_until_healthy
+kill -TERM "$service" 2>/dev/null || true
+gone() {
+  for _ in $(seq 30); do
+    kill -0 "$service" 2>/dev/null || return 0
+    sleep 1
+  done
+  return 1
+}
+claim "is gone within 30 s of SIGTERM" gone
+claim "is not healthy afterwards" not probe
+
+[ "$failures" = 0 ] || { echo "check_image: $failures of the claims about $tag failed" >&2; exit 1; }
+echo "check_image: $tag keeps its promises"
