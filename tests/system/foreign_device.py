@@ -1,0 +1,506 @@
+"""A storage device by other hands: a simulator that shares no code and few conventions with the project's own.
+
+It stands for "somebody else's device" in the end-to-end test: a recording made here must be decoded from the
+documented file layout alone. Lengths are millimetres inside. The pipe is propagated on its odd, periodic, 2w x 2w
+extension by FFT, in the oblique coordinates (x, y') of its walls; lenses are chirp-z transforms (zero-padded FFTs with
+a free scale) onto grids of another pitch for x and y; cameras look at the field through cubic splines. Nothing of the
+project is imported.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import h5py
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, spline_filter
+from scipy.signal import CZT
+
+ComplexArray = NDArray[np.complexfloating]
+FloatArray = NDArray[np.floating]
+
+WAVELENGTH = 532e-6
+WAVENUMBER = 2 * np.pi / WAVELENGTH
+GLASS_INDEX = 1.461
+NOMINAL_FOCAL_LENGTH = 20.0
+NOMINAL_PIPE_LENGTH = 18.75
+NOMINAL_PIPE_WIDTH = 0.88963
+SLM_PITCH = 9.2e-3
+SYMBOL_PX = 4
+PAGE_SHAPE = (56, 87)
+FRAME_SHAPE = (912, 1368)
+CAMERA_PITCH = 2.4e-3
+
+PAGE_PX = (PAGE_SHAPE[0] * SYMBOL_PX, PAGE_SHAPE[1] * SYMBOL_PX)
+CORNER = float(np.hypot(*PAGE_PX)) * SLM_PITCH / 2
+"""Distance of the page's corner from its centre, mm."""
+
+PADDED_PX = (270, 400)
+"""SLM pixels with a dark border, in which the page is turned against the pipe."""
+FACET = (225, 320)
+"""Samples from wall to wall in (y', x): 292 x 416 SLM pixels' worth of angles, 25% more than the page fills."""
+IMAGE_PITCH = 3e-3
+"""Pitch of the camera-plane field, a quarter of what its band asks for, so that cubic splines are good to -60 dB."""
+IMAGE_MARGIN = 0.09
+"""How far beyond the nominal frame the camera-plane field is computed, mm: shift, scale, rotation and distortion."""
+STEPS = 64
+TAYLOR_TERMS = 4
+REFERENCE_EXPOSURES = 64
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where a camera sits: the image is scaled and turned about the frame's centre, then shifted."""
+
+    scale: float = 0.0
+    rotation_deg: float = 0.0
+    shift_px: tuple[float, float] = (0.0, 0.0)
+    """(x, y)."""
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Everything that is true of one device. The defaults are a perfect one; errors are relative to nominal."""
+
+    pipe_angle_deg: float = 0.0
+    focal_length_error: float = 0.0
+    pipe_length_error: float = 0.0
+    pipe_width_error: float = 0.0
+    page_centre_px: tuple[float, float] = (0.0, 0.0)
+    """(x, y) of the page's centre off the optical axis, SLM pixels."""
+    pipe_roll_deg: float = 0.0
+    in_phase_camera: Camera = Camera()
+    quadrature_camera: Camera = Camera()
+    distortion: float = 0.0
+    """Relative radial displacement at the page's corner."""
+    defocus_rad: float = 0.0
+    astigmatism_rad: float = 0.0
+    astigmatism_axis_deg: float = 0.0
+    coma_rad: float = 0.0
+    coma_axis_deg: float = 0.0
+    reference_ratio: float = 1.6
+    """Mean amplitude of the reference over the root mean square of the signal's."""
+    ripple: float = 0.0
+    """Amplitude of the reference's fringes, relative."""
+    ripple_seed: int = 0
+    tilt_rad: tuple[float, float] = (0.0, 0.0)
+    """(x, y): phase of the reference at the page's right and lower edge."""
+    curvature_rad: float = 0.0
+    """Phase of the reference at the page's corner."""
+    quadrature_error_deg: float = 0.0
+    quadrature_gain: float = 1.0
+    quadrature_sign: int = 1
+    phase_noise_rad: float = 0.0
+    blur_px: float = 0.0
+    falloff: float = 0.0
+    """Loss of the illumination's amplitude at the page's corner."""
+    full_well_e: float = 15_000.0
+    read_noise_e: float = 2.5
+    bit_depth: int = 8
+    piston_drift_rad: float = 0.0
+    shift_drift_px: float = 0.0
+    """Standard deviations of the steps of two random walks from page to page; the shift is in camera pixels."""
+
+
+def draw_parameters(rng: np.random.Generator) -> Parameters:
+    """Draw a device uniformly from the whole range from which calibration must succeed; Q's sign is a coin's."""
+
+    def within(limit: float) -> float:
+        return float(rng.uniform(-limit, limit))
+
+    def camera() -> Camera:
+        return Camera(scale=within(0.01), rotation_deg=within(0.3), shift_px=(within(12), within(12)))
+
+    return Parameters(
+        pipe_angle_deg=within(1.0),
+        focal_length_error=within(0.003),
+        pipe_length_error=within(0.005),
+        pipe_width_error=within(0.0005),
+        page_centre_px=(within(6), within(6)),
+        pipe_roll_deg=within(0.4),
+        in_phase_camera=camera(),
+        quadrature_camera=camera(),
+        distortion=within(0.003),
+        defocus_rad=within(2),
+        astigmatism_rad=within(2),
+        astigmatism_axis_deg=within(90),
+        coma_rad=within(2),
+        coma_axis_deg=within(180),
+        reference_ratio=float(rng.uniform(1.2, 3.0)),
+        ripple=float(rng.uniform(0, 0.1)),
+        ripple_seed=int(rng.integers(2**31)),
+        tilt_rad=(within(3), within(3)),
+        curvature_rad=within(3),
+        quadrature_error_deg=within(6),
+        quadrature_gain=1 + within(0.1),
+        quadrature_sign=1 if rng.random() < 0.5 else -1,
+        phase_noise_rad=float(rng.uniform(0, 0.3)),
+        blur_px=float(rng.uniform(0, 0.5)),
+        falloff=float(rng.uniform(0, 0.3)),
+        full_well_e=float(rng.uniform(3_000, 15_000)),
+        read_noise_e=float(rng.uniform(0, 6)),
+        bit_depth=int(rng.choice([8, 10, 12, 14, 16])),
+        piston_drift_rad=float(rng.uniform(0, 0.5)),
+        shift_drift_px=float(rng.uniform(0, 0.2)),
+    )
+
+
+@dataclass(frozen=True)
+class PageDrift:
+    """Where the random walks stand on one page."""
+
+    piston_rad: float = 0.0
+    shift_px: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ForeignDevice:
+    """One device with its optics, cameras and noise; geometry and page of the bench device."""
+
+    parameters: Parameters = Parameters()
+
+    @classmethod
+    def draw(cls, seed: int) -> ForeignDevice:
+        """A device anywhere within the capture range."""
+        return cls(draw_parameters(np.random.default_rng([seed, 1])))
+
+    def with_parameters(self, **changes: object) -> ForeignDevice:
+        """The same device with some parameters changed."""
+        return ForeignDevice(dataclasses.replace(self.parameters, **changes))  # type: ignore[arg-type]
+
+    # --- geometry -----------------------------------------------------------------------------------------------------
+
+    @property
+    def angle(self) -> float:
+        """Pipe angle t, radians: the walls are x = +-w/2 and x sin t + y cos t = +-w/2."""
+        return float(np.deg2rad(self.parameters.pipe_angle_deg))
+
+    @property
+    def focal_length(self) -> float:
+        """True focal length of both lenses, mm."""
+        return NOMINAL_FOCAL_LENGTH * (1 + self.parameters.focal_length_error)
+
+    @property
+    def pipe_length(self) -> float:
+        """True length of the pipe, mm."""
+        return NOMINAL_PIPE_LENGTH * (1 + self.parameters.pipe_length_error)
+
+    @property
+    def pipe_width(self) -> float:
+        """True distance of opposite walls, mm."""
+        return NOMINAL_PIPE_WIDTH * (1 + self.parameters.pipe_width_error)
+
+    @property
+    def pitches(self) -> tuple[float, float]:
+        """Sample pitches (y', x) on the facet, mm."""
+        return self.pipe_width / FACET[0], self.pipe_width / FACET[1]
+
+    @cached_property
+    def facet_coordinates(self) -> tuple[FloatArray, FloatArray]:
+        """(y', x) of the facet's samples, mm; the first sample of each lies on a wall."""
+        return tuple(np.arange(n) * d - self.pipe_width / 2 for n, d in zip(FACET, self.pitches, strict=True))  # type: ignore[return-value]
+
+    # --- light --------------------------------------------------------------------------------------------------------
+
+    def modulate(self, symbols: NDArray[np.integer], levels: int, rng: np.random.Generator) -> ComplexArray:
+        """The field on the SLM's pixels, with illumination, phase noise and aberrations."""
+        p = self.parameters
+        phase = np.kron(symbols * (2 * np.pi / levels), np.ones((SYMBOL_PX, SYMBOL_PX)))
+        phase = phase + p.phase_noise_rad * rng.standard_normal(phase.shape)
+        y, x = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * SLM_PITCH for n in PAGE_PX), indexing="ij")
+        rho, phi = np.hypot(x, y) / CORNER, np.arctan2(y, x)
+        phase += p.defocus_rad * rho**2
+        phase += p.astigmatism_rad * rho**2 * np.cos(2 * (phi - np.deg2rad(p.astigmatism_axis_deg)))
+        phase += p.coma_rad * rho**3 * np.cos(phi - np.deg2rad(p.coma_axis_deg))
+        return (1 - p.falloff * rho**2) * np.exp(1j * phase)
+
+    def launch(self, page: ComplexArray) -> ComplexArray:
+        """From SLM pixels to the entrance facet [y', x], as the pipe sees it."""
+        roll, f = np.deg2rad(self.parameters.pipe_roll_deg), self.focal_length
+        padded = np.zeros(PADDED_PX, complex)
+        top, left = ((a - b) // 2 for a, b in zip(PADDED_PX, PAGE_PX, strict=True))
+        padded[top : top + PAGE_PX[0], left : left + PAGE_PX[1]] = page
+        turned = turn(padded, -roll)
+        centre_x, centre_y = rotate(*(c * SLM_PITCH for c in self.parameters.page_centre_px), -roll)
+        y0, x0 = (c - (n - 1) / 2 * SLM_PITCH for c, n in zip((centre_y, centre_x), PADDED_PX, strict=True))
+        facet_y, facet_x = self.facet_coordinates
+        dy, dx = self.pitches
+        tangent, cosine = np.tan(self.angle), np.cos(self.angle)
+        field = fourier_sum(turned, (x0, SLM_PITCH), (facet_x[0], dx, FACET[1]), -WAVENUMBER / f, axis=1)
+        page_y = y0 + np.arange(PADDED_PX[0]) * SLM_PITCH
+        field *= np.exp(1j * WAVENUMBER / f * tangent * np.outer(page_y, facet_x))
+        field = fourier_sum(field, (y0, SLM_PITCH), (facet_y[0], dy, FACET[0]), -WAVENUMBER / (f * cosine), axis=0)
+        y = (facet_y[:, None] - facet_x[None, :] * np.sin(self.angle)) / cosine
+        x = np.broadcast_to(facet_x, y.shape)
+        # Cycles a pixel along the SLM's own axes: they set what a square pixel and the blur let through.
+        u, v = (c * SLM_PITCH / (WAVELENGTH * f) for c in rotate(x, y, roll))
+        field *= np.sinc(u) * np.sinc(v) * np.exp(-2 * (np.pi * self.parameters.blur_px) ** 2 * (u**2 + v**2))
+        return field * SLM_PITCH**2 / (WAVELENGTH * f)
+
+    def propagate(self, facet: ComplexArray, steps: int = STEPS) -> ComplexArray:
+        """Through the pipe, from facet to facet [y', x]."""
+        return propagate_pipe(facet, self.pipe_width, self.pipe_length, self.angle, steps)
+
+    def delaunch(self, facet: ComplexArray) -> Image:
+        """From the exit facet to the camera plane, in the pipe's axes."""
+        f, (facet_y, facet_x), (dy, dx) = self.focal_length, self.facet_coordinates, self.pitches
+        counts = [int(np.ceil((n * CAMERA_PITCH / 2 + IMAGE_MARGIN) / IMAGE_PITCH)) * 2 + 1 for n in FRAME_SHAPE]
+        y0, x0 = (-(n - 1) / 2 * IMAGE_PITCH for n in counts)
+        tangent, cosine = np.tan(self.angle), np.cos(self.angle)
+        to_y = (y0, IMAGE_PITCH, counts[0])
+        field = fourier_sum(facet, (facet_y[0], dy), to_y, WAVENUMBER / (f * cosine), axis=0)
+        image_y = y0 + np.arange(counts[0]) * IMAGE_PITCH
+        field *= np.exp(-1j * WAVENUMBER / f * tangent * np.outer(image_y, facet_x))
+        field = fourier_sum(field, (facet_x[0], dx), (x0, IMAGE_PITCH, counts[1]), WAVENUMBER / f, axis=1)
+        return Image(field * (dy * dx / cosine / (WAVELENGTH * f)), y0, x0)
+
+    def image(self, symbols: NDArray[np.integer], levels: int, rng: np.random.Generator) -> Image:
+        """The whole way of one page's light, from symbols to the camera plane."""
+        return self.delaunch(self.propagate(self.launch(self.modulate(symbols, levels, rng))))
+
+    # --- cameras ------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def signal_rms(self) -> float:
+        """Root mean square amplitude of the signal over the page's image: pipe and lenses keep the power."""
+        rng = np.random.default_rng(0)
+        facet = self.launch(self.modulate(rng.integers(0, 256, PAGE_SHAPE), 256, rng))
+        power = np.sum(np.abs(facet) ** 2) * np.prod(self.pitches) / np.cos(self.angle)
+        return float(np.sqrt(power / (np.prod(PAGE_PX) * SLM_PITCH**2)))
+
+    def plane_coordinates(self, camera: Camera, drift: PageDrift) -> tuple[FloatArray, FloatArray]:
+        """(x, y) in the camera plane, mm, that each pixel of a frame looks at."""
+        rows, columns = (np.arange(n) - (n - 1) / 2 for n in FRAME_SHAPE)
+        x = columns[None, :] - camera.shift_px[0] - drift.shift_px[0]
+        y = rows[:, None] - camera.shift_px[1] - drift.shift_px[1]
+        scale = CAMERA_PITCH / (1 + camera.scale)
+        return rotate(x * scale, y * scale, -np.deg2rad(camera.rotation_deg))
+
+    def signal(self, image: Image, camera: Camera, drift: PageDrift) -> ComplexArray:
+        """The signal on a camera's pixels."""
+        x, y = self.plane_coordinates(camera, drift)
+        stretch = 1 + self.parameters.distortion * (x**2 + y**2) / CORNER**2
+        x, y = rotate(x * stretch, y * stretch, -np.deg2rad(self.parameters.pipe_roll_deg))
+        return image.at(x, y) * np.exp(1j * drift.piston_rad)
+
+    def reference(self, camera: Camera) -> ComplexArray:
+        """The reference on a camera's pixels."""
+        p = self.parameters
+        x, y = self.plane_coordinates(camera, PageDrift())
+        rng = np.random.default_rng(p.ripple_seed)
+        fringes = np.zeros(FRAME_SHAPE)
+        for amplitude in (0.5, 0.3, 0.2):
+            direction, period, phase = rng.uniform(0, np.pi), rng.uniform(0.4, 3.0), rng.uniform(0, 2 * np.pi)
+            along = x * np.cos(direction) + y * np.sin(direction)
+            fringes += amplitude * np.cos(2 * np.pi * along / period + phase)
+        half_height, half_width = (n * SLM_PITCH / 2 for n in PAGE_PX)
+        phase = p.tilt_rad[0] * x / half_width + p.tilt_rad[1] * y / half_height
+        phase = phase + p.curvature_rad * (x**2 + y**2) / CORNER**2
+        return self.signal_rms * p.reference_ratio * (1 + p.ripple * fringes) * np.exp(1j * phase)
+
+    @property
+    def electrons_per_intensity(self) -> float:
+        """Exposure: the full well takes the reference plus 2.3 times the signal, so that few pixels clip."""
+        p = self.parameters
+        brightest = self.signal_rms * (p.reference_ratio * (1 + p.ripple) + 2.3)
+        return p.full_well_e / (brightest**2 * max(1.0, p.quadrature_gain))
+
+    def expose(
+        self, intensity: FloatArray, rng: np.random.Generator, exposures: int = 1
+    ) -> NDArray[np.unsignedinteger]:
+        """Counts of a frame, or of the mean of several exposures: shot noise, read noise, full well, quantisation."""
+        p = self.parameters
+        electrons = rng.poisson(intensity * (self.electrons_per_intensity * exposures)).astype(np.float32)
+        electrons += np.float32(p.read_noise_e * np.sqrt(exposures)) * rng.standard_normal(
+            intensity.shape, dtype=np.float32
+        )
+        full_scale = 2**p.bit_depth - 1
+        counts = np.rint(electrons * (full_scale / (p.full_well_e * exposures)))
+        return np.clip(counts, 0, full_scale).astype(np.uint8 if p.bit_depth == 8 else np.uint16)
+
+    def intensities(self, image: Image | None, drift: PageDrift = PageDrift()) -> tuple[FloatArray, FloatArray]:
+        """Light on the in-phase and the quadrature camera; of the reference alone where there is no image."""
+        p = self.parameters
+        result = []
+        for camera, phase, gain in (
+            (p.in_phase_camera, 0.0, 1.0),
+            (
+                p.quadrature_camera,
+                p.quadrature_sign * (np.pi / 2 + np.deg2rad(p.quadrature_error_deg)),
+                p.quadrature_gain,
+            ),
+        ):
+            field = self.reference(camera) * np.exp(1j * phase)
+            if image is not None:
+                field += self.signal(image, camera, drift)
+            result.append(gain * (field.real**2 + field.imag**2))
+        return result[0], result[1]
+
+    # --- recordings ---------------------------------------------------------------------------------------------------
+
+    def walk(self, pages: int, rng: np.random.Generator) -> list[PageDrift]:
+        """Piston and shift of each page: random walks from a random piston."""
+        p = self.parameters
+        pistons = rng.uniform(-np.pi, np.pi) + np.cumsum(p.piston_drift_rad * rng.standard_normal(pages))
+        shifts = np.cumsum(p.shift_drift_px * rng.standard_normal((pages, 2)), axis=0)
+        return [PageDrift(float(a), (float(s[0]), float(s[1]))) for a, s in zip(pistons, shifts, strict=True)]
+
+    def write(
+        self,
+        path: str | Path,
+        pages: int,
+        levels: int,
+        seed: int,
+        pilots: NDArray[np.bool_] | None = None,
+        with_symbols: bool = True,
+    ) -> NDArray[np.uint8]:
+        """Record pages of random symbols, without a profile; returns the symbols [page, ny, nx].
+
+        Args:
+            path: HDF5 file, overwritten.
+            pages: how many.
+            levels: M, 2 to 256.
+            seed: of symbols, noise and drift.
+            pilots: boolean [ny, nx], written as it is.
+            with_symbols: whether the file tells the symbols.
+        """
+        rng = np.random.default_rng([seed, 2])
+        symbols = rng.integers(0, levels, size=(pages, *PAGE_SHAPE), dtype=np.uint8)
+        drifts = self.walk(pages, rng)
+        with h5py.File(str(path), "w") as file:
+            file.attrs["format"] = "lightpage-recording"
+            file.attrs["version"] = 1
+            file.attrs["camera_bit_depth"] = self.parameters.bit_depth
+            file.attrs["levels"] = levels
+            if with_symbols:
+                file["symbols"] = symbols
+            if pilots is not None:
+                file["pilots"] = pilots
+            names = ("in_phase", "quadrature")
+            dtype = np.uint8 if self.parameters.bit_depth == 8 else np.uint16
+            for name, intensity in zip(names, self.intensities(None), strict=True):
+                file[f"reference_{name}"] = self.expose(intensity, rng, REFERENCE_EXPOSURES)
+                file.create_dataset(name, (pages, *FRAME_SHAPE), dtype, chunks=(1, *FRAME_SHAPE))
+            for page in range(pages):
+                image = self.image(symbols[page], levels, rng)
+                for name, intensity in zip(names, self.intensities(image, drifts[page]), strict=True):
+                    file[name][page] = self.expose(intensity, rng)
+        return symbols
+
+
+@dataclass(frozen=True)
+class Image:
+    """The field in the camera plane on an even grid [y, x], first sample at (y0, x0), mm."""
+
+    field: ComplexArray
+    y0: float
+    x0: float
+
+    @cached_property
+    def _splines(self) -> tuple[FloatArray, FloatArray]:
+        real, imaginary = (
+            spline_filter(part, order=3, output=np.float32, mode="mirror")
+            for part in (self.field.real, self.field.imag)
+        )
+        return real, imaginary
+
+    def at(self, x: FloatArray, y: FloatArray) -> ComplexArray:
+        """The field at points (x, y), mm, by cubic splines; dark outside the grid."""
+        where = np.stack([(y - self.y0) / IMAGE_PITCH, (x - self.x0) / IMAGE_PITCH])
+        real, imaginary = (
+            map_coordinates(part, where, order=3, prefilter=False, mode="constant", output=np.float32)
+            for part in self._splines
+        )
+        return np.asarray(real + 1j * imaginary)
+
+
+def rotate(x: FloatArray | float, y: FloatArray | float, angle: float) -> tuple[FloatArray, FloatArray]:
+    """Turn (x, y) by `angle` radians from the x axis towards the y axis."""
+    return (
+        np.asarray(x * np.cos(angle) - y * np.sin(angle)),
+        np.asarray(x * np.sin(angle) + y * np.cos(angle)),
+    )
+
+
+def turn(page: ComplexArray, angle: float) -> ComplexArray:
+    """Turn a sampled field about its centre from x towards y by three shears, exact for band-limited lines."""
+    if angle == 0:
+        return page.copy()
+    for axis, slope in ((1, -np.tan(angle / 2)), (0, np.sin(angle)), (1, -np.tan(angle / 2))):
+        along, across = page.shape[axis], page.shape[1 - axis]
+        shift = slope * (np.arange(across) - (across - 1) / 2)
+        ramp = np.exp(-2j * np.pi * np.outer(shift, scipy.fft.fftfreq(along)))
+        lines = scipy.fft.fft(page, axis=axis) * (ramp if axis == 1 else ramp.T)
+        page = scipy.fft.ifft(lines, axis=axis)
+    return page
+
+
+def fourier_sum(
+    field: ComplexArray, source: tuple[float, float], target: tuple[float, float, int], wavenumber: float, axis: int
+) -> ComplexArray:
+    """Sum over one axis of field(a) exp(i wavenumber a b); a: (start, step), b: (start, step, count)."""
+    (a0, da), (b0, db, count) = source, target
+    n = field.shape[axis]
+    transform = CZT(n, count, w=np.exp(1j * wavenumber * da * db), a=np.exp(-1j * wavenumber * da * b0))
+    b = b0 + np.arange(count) * db
+    carrier = np.exp(1j * wavenumber * a0 * b)
+    return np.asarray(transform(field, axis=axis) * (carrier if axis == field.ndim - 1 else carrier[:, None]))
+
+
+def odd_extension(facet: ComplexArray) -> ComplexArray:
+    """Mirror a facet, whose first row and column lie on walls, to the periodic cell twice as wide, odd in both axes."""
+    for axis in (0, 1):
+        first = [slice(None)] * 2
+        first[axis] = slice(0, 1)
+        facet = facet.copy()
+        facet[tuple(first)] = 0
+        rest = [slice(None)] * 2
+        rest[axis] = slice(None, 0, -1)
+        facet = np.concatenate([facet, np.zeros_like(facet[tuple(first)]), -facet[tuple(rest)]], axis=axis)
+    return facet
+
+
+def propagate_pipe(facet: ComplexArray, width: float, length: float, angle: float, steps: int) -> ComplexArray:
+    """Propagate a facet field [y', x] through a rhombic pipe whose walls reflect with a change of sign.
+
+    In the oblique coordinates (x, y') the transverse Laplacian is d_x^2 + d_y'^2 + 2 sin(angle) d_x d_y'. The first two
+    terms are exact in the extension's Fourier space. The last changes its sign from cell to cell; it goes between half
+    steps of the others, as an exponential series of P (s d_x d_y') P, s the sign of the cell and P = kz^(-1/2), which
+    is the first-order term of the square root and keeps the power. Phases are relative to the glass wave number.
+    """
+    rows, columns = facet.shape
+    k_glass = GLASS_INDEX * WAVENUMBER
+    ky, kx = np.meshgrid(*(np.pi / width * n * scipy.fft.fftfreq(2 * n) * 2 for n in facet.shape), indexing="ij")
+    kz = np.sqrt(k_glass**2 - kx**2 - ky**2)
+    # kz - nk without cancellation, so that single precision serves afterwards.
+    relative = -(kx**2 + ky**2) / (kz + k_glass)
+    spectrum = scipy.fft.fft2(odd_extension(facet), workers=2)
+    if angle == 0:
+        return np.asarray(scipy.fft.ifft2(spectrum * np.exp(1j * relative * length), workers=2)[:rows, :columns])
+    dz = length / steps
+    half = np.exp(0.5j * relative * dz).astype(np.complex64)
+    whole = np.exp(1j * relative * dz).astype(np.complex64)
+    root = (kz / k_glass) ** -0.5
+    cross = (-np.sin(angle) * dz / k_glass * kx * ky * root).astype(np.float32)
+    signs = [
+        np.sign(np.where(i == 0, 0, np.where(i == n, 0, n - i)))
+        for i, n in ((np.arange(2 * n), n) for n in facet.shape)
+    ]
+    cells = np.outer(*signs).astype(np.float32)
+    root = root.astype(np.float32)
+    spectrum = spectrum.astype(np.complex64) * half
+    for step in range(steps):
+        term = spectrum
+        for order in range(1, TAYLOR_TERMS + 1):
+            kicked = scipy.fft.ifft2(term * cross, workers=2, overwrite_x=True)
+            kicked *= cells
+            term = scipy.fft.fft2(kicked, workers=2, overwrite_x=True)
+            term *= root * np.complex64(1j / order)
+            spectrum = spectrum + term
+        spectrum *= whole if step < steps - 1 else half
+    return np.asarray(scipy.fft.ifft2(spectrum, workers=2)[:rows, :columns])
