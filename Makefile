@@ -14,11 +14,11 @@ IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo test bench image proto lint format clean
+.PHONY: help setup demo test bench image check-image proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 setup: $(STAMP)  ## make the virtual environment with everything in it
 
@@ -55,6 +55,9 @@ proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
 
 image:  ## build the container image (IMAGE_TARGET=runtime or deep)
 	packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
+
+check-image:  ## start the image that buildah built, and see whether it keeps its promises
+	packaging/check_image.sh $(IMAGE_TAG)
 
 clean:  ## remove what was built and measured, and leave the environment
 	rm -rf build out .pytest_cache .mypy_cache .ruff_cache

@@ -20,7 +20,13 @@ tag="$2"
 scratch="$(mktemp -d)"
 store=(buildah --storage-driver vfs --root "$storage" --runroot "$scratch/run")
 container="$("${store[@]}" from --pull-never "$tag")"
-trap '"${store[@]}" rm "$container" >/dev/null 2>&1; rm -rf "$scratch"' EXIT
+clean_up() {
+  [ -z "${service:-}" ] || kill -KILL "$service" 2>/dev/null || true
+  umount --recursive "$scratch/root" 2>/dev/null || umount --recursive --lazy "$scratch/root" 2>/dev/null || true
+  "${store[@]}" rm "$container" >/dev/null || true
+  rm -rf --one-file-system "$scratch"
+}
+trap clean_up EXIT
 tree="$("${store[@]}" mount "$container")"
 
 root="$scratch/root"
@@ -47,9 +53,10 @@ mapfile -t arguments < <(field '{{range .Docker.Config.Cmd}}{{println .}}{{end}}
 mapfile -t health < <(field '{{range .Docker.Config.Healthcheck.Test}}{{println .}}{{end}}' | sed '/^$/d;1d')
 user="$(field '{{.Docker.Config.User}}')"
 
-in_image() {
-  env --ignore-environment "${environment[@]}" chroot --userspec="$user" "$root" "$@"
+become_image() { # in place of the calling shell, so that a signal reaches the command itself
+  exec env --ignore-environment "${environment[@]}" chroot --userspec="$user" "$root" "$@"
 }
+in_image() { (become_image "$@"); }
 failures=0
 claim() { # claim WORDS COMMAND...: the command must succeed
   local words="$1"
@@ -94,7 +101,7 @@ claim "is not healthy before it serves" not probe
 for index in "${!arguments[@]}"; do
   [ "${arguments[index]}" != "0.0.0.0:50051" ] || arguments[index]="127.0.0.1:$port"
 done
-in_image "${entrypoint[@]}" "${arguments[@]}" >"$scratch/service.log" 2>&1 &
+become_image "${entrypoint[@]}" "${arguments[@]}" >"$scratch/service.log" 2>&1 &
 service=$!
 claim "is healthy once it serves" probe_until_healthy
 kill -TERM "$service" 2>/dev/null || true
