@@ -459,6 +459,17 @@ class TestInterruption:
             assert recording.pages == 3
             assert np.array_equal(recording.frames(2).in_phase, random_frames(2).in_phase)
 
+    def test_a_page_cut_off_in_the_middle_is_dropped_when_nothing_follows(self, tmp_path: Path) -> None:
+        path, profile = tmp_path / "own.h5", small_profile()
+        with pytest.raises(KeyboardInterrupt):
+            interrupted(path, 2)
+        with h5py.File(tmp_path / "own.h5.partial", "r+") as file:
+            file["in_phase"].resize(3, axis=0)
+        with RecordingWriter.resume(path, profile, LEVELS, 12, random_frames(100), pilot_mask(profile)):
+            pass
+        with Recording.open(path) as recording:
+            assert recording.pages == 2
+
     @pytest.mark.parametrize("change", ["levels", "bit_depth", "references", "pilots", "profile"])
     def test_a_partial_file_of_other_arguments_is_not_gone_on_with(self, tmp_path: Path, change: str) -> None:
         path, profile = tmp_path / "own.h5", small_profile()

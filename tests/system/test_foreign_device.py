@@ -290,7 +290,7 @@ class TestNoise:
         assert counts.var() == pytest.approx((electrons + read_noise**2) * gain**2 + 1 / 12, rel=0.03)
 
     def test_averaging_takes_the_noise_out_of_reference_frames(self) -> None:
-        device = PERFECT.with_parameters(bit_depth=16)
+        device = PERFECT.with_parameters(bit_depth=16, read_noise_e=60.0)
         intensity = np.full((200, 200), 5000.0 / device.electrons_per_intensity)
         one, many = (device.expose(intensity, np.random.default_rng(0), n).astype(float) for n in (1, 64))
         assert many.mean() == pytest.approx(one.mean(), rel=1e-3)
