@@ -51,7 +51,7 @@ bench: $(STAMP)  ## measure the figures that the README reports
 	$(BIN)/lightpage bench
 
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
-	$(BIN)/python -m runtime.generate_stubs
+	$(BIN)/python proto/generate.py
 
 image:  ## build the container image (IMAGE_TARGET=runtime or deep)
 	packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
