@@ -13,6 +13,7 @@ from optics.device import CameraPose, Device
 from optics.page import check_symbols, symbol_phases
 from optics.profile import Profile
 from optics.recording import FramePair
+from optics.registration.parameters import NAMES, as_vector
 from optics.waves import WaveChannel, WaveGeometry, modes_for
 
 Real = NDArray[np.floating]
@@ -268,3 +269,37 @@ class Simulator:
                 counts = to_counts(seen * self.optics.electrons_per_unit, device.sensor)
             frames.append(counts.astype(np.uint8 if device.sensor.bit_depth == 8 else np.uint16))
         return FramePair(*frames)
+
+
+def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
+    """The truth as a ray twin's parameter vector [P] (see `optics.registration.parameters`)."""
+    g, pitch = device.geometry, profile.slm.pitch_m
+    values = dict.fromkeys(NAMES, 0.0)
+    values |= {
+        "pipe_angle_rad": np.deg2rad(g.pipe_angle_deg - profile.pipe.angle_deg),
+        "focal_length_relative": g.focal_length_relative_error,
+        "pipe_length_relative": g.pipe_length_relative_error,
+        "pipe_width_relative": g.pipe_width_relative_error,
+        "page_centre_x_m": g.page_shift_x_px * pitch,
+        "page_centre_y_m": g.page_shift_y_px * pitch,
+        "pipe_roll_rad": np.deg2rad(g.pipe_roll_deg),
+        "launch_defocus_rad": device.aberration.defocus_rad,
+        "launch_astigmatism_0_rad": device.aberration.astigmatism_rad,
+        "launch_coma_x_rad": device.aberration.coma_rad,
+        # the field is measured against the reference, so the reference's phase comes off
+        "camera_tilt_x_rad": -device.reference.tilt_x_rad,
+        "camera_tilt_y_rad": -device.reference.tilt_y_rad,
+        "camera_curvature_rad": -device.reference.curvature_rad,
+        "distortion_relative": device.aberration.distortion_relative,
+    }
+    for camera, pose in (("in_phase", device.in_phase_camera), ("quadrature", device.quadrature_camera)):
+        scale, turn = 1 + pose.scale_relative_error, np.deg2rad(pose.rotation_deg)
+        values |= {
+            f"{camera}_shift_x_px": pose.shift_x_px,
+            f"{camera}_shift_y_px": pose.shift_y_px,
+            f"{camera}_scale_x_relative": scale * np.cos(turn) - 1,
+            f"{camera}_scale_y_relative": scale * np.cos(turn) - 1,
+            f"{camera}_turn_xy_slope": -scale * np.sin(turn),
+            f"{camera}_turn_yx_slope": scale * np.sin(turn),
+        }
+    return as_vector(values)

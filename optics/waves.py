@@ -134,7 +134,9 @@ class PipePropagator:
         k_x = np.pi * self._bases[1].mode_numbers / w
         transverse = k_y[:, None, :, None] ** 2 + k_x[None, :, None, :] ** 2
         if transverse.max() >= nk**2:
-            raise ValueError(f"modes: got transverse wave number {np.sqrt(transverse.max()):.3g}, wanted below {nk:.3g}")
+            raise ValueError(
+                f"modes: got transverse wave number {np.sqrt(transverse.max()):.3g}, wanted below {nk:.3g}"
+            )
         dz = geometry.pipe_length_m / self._steps
         # kz - nk without cancellation
         detuning = -transverse / (np.sqrt(nk**2 - transverse) + nk)

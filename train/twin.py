@@ -174,7 +174,7 @@ class TorchTwin:
         """See `optics.registration.twin.Twin`."""
         with torch.no_grad():
             at = torch.as_tensor(points, dtype=torch.float64)
-            decided_by = at if anchors is None else torch.as_tensor(anchors, dtype=torch.float64)
+            decided_by = at if anchors is None else torch.tensor(anchors, dtype=torch.float64)
             places, phases, positions, _ = self.module(
                 torch.as_tensor(parameters, dtype=torch.float64), at, decided_by, at[:1]
             )

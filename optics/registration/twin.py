@@ -7,6 +7,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from optics.recording import FramePair
+
 Real = NDArray[np.float64]
 
 BRANCHES: tuple[str, ...] = ("direct", "x", "y", "xy", "yx")
@@ -44,4 +46,20 @@ class Twin(Protocol):
 
     def pixels(self, parameters: Real, places: Real) -> Real:
         """Camera-plane points [N, 2] (metres) to pixels (column, row) of both cameras, [2, N, 2]."""
+        ...
+
+
+class FieldSolver(Protocol):
+    """Turns a frame pair into the signal field on the common grid of `optics.grid`."""
+
+    def __call__(
+        self, pair: FramePair, references: FramePair, registration: NDArray[np.float32], homodyne: NDArray[np.float32]
+    ) -> tuple[NDArray[np.complex64], float]:
+        """Field [ny, nx] over the mean reference amplitude, and the residual of the two homodyne equations.
+
+        Args:
+            pair, references: frames [H, W].
+            registration: [2, 2, 10], see `optics.registration.table`.
+            homodyne: [2], cosine and sine of the turn between the arms.
+        """
         ...

@@ -1,0 +1,72 @@
+"""The common grid on the camera plane on which both cameras' frames become one complex field, and its filters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from optics.profile import Profile
+
+Real = NDArray[np.float64]
+
+_STEP_PX = 2
+"""Grid pitch in camera pixels: twice the Nyquist rate of the field, just above that of its intensity."""
+_MARGIN_PX = 70
+"""Grid beyond the nominal image of the page, camera pixels on each side: page shift and diffraction."""
+_PREFILTER_TAPS = 11
+_BAND_TAPS = 31
+_BAND_HEADROOM = 1.06
+"""Pass band over the pipe's nominal band, for misalignment of the pipe against the lens axes."""
+
+
+@dataclass(frozen=True)
+class FieldGrid:
+    """Axes and filters of the common grid.
+
+    Attributes:
+        x_m, y_m: uniform axes, metres from the optical axis, [nx] and [ny].
+        prefilter: taps applied along each axis of a raw frame before it is resampled to the grid.
+        band: taps applied along each axis of the field on the grid: the pipe's band.
+    """
+
+    x_m: Real
+    y_m: Real
+    prefilter: Real
+    band: Real
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        return len(self.y_m), len(self.x_m)
+
+    @property
+    def pitch_m(self) -> float:
+        """Sample spacing."""
+        return float(self.x_m[1] - self.x_m[0])
+
+
+def field_grid(profile: Profile) -> FieldGrid:
+    """The grid for a device: covers the nominal page image and a margin, pitch two camera pixels."""
+    pixel = profile.camera.pitch_m
+    pitch = _STEP_PX * pixel
+
+    def axis(extent_m: float) -> Real:
+        count = int(np.ceil((extent_m + 2 * _MARGIN_PX * pixel) / pitch / 2)) * 2
+        return np.asarray((np.arange(count) - (count - 1) / 2) * pitch)
+
+    edge = profile.pipe.width_m / 2 / (profile.light.wavelength_m * profile.lens.focal_length_m)
+    return FieldGrid(
+        x_m=axis(profile.page_width_m),
+        y_m=axis(profile.page_height_m),
+        prefilter=_low_pass(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / _STEP_PX - edge * pixel, 0.36)),
+        band=_low_pass(_BAND_TAPS, _BAND_HEADROOM * edge * pitch, 1.36 * edge * pitch),
+    )
+
+
+def _low_pass(taps: int, passed: float, stopped: float) -> Real:
+    """Equiripple low-pass with unit gain at zero; band edges in cycles per sample."""
+    kernel = signal.remez(taps, [0, passed, stopped, 0.5], [1, 0], weight=[3, 1], fs=1.0)
+    return np.asarray(kernel / kernel.sum())

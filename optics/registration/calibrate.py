@@ -1,0 +1,319 @@
+"""From nominal geometry to this device: coarse-to-fine registration of known pages, then a fit of everything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from optics.errors import CalibrationError
+from optics.grid import field_grid
+from optics.profile import Profile
+from optics.recording import FramePair
+from optics.registration.coherence import page_coherence
+from optics.registration.fit import Fit, fit_parameters
+from optics.registration.parameters import PARAMETERS, indices, nominal
+from optics.registration.patches import Measurement, Patch, measure, patches, search_window
+from optics.registration.samplers import FieldSampler, FrameSampler
+from optics.registration.table import registration_coefficients
+from optics.registration.twin import FieldSolver, Twin
+
+Real = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the share of the work that is behind, 0 to 1."""
+
+SIGNIFICANT = 14.0
+"""A patch counts from here: unrelated light reaches it in fewer than one search in a hundred."""
+_FEWEST = 5
+_CAMERA_GROUPS = ("in_phase", "quadrature", "centre", "camera_phase")
+_SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "launch")
+_ALL_GROUPS = tuple(dict.fromkeys(p.group for p in PARAMETERS))
+
+
+@dataclass(frozen=True)
+class KnownPage:
+    """A frame pair with the symbols that were written: phasors exp(i theta), [ny, nx]."""
+
+    pair: FramePair
+    symbols: NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Registered:
+    """What registration found.
+
+    Attributes:
+        parameters: [P] fitted vector.
+        deviations: [P] standard deviations.
+        turn: angle between the homodyne arms, radians.
+        coherence_before, coherence_after: mean over the pages, at the start's geometry and at the fitted one.
+        cost: mean squared normalised residual.
+        significant: share of the measured patches that were found, in the last stage.
+    """
+
+    parameters: Real
+    deviations: Real
+    turn: float
+    coherence_before: float
+    coherence_after: float
+    cost: float
+    significant: float
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """One round of measuring and fitting, distances in camera pixels."""
+
+    name: str
+    reach_px: float
+    step_px: float
+    groups: tuple[str, ...]
+    branches: tuple[str, ...] = ("direct",)
+    middle_only: bool = False
+    all_pages: bool = False
+    use_phase: bool = False
+
+
+_SINGLE_CAMERA = (
+    _Stage("find the direct image", 50, 4, _CAMERA_GROUPS, middle_only=True),
+    _Stage("follow it outwards", 24, 4, _SHAPE_GROUPS),
+    _Stage("settle the cameras", 6, 2, _SHAPE_GROUPS),
+)
+_COMPLEX = (
+    _Stage("find the reflections", 32, 4, _ALL_GROUPS, ("x", "y")),
+    _Stage("all branches, coarse", 8, 2, _ALL_GROUPS, ("direct", "x", "y")),
+    _Stage("all branches, fine", 3, 1, _ALL_GROUPS, ("direct", "x", "y")),
+)
+_PHASE = (
+    _Stage("phases", 2, 1, _ALL_GROUPS, ("direct", "x", "y"), use_phase=True),
+    _Stage("phases, all pages", 2, 1, _ALL_GROUPS, ("direct", "x", "y"), all_pages=True, use_phase=True),
+    _Stage("phases, last", 1.5, 0.75, _ALL_GROUPS, ("direct", "x", "y"), all_pages=True, use_phase=True),
+)
+
+
+def calibrate(
+    twin: Twin,
+    solve_field: FieldSolver,
+    profile: Profile,
+    references: FramePair,
+    pages: Sequence[KnownPage],
+    progress: Progress = lambda what, share: None,
+) -> Registered:
+    """Register known pages from nominal geometry.
+
+    Args:
+        twin: ray tracer of the nominal device.
+        solve_field: recovers the complex field from registered frames.
+        profile: the nominal device.
+        references: reference-only frames.
+        pages: one to a few known pages; the first finds the geometry, all refine it.
+        progress: told of every stage.
+
+    Raises:
+        CalibrationError: nothing within the capture range explains the frames.
+    """
+    work = _Registration(twin, solve_field, profile, references, list(pages), progress)
+    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASE) + 2
+    for stage in _SINGLE_CAMERA:
+        work.single_camera(stage)
+    work.estimate_turn()
+    for stage in _COMPLEX:
+        work.complex_field(stage)
+    work.refine_turn()
+    for stage in _PHASE:
+        work.complex_field(stage)
+    return work.result(nominal())
+
+
+def refine(
+    twin: Twin,
+    solve_field: FieldSolver,
+    profile: Profile,
+    references: FramePair,
+    pages: Sequence[KnownPage],
+    start: Real,
+    turn: float,
+    progress: Progress = lambda what, share: None,
+) -> Registered:
+    """Register known pages from an earlier calibration that has drifted: the reflections need no search from nominal.
+
+    Args:
+        start: [P] earlier parameters.
+        turn: earlier angle between the homodyne arms.
+        twin, solve_field, profile, references, pages, progress: as for `calibrate`.
+
+    Raises:
+        CalibrationError: the pages do not fit near the earlier calibration.
+    """
+    work = _Registration(twin, solve_field, profile, references, list(pages), progress)
+    work.parameters, work.turn = start.copy(), turn
+    stages = (*_COMPLEX[1:], *_PHASE)
+    work.total = len(stages) + 1
+    work.single_camera(_Stage("find the cameras", 12, 3, _SHAPE_GROUPS), centre=start)
+    for stage in stages:
+        work.complex_field(stage)
+    return work.result(start)
+
+
+class _Registration:
+    """The state that the stages pass on."""
+
+    def __init__(
+        self,
+        twin: Twin,
+        solve_field: FieldSolver,
+        profile: Profile,
+        references: FramePair,
+        pages: list[KnownPage],
+        progress: Progress,
+    ) -> None:
+        if not pages:
+            raise CalibrationError("calibration", "no known page", "at least one page with known symbols")
+        self.twin, self.solve_field, self.profile = twin, solve_field, profile
+        self.references, self.pages, self.progress = references, pages, progress
+        self.patches = patches(profile)
+        self.grid = field_grid(profile)
+        self.parameters = nominal()
+        self.turn = np.pi / 2
+        self.fit: Fit | None = None
+        self.total = 1
+        self._done = 0
+        self._pixel = profile.camera.pitch_m
+        self._last: list[Measurement] = []
+        self._looked = 1
+
+    def _tell(self, what: str) -> None:
+        self.progress(what, self._done / self.total)
+        self._done += 1
+
+    def single_camera(self, stage: _Stage, centre: Real | None = None) -> None:
+        """Measure the direct branch on each camera by itself and fit places and slopes."""
+        self._tell(stage.name)
+        page = self.pages[0]
+        frames = (page.pair.in_phase, page.pair.quadrature)
+        references = (self.references.in_phase, self.references.quadrature)
+        found: list[Measurement] = []
+        for camera in (0, 1):
+            sampler = FrameSampler(frames[camera], references[camera], camera, self.twin, self.parameters)
+            for patch in self._where(stage):
+                found += self._measure(sampler, stage, patch, page, (camera,), 0)
+        self._fit(stage, found, centre)
+
+    def complex_field(self, stage: _Stage) -> None:
+        """Measure branches on the recovered field and fit."""
+        self._tell(stage.name)
+        found: list[Measurement] = []
+        for index, page in enumerate(self.pages if stage.all_pages else self.pages[:1]):
+            sampler = FieldSampler(self._field(page)[0], self.grid)
+            for patch in self._where(stage):
+                found += self._measure(sampler, stage, patch, page, (0, 1), index)
+        self._fit(stage, found, None)
+
+    def estimate_turn(self) -> None:
+        """The angle between the arms, from the phase that the same patch shows on either camera."""
+        self._tell("angle between the arms")
+        sums = np.zeros(2, dtype=complex)
+        for m in self._last:
+            rays = self.twin.trace(self.parameters, m.centre_m[None])
+            sums[m.cameras[0]] += m.significance * np.exp(1j * (m.phase - rays.phases[0, 0]))
+        self.turn = -float(np.angle(sums[1] * np.conj(sums[0])))
+        if abs(np.sin(self.turn)) < 0.5:
+            raise CalibrationError(
+                "angle between the homodyne arms", f"{np.rad2deg(self.turn):.0f} degrees", "about +90 or -90 degrees"
+            )
+
+    def refine_turn(self) -> None:
+        """The same angle from the two homodyne equations alone: the residual is least where it is right."""
+        self._tell("angle between the arms, blind")
+        registration = registration_coefficients(self.twin, self.parameters, self.profile)
+        page, start = self.pages[0], self.turn
+
+        def residual(turn: float) -> float:
+            homodyne = np.array([np.cos(turn), np.sin(turn)], dtype=np.float32)
+            return self.solve_field(page.pair, self.references, registration, homodyne)[1]
+
+        reach = np.deg2rad(5)
+        solved = optimize.minimize_scalar(
+            residual, bounds=(start - reach, start + reach), method="bounded", options={"xatol": 2e-3, "maxiter": 12}
+        )
+        self.turn = float(solved.x)
+
+    def result(self, before: Real) -> Registered:
+        """Judge the outcome; `before` is the geometry that it is compared with."""
+        if self.fit is None:
+            raise CalibrationError("calibration", "no fit", "at least one stage")
+        after = float(np.mean([self._coherence(page, self.parameters) for page in self.pages]))
+        return Registered(
+            parameters=self.parameters,
+            deviations=self.fit.deviations,
+            turn=self.turn,
+            coherence_before=float(np.mean([self._coherence(page, before) for page in self.pages])),
+            coherence_after=after,
+            cost=self.fit.cost,
+            significant=len(self._last) / self._looked,
+        )
+
+    def _coherence(self, page: KnownPage, parameters: Real) -> float:
+        sampler = FieldSampler(self._field(page, parameters)[0], self.grid)
+        return page_coherence(sampler, self.twin, parameters, self.profile, page.symbols)
+
+    def _field(self, page: KnownPage, parameters: Real | None = None) -> tuple[NDArray[np.complex64], float]:
+        registration = registration_coefficients(
+            self.twin, self.parameters if parameters is None else parameters, self.profile
+        )
+        homodyne = np.array([np.cos(self.turn), np.sin(self.turn)], dtype=np.float32)
+        return self.solve_field(page.pair, self.references, registration, homodyne)
+
+    def _where(self, stage: _Stage) -> list[Patch]:
+        if not stage.middle_only:
+            return self.patches
+        width, height = self.profile.page_width_m, self.profile.page_height_m
+        return [p for p in self.patches if abs(p.centre_m[0]) < 0.16 * width and abs(p.centre_m[1]) < 0.2 * height]
+
+    def _measure(
+        self,
+        sampler: FrameSampler | FieldSampler,
+        stage: _Stage,
+        patch: Patch,
+        page: KnownPage,
+        cameras: tuple[int, ...],
+        index: int,
+    ) -> list[Measurement]:
+        window = search_window(stage.reach_px * self._pixel, stage.step_px * self._pixel)
+        return measure(
+            sampler,
+            self.twin,
+            self.parameters,
+            self.profile,
+            patch,
+            page.symbols,
+            stage.branches,
+            window,
+            cameras=cameras,
+            page=index,
+        )
+
+    def _fit(self, stage: _Stage, found: list[Measurement], centre: Real | None) -> None:
+        good = [m for m in found if m.significance > SIGNIFICANT]
+        self._last, self._looked = good, len(found)
+        if len(good) < _FEWEST:
+            best = max((m.significance for m in found), default=0.0)
+            raise CalibrationError(
+                f"calibration, stage '{stage.name}'",
+                f"{len(good)} of {len(found)} patches of known symbols found (best significance {best:.1f})",
+                f"at least {_FEWEST} above {SIGNIFICANT:.0f}: right symbols and profile, a device in the capture range",
+            )
+        self.fit = fit_parameters(
+            self.twin,
+            self.profile,
+            good,
+            self.parameters,
+            indices(*stage.groups),
+            use_phase=stage.use_phase,
+            centre=centre,
+        )
+        self.parameters = self.fit.parameters
+

@@ -1,0 +1,56 @@
+"""How well a geometry explains a known page: one number between 0 and 1."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optics.profile import Profile
+from optics.registration.patches import Sampler
+from optics.registration.table import symbol_centres
+from optics.registration.twin import BRANCHES, Twin
+
+Real = NDArray[np.float64]
+
+COHERENT_BRANCHES = ("direct", "x", "y")
+"""Branches that geometry is judged by; the mixed ones bias the pipe's angle."""
+
+_SAMPLES = 3
+
+
+def page_coherence(
+    sampler: Sampler, twin: Twin, parameters: Real, profile: Profile, symbols: NDArray[np.complexfloating]
+) -> float:
+    """Coherence of the demodulated branches with the known symbols over the whole page.
+
+    |sum w z conj(s)| / sqrt(sum w^2 sum |z|^2) over symbols and branches, with z the light of a branch demodulated by
+    the twin's phase and averaged over the symbol, s the symbol's phasor and w the share of the beam that leaves
+    through the branch's cell (a triangle in the exit centroid).
+
+    Args:
+        sampler: the recovered field.
+        twin, parameters: the geometry to judge.
+        profile: the nominal device.
+        symbols: phasors [ny, nx].
+    """
+    centres = symbol_centres(profile)
+    steps = ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * profile.symbol_pitch_m
+    light = np.zeros((len(COHERENT_BRANCHES), len(centres)), dtype=complex)
+    positions = np.empty(0)
+    chosen = [BRANCHES.index(name) for name in COHERENT_BRANCHES]
+    for dx in steps:
+        for dy in steps:
+            rays = twin.trace(parameters, centres + np.array([dx, dy]), centres)
+            light += sampler(rays.places[chosen]) * np.exp(-1j * rays.phases[chosen])
+            positions = rays.positions
+    even = np.clip(1 - np.abs(positions - 2 * np.round(positions / 2)), 0, 1)
+    odd = np.clip(1 - np.abs(positions - (2 * np.floor(positions / 2) + 1)), 0, 1)
+    shares = np.stack(
+        [
+            (odd if name == "x" else even)[:, 0] * (odd if name == "y" else even)[:, 1]
+            for name in COHERENT_BRANCHES
+        ]
+    )
+    total = np.sum(shares * light * np.conj(symbols.ravel()))
+    norm = np.sqrt(np.sum(shares**2) * np.sum(np.abs(light) ** 2))
+    return float(abs(total) / max(norm, 1e-30))

@@ -1,0 +1,186 @@
+"""Local measurements: how far, with what phase and slope, a patch of known symbols lies from where a twin puts it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optics.profile import Profile
+from optics.registration.twin import BRANCHES, Twin
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+Sampler = Callable[[Real], NDArray[np.inexact]]
+"""Camera-plane points [..., 2] (metres) to the measured signal there, real or complex."""
+
+_SAMPLES = 4
+"""Samples per symbol along each axis, the field's own rate at four SLM pixels a symbol."""
+_SLOPES = np.linspace(-0.6, 0.6, 17)
+"""Residual phase slopes that are tried, radians a sample: page centre and lengths anywhere in the capture range."""
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A rectangle of symbols.
+
+    Attributes:
+        rows, columns: slices of the page.
+        centre_m: (x, y) against the page's centre.
+    """
+
+    rows: slice
+    columns: slice
+    centre_m: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What one patch says of one branch.
+
+    Attributes:
+        branch: name.
+        centre_m: the patch's centre (x, y) on the page, [2].
+        pixels: where the centre was found, (column, row) on each camera, [2, 2].
+        cameras: which of the two were looked at.
+        phase: phase of the light against the symbols', radians, where the twin had put the centre.
+        slope: gradient of that phase along the page's (x, y), rad/m, [2].
+        significance: power of the coherent sum over that of the symbols' incoherent sum; the number of symbols when
+            all agree, about 1 when they are unrelated.
+        symbols: number of symbols in the patch.
+        page: which page it was measured on.
+    """
+
+    branch: str
+    centre_m: Real
+    pixels: Real
+    cameras: tuple[int, ...]
+    phase: float
+    slope: Real
+    significance: float
+    symbols: int
+    page: int
+
+
+def patches(profile: Profile, edge: int = 10) -> list[Patch]:
+    """Cut the page into patches of about `edge` x `edge` symbols that cover it."""
+    rows, columns = profile.page_shape
+
+    def cuts(count: int) -> list[tuple[int, int]]:
+        bounds = np.linspace(0, count, max(1, round(count / edge)) + 1).round().astype(int)
+        return list(zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True))
+
+    pitch = profile.symbol_pitch_m
+    return [
+        Patch(slice(r0, r1), slice(c0, c1), ((c0 + c1 - columns) / 2 * pitch, (r0 + r1 - rows) / 2 * pitch))
+        for r0, r1 in cuts(rows)
+        for c0, c1 in cuts(columns)
+    ]
+
+
+def search_window(reach_m: float, step_m: float) -> Real:
+    """Trial shifts [K, 2] on a square lattice of odd side that reaches at least `reach_m`."""
+    side = int(np.ceil(reach_m / step_m))
+    axis = np.arange(-side, side + 1) * step_m
+    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+
+
+def measure(
+    sampler: Sampler,
+    twin: Twin,
+    parameters: Real,
+    profile: Profile,
+    patch: Patch,
+    symbols: Complex,
+    branches: tuple[str, ...],
+    window: Real,
+    cameras: tuple[int, ...] = (0, 1),
+    page: int = 0,
+) -> list[Measurement]:
+    """Find each branch of a patch within a window around where the twin puts it.
+
+    Args:
+        sampler: the measured signal.
+        twin: the ray tracer.
+        parameters: [P] current parameters.
+        profile: the nominal device.
+        patch: which symbols.
+        symbols: phasors exp(i theta) of the whole page, [ny, nx].
+        branches: which branches to look for.
+        window: trial shifts [K, 2], metres on the camera plane, a square lattice (see `search_window`).
+        cameras: which cameras the sampler looks through, a label of the result.
+        page: a label of the result.
+    """
+    known = symbols[patch.rows, patch.columns]
+    rows, columns = known.shape
+    pitch = profile.symbol_pitch_m / _SAMPLES
+    x = (np.arange(columns * _SAMPLES) - (columns * _SAMPLES - 1) / 2) * pitch + patch.centre_m[0]
+    y = (np.arange(rows * _SAMPLES) - (rows * _SAMPLES - 1) / 2) * pitch + patch.centre_m[1]
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    centre = np.array(patch.centre_m)
+    stencil = centre + pitch * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    rays = twin.trace(parameters, np.vstack([points, stencil]), np.tile(centre, (len(points) + len(stencil), 1)))
+    template = np.conj(np.kron(known, np.ones((_SAMPLES, _SAMPLES)))).ravel()
+    kernel_y = np.exp(-1j * np.outer(_SLOPES, (y - centre[1]) / pitch)).astype(np.complex64)
+    kernel_x = np.exp(-1j * np.outer((x - centre[0]) / pitch, _SLOPES)).astype(np.complex64)
+    found = []
+    for branch in branches:
+        b = BRANCHES.index(branch)
+        expected = rays.phases[b, -len(stencil) :]
+        expected_slope = np.array([expected[1] - expected[2], expected[3] - expected[4]]) / (2 * pitch)
+        landing = rays.places[b, -len(stencil)]
+        matched = (template * np.exp(-1j * rays.phases[b, : len(points)])).astype(np.complex64)
+
+        def demodulated(shifts: Real, at: Real = rays.places[b, : len(points)], by: Complex = matched) -> Complex:
+            signal = sampler(at + shifts[:, None, :])
+            return np.asarray(signal * by, dtype=np.complex64).reshape(len(shifts), len(y), len(x))
+
+        trials = demodulated(window)
+        spectrum = np.abs(kernel_y @ trials @ kernel_x) ** 2
+        significance = spectrum / _incoherent(trials, rows, columns)[:, None, None]
+        best, i, j = np.unravel_index(int(np.argmax(significance)), significance.shape)
+        side = round(len(window) ** 0.5)
+        by_shift = significance[:, i, j].reshape(side, side)
+        row, column = divmod(int(best), side)
+        step = float(window[1, 0] - window[0, 0]) if side > 1 else 0.0
+        shift = window[best] + step * np.array([_peak(by_shift[row], column), _peak(by_shift[:, column], row)])
+        slope_step = _SLOPES[1] - _SLOPES[0]
+        slope_x = _SLOPES[j] + slope_step * _peak(significance[best, i], int(j))
+        slope_y = _SLOPES[i] + slope_step * _peak(significance[best, :, j], int(i))
+        # A beam that a wall has cut leaves through one side of the facet, so its phase runs across its image: where the
+        # shift is uncertain the phase must be read at the twin's place, not at the found one.
+        here, there = demodulated(np.stack([np.zeros(2), shift]))
+        ramp = np.exp(-1j * (slope_y * (y - centre[1])[:, None] + slope_x * (x - centre[0])[None, :]) / pitch)
+        power = abs(np.sum(there * ramp)) ** 2
+        floor = float(_incoherent((there * ramp)[None], rows, columns)[0])
+        found.append(
+            Measurement(
+                branch=branch,
+                centre_m=centre,
+                pixels=twin.pixels(parameters, (landing + shift)[None])[:, 0],
+                cameras=cameras,
+                phase=float(expected[0] + np.angle(np.sum(here * ramp))),
+                slope=expected_slope + np.array([slope_x, slope_y]) / pitch,
+                significance=float(power / floor),
+                symbols=rows * columns,
+                page=page,
+            )
+        )
+    return found
+
+
+def _incoherent(trials: Complex, rows: int, columns: int) -> Real:
+    """Sum over symbols of the power of each symbol's own sum, [K]."""
+    per_symbol = trials.reshape(len(trials), rows, _SAMPLES, columns, _SAMPLES).sum(axis=(2, 4))
+    return np.maximum(np.sum(np.abs(per_symbol) ** 2, axis=(1, 2)), 1e-30)
+
+
+def _peak(values: NDArray[np.floating], index: int) -> float:
+    """Vertex of the parabola through the maximum and its neighbours, in steps from `index`; 0 at the edge."""
+    if index in (0, len(values) - 1):
+        return 0.0
+    left, middle, right = (float(v) for v in values[index - 1 : index + 2])
+    bend = left - 2 * middle + right
+    return 0.0 if bend >= 0 else float(np.clip((left - right) / (2 * bend), -0.5, 0.5))
