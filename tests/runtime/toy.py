@@ -5,6 +5,7 @@ in-phase = 128 + 70 cos(theta), quadrature = 80 + 70 sin(theta), so that swapped
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,11 +13,15 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from optics.errors import CalibrationError
 from optics.page import random_symbols, symbol_phases
 from optics.profile import Profile, parse_profile
 from optics.recording import FramePair, RecordingWriter
-from runtime.bundle import npz, write_bundle
+from runtime.bundle import Bundle, npz, write_bundle
+from runtime.decoder import Decoder
 from runtime.manifest import DECODER, GOLDEN, TWIN, Manifest
+from runtime.recalibration import FitReport, FitResult, KnownPages, Progress
+from runtime.sources import SourcePage
 
 PROFILE_TOML = """
 schema_version = 1
@@ -222,3 +227,41 @@ def write_toy_recording(
         for index, page in enumerate(symbols):
             writer.append(page, device.page(page, levels, piston * index))
     return symbols
+
+
+def fit_references(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> FitResult:
+    """A fit for the toy device: its geometry is the offset of each camera, read from the reference frames."""
+    progress("fit", 0.5)
+    if pages.references is None:
+        raise CalibrationError("toy fit", "no references", "reference frames")
+    table = {
+        "reference_in_phase": pages.references.in_phase.astype(np.float32),
+        "reference_quadrature": pages.references.quadrature.astype(np.float32),
+    }
+    return FitResult(table, "angle_deg = 0.5\n", FitReport(0.5, 0.4, 0.9))
+
+
+class ToySource:
+    """A source of toy pages whose device may drift."""
+
+    name = "toy:device"
+
+    def __init__(self, device: ToyDevice, levels: int = 16, pages: int | None = None) -> None:
+        self.device, self.levels, self.pages = device, levels, pages
+        self._next, self._lock = 0, threading.Lock()
+
+    def check_against(self, profile: Profile) -> None:
+        assert profile.frame_shape == SHAPE
+
+    def read(self, page: int | None = None) -> SourcePage:
+        with self._lock:
+            if page is None:
+                page, self._next = self._next, self._next + 1
+            symbols = symbols_of(self.levels, page)[0]
+            return SourcePage(self.device.page(symbols, self.levels, 0.1 * page), page, symbols)
+
+    def references(self) -> FramePair:
+        return self.device.references()
+
+    def close(self) -> None:
+        pass

@@ -1,0 +1,269 @@
+"""A Python client of the service; its errors are of the same classes that the service raised."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import grpc
+import numpy as np
+from numpy.typing import NDArray
+
+from optics.errors import FrameError, LightpageError
+from optics.recording import FramePair
+from runtime.convert import PIXEL_CODES, PIXEL_TYPES, RemotePage, pilots_message, remote_page
+from runtime.limits import CHUNK_BYTES, REPLY_BYTES
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from runtime.status import error_of
+
+CALL_S = 60.0
+"""Deadline of a call where none is given."""
+
+RECALIBRATION_S = 600.0
+"""Deadline of a recalibration where none is given."""
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """A model that the service holds."""
+
+    name: str
+    version: str
+    created: str
+    current: bool
+    metrics: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a service is."""
+
+    service_version: str
+    model: ModelInfo
+    frame_shape: tuple[int, int]
+    frame_dtype: str
+    bit_depth: int
+    page_shape: tuple[int, int]
+    source: str
+    source_levels: int
+    profile_toml: str
+    calibration_toml: str
+
+
+@dataclass(frozen=True)
+class Recalibrated:
+    """The result of a recalibration: AIR in bits per symbol on held-back pages; None where the fit does not say."""
+
+    model_version: str
+    previous_version: str
+    pages_used: int
+    pages_held_back: int
+    air_before: float
+    air_after: float
+    angle_deg: float | None
+    coherence_before: float | None
+    coherence_after: float | None
+    seconds: float
+
+
+class LightpageClient:
+    """Talks to the service at `target` (HOST:PORT). Use it in a `with` statement, or `close` it.
+
+    Every method raises the `LightpageError` that the service raised, or one that says why there was no answer.
+
+    Args:
+        target: where the service is.
+        timeout_s: deadline of a call.
+    """
+
+    def __init__(self, target: str, timeout_s: float = CALL_S) -> None:
+        self.target, self._timeout = target, timeout_s
+        self._channel = grpc.insecure_channel(
+            target,
+            options=(
+                ("grpc.max_receive_message_length", REPLY_BYTES),
+                ("grpc.enable_http_proxy", 0),  # the device is on the local network
+            ),
+        )
+        self._stub = pb_grpc.LightpageStub(self._channel)  # type: ignore[no-untyped-call]
+        self._description: Description | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all calls and close the connection."""
+        self._channel.close()
+
+    def describe(self) -> Description:
+        """What the service is now."""
+        reply: pb.DescribeReply = self._unary(self._stub.Describe, pb.DescribeRequest())
+        self._description = Description(
+            service_version=reply.service_version,
+            model=_model(reply.model),
+            frame_shape=(reply.camera.rows_px, reply.camera.columns_px),
+            frame_dtype=PIXEL_TYPES.get(reply.camera.pixel_type, "unknown"),
+            bit_depth=reply.camera.bit_depth,
+            page_shape=(reply.page.rows, reply.page.columns),
+            source=reply.source,
+            source_levels=reply.source_levels,
+            profile_toml=reply.profile_toml,
+            calibration_toml=reply.calibration_toml,
+        )
+        return self._description
+
+    def decode(
+        self,
+        pair: FramePair,
+        levels: int = 256,
+        *,
+        bit_depth: int | None = None,
+        pilots: tuple[NDArray[np.bool_], NDArray[np.uint8]] | None = None,
+        want_concentration: bool = False,
+        want_phase: bool = False,
+        quantised: bool = False,
+    ) -> RemotePage:
+        """Send a frame pair and get its symbols.
+
+        Args:
+            pair: both frames, uint8 or uint16.
+            levels: M, 2..256.
+            bit_depth: bits of a camera count; by default those of the service's camera.
+            pilots: (mask, symbols), both [ny, nx], where they differ from the profile's pattern.
+            want_concentration: also get kappa.
+            want_phase: also get the phase.
+            quantised: get the confidence in one byte a symbol.
+
+        Raises:
+            FrameError: frames that cannot be sent, or that the service refuses.
+        """
+        if bit_depth is None:
+            bit_depth = (self._description or self.describe()).bit_depth
+        frames = [np.asarray(pair.in_phase), np.asarray(pair.quadrature)]
+        for name, frame in zip(("in-phase frame", "quadrature frame"), frames, strict=True):
+            if frame.dtype.name not in PIXEL_CODES or frame.ndim != 2 or frame.shape != frames[0].shape:
+                raise FrameError(
+                    name, f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the other"
+                )
+        if frames[0].dtype != frames[1].dtype:
+            raise FrameError("quadrature frame", f"type {frames[1].dtype}", f"type {frames[0].dtype}, as in-phase")
+        header = pb.DecodeHeader(
+            rows_px=frames[0].shape[0],
+            columns_px=frames[0].shape[1],
+            pixel_type=PIXEL_CODES[frames[0].dtype.name],
+            bit_depth=bit_depth,
+            options=_options(levels, want_concentration, want_phase, quantised),
+            pilots=pilots_message(*pilots) if pilots is not None else None,
+        )
+        reply: pb.DecodeReply = self._unary(self._stub.DecodeFrames, _parts(header, frames))
+        return remote_page(reply)
+
+    def read_page(
+        self,
+        page: int | None = None,
+        levels: int | None = None,
+        *,
+        want_concentration: bool = False,
+        want_phase: bool = False,
+        want_written: bool = False,
+        quantised: bool = False,
+    ) -> RemotePage:
+        """Have the service read a page from its source; None stands for the next page and the source's levels."""
+        request = pb.ReadPageRequest(
+            options=_options(levels or 0, want_concentration, want_phase, quantised), want_written=want_written
+        )
+        if page is not None:
+            request.page = page
+        reply: pb.ReadPageReply = self._unary(self._stub.ReadPage, request)
+        return remote_page(reply.decoded, reply)
+
+    def recalibrate(
+        self,
+        *,
+        count: int = 0,
+        pages: Sequence[int] = (),
+        recording: str | None = None,
+        progress: Callable[[str, float], None] = lambda step, fraction: None,
+        timeout_s: float = RECALIBRATION_S,
+    ) -> Recalibrated:
+        """Recalibrate with pages of the source (`pages`, or the next `count`) or with a recording on the server.
+
+        Raises:
+            RecalibrationRefusedError: the new model would not be better; the old one stays.
+            BusyError: another recalibration runs.
+        """
+        request = pb.RecalibrateRequest()
+        if recording is not None:
+            request.recording = recording
+        else:
+            request.source.CopyFrom(pb.SourcePages(count=count, pages=pages))
+        call = self._stub.Recalibrate(request, timeout=timeout_s)
+        try:
+            for reply in call:
+                if reply.WhichOneof("step") == "result":
+                    return _recalibrated(reply.result)
+                progress(reply.progress.step, reply.progress.fraction)
+        except grpc.RpcError as error:
+            raise error_of(error, self.target) from None
+        finally:
+            call.cancel()
+        raise LightpageError(f"service at {self.target}", "an end without a result", "a recalibration's result")
+
+    def rollback(self) -> tuple[str, str]:
+        """Go back to the model before; returns the versions (now current, dropped)."""
+        reply: pb.RollbackReply = self._unary(self._stub.Rollback, pb.RollbackRequest())
+        return reply.model_version, reply.previous_version
+
+    def models(self) -> list[ModelInfo]:
+        """All models that the service holds, the oldest first."""
+        reply: pb.ListModelsReply = self._unary(self._stub.ListModels, pb.ListModelsRequest())
+        return [_model(model) for model in reply.models]
+
+    def _unary(self, method: Callable[..., Any], request: object) -> Any:
+        try:
+            return method(request, timeout=self._timeout)
+        except grpc.RpcError as error:
+            raise error_of(error, self.target) from None
+
+
+def _parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> Iterator[pb.DecodeFramesRequest]:
+    yield pb.DecodeFramesRequest(header=header)
+    for frame in frames:
+        data = np.ascontiguousarray(frame, frame.dtype.newbyteorder("<")).view(np.uint8).reshape(-1)
+        for start in range(0, data.size, CHUNK_BYTES):
+            yield pb.DecodeFramesRequest(chunk=data[start : start + CHUNK_BYTES].tobytes())
+
+
+def _options(levels: int, concentration: bool, phase: bool, quantised: bool) -> pb.DecodeOptions:
+    code = pb.CONFIDENCE_FORMAT_UINT8 if quantised else pb.CONFIDENCE_FORMAT_FLOAT32
+    return pb.DecodeOptions(levels=levels, confidence_format=code, want_concentration=concentration, want_phase=phase)
+
+
+def _model(model: pb.Model) -> ModelInfo:
+    return ModelInfo(model.name, model.version, model.created, model.current, dict(model.metrics))
+
+
+def _recalibrated(result: pb.RecalibrationResult) -> Recalibrated:
+    def optional(name: str) -> float | None:
+        return float(getattr(result, name)) if result.HasField(name) else None
+
+    return Recalibrated(
+        model_version=result.model_version,
+        previous_version=result.previous_version,
+        pages_used=result.pages_used,
+        pages_held_back=result.pages_held_back,
+        air_before=result.air_before,
+        air_after=result.air_after,
+        angle_deg=optional("angle_deg"),
+        coherence_before=optional("coherence_before"),
+        coherence_after=optional("coherence_after"),
+        seconds=result.seconds,
+    )

@@ -1,0 +1,59 @@
+"""The limits of the service, each with its reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+MESSAGE_BYTES = 4 << 20
+"""One message in: chunks stay far below, so that no single message makes the service hold its breath."""
+
+CHUNK_BYTES = 1 << 20
+"""Chunk that a client sends: larger ones gain nothing, smaller ones cost calls."""
+
+PAIR_BYTES = 256 << 20
+"""Both frames of a pair: three times a full-scale 20-megapixel pair of 16 bits."""
+
+REPLY_BYTES = 64 << 20
+"""One reply: symbols, float32 confidence, concentration and phase of a full-scale page are 4 MB."""
+
+CONCURRENT_RECEIVES = 8
+"""Frame pairs being received, each with its buffer: bounds memory, leaves room for slow senders."""
+
+CONCURRENT_DECODES = 2
+"""Decodes at once: inference uses all cores, a second page fills the gaps around it, a third would only wait inside."""
+
+CONCURRENT_CALLS = 48
+"""Calls that hold a thread; beyond them the service answers RESOURCE_EXHAUSTED at once instead of queueing blindly."""
+
+WORKER_THREADS = 24
+"""Threads for calls: receives, decodes, a recalibration and small calls beside them."""
+
+RECEIVE_S = 30.0
+"""A client that has not sent its frames by then has stalled, and its buffer is given back."""
+
+DEADLINE_S = 60.0
+"""Wait for a free slot where the caller set no deadline of its own."""
+
+RECALIBRATION_PAGES = 16
+"""Pages that one recalibration reads into memory."""
+
+GRACE_S = 10.0
+"""Time that calls in flight get when the service is told to stop."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The limits that one service runs under."""
+
+    message_bytes: int = MESSAGE_BYTES
+    chunk_bytes: int = CHUNK_BYTES
+    pair_bytes: int = PAIR_BYTES
+    reply_bytes: int = REPLY_BYTES
+    concurrent_receives: int = CONCURRENT_RECEIVES
+    concurrent_decodes: int = CONCURRENT_DECODES
+    concurrent_calls: int = CONCURRENT_CALLS
+    worker_threads: int = WORKER_THREADS
+    receive_s: float = RECEIVE_S
+    deadline_s: float = DEADLINE_S
+    recalibration_pages: int = RECALIBRATION_PAGES
+    grace_s: float = GRACE_S

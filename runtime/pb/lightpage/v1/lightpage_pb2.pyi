@@ -1,0 +1,302 @@
+# mypy: ignore-errors
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class PixelType(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    PIXEL_TYPE_UNSPECIFIED: _ClassVar[PixelType]
+    PIXEL_TYPE_UINT8: _ClassVar[PixelType]
+    PIXEL_TYPE_UINT16: _ClassVar[PixelType]
+
+class ConfidenceFormat(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CONFIDENCE_FORMAT_UNSPECIFIED: _ClassVar[ConfidenceFormat]
+    CONFIDENCE_FORMAT_FLOAT32: _ClassVar[ConfidenceFormat]
+    CONFIDENCE_FORMAT_UINT8: _ClassVar[ConfidenceFormat]
+PIXEL_TYPE_UNSPECIFIED: PixelType
+PIXEL_TYPE_UINT8: PixelType
+PIXEL_TYPE_UINT16: PixelType
+CONFIDENCE_FORMAT_UNSPECIFIED: ConfidenceFormat
+CONFIDENCE_FORMAT_FLOAT32: ConfidenceFormat
+CONFIDENCE_FORMAT_UINT8: ConfidenceFormat
+
+class DescribeRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class DescribeReply(_message.Message):
+    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml")
+    SERVICE_VERSION_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    PAGE_FIELD_NUMBER: _ClassVar[int]
+    LIMITS_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_LEVELS_FIELD_NUMBER: _ClassVar[int]
+    PROFILE_TOML_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_TOML_FIELD_NUMBER: _ClassVar[int]
+    service_version: str
+    model: Model
+    camera: Camera
+    page: PageShape
+    limits: Limits
+    source: str
+    source_levels: int
+    profile_toml: str
+    calibration_toml: str
+    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ...) -> None: ...
+
+class Model(_message.Message):
+    __slots__ = ("name", "version", "created", "current", "metrics")
+    class MetricsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    CREATED_FIELD_NUMBER: _ClassVar[int]
+    CURRENT_FIELD_NUMBER: _ClassVar[int]
+    METRICS_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    version: str
+    created: str
+    current: bool
+    metrics: _containers.ScalarMap[str, float]
+    def __init__(self, name: _Optional[str] = ..., version: _Optional[str] = ..., created: _Optional[str] = ..., current: _Optional[bool] = ..., metrics: _Optional[_Mapping[str, float]] = ...) -> None: ...
+
+class Camera(_message.Message):
+    __slots__ = ("rows_px", "columns_px", "bit_depth", "pixel_type")
+    ROWS_PX_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_PX_FIELD_NUMBER: _ClassVar[int]
+    BIT_DEPTH_FIELD_NUMBER: _ClassVar[int]
+    PIXEL_TYPE_FIELD_NUMBER: _ClassVar[int]
+    rows_px: int
+    columns_px: int
+    bit_depth: int
+    pixel_type: PixelType
+    def __init__(self, rows_px: _Optional[int] = ..., columns_px: _Optional[int] = ..., bit_depth: _Optional[int] = ..., pixel_type: _Optional[_Union[PixelType, str]] = ...) -> None: ...
+
+class PageShape(_message.Message):
+    __slots__ = ("rows", "columns")
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    rows: int
+    columns: int
+    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ...) -> None: ...
+
+class Limits(_message.Message):
+    __slots__ = ("message_bytes", "chunk_bytes", "pair_bytes", "concurrent_decodes")
+    MESSAGE_BYTES_FIELD_NUMBER: _ClassVar[int]
+    CHUNK_BYTES_FIELD_NUMBER: _ClassVar[int]
+    PAIR_BYTES_FIELD_NUMBER: _ClassVar[int]
+    CONCURRENT_DECODES_FIELD_NUMBER: _ClassVar[int]
+    message_bytes: int
+    chunk_bytes: int
+    pair_bytes: int
+    concurrent_decodes: int
+    def __init__(self, message_bytes: _Optional[int] = ..., chunk_bytes: _Optional[int] = ..., pair_bytes: _Optional[int] = ..., concurrent_decodes: _Optional[int] = ...) -> None: ...
+
+class DecodeOptions(_message.Message):
+    __slots__ = ("levels", "confidence_format", "want_concentration", "want_phase")
+    LEVELS_FIELD_NUMBER: _ClassVar[int]
+    CONFIDENCE_FORMAT_FIELD_NUMBER: _ClassVar[int]
+    WANT_CONCENTRATION_FIELD_NUMBER: _ClassVar[int]
+    WANT_PHASE_FIELD_NUMBER: _ClassVar[int]
+    levels: int
+    confidence_format: ConfidenceFormat
+    want_concentration: bool
+    want_phase: bool
+    def __init__(self, levels: _Optional[int] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., want_concentration: _Optional[bool] = ..., want_phase: _Optional[bool] = ...) -> None: ...
+
+class Pilots(_message.Message):
+    __slots__ = ("mask", "values")
+    MASK_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    mask: bytes
+    values: bytes
+    def __init__(self, mask: _Optional[bytes] = ..., values: _Optional[bytes] = ...) -> None: ...
+
+class DecodeHeader(_message.Message):
+    __slots__ = ("rows_px", "columns_px", "pixel_type", "bit_depth", "options", "pilots")
+    ROWS_PX_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_PX_FIELD_NUMBER: _ClassVar[int]
+    PIXEL_TYPE_FIELD_NUMBER: _ClassVar[int]
+    BIT_DEPTH_FIELD_NUMBER: _ClassVar[int]
+    OPTIONS_FIELD_NUMBER: _ClassVar[int]
+    PILOTS_FIELD_NUMBER: _ClassVar[int]
+    rows_px: int
+    columns_px: int
+    pixel_type: PixelType
+    bit_depth: int
+    options: DecodeOptions
+    pilots: Pilots
+    def __init__(self, rows_px: _Optional[int] = ..., columns_px: _Optional[int] = ..., pixel_type: _Optional[_Union[PixelType, str]] = ..., bit_depth: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., pilots: _Optional[_Union[Pilots, _Mapping]] = ...) -> None: ...
+
+class DecodeFramesRequest(_message.Message):
+    __slots__ = ("header", "chunk")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    CHUNK_FIELD_NUMBER: _ClassVar[int]
+    header: DecodeHeader
+    chunk: bytes
+    def __init__(self, header: _Optional[_Union[DecodeHeader, _Mapping]] = ..., chunk: _Optional[bytes] = ...) -> None: ...
+
+class DecodeReply(_message.Message):
+    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings")
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_FIELD_NUMBER: _ClassVar[int]
+    LEVELS_FIELD_NUMBER: _ClassVar[int]
+    SYMBOLS_FIELD_NUMBER: _ClassVar[int]
+    CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    CONFIDENCE_FORMAT_FIELD_NUMBER: _ClassVar[int]
+    CONCENTRATION_FIELD_NUMBER: _ClassVar[int]
+    PHASE_FIELD_NUMBER: _ClassVar[int]
+    PISTON_RAD_FIELD_NUMBER: _ClassVar[int]
+    PILOT_COHERENCE_FIELD_NUMBER: _ClassVar[int]
+    MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    TIMINGS_FIELD_NUMBER: _ClassVar[int]
+    rows: int
+    columns: int
+    levels: int
+    symbols: bytes
+    confidence: bytes
+    confidence_format: ConfidenceFormat
+    concentration: bytes
+    phase: bytes
+    piston_rad: float
+    pilot_coherence: float
+    model_version: str
+    timings: Timings
+    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ...) -> None: ...
+
+class Timings(_message.Message):
+    __slots__ = ("receive_s", "decode_s", "inference_s", "total_s")
+    RECEIVE_S_FIELD_NUMBER: _ClassVar[int]
+    DECODE_S_FIELD_NUMBER: _ClassVar[int]
+    INFERENCE_S_FIELD_NUMBER: _ClassVar[int]
+    TOTAL_S_FIELD_NUMBER: _ClassVar[int]
+    receive_s: float
+    decode_s: float
+    inference_s: float
+    total_s: float
+    def __init__(self, receive_s: _Optional[float] = ..., decode_s: _Optional[float] = ..., inference_s: _Optional[float] = ..., total_s: _Optional[float] = ...) -> None: ...
+
+class ReadPageRequest(_message.Message):
+    __slots__ = ("page", "options", "want_written")
+    PAGE_FIELD_NUMBER: _ClassVar[int]
+    OPTIONS_FIELD_NUMBER: _ClassVar[int]
+    WANT_WRITTEN_FIELD_NUMBER: _ClassVar[int]
+    page: int
+    options: DecodeOptions
+    want_written: bool
+    def __init__(self, page: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., want_written: _Optional[bool] = ...) -> None: ...
+
+class ReadPageReply(_message.Message):
+    __slots__ = ("decoded", "page", "written", "pilot_mask")
+    DECODED_FIELD_NUMBER: _ClassVar[int]
+    PAGE_FIELD_NUMBER: _ClassVar[int]
+    WRITTEN_FIELD_NUMBER: _ClassVar[int]
+    PILOT_MASK_FIELD_NUMBER: _ClassVar[int]
+    decoded: DecodeReply
+    page: int
+    written: bytes
+    pilot_mask: bytes
+    def __init__(self, decoded: _Optional[_Union[DecodeReply, _Mapping]] = ..., page: _Optional[int] = ..., written: _Optional[bytes] = ..., pilot_mask: _Optional[bytes] = ...) -> None: ...
+
+class RecalibrateRequest(_message.Message):
+    __slots__ = ("source", "recording")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    RECORDING_FIELD_NUMBER: _ClassVar[int]
+    source: SourcePages
+    recording: str
+    def __init__(self, source: _Optional[_Union[SourcePages, _Mapping]] = ..., recording: _Optional[str] = ...) -> None: ...
+
+class SourcePages(_message.Message):
+    __slots__ = ("count", "pages")
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    PAGES_FIELD_NUMBER: _ClassVar[int]
+    count: int
+    pages: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, count: _Optional[int] = ..., pages: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class RecalibrateReply(_message.Message):
+    __slots__ = ("progress", "result")
+    PROGRESS_FIELD_NUMBER: _ClassVar[int]
+    RESULT_FIELD_NUMBER: _ClassVar[int]
+    progress: Progress
+    result: RecalibrationResult
+    def __init__(self, progress: _Optional[_Union[Progress, _Mapping]] = ..., result: _Optional[_Union[RecalibrationResult, _Mapping]] = ...) -> None: ...
+
+class Progress(_message.Message):
+    __slots__ = ("step", "fraction")
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    FRACTION_FIELD_NUMBER: _ClassVar[int]
+    step: str
+    fraction: float
+    def __init__(self, step: _Optional[str] = ..., fraction: _Optional[float] = ...) -> None: ...
+
+class RecalibrationResult(_message.Message):
+    __slots__ = ("model_version", "previous_version", "pages_used", "pages_held_back", "air_before", "air_after", "angle_deg", "coherence_before", "coherence_after", "seconds")
+    MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    PREVIOUS_VERSION_FIELD_NUMBER: _ClassVar[int]
+    PAGES_USED_FIELD_NUMBER: _ClassVar[int]
+    PAGES_HELD_BACK_FIELD_NUMBER: _ClassVar[int]
+    AIR_BEFORE_FIELD_NUMBER: _ClassVar[int]
+    AIR_AFTER_FIELD_NUMBER: _ClassVar[int]
+    ANGLE_DEG_FIELD_NUMBER: _ClassVar[int]
+    COHERENCE_BEFORE_FIELD_NUMBER: _ClassVar[int]
+    COHERENCE_AFTER_FIELD_NUMBER: _ClassVar[int]
+    SECONDS_FIELD_NUMBER: _ClassVar[int]
+    model_version: str
+    previous_version: str
+    pages_used: int
+    pages_held_back: int
+    air_before: float
+    air_after: float
+    angle_deg: float
+    coherence_before: float
+    coherence_after: float
+    seconds: float
+    def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ..., pages_used: _Optional[int] = ..., pages_held_back: _Optional[int] = ..., air_before: _Optional[float] = ..., air_after: _Optional[float] = ..., angle_deg: _Optional[float] = ..., coherence_before: _Optional[float] = ..., coherence_after: _Optional[float] = ..., seconds: _Optional[float] = ...) -> None: ...
+
+class RollbackRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class RollbackReply(_message.Message):
+    __slots__ = ("model_version", "previous_version")
+    MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    PREVIOUS_VERSION_FIELD_NUMBER: _ClassVar[int]
+    model_version: str
+    previous_version: str
+    def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ...) -> None: ...
+
+class ListModelsRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class ListModelsReply(_message.Message):
+    __slots__ = ("models",)
+    MODELS_FIELD_NUMBER: _ClassVar[int]
+    models: _containers.RepeatedCompositeFieldContainer[Model]
+    def __init__(self, models: _Optional[_Iterable[_Union[Model, _Mapping]]] = ...) -> None: ...
+
+class ErrorDetail(_message.Message):
+    __slots__ = ("kind", "thing", "got", "wanted")
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    THING_FIELD_NUMBER: _ClassVar[int]
+    GOT_FIELD_NUMBER: _ClassVar[int]
+    WANTED_FIELD_NUMBER: _ClassVar[int]
+    kind: str
+    thing: str
+    got: str
+    wanted: str
+    def __init__(self, kind: _Optional[str] = ..., thing: _Optional[str] = ..., got: _Optional[str] = ..., wanted: _Optional[str] = ...) -> None: ...

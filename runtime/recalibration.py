@@ -1,0 +1,262 @@
+"""Recalibration: re-fit the geometry on known pages, judge it on held-back ones, write a new bundle or refuse."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optics.errors import CalibrationError, FrameError, InvalidInputError, RecalibrationRefusedError
+from optics.measures import measure
+from optics.page import check_symbols
+from optics.recording import FramePair, hash_frames
+from runtime.bundle import Bundle, Table, npz, write_bundle
+from runtime.decoder import Decoder
+from runtime.manifest import GOLDEN, TABLE, Manifest, Provenance
+from runtime.pilots import Pilots
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and how far it is, 0..1. It may raise to stop the work."""
+
+FIT_PAGES = 2
+"""Most pages that are fitted on: more cost time and add little."""
+
+MIN_PAGES = 2
+"""One to fit on, one to judge by."""
+
+MIN_AIR_SHARE = 0.02
+"""Share of log2 M below which the held-back pages do not match their symbols at all: wrong pilots, wrong device."""
+
+TOLERATED_LOSS_BITS = 0.01
+"""AIR that a re-fit may lose to the noise of a few held-back pages and still replace an equally good model."""
+
+
+@dataclass(frozen=True)
+class KnownPages:
+    """Pages whose symbols are known.
+
+    Attributes:
+        pairs: frame pairs, one a page.
+        symbols: what was written, uint8 [ny, nx], one a page.
+        levels: M of those symbols.
+        references: reference-only frames taken with them, or None: then the bundle's hold.
+        pilot_mask: where the pilots are, bool [ny, nx], or None for the device's usual positions.
+    """
+
+    pairs: tuple[FramePair, ...]
+    symbols: tuple[NDArray[np.uint8], ...]
+    levels: int
+    references: FramePair | None = None
+    pilot_mask: NDArray[np.bool_] | None = None
+
+    def check(self, decoder: Decoder) -> None:
+        """Check everything against the device of `decoder`.
+
+        Raises:
+            InvalidInputError: too few pages, or not as many symbols as frames.
+            FrameError: a bad frame.
+            PageError: symbols of the wrong shape or range.
+        """
+        if len(self.pairs) < MIN_PAGES or len(self.pairs) != len(self.symbols):
+            got = f"{len(self.pairs)} frame pairs and {len(self.symbols)} pages of symbols"
+            raise InvalidInputError("pages to recalibrate with", got, f"at least {MIN_PAGES} of both")
+        for pair, symbols in zip(self.pairs, self.symbols, strict=True):
+            decoder.check(pair)
+            check_symbols(symbols, decoder.bundle.profile.page_shape, self.levels, "known symbols")
+        if self.references is not None:
+            decoder.check(self.references)
+
+    def part(self, pages: slice) -> KnownPages:
+        """Some of the pages, the rest as it is."""
+        return KnownPages(self.pairs[pages], self.symbols[pages], self.levels, self.references, self.pilot_mask)
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What a fit says of itself; None where it does not know.
+
+    Attributes:
+        angle_deg: fitted pipe angle.
+        coherence_before: of the pages with the old geometry, 0..1.
+        coherence_after: with the new one.
+        details: further numbers for people.
+    """
+
+    angle_deg: float | None = None
+    coherence_before: float | None = None
+    coherence_after: float | None = None
+    details: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A re-fitted device.
+
+    Attributes:
+        table: re-traced tensors to feed to the decoder, by input name; those left out stay as they are.
+        calibration_toml: the new calibration document.
+        report: the fit's own figures.
+    """
+
+    table: Table
+    calibration_toml: str
+    report: FitReport
+
+
+class Fit(Protocol):
+    """Re-fits the geometry with the exported twin and re-traces the table."""
+
+    def __call__(self, bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> FitResult:
+        """Fit on all `pages`.
+
+        Raises:
+            CalibrationError: the pages fit no geometry within the capture range.
+        """
+
+
+@dataclass(frozen=True)
+class RecalibrationOutcome:
+    """A new bundle and why it is better."""
+
+    path: Path
+    version: str
+    previous_version: str
+    report: FitReport
+    air_before: float
+    air_after: float
+    pages_used: int
+    pages_held_back: int
+    seconds: float
+
+
+def recalibrate(
+    decoder: Decoder, pages: KnownPages, out: Path, version: str, fit: Fit, progress: Progress
+) -> RecalibrationOutcome:
+    """Fit on the first pages, judge on the others, and write a new bundle to `out` if it is not worse.
+
+    Args:
+        decoder: the model in service; it is not touched.
+        pages: pages with known symbols, at least two.
+        out: a new path, a zip where it ends in .zip.
+        version: version of the new bundle.
+        fit: how to fit.
+        progress: told of every step.
+
+    Raises:
+        RecalibrationRefusedError: the pages do not fit, or the new model would decode the held-back pages worse.
+        InvalidInputError, FrameError, PageError: unusable pages.
+        BundleError: `out` cannot be written.
+    """
+    start = time.perf_counter()
+    pages.check(decoder)
+    fitted_count = min(FIT_PAGES, len(pages.pairs) - 1)
+    fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))
+    progress("measure the model in service", 0.0)
+    before = _air(decoder, held_back, None)
+    try:
+        result = fit(decoder.bundle, fitted, lambda step, share: progress(step, 0.05 + 0.85 * share), decoder)
+        progress("judge by the held-back pages", 0.9)
+        after = _air(decoder, held_back, result.table)
+    except (CalibrationError, FrameError) as error:
+        raise RecalibrationRefusedError(error.thing, error.got, error.wanted) from error
+    _judge(before, after, pages.levels)
+    progress("write the new bundle", 0.95)
+    files, manifest = _new_contents(decoder, held_back.pairs[0], pages, result, version, before, after)
+    write_bundle(out, manifest, files)
+    progress("done", 1.0)
+    return RecalibrationOutcome(
+        path=out,
+        version=version,
+        previous_version=decoder.version,
+        report=result.report,
+        air_before=before,
+        air_after=after,
+        pages_used=len(pages.pairs),
+        pages_held_back=len(held_back.pairs),
+        seconds=time.perf_counter() - start,
+    )
+
+
+def next_version(version: str, taken: Sequence[str] = ()) -> str:
+    """The next version not in `taken`: ``bench-1`` gives ``bench-1+r1``, and that gives ``bench-1+r2``."""
+    match = re.fullmatch(r"(.*)\+r(\d+)", version)
+    base, number = (match[1], int(match[2])) if match else (version, 0)
+    while (candidate := f"{base}+r{(number := number + 1)}") in taken:
+        pass
+    return candidate
+
+
+def _air(decoder: Decoder, pages: KnownPages, table: Table | None) -> float:
+    """AIR over the data symbols of all `pages`, bits per symbol; -inf where the old model refuses the frames."""
+    mask = decoder.bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
+    data = ~mask
+    phases, concentrations, truths = [], [], []
+    for pair, symbols in zip(pages.pairs, pages.symbols, strict=True):
+        try:
+            page = decoder.decode(pair, pages.levels, table, Pilots.of_symbols(mask, symbols, pages.levels))
+        except FrameError:
+            if table is not None:
+                raise
+            return -math.inf
+        phases.append(page.phase[data])
+        concentrations.append(page.concentration[data])
+        truths.append(symbols[data])
+    figures = measure(np.concatenate(phases), np.concatenate(concentrations), np.concatenate(truths), pages.levels)
+    return figures.air_bits_per_symbol
+
+
+def _judge(before: float, after: float, levels: int) -> None:
+    least = MIN_AIR_SHARE * math.log2(levels)
+    if not after >= least:
+        raise RecalibrationRefusedError(
+            "re-fitted geometry",
+            f"an AIR of {after:.3f} bit/symbol on held-back pages",
+            f"at least {least:.3f}: the pages do not match their symbols",
+        )
+    if after < before - TOLERATED_LOSS_BITS:
+        raise RecalibrationRefusedError(
+            "re-fitted geometry",
+            f"an AIR of {after:.3f} bit/symbol on held-back pages",
+            f"at least the {before:.3f} of the model in service",
+        )
+
+
+def _new_contents(
+    decoder: Decoder,
+    golden: FramePair,
+    pages: KnownPages,
+    result: FitResult,
+    version: str,
+    before: float,
+    after: float,
+) -> tuple[dict[str, bytes], Manifest]:
+    """Files and manifest of the new bundle: the same graphs, the new table, and a golden page that belongs to it."""
+    bundle = decoder.bundle
+    p = decoder.infer(golden, result.table).p
+    files = {
+        **bundle.files,
+        TABLE: npz(**{**bundle.table, **result.table}),
+        GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=p),
+    }
+    figures = {"recalibration_air_bits_per_symbol": after, "recalibration_pages": len(pages.pairs)}
+    if math.isfinite(before):
+        figures["recalibration_air_bits_per_symbol_before"] = before
+    manifest = bundle.manifest.model_copy(
+        update={
+            "version": version,
+            "created": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+            "calibration": result.calibration_toml,
+            "metrics": {**bundle.manifest.metrics, **figures},
+            "calibrated_pages": (*bundle.manifest.calibrated_pages, *map(hash_frames, pages.pairs)),
+            "provenance": Provenance(command=f"recalibrate from {bundle.version}"),
+        }
+    )
+    return files, manifest

@@ -1,0 +1,209 @@
+"""Runs one recalibration at a time beside the decoding, reports its progress, and puts the result in service."""
+
+from __future__ import annotations
+
+import queue
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from optics.errors import BusyError, InvalidInputError, LimitError, PageError, RecalibrationRefusedError
+from optics.recording import Recording
+from runtime.archive import check_name
+from runtime.bundle import Bundle
+from runtime.caller import Caller, CallerLeft
+from runtime.dataplane import DataPlane
+from runtime.decoder import Decoder
+from runtime.recalibration import Fit, KnownPages, Progress, RecalibrationOutcome, next_version, recalibrate
+from runtime.sources import FrameSource
+
+_POLL_S = 0.25
+"""How often a silent recalibration looks whether its caller is still there."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """Progress: what is being done, and how far all of it is, 0..1."""
+
+    name: str
+    fraction: float
+
+
+class Recalibrator:
+    """Recalibrates the model in service. Its iterators begin with their first step, and end the work when closed.
+
+    Args:
+        plane: whose model, source and limits.
+        fit: how to fit.
+        recordings: folder whose recordings a caller may name, or None for none.
+    """
+
+    def __init__(self, plane: DataPlane, fit: Fit, recordings: Path | None = None) -> None:
+        self._plane, self._fit, self._recordings = plane, fit, recordings
+        self._busy = threading.Lock()
+        """Held from the first page read to the swap; a second recalibration finds it taken and is turned away."""
+        self._stop = threading.Event()
+        self._temporary: tempfile.TemporaryDirectory[str] | None = None
+
+    def from_source(self, count: int, pages: Sequence[int], caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
+        """Recalibrate with `pages` of the source, or with its next `count`; yields steps, then the outcome.
+
+        Raises:
+            BusyError: another recalibration runs.
+            LimitError: more pages than the service takes.
+            RecalibrationRefusedError: the new model would not be better; the old one stays.
+            InvalidInputError: no source, or pages without known symbols.
+        """
+        source = self._plane.source
+        self._check_count(len(pages) or count)
+        wanted: list[int | None] = list(pages) or [None] * count
+        return self._run(lambda: read_known(source, wanted), caller)
+
+    def from_recording(self, name: str, caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
+        """Recalibrate with a recording in the recordings folder; yields and raises as `from_source`."""
+        path = self._path(name)
+
+        def read() -> KnownPages:
+            with Recording.open(path) as recording:
+                self._check_count(recording.pages)
+                return known_pages(recording)
+
+        return self._run(read, caller)
+
+    def close(self) -> None:
+        """Stop a running recalibration at its next step and drop temporary bundles."""
+        self._stop.set()
+        with self._busy:  # the running one has ended
+            if self._temporary is not None:
+                self._temporary.cleanup()
+                self._temporary = None
+
+    def _run(self, read: Callable[[], KnownPages], caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
+        """Work in a thread of its own; one who stops iterating stops it at its next step."""
+        if not self._busy.acquire(blocking=False):
+            raise BusyError("recalibration", "one that is running", "one at a time; try again when it has ended")
+        steps: queue.SimpleQueue[Step | RecalibrationOutcome | BaseException] = queue.SimpleQueue()
+        left = threading.Event()
+
+        def progress(name: str, fraction: float) -> None:
+            if left.is_set() or self._stop.is_set():
+                raise CallerLeft
+            steps.put(Step(name, fraction))
+
+        def work() -> None:
+            try:
+                progress("read the pages", 0.0)
+                result: RecalibrationOutcome | BaseException = self._work(read(), progress)
+            except BaseException as error:
+                result = error
+            finally:
+                # Before the last step is told: whoever hears the end may start the next one at once.
+                self._busy.release()
+            self._count(result)
+            steps.put(result)
+
+        thread = threading.Thread(target=work, name="lightpage-recalibration", daemon=True)
+        try:
+            thread.start()
+        except BaseException:
+            self._busy.release()
+            raise
+        try:
+            yield from _follow(steps, caller)
+        finally:
+            left.set()
+
+    def _work(self, pages: KnownPages, progress: Progress) -> RecalibrationOutcome:
+        plane = self._plane
+        model = plane.registry.current
+        held = [m.version for m in plane.registry.models]
+        taken = [*held, *(plane.store.versions() if plane.store is not None else [])]
+        version = next_version(model.version, taken)
+        path = plane.store.path_of(version) if plane.store is not None else self._folder() / f"{version}.zip"
+        outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress)
+        try:
+            progress("put the new model in service", 1.0)
+            plane.adopt(Decoder(Bundle.open(path)), path, expected=model)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+        return outcome
+
+    def _folder(self) -> Path:
+        if self._temporary is None:
+            self._temporary = tempfile.TemporaryDirectory(prefix="lightpage-models-")
+        return Path(self._temporary.name)
+
+    def _count(self, result: RecalibrationOutcome | BaseException) -> None:
+        if isinstance(result, RecalibrationOutcome):
+            name = "done"
+        elif isinstance(result, RecalibrationRefusedError):
+            name = "refused"
+        else:
+            name = "dropped" if isinstance(result, CallerLeft) else "failed"
+        self._plane.metrics.recalibrations.labels(name).inc()
+
+    def _check_count(self, count: int) -> None:
+        if count > self._plane.limits.recalibration_pages:
+            limit = self._plane.limits.recalibration_pages
+            raise LimitError("pages to recalibrate with", count, f"at most {limit}")
+
+    def _path(self, name: str) -> Path:
+        if self._recordings is None:
+            raise InvalidInputError("recording to recalibrate with", name, "a service started with --recordings")
+        try:
+            check_name(name, "recording to recalibrate with")
+        except Exception as error:
+            raise InvalidInputError("recording to recalibrate with", repr(name), "a plain file name") from error
+        path = self._recordings / name
+        if path.is_symlink() or not path.is_file():
+            raise InvalidInputError("recording to recalibrate with", repr(name), "a file in the recordings folder")
+        return path
+
+
+def read_known(source: FrameSource, pages: Sequence[int | None]) -> KnownPages:
+    """Pages of a source with their symbols.
+
+    Raises:
+        PageError: the source does not know what was written.
+    """
+    found = [source.read(page) for page in pages]
+    symbols = [page.symbols for page in found if page.symbols is not None]
+    if len(symbols) != len(found):
+        raise PageError(f"pages of {source.name}", "unknown symbols", "pages whose symbols are known")
+    mask = found[0].pilot_mask if found else None
+    return KnownPages(tuple(p.pair for p in found), tuple(symbols), source.levels, source.references(), mask)
+
+
+def known_pages(recording: Recording, pages: Sequence[int] | None = None) -> KnownPages:
+    """Pages of a recording with their symbols, all of them by default.
+
+    Raises:
+        RecordingError: unreadable.
+        PageError: the recording holds no symbols.
+    """
+    indices = range(recording.pages) if pages is None else pages
+    symbols = [found for index in indices if (found := recording.symbols(index)) is not None]
+    if len(symbols) != len(indices):
+        raise PageError(f"recording {recording.path}", "no symbols", "a recording with known symbols")
+    pairs = tuple(recording.frames(index) for index in indices)
+    return KnownPages(pairs, tuple(symbols), recording.levels, recording.references(), recording.pilots())
+
+
+def _follow(
+    steps: queue.SimpleQueue[Step | RecalibrationOutcome | BaseException], caller: Caller
+) -> Iterator[Step | RecalibrationOutcome]:
+    """Hand on what the worker tells, until its outcome or error, or until the caller has gone."""
+    while True:
+        try:
+            step = steps.get(timeout=_POLL_S)
+        except queue.Empty:
+            caller.check()
+            continue
+        if isinstance(step, BaseException):
+            raise step
+        yield step
+        if isinstance(step, RecalibrationOutcome):
+            return

@@ -1,0 +1,108 @@
+"""The models' life: which one decodes now, how the next one takes over, and the way back."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from optics.errors import BundleError, RecalibrationRefusedError
+from runtime.decoder import Decoder
+from runtime.tracking import NoTracker, Tracker
+
+KEPT_MODELS = 4
+"""Models held loaded, the current one included: enough to step back over a bad day, little enough to bound memory."""
+
+TrackerFactory = Callable[[Decoder], Tracker]
+
+
+def no_tracker(decoder: Decoder) -> Tracker:
+    """A tracker that leaves every page as it is."""
+    return NoTracker()
+
+
+@dataclass(frozen=True)
+class Model:
+    """A loaded decoder with the tracker that belongs to it."""
+
+    decoder: Decoder
+    tracker: Tracker = field(default_factory=NoTracker)
+
+    @property
+    def version(self) -> str:
+        """The bundle's version."""
+        return self.decoder.version
+
+
+class ModelRegistry:
+    """Holds the models. A request takes `current` once and keeps it: a swap never pulls a model from under it.
+
+    Args:
+        first: the decoder to start with.
+        make_tracker: makes the tracker of each model.
+        kept: models held at most.
+    """
+
+    def __init__(self, first: Decoder, make_tracker: TrackerFactory = no_tracker, kept: int = KEPT_MODELS) -> None:
+        self._make_tracker, self._kept = make_tracker, kept
+        self._lock = threading.Lock()
+        """Guards the list; never held while a model is loaded or decodes."""
+        self._models = [Model(first, make_tracker(first))]
+
+    @property
+    def current(self) -> Model:
+        """The model that new requests use."""
+        with self._lock:
+            return self._models[-1]
+
+    @property
+    def models(self) -> tuple[Model, ...]:
+        """All models held, the oldest first, the current one last."""
+        with self._lock:
+            return tuple(self._models)
+
+    def swap(self, decoder: Decoder, expected: Model | None = None) -> Model:
+        """Put a loaded decoder in service and return its model; the previous one is kept for `rollback`.
+
+        Args:
+            decoder: loaded and checked.
+            expected: if given, the model that must still be current: a result derived from another is out of date.
+
+        Raises:
+            BundleError: the decoder is for another device, or its version is held already.
+            RecalibrationRefusedError: `expected` is no longer current.
+        """
+        model = Model(decoder, self._make_tracker(decoder))
+        with self._lock:
+            current = self._models[-1]
+            if expected is not None and current is not expected:
+                raise RecalibrationRefusedError(
+                    "model in service", f"{current.version} by now", f"{expected.version}, which was recalibrated"
+                )
+            self._check_replaces(decoder, current.decoder)
+            if any(held.version == decoder.version for held in self._models):
+                raise BundleError(f"{decoder.bundle.thing}: version", decoder.version, "a version not held already")
+            self._models = [*self._models, model][-self._kept :]
+        return model
+
+    def rollback(self) -> tuple[Model, Model]:
+        """Put the model before the current one back in service; returns (now current, dropped).
+
+        Raises:
+            BundleError: there is no earlier model.
+        """
+        with self._lock:
+            if len(self._models) < 2:
+                raise BundleError("rollback", f"only {self._models[-1].version}", "an earlier model to go back to")
+            dropped = self._models.pop()
+            return self._models[-1], dropped
+
+    @staticmethod
+    def _check_replaces(new: Decoder, old: Decoder) -> None:
+        """A caller must not see shapes change between two calls."""
+        shapes = [
+            (d.bundle.profile.frame_shape, d.bundle.profile.page_shape, d.bundle.manifest.frame_dtype)
+            for d in (new, old)
+        ]
+        if shapes[0] != shapes[1]:
+            raise BundleError(f"{new.bundle.thing}: frames and page", shapes[0], f"{shapes[1]}, as in service")

@@ -1,0 +1,76 @@
+"""The one place where errors become gRPC status codes, and on the client's side errors again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import grpc
+
+from optics import errors
+from optics.errors import (
+    BundleError,
+    BusyError,
+    CalibrationError,
+    InvalidInputError,
+    LightpageError,
+    LimitError,
+    RecalibrationRefusedError,
+)
+from runtime.caller import CallerLeft
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+
+DETAIL_KEY = "lightpage-error-bin"
+
+_CODES: tuple[tuple[type[BaseException], grpc.StatusCode], ...] = (
+    (InvalidInputError, grpc.StatusCode.INVALID_ARGUMENT),
+    (LimitError, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    (BusyError, grpc.StatusCode.ABORTED),
+    (BundleError, grpc.StatusCode.FAILED_PRECONDITION),
+    (RecalibrationRefusedError, grpc.StatusCode.FAILED_PRECONDITION),
+    (CalibrationError, grpc.StatusCode.FAILED_PRECONDITION),
+    (CallerLeft, grpc.StatusCode.CANCELLED),
+    (grpc.RpcError, grpc.StatusCode.CANCELLED),  # raised while reading a request whose sender has gone
+)
+
+_BY_NAME: dict[str, type[LightpageError]] = {
+    name: kind for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, LightpageError)
+}
+
+
+def status_of(error: BaseException) -> grpc.StatusCode:
+    """The status code for an error; INTERNAL for what nobody foresaw."""
+    for kind, code in _CODES:
+        if isinstance(error, kind):
+            return code
+    return grpc.StatusCode.INTERNAL
+
+
+def abort(context: grpc.ServicerContext, error: BaseException) -> None:
+    """End the call with the status of `error`. Always raises, as `context.abort` does.
+
+    An unforeseen error gives its class only: its text may hold paths or data that are nobody's business.
+    """
+    code = status_of(error)
+    if isinstance(error, LightpageError):
+        detail = pb.ErrorDetail(
+            kind=type(error).__name__, thing=error.thing, got=error.got[:1000], wanted=error.wanted[:1000]
+        )
+        context.set_trailing_metadata(((DETAIL_KEY, detail.SerializeToString()),))
+        context.abort(code, str(error)[:2000])
+    context.abort(code, f"{type(error).__name__} in the service; its log says more")
+
+
+def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
+    """The error that the service at `target` meant, of the same class wherever it said which."""
+    call: Any = rpc
+    for key, value in call.trailing_metadata() or ():
+        if key == DETAIL_KEY:
+            detail = pb.ErrorDetail.FromString(value)
+            return _BY_NAME.get(detail.kind, LightpageError)(detail.thing, detail.got, detail.wanted)
+    code, text = call.code(), call.details() or "no details"
+    thing = f"service at {target}"
+    if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
+        return LimitError(thing, text, "a smaller or a later request")
+    if code == grpc.StatusCode.UNAVAILABLE:
+        return LightpageError(thing, f"no connection ({text})", "a running Lightpage service at this address")
+    return LightpageError(thing, f"{code.name}: {text}", "an answer")

@@ -1,0 +1,67 @@
+"""The folder in which a service keeps the bundles that it made, and remembers across restarts which one it used."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+from optics.errors import BundleError
+from runtime.bundle import Bundle
+from runtime.manifest import MANIFEST, sha256
+
+CURRENT = "current.json"
+
+
+class ModelStore:
+    """A folder of bundles descended from one base bundle.
+
+    Args:
+        folder: made if absent.
+        base: the bundle that the operator gave; another base has its own memory.
+
+    Raises:
+        BundleError: the folder cannot be made or written.
+    """
+
+    def __init__(self, folder: Path, base: Bundle) -> None:
+        self.folder = folder
+        self._base = sha256(base.manifest.to_json())
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BundleError(f"model store {folder}", error, "a folder that can be written") from None
+
+    def path_of(self, version: str) -> Path:
+        """Where the bundle of this version is or will be."""
+        return self.folder / f"{version}.zip"
+
+    def versions(self) -> list[str]:
+        """Versions that exist here."""
+        return sorted(path.name.removesuffix(".zip") for path in self.folder.glob("*.zip"))
+
+    def remember(self, path: Path | None) -> None:
+        """Note which bundle is in service, None standing for the base; survives a crash in the middle.
+
+        Raises:
+            BundleError: the note cannot be written.
+        """
+        note = {"base": self._base, "bundle": path.name if path is not None else None}
+        temporary = self.folder / f".{CURRENT}.{os.getpid()}"
+        try:
+            temporary.write_text(json.dumps(note), "utf-8")
+            os.replace(temporary, self.folder / CURRENT)
+        except OSError as error:
+            raise BundleError(f"model store {self.folder}", error, "a folder that can be written") from None
+
+    def last(self) -> Path | None:
+        """The bundle that was in service when the program ended, if it came from the same base and is still here."""
+        try:
+            note = json.loads((self.folder / CURRENT).read_text("utf-8"))
+            name, base = note["bundle"], note["base"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return None  # no note, or one that cannot be read: the base it is
+        if base != self._base or not isinstance(name, str) or Path(name).name != name or name == MANIFEST:
+            return None
+        path = self.folder / name
+        return path if path.is_file() else None

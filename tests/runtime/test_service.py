@@ -1,0 +1,543 @@
+"""The running service: what it answers, what it refuses, and that it loses no request and keeps nothing behind."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import grpc
+import numpy as np
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from optics.errors import (
+    BundleError,
+    BusyError,
+    FrameError,
+    InvalidInputError,
+    LightpageError,
+    LimitError,
+    PageError,
+    RecalibrationRefusedError,
+)
+from optics.measures import measure
+from optics.recording import FramePair
+from runtime.bundle import Bundle
+from runtime.client import LightpageClient
+from runtime.dataplane import DataPlane
+from runtime.decoder import Decoder
+from runtime.limits import Limits
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from runtime.recalibration import Fit, FitResult
+from runtime.recalibrator import Recalibrator
+from runtime.registry import ModelRegistry
+from runtime.server import SERVICE, LightpageServer
+from tests.runtime import toy
+
+DRIFTED = (150.0, 62.0)
+
+
+@dataclass
+class Running:
+    """A service with all its parts in reach."""
+
+    plane: DataPlane
+    recalibrator: Recalibrator
+    server: LightpageServer
+    source: toy.ToySource
+    client: LightpageClient
+
+    @property
+    def device(self) -> toy.ToyDevice:
+        return self.source.device
+
+    def stub(self, channel: grpc.Channel) -> pb_grpc.LightpageStub:
+        return pb_grpc.LightpageStub(channel)
+
+
+Start = Callable[..., Running]
+
+
+@pytest.fixture
+def start(toy_zip: Path, tmp_path: Path) -> Iterator[Start]:
+    """Starts services on free loopback ports and ends them."""
+    running: list[Running] = []
+
+    def begin(limits: Limits | None = None, fit: Fit = toy.fit_references, bundle: Path = toy_zip) -> Running:
+        source = toy.ToySource(toy.ToyDevice())
+        plane = DataPlane(ModelRegistry(Decoder(Bundle.open(bundle), threads=1)), source, limits=limits)
+        recalibrator = Recalibrator(plane, fit, tmp_path)
+        server = LightpageServer(plane, recalibrator).start()
+        client = LightpageClient(server.target, timeout_s=20)
+        running.append(Running(plane, recalibrator, server, source, client))
+        return running[-1]
+
+    yield begin
+    for service in running:
+        service.client.close()
+        service.server.stop(0.5)
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        if condition():
+            return True
+        time.sleep(0.01)
+    return condition()
+
+
+def a_page(levels: int = 16, seed: int = 3) -> tuple[np.ndarray, FramePair]:
+    symbols = toy.symbols_of(levels, seed)[0]
+    return symbols, toy.ToyDevice(seed=seed).page(symbols, levels, 0.7)
+
+
+def test_the_service_describes_itself(start: Start) -> None:
+    service = start()
+    description = service.client.describe()
+    assert description.model.version == "toy-1"
+    assert description.model.current
+    assert (description.frame_shape, description.page_shape) == (toy.SHAPE, toy.PAGE)
+    assert (description.frame_dtype, description.bit_depth) == ("uint8", 8)
+    assert (description.source, description.source_levels) == ("toy:device", 16)
+    assert "toy" in description.profile_toml
+    assert "angle_deg" in description.calibration_toml
+
+
+def test_a_sent_pair_comes_back_as_the_local_decoder_would_decode_it(start: Start, decoder: Decoder) -> None:
+    symbols, pair = a_page()
+    here = decoder.decode(pair, 16)
+    there = start().client.decode(pair, 16, want_concentration=True, want_phase=True)
+    assert (there.symbols == symbols).all()
+    for name in ("symbols", "confidence", "concentration", "phase"):
+        np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
+    assert there.piston_rad == pytest.approx(here.piston_rad)
+    assert there.model_version == "toy-1"
+    timings = there.timings
+    assert 0 < timings.inference_s < timings.decode_s < timings.total_s
+    assert 0 < timings.receive_s < timings.total_s
+
+
+def test_only_what_is_asked_for_is_sent(start: Start) -> None:
+    page = start().client.decode(a_page()[1], 16, quantised=True)
+    assert page.concentration is None
+    assert page.phase is None
+    assert set(np.unique(page.confidence * 255 % 1)) == {0}
+
+
+def test_quantised_confidence_never_claims_more(start: Start) -> None:
+    client, pair = start().client, a_page(64)[1]
+    exact, coarse = client.decode(pair, 64), client.decode(pair, 64, quantised=True)
+    assert (coarse.confidence <= exact.confidence).all()
+    assert (exact.confidence - coarse.confidence).max() <= 1 / 255
+
+
+@pytest.mark.parametrize("levels", [2, 5, 256])
+def test_any_level_count_can_be_asked_for(levels: int, start: Start) -> None:
+    page = start().client.decode(a_page(levels)[1], levels)
+    assert page.levels == levels
+    assert page.symbols.max() < levels
+
+
+def test_pilots_of_ones_own_can_be_sent(start: Start) -> None:
+    symbols = np.random.default_rng(5).integers(16, size=toy.PAGE).astype(np.uint8)
+    mask = np.zeros(toy.PAGE, bool)
+    mask[::4, ::6] = True
+    page = start().client.decode(toy.ToyDevice().page(symbols, 16, 2.0), 16, pilots=(mask, symbols))
+    assert (page.symbols == symbols).all()
+
+
+def test_pages_are_read_from_the_source_in_turn_or_by_number(start: Start) -> None:
+    client = start().client
+    pages = [client.read_page(want_written=True), client.read_page(want_written=True), client.read_page(9)]
+    assert [page.page for page in pages] == [0, 1, 9]
+    for page in pages[:2]:
+        assert page.levels == 16
+        assert page.written is not None
+        assert page.pilot_mask is not None
+        assert (page.symbols == page.written).all()
+        assert page.pilot_mask.sum() > 4
+    assert pages[2].written is None
+
+
+@pytest.mark.parametrize(
+    ("pair", "kind", "named"),
+    [
+        (FramePair(np.full((64, 95), 9, np.uint8), np.full((64, 95), 9, np.uint8)), FrameError, "64x95"),
+        (FramePair(np.full(toy.SHAPE, 9, np.uint16), np.full(toy.SHAPE, 9, np.uint16)), FrameError, "uint16"),
+        (FramePair(np.zeros(toy.SHAPE, np.uint8), np.zeros(toy.SHAPE, np.uint8)), FrameError, "in-phase frame.*black"),
+        (FramePair(a_page()[1].quadrature, a_page()[1].in_phase), FrameError, "swapped"),
+    ],
+)
+def test_bad_frames_are_the_callers_fault_and_named(
+    pair: FramePair, kind: type[LightpageError], named: str, start: Start
+) -> None:
+    with pytest.raises(kind, match=named):
+        start().client.decode(pair, 16)
+
+
+def test_bad_requests_are_the_callers_fault_and_named(start: Start) -> None:
+    service = start()
+    with pytest.raises(PageError, match="levels"):
+        service.client.decode(a_page()[1], 1000)
+    with pytest.raises(FrameError, match="10 bits"):
+        service.client.decode(a_page()[1], 16, bit_depth=10)
+    mask = np.ones((2, 2), bool)
+    with pytest.raises(PageError, match="pilots"):
+        service.client.decode(a_page()[1], 16, pilots=(mask, np.zeros((2, 2), np.uint8)))
+    with pytest.raises(InvalidInputError, match="recalibrate"):
+        service.client.recalibrate(count=0)
+
+
+def call_with(service: Running, parts: list[pb.DecodeFramesRequest]) -> tuple[grpc.StatusCode, str]:
+    with grpc.insecure_channel(service.server.target) as channel:
+        try:
+            service.stub(channel).DecodeFrames(iter(parts), timeout=20)
+        except grpc.RpcError as error:
+            return error.code(), error.details()
+    return grpc.StatusCode.OK, ""
+
+
+def header(rows: int = toy.SHAPE[0], columns: int = toy.SHAPE[1], kind: int = pb.PIXEL_TYPE_UINT8) -> pb.DecodeHeader:
+    options = pb.DecodeOptions(levels=16)
+    return pb.DecodeHeader(rows_px=rows, columns_px=columns, pixel_type=kind, bit_depth=8, options=options)
+
+
+def test_a_broken_stream_is_the_callers_fault_and_named(start: Start) -> None:
+    service, size = start(), toy.SHAPE[0] * toy.SHAPE[1]
+    begin, chunk = pb.DecodeFramesRequest(header=header()), pb.DecodeFramesRequest
+    cases = [
+        ([], "header"),
+        ([chunk(chunk=b"abc")], "header"),
+        ([begin], "0 bytes"),
+        ([begin, chunk(chunk=bytes(size))], f"{size} bytes"),
+        ([begin, chunk(chunk=bytes(2 * size + 1))], f"{2 * size} bytes"),
+        ([begin, begin], "second header"),
+        ([chunk(header=header(kind=0))], "pixel_type"),
+        ([chunk(header=header(kind=77))], "pixel_type"),
+    ]
+    for parts, named in cases:
+        code, text = call_with(service, parts)
+        assert code == grpc.StatusCode.INVALID_ARGUMENT, text
+        assert named in text
+
+
+def test_oversize_requests_are_refused_before_anything_is_allocated(start: Start) -> None:
+    service = start(Limits(pair_bytes=1 << 20, chunk_bytes=1 << 16, message_bytes=1 << 20))
+    code, text = call_with(service, [pb.DecodeFramesRequest(header=header(60_000, 60_000))])
+    assert code == grpc.StatusCode.RESOURCE_EXHAUSTED
+    assert "7200000000 bytes" in text
+    begin = pb.DecodeFramesRequest(header=header())
+    code, text = call_with(service, [begin, pb.DecodeFramesRequest(chunk=bytes((1 << 16) + 1))])
+    assert code == grpc.StatusCode.RESOURCE_EXHAUSTED
+    assert "chunk" in text
+    code, _ = call_with(service, [begin, pb.DecodeFramesRequest(chunk=bytes(2 << 20))])
+    assert code == grpc.StatusCode.RESOURCE_EXHAUSTED
+    assert (service.client.decode(a_page()[1], 16).symbols == a_page()[0]).all()
+
+
+def test_a_client_that_leaves_mid_call_leaves_nothing_behind(start: Start) -> None:
+    service = start(Limits(concurrent_receives=2))
+    gone = threading.Event()
+
+    def endless() -> Iterator[pb.DecodeFramesRequest]:
+        yield pb.DecodeFramesRequest(header=header())
+        yield pb.DecodeFramesRequest(chunk=bytes(100))
+        gone.wait(20)
+
+    in_flight = service.plane.metrics.in_flight._value.get
+    for _ in range(6):  # three times as many as there are slots
+        with grpc.insecure_channel(service.server.target) as channel:
+            call = service.stub(channel).DecodeFrames.future(endless(), timeout=20)
+            assert wait_until(lambda: in_flight() == 1)
+            call.cancel()
+        assert wait_until(lambda: in_flight() == 0)
+    gone.set()
+    assert (service.client.decode(a_page()[1], 16).symbols == a_page()[0]).all()
+    assert service.plane.metrics.pages.labels("toy-1")._value.get() == 1
+
+
+def test_a_client_that_stalls_is_cut_off_and_gives_its_slot_back(start: Start) -> None:
+    service = start(Limits(concurrent_receives=1, receive_s=0.3))
+    over = threading.Event()
+
+    def stalling() -> Iterator[pb.DecodeFramesRequest]:
+        yield pb.DecodeFramesRequest(header=header())
+        over.wait(20)
+
+    with grpc.insecure_channel(service.server.target) as channel:
+        call = service.stub(channel).DecodeFrames.future(stalling(), timeout=20)
+        page = service.client.decode(a_page()[1], 16)  # waits for the one slot
+        assert (page.symbols == a_page()[0]).all()
+        with pytest.raises(grpc.RpcError) as error:
+            call.result()
+        assert error.value.code() == grpc.StatusCode.CANCELLED
+        over.set()
+
+
+def test_too_many_at_once_are_told_to_come_back(start: Start) -> None:
+    service = start(Limits(concurrent_decodes=1, deadline_s=0.2))
+    assert service.plane._decodes.acquire(timeout=1)
+    with pytest.raises(BusyError, match="try again"):
+        service.client.decode(a_page()[1], 16)
+    service.plane._decodes.release()
+    assert service.client.decode(a_page()[1], 16).levels == 16
+
+
+def test_health_is_served_beside_the_service_and_ends_first(start: Start) -> None:
+    service = start()
+    with grpc.insecure_channel(service.server.target) as channel:
+        stub = health_pb2_grpc.HealthStub(channel)
+        for name in ("", SERVICE):
+            answer = stub.Check(health_pb2.HealthCheckRequest(service=name), timeout=5)
+            assert answer.status == health_pb2.HealthCheckResponse.SERVING
+        watch = stub.Watch(health_pb2.HealthCheckRequest(service=SERVICE), timeout=10)
+        assert next(watch).status == health_pb2.HealthCheckResponse.SERVING
+        ending = threading.Thread(target=service.server.stop, args=(2.0,))
+        ending.start()
+        assert next(watch).status == health_pb2.HealthCheckResponse.NOT_SERVING
+        watch.cancel()
+        ending.join(10)
+        assert not ending.is_alive()
+
+
+def test_an_answer_in_flight_survives_the_stop(start: Start) -> None:
+    service = start()
+    assert service.plane._decodes.acquire(timeout=1)
+    assert service.plane._decodes.acquire(timeout=1)
+    pages: list[object] = []
+    caller = threading.Thread(target=lambda: pages.append(service.client.decode(a_page()[1], 16)))
+    caller.start()
+    assert wait_until(lambda: service.plane.metrics.in_flight._value.get() == 1)
+    ending = threading.Thread(target=service.server.stop, args=(10.0,))
+    ending.start()
+    service.plane._decodes.release(2)
+    caller.join(10)
+    ending.join(10)
+    assert len(pages) == 1
+    with pytest.raises(LightpageError, match="no connection"):
+        service.client.describe()
+
+
+def air_of(service: Running, pages: int = 3) -> float:
+    read = [service.client.read_page(want_phase=True, want_concentration=True, want_written=True) for _ in range(pages)]
+    data = ~np.stack([page.pilot_mask for page in read])  # type: ignore[arg-type,misc]
+    stacked = [np.stack([getattr(page, name) for page in read])[data] for name in ("phase", "concentration", "written")]
+    return measure(*stacked, 16).air_bits_per_symbol
+
+
+def test_recalibration_over_the_endpoint_recovers_what_drift_cost_and_rollback_undoes_it(start: Start) -> None:
+    service = start()
+    before = air_of(service)
+    service.device.offsets = DRIFTED
+    drifted = air_of(service)
+    assert drifted < before - 0.8
+    steps: list[tuple[str, float]] = []
+    result = service.client.recalibrate(count=2, progress=lambda name, share: steps.append((name, share)))
+    assert (result.model_version, result.previous_version) == ("toy-1+r1", "toy-1")
+    assert (result.pages_used, result.pages_held_back) == (2, 1)
+    assert (result.angle_deg, result.coherence_before, result.coherence_after) == (0.5, 0.4, 0.9)
+    assert result.air_after > result.air_before
+    assert [share for _, share in steps] == sorted(share for _, share in steps)
+    assert ("fit", pytest.approx(0.475)) in steps
+    assert air_of(service) > 0.98 * before
+    assert [(m.version, m.current) for m in service.client.models()] == [("toy-1", False), ("toy-1+r1", True)]
+    assert service.client.describe().calibration_toml == "angle_deg = 0.5\n"
+    assert service.client.rollback() == ("toy-1", "toy-1+r1")
+    assert air_of(service) < before - 0.8
+    with pytest.raises(BundleError, match="earlier model"):
+        service.client.rollback()
+
+
+def test_recalibration_with_wrong_pilots_is_refused_and_the_old_model_stays(start: Start) -> None:
+    service = start()
+    honest = service.source.read
+
+    def lying(page: int | None = None) -> object:
+        found = honest(page)
+        wrong = np.random.default_rng(1).integers(16, size=toy.PAGE).astype(np.uint8)
+        return type(found)(found.pair, found.page_index, wrong)
+
+    service.source.read = lying  # type: ignore[method-assign,assignment]
+    with pytest.raises(RecalibrationRefusedError, match="do not match"):
+        service.client.recalibrate(count=3)
+    service.source.read = honest  # type: ignore[method-assign]
+    assert service.client.describe().model.version == "toy-1"
+    assert [m.version for m in service.client.models()] == ["toy-1"]
+    assert service.plane.metrics.recalibrations.labels("refused")._value.get() == 1
+
+
+def test_recalibration_that_would_decode_worse_is_refused(start: Start) -> None:
+    def worse(*arguments: object) -> FitResult:
+        good = toy.fit_references(*arguments)  # type: ignore[arg-type]
+        return FitResult({"homodyne": np.array([5.7, 0.7], np.float32)}, good.calibration_toml, good.report)
+
+    service = start(fit=worse)
+    with pytest.raises(RecalibrationRefusedError, match="model in service"):
+        service.client.recalibrate(count=2)
+    assert service.client.describe().model.version == "toy-1"
+
+
+@dataclass
+class SlowFit:
+    """A fit that waits for leave to go on."""
+
+    entered: threading.Event
+    go: threading.Event
+    ended: threading.Event
+
+    def __call__(
+        self, bundle: object, pages: object, progress: Callable[[str, float], None], decoder: object
+    ) -> object:
+        self.entered.set()
+        try:
+            until = time.monotonic() + 20
+            while not self.go.wait(0.02) and time.monotonic() < until:
+                progress("wait", 0.1)
+            return toy.fit_references(bundle, pages, progress, decoder)  # type: ignore[arg-type]
+        finally:
+            self.ended.set()
+
+
+def slow_fit() -> SlowFit:
+    return SlowFit(threading.Event(), threading.Event(), threading.Event())
+
+
+def test_a_second_recalibration_is_turned_away_and_the_first_ends_well(start: Start) -> None:
+    fit = slow_fit()
+    service = start(fit=fit)  # type: ignore[arg-type]
+    results: list[object] = []
+    first = threading.Thread(target=lambda: results.append(service.client.recalibrate(count=2)))
+    first.start()
+    assert fit.entered.wait(10)
+    with LightpageClient(service.server.target) as second, pytest.raises(BusyError, match="recalibration"):
+        second.recalibrate(count=2)
+    assert (service.client.decode(a_page()[1], 16).symbols == a_page()[0]).all()  # decoding goes on beside it
+    fit.go.set()
+    first.join(10)
+    assert len(results) == 1
+    assert service.client.describe().model.version == "toy-1+r1"
+
+
+def test_a_recalibration_whose_caller_leaves_is_dropped(start: Start) -> None:
+    fit = slow_fit()
+    service = start(fit=fit)  # type: ignore[arg-type]
+    with grpc.insecure_channel(service.server.target) as channel:
+        call = service.stub(channel).Recalibrate(pb.RecalibrateRequest(source=pb.SourcePages(count=2)), timeout=20)
+        assert next(call).progress.step
+        assert fit.entered.wait(10)
+        call.cancel()
+    assert fit.ended.wait(10)
+    assert wait_until(lambda: service.plane.metrics.recalibrations.labels("dropped")._value.get() == 1)
+    assert service.client.describe().model.version == "toy-1"
+    fit.go.set()
+    assert service.client.recalibrate(count=2).model_version == "toy-1+r1"
+
+
+def test_a_rollback_during_recalibration_makes_its_result_out_of_date(start: Start) -> None:
+    fit = slow_fit()
+    service = start(fit=fit)  # type: ignore[arg-type]
+    fit.go.set()
+    service.client.recalibrate(count=2)
+    fit.go.clear()
+    fit.entered.clear()
+    errors: list[Exception] = []
+
+    def again() -> None:
+        try:
+            service.client.recalibrate(count=2)
+        except RecalibrationRefusedError as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=again)
+    thread.start()
+    assert fit.entered.wait(10)
+    assert service.client.rollback()[0] == "toy-1"
+    fit.go.set()
+    thread.join(10)
+    assert len(errors) == 1
+    assert service.client.describe().model.version == "toy-1"
+
+
+def test_recalibration_from_a_recording_on_the_server(start: Start, tmp_path: Path) -> None:
+    service = start()
+    toy.write_toy_recording(tmp_path / "known.h5", toy.ToyDevice(DRIFTED), 16, 3)
+    assert service.client.recalibrate(recording="known.h5").pages_used == 3
+    for name in ("absent.h5", "../known.h5", str(tmp_path / "known.h5"), ""):
+        with pytest.raises(InvalidInputError, match="recording"):
+            service.client.recalibrate(recording=name)
+    with pytest.raises(LimitError, match="at most 16"):
+        service.client.recalibrate(count=17)
+
+
+def test_a_swap_under_load_loses_no_request(start: Start) -> None:
+    service = start()
+    stop, answers, errors = threading.Event(), [], []
+    symbols, pair = a_page()
+
+    def load() -> None:
+        with LightpageClient(service.server.target) as client:
+            until = time.monotonic() + 20
+            while not stop.is_set() and time.monotonic() < until:
+                try:
+                    answers.append(client.decode(pair, 16))
+                except LightpageError as error:
+                    errors.append(error)
+
+    threads = [threading.Thread(target=load) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    versions = ["toy-1+r1", "toy-1+r2", "toy-1+r3"]
+    for version in versions:
+        assert service.client.recalibrate(count=2).model_version == version
+        assert wait_until(lambda version=version: answers[-1].model_version == version)  # type: ignore[misc]
+    service.client.rollback()
+    assert wait_until(lambda: answers[-1].model_version == "toy-1+r2")
+    stop.set()
+    for thread in threads:
+        thread.join(10)
+    assert errors == []
+    assert {answer.model_version for answer in answers} >= set(versions)
+    assert all((answer.symbols == symbols).all() for answer in answers)
+
+
+def test_an_unforeseen_error_is_internal_and_tells_nothing_of_the_inside(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = start()
+
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("secret path /srv/keys")
+
+    monkeypatch.setattr(service.plane, "read_page", broken)
+    with pytest.raises(LightpageError, match="INTERNAL") as error:
+        service.client.read_page()
+    assert "secret" not in str(error.value)
+
+
+def test_a_port_that_is_taken_is_named(start: Start, toy_zip: Path) -> None:
+    service = start()
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)))
+    address = service.server.target
+    with pytest.raises(InvalidInputError, match=address):
+        LightpageServer(plane, Recalibrator(plane, toy.fit_references), address).start()
+
+
+def test_a_service_without_a_source_says_so(toy_zip: Path) -> None:
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)))
+    server = LightpageServer(plane, Recalibrator(plane, toy.fit_references))
+    with server, LightpageClient(server.target) as client:
+        assert client.describe().source == ""
+        with pytest.raises(InvalidInputError, match="--source"):
+            client.read_page()
+        with pytest.raises(InvalidInputError, match="--recordings"):
+            client.recalibrate(recording="R.h5")
+
+
+def test_nobody_at_the_address_is_said_plainly() -> None:
+    with LightpageClient("127.0.0.1:9", timeout_s=3) as client, pytest.raises(LightpageError, match="no connection"):
+        client.describe()
