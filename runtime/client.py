@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from optics.errors import FrameError, LightpageError
 from optics.recording import FramePair
-from runtime.convert import PIXEL_CODES, PIXEL_TYPES, RemotePage, pilots_message, remote_page
+from runtime.convert import PIXEL_CODES, PIXEL_TYPES, KnownPilots, RemotePage, pilots_message, remote_page
 from runtime.limits import CHUNK_BYTES, REPLY_BYTES
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
@@ -51,6 +51,7 @@ class Description:
     source_levels: int
     profile_toml: str
     calibration_toml: str
+    pilot_mask: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,7 @@ class LightpageClient:
             source_levels=reply.source_levels,
             profile_toml=reply.profile_toml,
             calibration_toml=reply.calibration_toml,
+            pilot_mask=np.frombuffer(reply.pilot_mask, np.uint8).reshape(reply.page.rows, reply.page.columns) != 0,
         )
         return self._description
 
@@ -126,7 +128,7 @@ class LightpageClient:
         levels: int = 256,
         *,
         bit_depth: int | None = None,
-        pilots: tuple[NDArray[np.bool_], NDArray[np.uint8]] | None = None,
+        pilots: KnownPilots | None = None,
         want_concentration: bool = False,
         want_phase: bool = False,
         quantised: bool = False,
@@ -137,7 +139,7 @@ class LightpageClient:
             pair: both frames, uint8 or uint16.
             levels: M, 2..256.
             bit_depth: bits of a camera count; by default those of the service's camera.
-            pilots: (mask, symbols), both [ny, nx], where they differ from the profile's pattern.
+            pilots: known symbols, where they differ from the profile's pattern.
             want_concentration: also get kappa.
             want_phase: also get the phase.
             quantised: get the confidence in one byte a symbol.
@@ -161,7 +163,7 @@ class LightpageClient:
             pixel_type=PIXEL_CODES[frames[0].dtype.name],
             bit_depth=bit_depth,
             options=_options(levels, want_concentration, want_phase, quantised),
-            pilots=pilots_message(*pilots) if pilots is not None else None,
+            pilots=pilots_message(pilots) if pilots is not None else None,
         )
         reply: pb.DecodeReply = self._unary(self._stub.DecodeFrames, _parts(header, frames))
         return remote_page(reply)

@@ -44,14 +44,31 @@ def pilots_of(message: pb.Pilots, page_shape: tuple[int, int], levels: int) -> P
     if flags.size != page_shape[0] * page_shape[1] or np.count_nonzero(flags) != values.size:
         got = f"{flags.size} flags, {np.count_nonzero(flags)} of them set, and {values.size} values"
         raise PageError("pilots", got, f"{page_shape[0] * page_shape[1]} flags and one value a set flag")
+    levels = message.levels or levels
     if values.size and int(values.max()) >= levels:
         raise PageError("pilots", f"level {values.max()}", f"0..{levels - 1}")
     return Pilots(flags.reshape(page_shape) != 0, symbol_phases(values, levels))
 
 
-def pilots_message(mask: NDArray[np.bool_], symbols: NDArray[np.uint8]) -> pb.Pilots:
-    """Pilots at `mask` of a known page."""
-    return pb.Pilots(mask=mask.astype(np.uint8).tobytes(), values=symbols[mask].tobytes())
+@dataclass(frozen=True)
+class KnownPilots:
+    """Pilots that a caller knows: bool mask [ny, nx], a page of symbols [ny, nx], and their level count."""
+
+    mask: NDArray[np.bool_]
+    symbols: NDArray[np.uint8]
+    levels: int
+
+
+def pilots_message(pilots: KnownPilots) -> pb.Pilots:
+    """Pilots as their message.
+
+    Raises:
+        PageError: mask and page differ in shape.
+    """
+    if pilots.mask.shape != pilots.symbols.shape:
+        raise PageError("pilots", f"mask {pilots.mask.shape}, page {pilots.symbols.shape}", "two equal shapes")
+    values = pilots.symbols[pilots.mask].tobytes()
+    return pb.Pilots(mask=pilots.mask.astype(np.uint8).tobytes(), values=values, levels=pilots.levels)
 
 
 def levels_of(options: pb.DecodeOptions) -> int:

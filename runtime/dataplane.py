@@ -71,7 +71,7 @@ class DataPlane:
         self.metrics = metrics or ServiceMetrics()
         self._source = source
         if source is not None:
-            source.check_against(registry.current.decoder.bundle.profile)
+            _check_source(source, registry.current.decoder)
         self._receives = threading.BoundedSemaphore(self.limits.concurrent_receives)
         self._decodes = threading.BoundedSemaphore(self.limits.concurrent_decodes)
         self.metrics.in_service(registry.current.version)
@@ -162,11 +162,11 @@ class DataPlane:
         levels = source.levels if levels is None else levels
         found = source.read(page)
         mask = self._mask(found, self.registry.current.decoder)
-        pilots = None
-        if found.symbols is not None and levels == source.levels:
-            pilots = Pilots.of_symbols(mask, found.symbols, levels)
-        elif found.pilot_mask is not None:
-            pilots = Pilots.of_profile(self.registry.current.decoder.bundle.profile, levels, mask)
+        # Pilots are what was written, whatever level count the caller wants to see.
+        if found.symbols is not None:
+            pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
+        else:
+            pilots = Pilots.of_profile(self.registry.current.decoder.bundle.profile, source.levels, mask)
         answer = self.decode(found.pair, levels, caller, pilots, start=start, received=time.perf_counter())
         return ReadAnswer(answer, found, mask)
 
@@ -218,3 +218,10 @@ class DataPlane:
             yield
         finally:
             slots.release()
+
+
+def _check_source(source: FrameSource, decoder: Decoder) -> None:
+    source.check_against(decoder.bundle.profile)
+    depth = decoder.bundle.manifest.camera_bit_depth
+    if source.bit_depth != depth:
+        raise InvalidInputError(f"source {source.name}", f"{source.bit_depth} bits", f"{depth} bits, as the bundle")

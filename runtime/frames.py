@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from optics.errors import FrameError
 from optics.recording import FramePair
+from optics.recording_layout import frame_type
 
 BLACK_FRACTION = 0.02
 """A frame whose brightest pixel is below this share of full scale is dark: its laser or its shutter is off."""
@@ -48,3 +49,16 @@ def _check_frame(name: str, frame: NDArray[Any], shape: tuple[int, int], dtype: 
         clipped = np.count_nonzero(frame == full_scale) / frame.size
         if clipped > SATURATED_FRACTION:
             raise FrameError(name, f"saturated: {clipped:.1%} at full scale", f"at most {SATURATED_FRACTION:.0%}")
+
+
+def narrow(pair: FramePair, bit_depth: int) -> FramePair:
+    """The pair in the narrowest type for `bit_depth` bits, native byte order, where all counts fit into it.
+
+    A recording may hold 8-bit counts in 16 bits; a camera and a bundle do not.
+    """
+    wanted = frame_type(bit_depth)
+    frames = [
+        frame.astype(wanted, copy=False) if int(frame.max(initial=0)) <= np.iinfo(wanted).max else frame
+        for frame in (pair.in_phase, pair.quadrature)
+    ]
+    return FramePair(frames[0], frames[1])

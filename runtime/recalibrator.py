@@ -16,6 +16,7 @@ from runtime.bundle import Bundle
 from runtime.caller import Caller, CallerLeft
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
+from runtime.frames import narrow
 from runtime.recalibration import Fit, KnownPages, Progress, RecalibrationOutcome, next_version, recalibrate
 from runtime.sources import FrameSource
 
@@ -188,8 +189,10 @@ def known_pages(recording: Recording, pages: Sequence[int] | None = None) -> Kno
     symbols = [found for index in indices if (found := recording.symbols(index)) is not None]
     if len(symbols) != len(indices):
         raise PageError(f"recording {recording.path}", "no symbols", "a recording with known symbols")
-    pairs = tuple(recording.frames(index) for index in indices)
-    return KnownPages(pairs, tuple(symbols), recording.levels, recording.references(), recording.pilots())
+    bits = recording.bit_depth
+    pairs = tuple(narrow(recording.frames(index), bits) for index in indices)
+    references = narrow(recording.references(), bits)
+    return KnownPages(pairs, tuple(symbols), recording.levels, references, recording.pilots())
 
 
 def _follow(

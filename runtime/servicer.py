@@ -64,6 +64,7 @@ class LightpageServicer(pb_grpc.LightpageServicer):
                 source_levels=plane.source.levels if plane.has_source else 0,
                 profile_toml=bundle.manifest.profile,
                 calibration_toml=bundle.manifest.calibration,
+                pilot_mask=bundle.pilot_mask.astype("uint8").tobytes(),
             )
 
     def DecodeFrames(

@@ -16,6 +16,7 @@ from optics.errors import InvalidInputError, PageError
 from optics.page import pilot_mask, random_symbols
 from optics.profile import Profile, load_profile
 from optics.recording import FramePair, Recording
+from runtime.frames import narrow
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,10 @@ class FrameSource(Protocol):
     def levels(self) -> int:
         """Level count of its pages."""
 
+    @property
+    def bit_depth(self) -> int:
+        """Bits of a camera count."""
+
     def check_against(self, profile: Profile) -> None:
         """Raise `InvalidInputError` unless its frames and pages have the shapes of `profile`."""
 
@@ -72,7 +77,7 @@ class RecordingSource:
         """Guards the file and the position; held while one page is read."""
         self._next = 0
         self.name = f"recording:{path}"
-        self.levels = self._recording.levels
+        self.levels, self.bit_depth = self._recording.levels, self._recording.bit_depth
 
     def check_against(self, profile: Profile) -> None:
         """Raise `RecordingError` unless the recording's shapes are those of `profile`."""
@@ -91,12 +96,14 @@ class RecordingSource:
                 page, self._next = self._next, (self._next + 1) % max(1, recording.pages)
             if not 0 <= page < recording.pages:
                 raise PageError(f"page of {self.name}", page, f"0..{recording.pages - 1}")
-            return SourcePage(recording.frames(page), page, recording.symbols(page), recording.pilots())
+            return SourcePage(
+                narrow(recording.frames(page), self.bit_depth), page, recording.symbols(page), recording.pilots()
+            )
 
     def references(self) -> FramePair:
         """The recording's reference frames."""
         with self._lock:
-            return self._recording.references()
+            return narrow(self._recording.references(), self.bit_depth)
 
     def close(self) -> None:
         """Close the file."""
@@ -114,7 +121,7 @@ class SimulatorSource:
         self._lock = threading.Lock()
         """Guards the simulator and the position; held while one page is simulated."""
         self._next, self._seed = 0, seed
-        self.profile, self.levels = profile, levels
+        self.profile, self.levels, self.bit_depth = profile, levels, device.sensor.bit_depth
         self.name = name or f"simulator:{profile.name}"
 
     def check_against(self, profile: Profile) -> None:

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from optics.recording import FramePair
 from runtime.bundle import Table
-from runtime.decoder import DecodedPage
+from runtime.decoder import DecodedPage, Decoder
 
 
 @dataclass(frozen=True)
@@ -103,3 +103,8 @@ class ShiftTracker:
 
     def _step(self, old: float, rest: float) -> float:
         return min(self._limit, max(-self._limit, old + self._gain * rest))
+
+
+def tracker_for(decoder: Decoder) -> Tracker:
+    """The tracker that a bundle's decoder is run with, in service and in evaluation."""
+    return NoTracker()

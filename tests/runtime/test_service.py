@@ -24,9 +24,11 @@ from optics.errors import (
     RecalibrationRefusedError,
 )
 from optics.measures import measure
+from optics.page import pilot_mask
 from optics.recording import FramePair
 from runtime.bundle import Bundle
 from runtime.client import LightpageClient
+from runtime.convert import KnownPilots
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
 from runtime.limits import Limits
@@ -105,6 +107,7 @@ def test_the_service_describes_itself(start: Start) -> None:
     assert (description.frame_dtype, description.bit_depth) == ("uint8", 8)
     assert (description.source, description.source_levels) == ("toy:device", 16)
     assert "toy" in description.profile_toml
+    assert (description.pilot_mask == pilot_mask(toy.PROFILE)).all()
     assert "angle_deg" in description.calibration_toml
 
 
@@ -147,7 +150,7 @@ def test_pilots_of_ones_own_can_be_sent(start: Start) -> None:
     symbols = np.random.default_rng(5).integers(16, size=toy.PAGE).astype(np.uint8)
     mask = np.zeros(toy.PAGE, bool)
     mask[::4, ::6] = True
-    page = start().client.decode(toy.ToyDevice().page(symbols, 16, 2.0), 16, pilots=(mask, symbols))
+    page = start().client.decode(toy.ToyDevice().page(symbols, 16, 2.0), 16, pilots=KnownPilots(mask, symbols, 16))
     assert (page.symbols == symbols).all()
 
 
@@ -162,6 +165,10 @@ def test_pages_are_read_from_the_source_in_turn_or_by_number(start: Start) -> No
         assert (page.symbols == page.written).all()
         assert page.pilot_mask.sum() > 4
     assert pages[2].written is None
+    coarse = client.read_page(1, 8)  # the same page seen in other levels keeps its phase reference
+    assert pages[1].written is not None
+    even = pages[1].written % 2 == 0
+    assert (coarse.symbols[even] == pages[1].written[even] // 2).all()
 
 
 @pytest.mark.parametrize(
@@ -188,7 +195,7 @@ def test_bad_requests_are_the_callers_fault_and_named(start: Start) -> None:
         service.client.decode(a_page()[1], 16, bit_depth=10)
     mask = np.ones((2, 2), bool)
     with pytest.raises(PageError, match="pilots"):
-        service.client.decode(a_page()[1], 16, pilots=(mask, np.zeros((2, 2), np.uint8)))
+        service.client.decode(a_page()[1], 16, pilots=KnownPilots(mask, np.zeros((2, 2), np.uint8), 16))
     with pytest.raises(InvalidInputError, match="recalibrate"):
         service.client.recalibrate(count=0)
 

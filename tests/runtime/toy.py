@@ -245,6 +245,7 @@ class ToySource:
     """A source of toy pages whose device may drift."""
 
     name = "toy:device"
+    bit_depth = 8
 
     def __init__(self, device: ToyDevice, levels: int = 16, pages: int | None = None) -> None:
         self.device, self.levels, self.pages = device, levels, pages

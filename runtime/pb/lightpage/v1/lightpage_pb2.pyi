@@ -31,7 +31,7 @@ class DescribeRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class DescribeReply(_message.Message):
-    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml")
+    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml", "pilot_mask")
     SERVICE_VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -41,6 +41,7 @@ class DescribeReply(_message.Message):
     SOURCE_LEVELS_FIELD_NUMBER: _ClassVar[int]
     PROFILE_TOML_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_TOML_FIELD_NUMBER: _ClassVar[int]
+    PILOT_MASK_FIELD_NUMBER: _ClassVar[int]
     service_version: str
     model: Model
     camera: Camera
@@ -50,7 +51,8 @@ class DescribeReply(_message.Message):
     source_levels: int
     profile_toml: str
     calibration_toml: str
-    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ...) -> None: ...
+    pilot_mask: bytes
+    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ..., pilot_mask: _Optional[bytes] = ...) -> None: ...
 
 class Model(_message.Message):
     __slots__ = ("name", "version", "created", "current", "metrics")
@@ -118,12 +120,14 @@ class DecodeOptions(_message.Message):
     def __init__(self, levels: _Optional[int] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., want_concentration: _Optional[bool] = ..., want_phase: _Optional[bool] = ...) -> None: ...
 
 class Pilots(_message.Message):
-    __slots__ = ("mask", "values")
+    __slots__ = ("mask", "values", "levels")
     MASK_FIELD_NUMBER: _ClassVar[int]
     VALUES_FIELD_NUMBER: _ClassVar[int]
+    LEVELS_FIELD_NUMBER: _ClassVar[int]
     mask: bytes
     values: bytes
-    def __init__(self, mask: _Optional[bytes] = ..., values: _Optional[bytes] = ...) -> None: ...
+    levels: int
+    def __init__(self, mask: _Optional[bytes] = ..., values: _Optional[bytes] = ..., levels: _Optional[int] = ...) -> None: ...
 
 class DecodeHeader(_message.Message):
     __slots__ = ("rows_px", "columns_px", "pixel_type", "bit_depth", "options", "pilots")

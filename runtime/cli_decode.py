@@ -1,0 +1,130 @@
+"""`lightpage decode`: decodes pages with a running service."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from typing import Any
+
+import click
+from tqdm import tqdm
+
+from optics.errors import InvalidInputError
+from optics.measures import PageMeasures, measure
+from optics.page import pilot_symbols
+from optics.profile import parse_profile
+from optics.recording import Recording
+from runtime.client import LightpageClient
+from runtime.convert import KnownPilots, RemotePage
+from runtime.decoded import DecodedWriter
+from runtime.frames import narrow
+from runtime.report import write_json
+
+
+@click.command()
+@click.option("--target", metavar="HOST:PORT", required=True, help="The running service.")
+@click.option("--recording", type=click.Path(), help="Send the pages of this recording.")
+@click.option("--source", is_flag=True, help="Have the service read pages from its own source.")
+@click.option("--pages", type=click.IntRange(1), help="How many pages; all of a recording, or one of the source.")
+@click.option("--levels", type=click.IntRange(2, 256), help="Level count; that of the recording or source by default.")
+@click.option("--out", type=click.Path(), help="Write symbols and confidences to this HDF5 file.")
+@click.option("--json", "json_path", type=click.Path(), help="Write the figures to this file.")
+def decode(
+    target: str,
+    recording: str | None,
+    source: bool,
+    pages: int | None,
+    levels: int | None,
+    out: str | None,
+    json_path: str | None,
+) -> None:
+    """Decode a recording, or pages of the service's source."""
+    if (recording is None) == (not source):
+        raise InvalidInputError("options", "both or none", "either --recording or --source")
+    results: list[dict[str, Any]] = []
+    with ExitStack() as stack:
+        client = stack.enter_context(LightpageClient(target))
+        if recording is not None:
+            file = stack.enter_context(Recording.open(recording))
+            count, levels = min(pages or file.pages, file.pages), levels or file.levels
+            decoded = _sent(client, file, count, levels)
+        else:
+            count, levels = pages or 1, levels or client.describe().source_levels
+            if not levels:
+                raise InvalidInputError(f"service at {target}", "no source", "a service started with --source")
+            decoded = _read(client, count, levels)
+        writer = stack.enter_context(DecodedWriter(out, levels)) if out is not None else None
+        for page in tqdm(decoded, total=count, unit="page", desc="decode"):
+            if writer is not None:
+                writer.append(page)
+            results.append(page_report(page))
+    if json_path is not None:
+        write_json(json_path, {"target": target, "levels": levels, "pages": results})
+    click.echo(table(results))
+
+
+def page_report(page: RemotePage) -> dict[str, Any]:
+    """The figures of one page; AIR and error rate where its symbols are known."""
+    figures = _measured(page)
+    return {
+        "page": page.page,
+        "model_version": page.model_version,
+        "mean_confidence": float(page.confidence.mean()),
+        "piston_rad": page.piston_rad,
+        "pilot_coherence": page.pilot_coherence,
+        "air_bits_per_symbol": figures.air_bits_per_symbol if figures is not None else None,
+        "symbol_error_rate": figures.symbol_error_rate if figures is not None else None,
+        **asdict(page.timings),
+    }
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """One line a page."""
+
+    def figure(value: float | None, form: str) -> str:
+        return "-" if value is None else format(value, form)
+
+    lines = [f"{'page':>5} {'model':<20} {'confidence':>10} {'AIR':>7} {'errors':>8} {'total ms':>9}"]
+    lines += [
+        f"{r['page']:>5} {r['model_version']:<20} {r['mean_confidence']:>10.4f} "
+        f"{figure(r['air_bits_per_symbol'], '7.3f'):>7} {figure(r['symbol_error_rate'], '8.4f'):>8} "
+        f"{1e3 * r['total_s']:>9.1f}"
+        for r in results
+    ]
+    return "\n".join(lines)
+
+
+def _measured(page: RemotePage) -> PageMeasures | None:
+    """Figures over the data symbols of a page whose symbols are known in the level count that was asked for."""
+    if page.written is None or page.phase is None or page.concentration is None or page.pilot_mask is None:
+        return None
+    data = ~page.pilot_mask
+    if not data.any():
+        return None
+    return measure(page.phase[data], page.concentration[data], page.written[data], page.levels)
+
+
+def _read(client: LightpageClient, count: int, levels: int) -> Iterator[RemotePage]:
+    known = client.describe().source_levels == levels
+    for _ in range(count):
+        yield client.read_page(levels=levels, want_phase=known, want_concentration=known, want_written=known)
+
+
+def _sent(client: LightpageClient, file: Recording, count: int, levels: int) -> Iterator[RemotePage]:
+    description = client.describe()
+    own = file.pilots()
+    mask = description.pilot_mask if own is None else own
+    pattern = pilot_symbols(parse_profile(description.profile_toml, "profile of the service"), file.levels)
+    for index in range(count):
+        symbols = file.symbols(index)
+        known = symbols is not None and file.levels == levels
+        page = client.decode(
+            narrow(file.frames(index), file.bit_depth),
+            levels,
+            bit_depth=file.bit_depth,
+            pilots=KnownPilots(mask, pattern if symbols is None else symbols, file.levels),
+            want_phase=known,
+            want_concentration=known,
+        )
+        yield replace(page, page=index, written=symbols if known else None, pilot_mask=mask)

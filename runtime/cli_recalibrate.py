@@ -1,0 +1,122 @@
+"""`lightpage recalibrate` and `lightpage rollback`: a bundle offline, or a running service's model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+from tqdm import tqdm
+
+from optics.errors import InvalidInputError, RecordingError
+from optics.recording import Recording
+from runtime.client import LightpageClient, Recalibrated
+from runtime.decoder import Decoder
+from runtime.evaluation import check_recording
+from runtime.recalibration import KnownPages, RecalibrationOutcome, next_version
+from runtime.recalibration import recalibrate as recalibrate_bundle
+from runtime.recalibrator import known_pages
+from runtime.refit import refit
+from runtime.report import write_json
+from runtime.shipped import bundle_path
+
+DEFAULT_PAGES = 2
+
+
+@click.command()
+@click.option("--bundle", help="Offline: the bundle to start from, a path or a shipped name.")
+@click.option("--recording", help="Pages with known symbols: a file, or with --target a name in the service's folder.")
+@click.option("--out", type=click.Path(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
+@click.option("--target", metavar="HOST:PORT", help="Recalibrate this running service instead of a bundle.")
+@click.option("--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(2), help="Known pages to use.")
+@click.option("--version", help="Offline: version of the new bundle; by default the next one.")
+@click.option("--json", "json_path", type=click.Path(), help="Write the result to this file.")
+def recalibrate(
+    bundle: str | None,
+    recording: str | None,
+    out: str | None,
+    target: str | None,
+    pages: int,
+    version: str | None,
+    json_path: str | None,
+) -> None:
+    """Re-fit the geometry of a drifted device from known pages, keep it only if it decodes better.
+
+    Offline with --bundle, --recording and --out; over the endpoint with --target, from the service's source or, with
+    --recording, from a file in its recordings folder.
+    """
+    start = time.perf_counter()
+    if target is not None:
+        if bundle or out or version:
+            raise InvalidInputError("--target", "with --bundle, --out or --version", "either a service or a bundle")
+        result: RecalibrationOutcome | Recalibrated = _remote(target, recording, pages)
+    else:
+        if not (bundle and recording and out):
+            raise InvalidInputError("options", "not all of them", "--bundle, --recording and --out, or --target")
+        result = _offline(bundle, recording, Path(out), pages, version)
+    data = summary(result, time.perf_counter() - start)
+    if json_path is not None:
+        write_json(json_path, data)
+    click.echo("\n".join(f"{name:<20} {value}" for name, value in data.items() if value is not None))
+
+
+def summary(result: RecalibrationOutcome | Recalibrated, seconds: float) -> dict[str, str | float | None]:
+    """The result under the names that other programs read."""
+    report = result.report if isinstance(result, RecalibrationOutcome) else result
+    return {
+        "version": result.version if isinstance(result, RecalibrationOutcome) else result.model_version,
+        "previous_version": result.previous_version,
+        "angle_deg": report.angle_deg,
+        "pages_used": result.pages_used,
+        "pages_held_back": result.pages_held_back,
+        "seconds": seconds,
+        "coherence_before": report.coherence_before,
+        "coherence_after": report.coherence_after,
+        "air_before": result.air_before,
+        "air_after": result.air_after,
+    }
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[str, float], None]]:
+    """A progress bar as the callback that a recalibration calls."""
+    with tqdm(total=100, unit="%", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}") as bar:
+
+        def progress(step: str, fraction: float) -> None:
+            bar.set_description(step)
+            bar.update(max(0.0, 100 * fraction - bar.n))
+
+        yield progress
+
+
+def _remote(target: str, recording: str | None, pages: int) -> Recalibrated:
+    with LightpageClient(target) as client, _bar() as progress:
+        return client.recalibrate(count=0 if recording else pages, recording=recording, progress=progress)
+
+
+def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> RecalibrationOutcome:
+    if out.exists():
+        raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
+    decoder = Decoder.load(bundle_path(bundle))
+    with _bar() as progress:
+        known = _read(decoder, recording, pages)
+        return recalibrate_bundle(decoder, known, out, version or next_version(decoder.version), refit, progress)
+
+
+def _read(decoder: Decoder, recording: str, pages: int) -> KnownPages:
+    with Recording.open(recording) as file:
+        check_recording(decoder, file)
+        if file.pages < pages:
+            raise RecordingError(f"recording {recording}", f"{file.pages} pages", f"at least {pages}")
+        return known_pages(file, range(pages))
+
+
+@click.command()
+@click.option("--target", metavar="HOST:PORT", required=True, help="The running service.")
+def rollback(target: str) -> None:
+    """Put a service's previous model back in service."""
+    with LightpageClient(target) as client:
+        current, dropped = client.rollback()
+    click.echo(f"{current} is in service again, {dropped} is not")

@@ -1,0 +1,67 @@
+"""Decoded pages in one HDF5 file, written page by page and given its name when it is complete."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+
+from optics.errors import InvalidInputError
+from runtime.convert import RemotePage
+
+FORMAT = "lightpage-decoded"
+VERSION = 1
+
+
+class DecodedWriter:
+    """Writes `symbols` uint8 and `confidence` float32, both [page, ny, nx], with `levels` and the model versions.
+
+    Args:
+        path: final name; replaced only when the `with` statement ends well.
+        levels: M.
+
+    Raises:
+        InvalidInputError: the path cannot be written.
+    """
+
+    def __init__(self, path: str | Path, levels: int) -> None:
+        self.path = Path(path)
+        self._partial = self.path.with_name(self.path.name + ".partial")
+        try:
+            self._file = h5py.File(str(self._partial), "w")
+        except OSError as error:
+            raise InvalidInputError(f"output {self.path}", error, "a path that can be written") from None
+        self._file.attrs.update({"format": FORMAT, "version": VERSION, "levels": levels})
+        self._versions: list[str] = []
+
+    def append(self, page: RemotePage) -> None:
+        """Add one page."""
+        for name, values in (("symbols", page.symbols), ("confidence", page.confidence)):
+            dataset = self._dataset(name, values.shape, values.dtype)
+            dataset.resize(len(self._versions) + 1, axis=0)
+            dataset[-1] = values
+        self._versions.append(page.model_version)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self._file["model_versions"] = np.array(self._versions, dtype=h5py.string_dtype())
+        self._file.close()
+        if kind is None:
+            os.replace(self._partial, self.path)
+        else:
+            self._partial.unlink(missing_ok=True)
+
+    def _dataset(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> h5py.Dataset:
+        if name not in self._file:
+            self._file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape))
+        dataset: h5py.Dataset = self._file[name]
+        return dataset

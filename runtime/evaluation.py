@@ -1,0 +1,156 @@
+"""Measures a decoder on a recording with known symbols, on pages that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from optics.errors import InvalidInputError, RecordingError
+from optics.measures import ConcentrationBin, PageMeasures, concentration_calibration, measure
+from optics.recording import Recording, hash_frames
+from runtime.decoder import Decoder
+from runtime.frames import narrow
+from runtime.pilots import Pilots
+from runtime.tracking import Tracker
+
+PageDone = Callable[[], object]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Figures over the data symbols of held-out pages.
+
+    Attributes:
+        bundle_version: what was measured.
+        figures: over all pages together.
+        pages: how many were measured.
+        pages_left_out: how many the bundle was calibrated or trained on.
+        symbols_per_page: data symbols, pilots not counted.
+        seconds_per_page: median of the whole decode.
+        inference_seconds_per_page: median of the inference alone.
+        air_per_page: AIR of each page, bits per symbol.
+        concentration_bins: what concentrations promise against what happened.
+    """
+
+    bundle_version: str
+    figures: PageMeasures
+    pages: int
+    pages_left_out: int
+    symbols_per_page: int
+    seconds_per_page: float
+    inference_seconds_per_page: float
+    air_per_page: tuple[float, ...]
+    concentration_bins: tuple[ConcentrationBin, ...]
+
+    @property
+    def page_kb(self) -> float:
+        """What a page carries: AIR times data symbols, kilobytes of 8000 bits."""
+        return self.figures.air_bits_per_symbol * self.symbols_per_page / 8000
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures under the names that other programs read."""
+        figures = self.figures
+        return {
+            "bundle_version": self.bundle_version,
+            "pages": self.pages,
+            "pages_left_out": self.pages_left_out,
+            "symbols_per_page": self.symbols_per_page,
+            "levels": figures.levels,
+            "air_bits_per_symbol": figures.air_bits_per_symbol,
+            "own_mi_bits_per_symbol": figures.own_mi_bits_per_symbol,
+            "over_claim_bits_per_symbol": figures.over_claim_bits_per_symbol,
+            "gmi_bits_per_symbol": figures.gmi_bits_per_symbol,
+            "page_kB": self.page_kb,
+            "symbol_error_rate": figures.symbol_error_rate,
+            "ece": figures.ece,
+            "seconds_per_page": self.seconds_per_page,
+            "inference_seconds_per_page": self.inference_seconds_per_page,
+            "air_per_page": list(self.air_per_page),
+            "concentration_bins": [asdict(part) for part in self.concentration_bins],
+        }
+
+
+def unseen_pages(decoder: Decoder, recording: Recording) -> Iterator[tuple[int, bool]]:
+    """Every page's number, and whether the bundle was neither calibrated nor trained on it."""
+    manifest = decoder.bundle.manifest
+    seen = {*manifest.calibrated_pages, *manifest.trained_pages}
+    for index in range(recording.pages):
+        # The same page may have been hashed in the camera's narrowest type, or as it lies in the file.
+        frames = recording.frames(index)
+        hashes = {hash_frames(frames), hash_frames(narrow(frames, recording.bit_depth))}
+        yield index, not (seen and hashes & seen)
+
+
+def check_recording(decoder: Decoder, recording: Recording) -> None:
+    """Check that a recording is of this decoder's kind of device.
+
+    Raises:
+        RecordingError: other shapes or another bit depth.
+    """
+    recording.check_against(decoder.bundle.profile)
+    depth = decoder.bundle.manifest.camera_bit_depth
+    if recording.bit_depth != depth:
+        raise RecordingError(
+            f"recording {recording.path}", f"{recording.bit_depth} bits", f"{depth} bits, as the bundle"
+        )
+
+
+def evaluate(
+    decoder: Decoder, recording: Recording, tracker: Tracker, page_done: PageDone = lambda: None
+) -> Evaluation:
+    """Decode all unseen pages in their order and measure them against their symbols.
+
+    Args:
+        decoder: what to measure.
+        recording: pages with known symbols.
+        tracker: follows the device from page to page.
+        page_done: told after every page, seen ones too.
+
+    Raises:
+        RecordingError: another device's recording, or one without symbols.
+        InvalidInputError: the bundle has seen every page.
+        FrameError: a page whose frames cannot be decoded.
+    """
+    check_recording(decoder, recording)
+    if not recording.has_symbols:
+        raise RecordingError(f"recording {recording.path}", "no symbols", "known symbols to measure against")
+    levels = recording.levels
+    own = recording.pilots()
+    mask = decoder.bundle.pilot_mask if own is None else own
+    data = ~mask
+    phases, concentrations, truths, timings = [], [], [], []
+    for index, unseen in unseen_pages(decoder, recording):
+        symbols = recording.symbols(index)
+        if unseen and symbols is not None:
+            pair = narrow(recording.frames(index), recording.bit_depth)
+            table = tracker.table()
+            page = decoder.decode(pair, levels, table, Pilots.of_symbols(mask, symbols, levels))
+            tracker.update(pair, page, table)
+            phases.append(page.phase[data])
+            concentrations.append(page.concentration[data])
+            truths.append(symbols[data])
+            timings.append(page.timings)
+        page_done()
+    if not truths:
+        raise InvalidInputError(
+            f"recording {recording.path}",
+            f"{recording.pages} pages, all of them used to make {decoder.version}",
+            "pages that the bundle has not seen",
+        )
+    phase, concentration, truth = np.concatenate(phases), np.concatenate(concentrations), np.concatenate(truths)
+    return Evaluation(
+        bundle_version=decoder.version,
+        figures=measure(phase, concentration, truth, levels),
+        pages=len(truths),
+        pages_left_out=recording.pages - len(truths),
+        symbols_per_page=int(np.count_nonzero(data)),
+        seconds_per_page=float(np.median([t.total_s for t in timings])),
+        inference_seconds_per_page=float(np.median([t.inference_s for t in timings])),
+        air_per_page=tuple(
+            measure(*page, levels).air_bits_per_symbol for page in zip(phases, concentrations, truths, strict=True)
+        ),
+        concentration_bins=tuple(concentration_calibration(phase, concentration, truth, levels)),
+    )
