@@ -41,6 +41,7 @@ COPY --from=build /opt/lightpage /opt/lightpage
 # MPLCONFIGDIR: matplotlib insists on a folder of its own.
 ENV PATH=/opt/lightpage/bin:$PATH \
     HOME=/state \
+    LIGHTPAGE_STORE=/state/models \
     MPLCONFIGDIR=/tmp/matplotlib \
     ORT_DISABLE_TELEMETRY=1 \
     PYTHONDONTWRITEBYTECODE=1 \

@@ -57,7 +57,7 @@ image:  ## build the container image (IMAGE_TARGET=runtime or deep)
 	packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
 
 check-image:  ## start the image that buildah built, and see whether it keeps its promises
-	packaging/check_image.sh $(IMAGE_TAG)
+	packaging/check_image.sh $(IMAGE_TAG) $(BUNDLE)
 
 clean:  ## remove what was built and measured, and leave the environment
 	rm -rf build out .pytest_cache .mypy_cache .ruff_cache

@@ -2,21 +2,26 @@
 # Starts an image that buildah built, as it is meant to run, and sees whether it keeps its promises: not root, root file
 # system read-only, no torch (unless deep), healthy only while it serves, gone soon after SIGTERM.
 #
-#   packaging/check_image.sh [TAG]        TAG: lightpage:runtime; needs root, since it makes a mount namespace of its own
+#   packaging/check_image.sh [TAG [BUNDLE]]
+#
+# TAG: lightpage:runtime. BUNDLE: a file to serve from the volume /bundles, without a frame source, in place of what the
+# image serves by itself. Needs root, since it makes a mount namespace of its own.
 set -euo pipefail
+[ -z "${2:-}" ] || [ "$1" = --inside ] || set -- "$1" "$(realpath "$2")"
 cd "$(dirname "$0")/.."
 
 tag="${1:-lightpage:runtime}"
+bundle="${2:-}"
 port="${LIGHTPAGE_CHECK_PORT:-50951}"
 storage="$(realpath -m "${LIGHTPAGE_STORAGE:-build/containers}")"
-export storage tag port
 
 if [ "${1:-}" != --inside ]; then
-  exec unshare --mount --pid --fork --kill-child --propagation private "$0" --inside "$tag"
+  exec unshare --mount --pid --fork --kill-child --propagation private "$0" --inside "$tag" "$bundle"
 fi
 
 # ---- inside a mount and process namespace of its own: whatever is mounted or left running here ends with it ---------------
 tag="$2"
+bundle="$3"
 scratch="$(mktemp -d)"
 store=(buildah --storage-driver vfs --root "$storage" --runroot "$scratch/run")
 container="$("${store[@]}" from --pull-never "$tag")"
@@ -42,6 +47,7 @@ mount --types tmpfs -o mode=1777 tmpfs "$root/tmp"
 for volume in bundles state; do
   mount --types tmpfs -o uid=10001,gid=10001,mode=755 tmpfs "$root/$volume"
 done
+[ -z "$bundle" ] || install -m 644 "$bundle" "$root/bundles/$(basename "$bundle")"
 mount -o remount,bind,ro "$root"
 
 field() {
@@ -98,6 +104,7 @@ claim "has the command" in_image "${entrypoint[0]}" --help
 claim "is not healthy before it serves" not probe
 
 # What the image itself starts, on loopback and a port of the check's own.
+[ -z "$bundle" ] || arguments=(--bundle "/bundles/$(basename "$bundle")" --address 0.0.0.0:50051)
 for index in "${!arguments[@]}"; do
   [ "${arguments[index]}" != "0.0.0.0:50051" ] || arguments[index]="127.0.0.1:$port"
 done
@@ -113,6 +120,7 @@ gone() {
   return 1
 }
 claim "is gone within 30 s of SIGTERM" gone
+claim "ended in order" wait "$service"
 claim "is not healthy afterwards" not probe
 
 [ "$failures" = 0 ] || { echo "check_image: $failures of the claims about $tag failed" >&2; exit 1; }
