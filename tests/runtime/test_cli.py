@@ -1,0 +1,391 @@
+"""The command line: loads little, says much, ends in one line, and stops when told."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import click
+import h5py
+import numpy as np
+import pytest
+
+from optics.recording import FramePair, Recording
+from runtime import cli, cli_recalibrate
+from runtime.bundle import Bundle
+from runtime.cli import RESUME_KEY, LazyGroup, lightpage
+from runtime.client import LightpageClient
+from runtime.dataplane import DataPlane
+from runtime.decoder import Decoder
+from runtime.recalibrator import Recalibrator
+from runtime.registry import ModelRegistry
+from runtime.server import LightpageServer
+from tests.runtime import toy
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(arguments: Sequence[str | Path], group: click.Group = lightpage) -> int:
+    return cli.run(group, [str(argument) for argument in arguments])
+
+
+@click.command()
+def interrupted() -> None:
+    click.get_current_context().meta[RESUME_KEY] = "call it with --resume"
+    raise KeyboardInterrupt
+
+
+@click.command()
+def plainly_interrupted() -> None:
+    raise KeyboardInterrupt
+
+
+@click.command()
+def needs_torch() -> None:
+    raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+
+@click.command()
+def broken() -> None:
+    raise ZeroDivisionError
+
+
+def group_of(**points: str) -> LazyGroup:
+    return LazyGroup([EntryPoint(name, value, cli.GROUP) for name, value in points.items()], name="lightpage")
+
+
+HERE = "tests.runtime.test_cli"
+
+
+def test_the_overview_imports_no_command(capsys: pytest.CaptureFixture[str]) -> None:
+    group = group_of(train="no_such_package.cli:train", serve="no_such_package.cli:serve")
+    assert run(["--help"], group) == 0
+    shown = capsys.readouterr().out
+    assert "Train a decoder" in shown
+    assert "Run the service" in shown
+
+
+def test_a_missing_extra_is_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "wants_torch.py").write_text("import torch.not_there\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    assert run(["train"], group_of(train="wants_torch:train")) == 2
+    assert "pip install 'lightpage[train]'" in capsys.readouterr().err
+    assert run(["x"], group_of(x=f"{HERE}:needs_torch")) == 2
+    assert "pip install 'lightpage[train]'" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_with_130_and_says_how_to_go_on(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["x"], group_of(x=f"{HERE}:interrupted")) == 130
+    assert "interrupted; call it with --resume" in capsys.readouterr().err
+    assert run(["x"], group_of(x=f"{HERE}:plainly_interrupted")) == 130
+    assert "run the same command again" in capsys.readouterr().err
+
+
+def test_an_unforeseen_error_keeps_its_traceback() -> None:
+    with pytest.raises(ZeroDivisionError):
+        run(["x"], group_of(x=f"{HERE}:broken"))
+
+
+def test_wrong_usage_is_status_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["nonsense"]) == 2
+    assert run(["evaluate"]) == 2
+    assert "--recording" in capsys.readouterr().err
+
+
+def test_the_installed_command_finds_the_runtimes_subcommands() -> None:
+    assert {"serve", "decode", "evaluate", "recalibrate", "rollback"} <= set(lightpage.points)  # type: ignore[attr-defined]
+    for name in ("serve", "decode", "evaluate", "recalibrate", "rollback"):
+        assert isinstance(lightpage.points[name].load(), click.Command)  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> tuple[Path, np.ndarray]:
+    return tmp_path / "r.h5", toy.write_toy_recording(tmp_path / "r.h5", toy.ToyDevice(noise=30.0), 16, 4)
+
+
+def evaluate(bundle: Path, recording: Path, out: Path) -> dict[str, object]:
+    assert run(["evaluate", "--bundle", bundle, "--recording", recording, "--json", out, "--threads", "1"]) == 0
+    data: dict[str, object] = json.loads(out.read_text())
+    return data
+
+
+def test_evaluate_writes_the_promised_figures(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = evaluate(toy_zip, recording[0], tmp_path / "e.json")
+    data_symbols = toy.PAGE[0] * toy.PAGE[1] - int(Bundle.open(toy_zip).pilot_mask.sum())
+    assert (data["pages"], data["pages_left_out"], data["levels"]) == (4, 0, 16)
+    assert data["symbols_per_page"] == data_symbols
+    air = data["air_bits_per_symbol"]
+    assert isinstance(air, float)
+    assert 2 < air <= 4
+    assert data["page_kB"] == pytest.approx(air * data_symbols / 8000)
+    for key in ("own_mi_bits_per_symbol", "gmi_bits_per_symbol", "symbol_error_rate", "ece", "seconds_per_page"):
+        assert isinstance(data[key], float)
+    assert "AIR" in capsys.readouterr().out
+
+
+def test_evaluate_leaves_out_pages_that_the_bundle_has_seen_and_says_so(
+    recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Recording.open(recording[0]) as file:
+        hashes = [file.page_hash(index) for index in range(4)]
+    some = toy.write_toy_bundle(tmp_path / "some.zip", calibrated_pages=hashes[:1], trained_pages=hashes[1:2])
+    data = evaluate(some, recording[0], tmp_path / "e.json")
+    assert (data["pages"], data["pages_left_out"]) == (2, 2)
+    assert "2 that the bundle was calibrated or trained on" in capsys.readouterr().out
+    every = toy.write_toy_bundle(tmp_path / "all.zip", trained_pages=hashes)
+    assert run(["evaluate", "--bundle", every, "--recording", recording[0]]) == 2
+    assert "has not seen" in capsys.readouterr().err
+
+
+def test_evaluate_takes_eight_bit_counts_in_sixteen_bits(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    wide = tmp_path / "wide.h5"
+    with h5py.File(recording[0]) as old, h5py.File(wide, "w") as new:
+        new.attrs.update(dict(old.attrs))
+        for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature", "symbols"):
+            new[name] = old[name][()].astype(np.uint8 if name == "symbols" else np.uint16)
+    narrow = evaluate(toy_zip, recording[0], tmp_path / "n.json")
+    assert evaluate(toy_zip, wide, tmp_path / "w.json")["air_bits_per_symbol"] == narrow["air_bits_per_symbol"]
+
+
+def test_evaluate_uses_the_recordings_own_pilots(toy_zip: Path, tmp_path: Path) -> None:
+    """A device whose symbols know nothing of the seeded pattern."""
+    symbols = np.random.default_rng(3).integers(16, size=(2, *toy.PAGE)).astype(np.uint8)
+    mask = np.zeros(toy.PAGE, bool)
+    mask[::5, ::5] = True
+    device = toy.ToyDevice()
+    pairs = [device.page(page, 16, 1.0 + index) for index, page in enumerate(symbols)]
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file.attrs.update({"format": "lightpage-recording", "version": 1, "camera_bit_depth": 8, "levels": 16})
+        file["symbols"], file["pilots"] = symbols, mask
+        file["in_phase"] = np.stack([pair.in_phase for pair in pairs])
+        file["quadrature"] = np.stack([pair.quadrature for pair in pairs])
+        references = device.references()
+        file["reference_in_phase"], file["reference_quadrature"] = references.in_phase, references.quadrature
+    data = evaluate(toy_zip, tmp_path / "foreign.h5", tmp_path / "e.json")
+    assert data["symbol_error_rate"] == 0
+    assert data["symbols_per_page"] == int((~mask).sum())
+
+
+@pytest.mark.parametrize(
+    ("edit", "named"),
+    [("symbols", "no symbols"), ("depth", "10 bits"), ("truncate", "HDF5"), ("black", "black"), ("shape", "pixels")],
+)
+def test_evaluate_refuses_what_it_cannot_measure_in_one_line(
+    edit: str,
+    named: str,
+    toy_zip: Path,
+    recording: tuple[Path, np.ndarray],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path, out = recording[0], tmp_path / "e.json"
+    if edit == "truncate":
+        path.write_bytes(path.read_bytes()[:5000])
+    else:
+        with h5py.File(path, "r+") as file:
+            if edit == "symbols":
+                del file["symbols"]
+            elif edit == "black":
+                file["quadrature"][2] = 0
+            elif edit == "shape":
+                for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+                    data = file[name][..., :90]
+                    del file[name]
+                    file[name] = data
+            else:
+                file.attrs["camera_bit_depth"] = 10
+                for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+                    data = file[name][()].astype(np.uint16)
+                    del file[name]
+                    file[name] = data
+    assert run(["evaluate", "--bundle", toy_zip, "--recording", path, "--json", out]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if "error:" in line]
+    assert len(lines) == 1
+    assert named in lines[0]
+    assert not out.exists()
+
+
+def test_offline_recalibration_writes_a_better_bundle(
+    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli_recalibrate, "refit", toy.fit_references)
+    toy.write_toy_recording(tmp_path / "d.h5", toy.ToyDevice((150.0, 62.0)), 16, 5)
+    arguments = ["recalibrate", "--bundle", toy_zip, "--recording", tmp_path / "d.h5", "--out", tmp_path / "new.zip"]
+    assert run([*arguments, "--json", tmp_path / "r.json"]) == 0
+    data = json.loads((tmp_path / "r.json").read_text())
+    assert (data["version"], data["pages_used"], data["angle_deg"]) == ("toy-1+r1", 2, 0.5)
+    assert (data["coherence_before"], data["coherence_after"]) == (0.4, 0.9)
+    assert data["seconds"] > 0
+    before = evaluate(toy_zip, tmp_path / "d.h5", tmp_path / "b.json")
+    after = evaluate(tmp_path / "new.zip", tmp_path / "d.h5", tmp_path / "a.json")
+    assert after["pages_left_out"] == 2
+    assert after["air_bits_per_symbol"] > before["air_bits_per_symbol"] + 0.5  # type: ignore[operator]
+    assert run(arguments) == 2  # never overwrites
+
+
+def test_offline_recalibration_with_wrong_pilots_is_refused(
+    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli_recalibrate, "refit", toy.fit_references)
+    toy.write_toy_recording(tmp_path / "d.h5", toy.ToyDevice(), 16, 3)
+    with h5py.File(tmp_path / "d.h5", "r+") as file:
+        file["symbols"][...] = np.random.default_rng(0).integers(16, size=file["symbols"].shape)
+    arguments = ["recalibrate", "--bundle", toy_zip, "--recording", tmp_path / "d.h5", "--out", tmp_path / "new.zip"]
+    assert run(arguments) == 2
+    assert "do not match" in capsys.readouterr().err
+    assert not (tmp_path / "new.zip").exists()
+
+
+@pytest.fixture
+def service(toy_zip: Path) -> Iterator[LightpageServer]:
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), toy.ToySource(toy.ToyDevice()))
+    with LightpageServer(plane, Recalibrator(plane, toy.fit_references)) as server:
+        yield server
+
+
+def test_decode_sends_a_recording_and_keeps_the_symbols(
+    service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, report = tmp_path / "decoded.h5", tmp_path / "d.json"
+    where = ["--target", service.target, "--recording", recording[0]]
+    assert run(["decode", *where, "--out", out, "--json", report]) == 0
+    with h5py.File(out) as file:
+        assert file["symbols"].shape == file["confidence"].shape == (4, *toy.PAGE)
+        assert (file["symbols"][()] == recording[1]).mean() > 0.9
+        assert file.attrs["levels"] == 16
+    pages = json.loads(report.read_text())["pages"]
+    assert [page["page"] for page in pages] == [0, 1, 2, 3]
+    assert all(0 < page["air_bits_per_symbol"] <= 4 and page["total_s"] > 0 for page in pages)
+    assert "toy-1" in capsys.readouterr().out
+
+
+def test_decode_reads_the_services_source(service: LightpageServer, tmp_path: Path) -> None:
+    report = tmp_path / "d.json"
+    assert run(["decode", "--target", service.target, "--source", "--pages", "3", "--json", report]) == 0
+    pages = json.loads(report.read_text())["pages"]
+    assert [page["page"] for page in pages] == [0, 1, 2]
+    assert all(page["symbol_error_rate"] == 0 for page in pages)
+
+
+def test_recalibrate_and_rollback_work_on_a_running_service(service: LightpageServer, tmp_path: Path) -> None:
+    report = tmp_path / "r.json"
+    assert run(["recalibrate", "--target", service.target, "--pages", "2", "--json", report]) == 0
+    assert json.loads(report.read_text())["version"] == "toy-1+r1"
+    assert run(["rollback", "--target", service.target]) == 0
+    assert run(["rollback", "--target", service.target]) == 2
+
+
+def test_an_interrupted_decode_leaves_nothing_half_written(
+    service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = Recording.frames
+
+    def interrupting(self: Recording, page: int) -> FramePair:
+        if page == 2:
+            raise KeyboardInterrupt
+        return frames(self, page)
+
+    monkeypatch.setattr(Recording, "frames", interrupting)
+    where = ["--target", service.target, "--recording", recording[0]]
+    assert run(["decode", *where, "--out", tmp_path / "decoded.h5", "--json", tmp_path / "d.json"]) == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
+
+
+def test_a_command_without_a_service_or_a_choice_says_so(
+    recording: tuple[Path, np.ndarray], toy_zip: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["decode", "--target", "127.0.0.1:9", "--recording", recording[0]]) == 2
+    assert "no connection" in capsys.readouterr().err
+    assert run(["decode", "--target", "127.0.0.1:9"]) == 2
+    assert "either --recording or --source" in capsys.readouterr().err
+    assert run(["recalibrate", "--bundle", toy_zip]) == 2
+    assert "--out" in capsys.readouterr().err
+
+
+class Served:
+    """`lightpage serve` in a process of its own."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        command = [sys.executable, "-m", "runtime.cli", "serve", "--address", "127.0.0.1:0", *map(str, arguments)]
+        self.process = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        )
+
+    def target(self) -> str:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if found := re.search(r"serving .* at (\S+)", line):
+                return found[1]
+        raise AssertionError(self.process.communicate(timeout=10)[1])
+
+    def end(self, kind: signal.Signals) -> tuple[int, str, str]:
+        self.process.send_signal(kind)
+        out, err = self.process.communicate(timeout=30)
+        return self.process.returncode, out, err
+
+
+@pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGINT])
+def test_serve_decodes_until_it_is_told_to_stop(
+    kind: signal.Signals, toy_zip: Path, recording: tuple[Path, np.ndarray]
+) -> None:
+    served = Served("--bundle", toy_zip, "--source", f"recording:{recording[0]}", "--metrics-port", "0")
+    try:
+        with LightpageClient(served.target(), timeout_s=20) as client:
+            assert (client.read_page(want_written=True).symbols == recording[1][0]).mean() > 0.9
+        start = time.monotonic()
+        status, out, err = served.end(kind)
+        assert status == 0, err
+        assert "stopping" in out
+        assert "Traceback" not in err
+        assert time.monotonic() - start < 10
+    finally:
+        served.process.kill()
+        served.process.wait()
+
+
+def test_a_restarted_service_uses_the_model_that_was_in_service(toy_zip: Path, tmp_path: Path) -> None:
+    from runtime.store import ModelStore
+
+    store = ModelStore(tmp_path / "store", Bundle.open(toy_zip))
+    store.remember(toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1"))
+    served = Served("--bundle", toy_zip, "--store", tmp_path / "store")
+    try:
+        with LightpageClient(served.target(), timeout_s=20) as client:
+            assert client.describe().model.version == "toy-1+r1"
+            assert client.rollback()[0] == "toy-1"
+        assert served.end(signal.SIGTERM)[0] == 0
+    finally:
+        served.process.kill()
+        served.process.wait()
+    assert store.last() is None
+
+
+def test_serve_refuses_a_damaged_bundle_in_one_line(toy_zip: Path, tmp_path: Path) -> None:
+    data = bytearray(toy_zip.read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "damaged.zip").write_bytes(data)
+    served = Served("--bundle", tmp_path / "damaged.zip")
+    out, err = served.process.communicate(timeout=60)
+    assert served.process.returncode == 2
+    assert out == ""
+    assert len(err.strip().splitlines()) == 1
