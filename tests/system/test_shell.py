@@ -243,7 +243,7 @@ def test_the_command_runs_without_torch(torchless: Path) -> None:
     helped = run([torchless / "lightpage", "--help"], cwd=torchless)
     assert helped.returncode == 0, helped.stderr
     for name in ("serve", "decode", "evaluate", "recalibrate"):
-        assert name in helped.stdout
+        assert re.search(rf"^  {name} ", helped.stdout, re.MULTILINE), helped.stdout
 
 
 def test_profiles_and_type_markers_travel_with_the_wheel(torchless: Path) -> None:
