@@ -322,6 +322,8 @@ def test_an_answer_in_flight_survives_the_stop(start: Start) -> None:
     assert wait_until(lambda: service.plane.metrics.in_flight._value.get() == 1)
     ending = threading.Thread(target=service.server.stop, args=(10.0,))
     ending.start()
+    ending.join(0.3)
+    assert ending.is_alive()  # it waits for the answer
     service.plane._decodes.release(2)
     caller.join(10)
     ending.join(10)
