@@ -20,15 +20,13 @@ from optics.grid import FieldGrid, field_grid
 from optics.profile import Profile
 from optics.recording import FramePair
 from optics.registration.table import monomial_powers
-
+from train.filters import SeparableFilter
 
 _DAMPING = (1.0, 1.0, 0.5, 0.3, 0.2, 0.1)
 """Damping of the Gauss-Newton rounds, one each: strong first, while the root may still be the wrong one. Against the
 closed root alone the error of the field falls from -22.6 to -28.1 dB at a reference of 1.6 times the signal."""
 _FLOOR = 0.1
 """Least reference, as a share of its mean, that frames are divided by: outside the beam there is nothing to learn."""
-
-
 
 
 class FieldRecovery(nn.Module):
@@ -44,12 +42,10 @@ class FieldRecovery(nn.Module):
         self.grid: FieldGrid = grid
         self.rows_px, self.columns_px = profile.frame_shape
         corner = float((profile.page_width_m**2 + profile.page_height_m**2) ** 0.5 / 2)
-        self.prefilter: Tensor
-        self.band: Tensor
+        self.prefilter = SeparableFilter(grid.prefilter)
+        self.band = SeparableFilter(grid.band)
         self.u: Tensor
         self.v: Tensor
-        self.register_buffer("prefilter", torch.tensor(grid.prefilter, dtype=torch.float32))
-        self.register_buffer("band", torch.tensor(grid.band, dtype=torch.float32))
         self.register_buffer("u", torch.tensor(grid.x_m / corner, dtype=torch.float32))
         self.register_buffer("v", torch.tensor(grid.y_m / corner, dtype=torch.float32))
 
@@ -73,13 +69,13 @@ class FieldRecovery(nn.Module):
 
         Returns:
             field: [2, ny, nx], real and imaginary part of E over the mean reference amplitude.
-            residual: scalar, what the two equations leave over the field's power; large when the frames do not
-                belong to this calibration (swapped cameras, say).
+            residual: [2, ny, nx], what is left of the two equations inside the pipe's band, over the mean reference
+                amplitude; large against the field when the frames do not belong to this calibration.
         """
         frames = torch.stack([in_phase, quadrature]).to(torch.float32)
         references = torch.stack([reference_in_phase, reference_quadrature])
         stack = torch.stack([frames - references, references], dim=1)
-        stack = self._filter(stack.reshape(1, 4, self.rows_px, self.columns_px), self.prefilter)
+        stack = self.prefilter(stack.reshape(4, self.rows_px, self.columns_px))
         stack = stack.reshape(2, 2, self.rows_px, self.columns_px)
         on_grid = functional.grid_sample(
             stack, self._where(registration), mode="bicubic", padding_mode="zeros", align_corners=True
@@ -95,8 +91,7 @@ class FieldRecovery(nn.Module):
         half_power = (real * real + imaginary * imaginary) / 2
         left_a = measured[0] - real - half_power
         left_b = measured[1] - homodyne[0] * real - homodyne[1] * imaginary - half_power
-        left = self._low_pass(torch.stack([left_a, left_b]) * amplitude)
-        residual = (left * left).mean() / (half_power * amplitude * amplitude).mean()
+        residual = self.band(torch.stack([left_a, left_b]) * amplitude)
         return torch.stack([real, imaginary]) * amplitude, residual
 
     def _solve(self, a: Tensor, b: Tensor, cos: Tensor, sin: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,7 +100,7 @@ class FieldRecovery(nn.Module):
         Each sample alone is a quadratic with two roots, which meet where the signal outshines the reference. So: the
         closed root nearer to the linear estimate, then damped Gauss-Newton steps, every round kept to the pipe's band.
         """
-        start = self._low_pass(torch.stack([a, (b - cos * a) / sin]) * amplitude) / amplitude
+        start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) / amplitude
         # Im e = slope Re e - offset, from the difference of the equations; then a quadratic in Re e
         slope, offset = (1 - cos) / sin, (a - b) / sin
         quadratic = 1 + slope * slope
@@ -113,7 +108,7 @@ class FieldRecovery(nn.Module):
         discriminant = linear * linear - quadratic * (offset * offset - 2 * a)
         middle = -linear / quadratic
         real = middle + torch.sign(start[0] - middle) * torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
-        estimate = self._low_pass(torch.stack([real, slope * real - offset]) * amplitude) / amplitude
+        estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) / amplitude
         for damping in _DAMPING:
             real, imaginary = estimate[0], estimate[1]
             half_power = (real * real + imaginary * imaginary) / 2
@@ -129,30 +124,21 @@ class FieldRecovery(nn.Module):
             step_r = (normal_ii * pull_r - normal_ri * pull_i) / determinant
             step_i = (normal_rr * pull_i - normal_ri * pull_r) / determinant
             step = torch.stack([step_r, step_i])
-            estimate = self._low_pass((estimate + step) * amplitude) / amplitude
+            estimate = self.band((estimate + step) * amplitude) / amplitude
         return estimate[0], estimate[1]
-
-    def _low_pass(self, field: Tensor) -> Tensor:
-        return self._filter(field[None], self.band)[0]
-
-    @staticmethod
-    def _filter(stack: Tensor, taps: Tensor) -> Tensor:
-        """Convolve [1, C, H, W] with `taps` along both axes."""
-        channels, reach = stack.shape[1], len(taps) // 2
-        along_x = taps.reshape(1, 1, 1, -1).expand(channels, 1, 1, -1)
-        along_y = taps.reshape(1, 1, -1, 1).expand(channels, 1, -1, 1)
-        stack = functional.conv2d(stack, along_x, padding=(0, reach), groups=channels)
-        return functional.conv2d(stack, along_y, padding=(reach, 0), groups=channels)
 
     def _where(self, registration: Tensor) -> Tensor:
         """Sampling grid [2, ny, nx, 2] in grid_sample's coordinates."""
         x, y = self.u[None, :], self.v[:, None]
         size = registration.new_tensor([self.columns_px - 1, self.rows_px - 1])
-        terms = [
-            registration[:, :, term, None, None] * (x**i * y**j) for term, (i, j) in enumerate(monomial_powers())
-        ]
+        terms = [registration[:, :, term, None, None] * (x**i * y**j) for term, (i, j) in enumerate(monomial_powers())]
         pixels = torch.stack(terms).sum(0)
         return (2 * pixels / size[None, :, None, None] - 1).permute(0, 2, 3, 1)
+
+
+def unexplained(field: Tensor, residual: Tensor) -> Tensor:
+    """Power of the residual over that of the field, scalar."""
+    return (residual * residual).mean() / (field * field).mean()
 
 
 class TorchFieldSolver:
@@ -163,7 +149,7 @@ class TorchFieldSolver:
 
     def __call__(
         self, pair: FramePair, references: FramePair, registration: NDArray[np.float32], homodyne: NDArray[np.float32]
-    ) -> tuple[NDArray[np.complex64], float]:
+    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """See `optics.registration.twin.FieldSolver`."""
         frames = (pair.in_phase, pair.quadrature, references.in_phase, references.quadrature)
         with torch.no_grad():
@@ -173,4 +159,4 @@ class TorchFieldSolver:
                 torch.from_numpy(homodyne),
             )
         real, imaginary = field.numpy()
-        return np.asarray(real + 1j * imaginary, dtype=np.complex64), float(residual)
+        return np.asarray(real + 1j * imaginary, dtype=np.complex64), residual.numpy()

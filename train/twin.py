@@ -21,6 +21,9 @@ _WIDEST_SPREAD = 1.05
 """Headroom on the nominal exit centroid when counting how many walls a beam can meet."""
 
 
+Real = NDArray[np.float64]
+
+
 class RayTwin(nn.Module):
     """Ray tracer of one nominal device; all that can deviate comes in as `parameters`.
 
@@ -160,31 +163,27 @@ def _turn(points: Tensor, angle: Tensor) -> Tensor:
 
 
 class TorchTwin:
-    """`RayTwin` behind the numpy interface that registration takes."""
+    """`RayTwin` behind the numpy interface that registration takes (`optics.registration.twin.Twin`)."""
 
     def __init__(self, twin: RayTwin) -> None:
         self.module = twin
 
-    def trace(
-        self,
-        parameters: NDArray[np.float64],
-        points: NDArray[np.float64],
-        anchors: NDArray[np.float64] | None = None,
-    ) -> Rays:
+    def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
         """See `optics.registration.twin.Twin`."""
-        with torch.no_grad():
-            at = torch.as_tensor(points, dtype=torch.float64)
-            decided_by = at if anchors is None else torch.tensor(anchors, dtype=torch.float64)
-            places, phases, positions, _ = self.module(
-                torch.as_tensor(parameters, dtype=torch.float64), at, decided_by, at[:1]
-            )
-        return Rays(places.numpy(), phases.numpy(), positions.numpy())
+        decided_by = points if anchors is None else anchors
+        places, phases, positions, _ = self._run(parameters, points, decided_by, points[:1])
+        return Rays(places, phases, positions)
 
-    def pixels(self, parameters: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+    def pixels(self, parameters: Real, places: Real) -> Real:
         """See `optics.registration.twin.Twin`."""
+        return self._run(parameters, places[:1], places[:1], places)[3]
+
+    def _run(self, parameters: Real, *inputs: Real) -> tuple[Real, ...]:
+        vector = torch.tensor(parameters, dtype=torch.float64)
+        tensors = [torch.tensor(array, dtype=torch.float64) for array in inputs]
         with torch.no_grad():
-            at = torch.as_tensor(places, dtype=torch.float64)
-            pixels: NDArray[np.float64] = self.module(
-                torch.as_tensor(parameters, dtype=torch.float64), at[:1], at[:1], at
-            )[3].numpy()
-        return pixels
+            if vector.ndim == 1:
+                outputs = self.module(vector, *tensors)
+            else:
+                outputs = torch.func.vmap(self.module, in_dims=(0, *(None for _ in tensors)))(vector, *tensors)
+        return tuple(output.numpy() for output in outputs)

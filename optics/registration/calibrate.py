@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
 from optics.errors import CalibrationError
 from optics.grid import field_grid
 from optics.profile import Profile
 from optics.recording import FramePair
-from optics.registration.coherence import page_coherence
+from optics.registration.coherence import COHERENT_BRANCHES, page_coherence
 from optics.registration.fit import Fit, fit_parameters
 from optics.registration.parameters import PARAMETERS, indices, nominal
 from optics.registration.patches import Measurement, Patch, measure, patches, search_window
@@ -31,6 +30,9 @@ _FEWEST = 5
 _CAMERA_GROUPS = ("in_phase", "quadrature", "centre", "camera_phase")
 _SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "launch")
 _ALL_GROUPS = tuple(dict.fromkeys(p.group for p in PARAMETERS))
+_POSE_STEPS = np.array([0.2, 0.2, 3e-4, 3e-4, 3e-4, 3e-4])
+"""Finite differences of a camera's pose: shift (pixels), scales and turns (0.2 pixel at the page's edge)."""
+_TURN_STEP = 0.02
 
 
 @dataclass(frozen=True)
@@ -75,23 +77,24 @@ class _Stage:
     middle_only: bool = False
     all_pages: bool = False
     use_phase: bool = False
+    samples: int = 4
 
 
 _SINGLE_CAMERA = (
-    _Stage("find the direct image", 50, 4, _CAMERA_GROUPS, middle_only=True),
-    _Stage("follow it outwards", 24, 4, _SHAPE_GROUPS),
+    _Stage("find the direct image", 50, 4, _CAMERA_GROUPS, middle_only=True, samples=2),
+    _Stage("follow it outwards", 24, 4, _SHAPE_GROUPS, samples=2),
     _Stage("settle the cameras", 6, 2, _SHAPE_GROUPS),
 )
 _COMPLEX = (
-    _Stage("find the reflections", 32, 4, _ALL_GROUPS, ("x", "y")),
-    _Stage("all branches, coarse", 8, 2, _ALL_GROUPS, ("direct", "x", "y")),
-    _Stage("all branches, fine", 3, 1, _ALL_GROUPS, ("direct", "x", "y")),
+    _Stage("find the reflections", 32, 4, _ALL_GROUPS, ("x", "y"), samples=2),
+    _Stage("all branches, coarse", 8, 2, _ALL_GROUPS, COHERENT_BRANCHES),
+    _Stage("all branches, fine", 3, 1, _ALL_GROUPS, COHERENT_BRANCHES),
 )
 _PHASE = (
-    _Stage("phases", 2, 1, _ALL_GROUPS, ("direct", "x", "y"), use_phase=True),
-    _Stage("phases, all pages", 2, 1, _ALL_GROUPS, ("direct", "x", "y"), all_pages=True, use_phase=True),
-    _Stage("phases, last", 1.5, 0.75, _ALL_GROUPS, ("direct", "x", "y"), all_pages=True, use_phase=True),
+    *(_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True) for _ in range(4)),
+    *(_Stage("phases, all pages", 1.5, 0.75, _ALL_GROUPS, COHERENT_BRANCHES, all_pages=True, use_phase=True),) * 2,
 )
+"""Each round halves what is left of the error, since patches are measured about the current geometry."""
 
 
 def calibrate(
@@ -116,15 +119,16 @@ def calibrate(
         CalibrationError: nothing within the capture range explains the frames.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
-    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASE) + 2
+    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASE) + 3
     for stage in _SINGLE_CAMERA:
         work.single_camera(stage)
     work.estimate_turn()
     for stage in _COMPLEX:
         work.complex_field(stage)
-    work.refine_turn()
+    work.refine_homodyne()
     for stage in _PHASE:
         work.complex_field(stage)
+    work.refine_homodyne()
     return work.result(nominal())
 
 
@@ -225,21 +229,31 @@ class _Registration:
                 "angle between the homodyne arms", f"{np.rad2deg(self.turn):.0f} degrees", "about +90 or -90 degrees"
             )
 
-    def refine_turn(self) -> None:
-        """The same angle from the two homodyne equations alone: the residual is least where it is right."""
-        self._tell("angle between the arms, blind")
-        registration = registration_coefficients(self.twin, self.parameters, self.profile)
-        page, start = self.pages[0], self.turn
+    def refine_homodyne(self) -> None:
+        """Relation of the two cameras from the homodyne equations alone, no symbol known.
 
-        def residual(turn: float) -> float:
-            homodyne = np.array([np.cos(turn), np.sin(turn)], dtype=np.float32)
-            return self.solve_field(page.pair, self.references, registration, homodyne)[1]
+        Angle between the arms and pose of the quadrature camera against the in-phase one: what is left of the
+        equations is least where they are right. Gauss-Newton on the residual images, by finite differences.
+        """
+        self._tell("relation of the cameras")
+        page, chosen = self.pages[0], indices("quadrature")
+        steps = np.append(_POSE_STEPS, _TURN_STEP)
 
-        reach = np.deg2rad(5)
-        solved = optimize.minimize_scalar(
-            residual, bounds=(start - reach, start + reach), method="bounded", options={"xatol": 2e-3, "maxiter": 12}
-        )
-        self.turn = float(solved.x)
+        def residual(offset: Real) -> NDArray[np.float32]:
+            parameters = self.parameters.copy()
+            parameters[chosen] += offset[:-1]
+            return self._field(page, parameters, self.turn + float(offset[-1]))[1].ravel()
+
+        here = residual(np.zeros(len(steps)))
+        slopes = np.stack([residual(step) - here for step in np.diag(steps)], axis=1)
+        move = np.linalg.lstsq(slopes.T @ slopes, -slopes.T @ here, rcond=None)[0] * steps
+        # noise inflates the Jacobian, so the step is short: go to the vertex of the parabola along it
+        powers = [float(here @ here), *(float(np.sum(residual(reach * move) ** 2)) for reach in (1.0, 2.0))]
+        bend = powers[0] - 2 * powers[1] + powers[2]
+        move = move * (np.clip(1 - (powers[2] - powers[0]) / (2 * bend), 0, 4) if bend > 0 else 1.0)
+        self.parameters = self.parameters.copy()
+        self.parameters[chosen] += move[:-1]
+        self.turn += float(move[-1])
 
     def result(self, before: Real) -> Registered:
         """Judge the outcome; `before` is the geometry that it is compared with."""
@@ -260,11 +274,14 @@ class _Registration:
         sampler = FieldSampler(self._field(page, parameters)[0], self.grid)
         return page_coherence(sampler, self.twin, parameters, self.profile, page.symbols)
 
-    def _field(self, page: KnownPage, parameters: Real | None = None) -> tuple[NDArray[np.complex64], float]:
+    def _field(
+        self, page: KnownPage, parameters: Real | None = None, turn: float | None = None
+    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         registration = registration_coefficients(
             self.twin, self.parameters if parameters is None else parameters, self.profile
         )
-        homodyne = np.array([np.cos(self.turn), np.sin(self.turn)], dtype=np.float32)
+        turn = self.turn if turn is None else turn
+        homodyne = np.array([np.cos(turn), np.sin(turn)], dtype=np.float32)
         return self.solve_field(page.pair, self.references, registration, homodyne)
 
     def _where(self, stage: _Stage) -> list[Patch]:
@@ -292,6 +309,7 @@ class _Registration:
             page.symbols,
             stage.branches,
             window,
+            samples=stage.samples,
             cameras=cameras,
             page=index,
         )
@@ -316,4 +334,3 @@ class _Registration:
             centre=centre,
         )
         self.parameters = self.fit.parameters
-

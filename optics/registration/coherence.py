@@ -46,10 +46,7 @@ def page_coherence(
     even = np.clip(1 - np.abs(positions - 2 * np.round(positions / 2)), 0, 1)
     odd = np.clip(1 - np.abs(positions - (2 * np.floor(positions / 2) + 1)), 0, 1)
     shares = np.stack(
-        [
-            (odd if name == "x" else even)[:, 0] * (odd if name == "y" else even)[:, 1]
-            for name in COHERENT_BRANCHES
-        ]
+        [(odd if name == "x" else even)[:, 0] * (odd if name == "y" else even)[:, 1] for name in COHERENT_BRANCHES]
     )
     total = np.sum(shares * light * np.conj(symbols.ravel()))
     norm = np.sqrt(np.sum(shares**2) * np.sum(np.abs(light) ** 2))

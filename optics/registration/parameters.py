@@ -45,8 +45,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("camera_tilt_x_rad", 3.0, "camera_phase"),
     Parameter("camera_tilt_y_rad", 3.0, "camera_phase"),
     Parameter("camera_curvature_rad", 2.0, "camera_phase"),
-    Parameter("camera_astigmatism_0_rad", 0.5, "camera_phase"),
-    Parameter("camera_astigmatism_45_rad", 0.5, "camera_phase"),
+    Parameter("camera_astigmatism_0_rad", 0.1, "camera_phase"),
+    Parameter("camera_astigmatism_45_rad", 0.1, "camera_phase"),
     Parameter("distortion_relative", 0.002, "distortion"),
     *(
         Parameter(f"{camera}_{name}", prior, camera)

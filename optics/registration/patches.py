@@ -16,10 +16,10 @@ Complex = NDArray[np.complexfloating]
 Sampler = Callable[[Real], NDArray[np.inexact]]
 """Camera-plane points [..., 2] (metres) to the measured signal there, real or complex."""
 
-_SAMPLES = 4
-"""Samples per symbol along each axis, the field's own rate at four SLM pixels a symbol."""
-_SLOPES = np.linspace(-0.6, 0.6, 17)
-"""Residual phase slopes that are tried, radians a sample: page centre and lengths anywhere in the capture range."""
+_SLOPES = np.linspace(-2.4, 2.4, 17)
+"""Residual phase slopes that are tried, radians a symbol: page centre and lengths anywhere in the capture range."""
+_CARRIER_PROBE = 0.3
+"""Reach of the finite difference that finds the carrier, samples."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,9 @@ class Measurement:
         centre_m: the patch's centre (x, y) on the page, [2].
         pixels: where the centre was found, (column, row) on each camera, [2, 2].
         cameras: which of the two were looked at.
-        phase: phase of the light against the symbols', radians, where the twin had put the centre.
+        read_at: (column, row) on each camera where the twin had put the centre, [2, 2].
+        phase: phase of the light against the symbols', radians, read there.
+        carrier: how that phase changes with the point where it is read, radians a pixel along (column, row), [2].
         slope: gradient of that phase along the page's (x, y), rad/m, [2].
         significance: power of the coherent sum over that of the symbols' incoherent sum; the number of symbols when
             all agree, about 1 when they are unrelated.
@@ -57,7 +59,9 @@ class Measurement:
     centre_m: Real
     pixels: Real
     cameras: tuple[int, ...]
+    read_at: Real
     phase: float
+    carrier: Real
     slope: Real
     significance: float
     symbols: int
@@ -96,6 +100,7 @@ def measure(
     symbols: Complex,
     branches: tuple[str, ...],
     window: Real,
+    samples: int = 4,
     cameras: tuple[int, ...] = (0, 1),
     page: int = 0,
 ) -> list[Measurement]:
@@ -110,21 +115,23 @@ def measure(
         symbols: phasors exp(i theta) of the whole page, [ny, nx].
         branches: which branches to look for.
         window: trial shifts [K, 2], metres on the camera plane, a square lattice (see `search_window`).
+        samples: samples per symbol along each axis; four is the field's own rate, two serves a wide search.
         cameras: which cameras the sampler looks through, a label of the result.
         page: a label of the result.
     """
     known = symbols[patch.rows, patch.columns]
     rows, columns = known.shape
-    pitch = profile.symbol_pitch_m / _SAMPLES
-    x = (np.arange(columns * _SAMPLES) - (columns * _SAMPLES - 1) / 2) * pitch + patch.centre_m[0]
-    y = (np.arange(rows * _SAMPLES) - (rows * _SAMPLES - 1) / 2) * pitch + patch.centre_m[1]
+    pitch = profile.symbol_pitch_m / samples
+    slopes = _SLOPES / samples
+    x = (np.arange(columns * samples) - (columns * samples - 1) / 2) * pitch + patch.centre_m[0]
+    y = (np.arange(rows * samples) - (rows * samples - 1) / 2) * pitch + patch.centre_m[1]
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     centre = np.array(patch.centre_m)
     stencil = centre + pitch * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     rays = twin.trace(parameters, np.vstack([points, stencil]), np.tile(centre, (len(points) + len(stencil), 1)))
-    template = np.conj(np.kron(known, np.ones((_SAMPLES, _SAMPLES)))).ravel()
-    kernel_y = np.exp(-1j * np.outer(_SLOPES, (y - centre[1]) / pitch)).astype(np.complex64)
-    kernel_x = np.exp(-1j * np.outer((x - centre[0]) / pitch, _SLOPES)).astype(np.complex64)
+    template = np.conj(np.kron(known, np.ones((samples, samples)))).ravel()
+    kernel_y = np.exp(-1j * np.outer(slopes, (y - centre[1]) / pitch)).astype(np.complex64)
+    kernel_x = np.exp(-1j * np.outer((x - centre[0]) / pitch, slopes)).astype(np.complex64)
     found = []
     for branch in branches:
         b = BRANCHES.index(branch)
@@ -133,7 +140,9 @@ def measure(
         landing = rays.places[b, -len(stencil)]
         matched = (template * np.exp(-1j * rays.phases[b, : len(points)])).astype(np.complex64)
 
-        def demodulated(shifts: Real, at: Real = rays.places[b, : len(points)], by: Complex = matched) -> Complex:
+        places = rays.places[b, : len(points)]
+
+        def demodulated(shifts: Real, at: Real = places, by: Complex = matched) -> Complex:
             signal = sampler(at + shifts[:, None, :])
             return np.asarray(signal * by, dtype=np.complex64).reshape(len(shifts), len(y), len(x))
 
@@ -146,22 +155,29 @@ def measure(
         row, column = divmod(int(best), side)
         step = float(window[1, 0] - window[0, 0]) if side > 1 else 0.0
         shift = window[best] + step * np.array([_peak(by_shift[row], column), _peak(by_shift[:, column], row)])
-        slope_step = _SLOPES[1] - _SLOPES[0]
-        slope_x = _SLOPES[j] + slope_step * _peak(significance[best, i], int(j))
-        slope_y = _SLOPES[i] + slope_step * _peak(significance[best, :, j], int(i))
-        # A beam that a wall has cut leaves through one side of the facet, so its phase runs across its image: where the
-        # shift is uncertain the phase must be read at the twin's place, not at the found one.
-        here, there = demodulated(np.stack([np.zeros(2), shift]))
+        slope_step = slopes[1] - slopes[0]
+        slope_x = slopes[j] + slope_step * _peak(significance[best, i], int(j))
+        slope_y = slopes[i] + slope_step * _peak(significance[best, :, j], int(i))
+        # A beam that a wall has cut leaves through one side of the facet, so its phase runs across its image: read it
+        # at the twin's place, together with how fast it runs, and let the fit carry it to the true place.
+        probe = _CARRIER_PROBE * pitch * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         ramp = np.exp(-1j * (slope_y * (y - centre[1])[:, None] + slope_x * (x - centre[0])[None, :]) / pitch)
-        power = abs(np.sum(there * ramp)) ** 2
-        floor = float(_incoherent((there * ramp)[None], rows, columns)[0])
+        *around, there = demodulated(np.vstack([probe, shift])) * ramp
+        read = np.array([np.sum(light) for light in around])
+        reach_px = 2 * _CARRIER_PROBE * pitch / profile.camera.pitch_m
+        carrier = np.angle([read[1] * np.conj(read[2]), read[3] * np.conj(read[4])]) / reach_px
+        read_at, found_at = np.moveaxis(twin.pixels(parameters, np.stack([landing, landing + shift])), 1, 0)
+        power = abs(np.sum(there)) ** 2
+        floor = float(_incoherent(there[None], rows, columns)[0])
         found.append(
             Measurement(
                 branch=branch,
                 centre_m=centre,
-                pixels=twin.pixels(parameters, (landing + shift)[None])[:, 0],
+                pixels=found_at,
                 cameras=cameras,
-                phase=float(expected[0] + np.angle(np.sum(here * ramp))),
+                read_at=read_at,
+                phase=float(expected[0] + np.angle(read[0])),
+                carrier=carrier,
                 slope=expected_slope + np.array([slope_x, slope_y]) / pitch,
                 significance=float(power / floor),
                 symbols=rows * columns,
@@ -173,7 +189,8 @@ def measure(
 
 def _incoherent(trials: Complex, rows: int, columns: int) -> Real:
     """Sum over symbols of the power of each symbol's own sum, [K]."""
-    per_symbol = trials.reshape(len(trials), rows, _SAMPLES, columns, _SAMPLES).sum(axis=(2, 4))
+    samples = trials.shape[1] // rows
+    per_symbol = trials.reshape(len(trials), rows, samples, columns, samples).sum(axis=(2, 4))
     return np.maximum(np.sum(np.abs(per_symbol) ** 2, axis=(1, 2)), 1e-30)
 
 

@@ -37,7 +37,7 @@ class Twin(Protocol):
         """Trace page points.
 
         Args:
-            parameters: [P].
+            parameters: [P], or [K, P] for K devices at once; the results then have a leading axis K.
             points: [N, 2] as (x, y), metres from the page's centre.
             anchors: [N, 2], points whose cells decide the paths (a symbol's centre for all of its samples); the
                 points themselves if None.
@@ -45,7 +45,10 @@ class Twin(Protocol):
         ...
 
     def pixels(self, parameters: Real, places: Real) -> Real:
-        """Camera-plane points [N, 2] (metres) to pixels (column, row) of both cameras, [2, N, 2]."""
+        """Camera-plane points [N, 2] (metres) to pixels (column, row) of both cameras, [2, N, 2].
+
+        Parameters [K, P] give [K, 2, N, 2].
+        """
         ...
 
 
@@ -54,8 +57,8 @@ class FieldSolver(Protocol):
 
     def __call__(
         self, pair: FramePair, references: FramePair, registration: NDArray[np.float32], homodyne: NDArray[np.float32]
-    ) -> tuple[NDArray[np.complex64], float]:
-        """Field [ny, nx] over the mean reference amplitude, and the residual of the two homodyne equations.
+    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+        """Field [ny, nx] over the mean reference amplitude, and what is left of the homodyne equations, [2, ny, nx].
 
         Args:
             pair, references: frames [H, W].
