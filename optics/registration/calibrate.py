@@ -30,9 +30,15 @@ _FEWEST = 5
 _CAMERA_GROUPS = ("in_phase", "quadrature", "centre", "camera_phase")
 _SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "launch")
 _ALL_GROUPS = tuple(dict.fromkeys(p.group for p in PARAMETERS))
-_POSE_STEPS = np.array([0.2, 0.2, 3e-4, 3e-4, 3e-4, 3e-4])
-"""Finite differences of a camera's pose: shift (pixels), scales and turns (0.2 pixel at the page's edge)."""
-_TURN_STEP = 0.02
+_POSE_ERRORS = np.array([0.1, 0.1, 2e-4, 2e-4, 2e-4, 2e-4])
+"""How well known symbols place one camera against the other: shift (pixels), scales and turns."""
+_TURN_ERROR = np.deg2rad(0.6)
+"""How well they give the angle between the arms."""
+_SAMPLES_PER_DEGREE = 6.0
+"""Grid samples per independent number of the residual: the grid's rate over the pipe's band, squared."""
+_HOMODYNE_ROUNDS = 2
+_LEAST_QUADRATURE = 0.5
+"""Sine of the angle between the arms below which the two frames hardly differ."""
 
 
 @dataclass(frozen=True)
@@ -119,15 +125,17 @@ def calibrate(
         CalibrationError: nothing within the capture range explains the frames.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
-    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASE) + 3
+    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASE) + 5
     for stage in _SINGLE_CAMERA:
         work.single_camera(stage)
     work.estimate_turn()
     for stage in _COMPLEX:
         work.complex_field(stage)
+    work.estimate_turn()
     work.refine_homodyne()
     for stage in _PHASE:
         work.complex_field(stage)
+    work.estimate_turn()
     work.refine_homodyne()
     return work.result(nominal())
 
@@ -155,10 +163,12 @@ def refine(
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.turn = start.copy(), turn
     stages = (*_COMPLEX[1:], *_PHASE)
-    work.total = len(stages) + 1
+    work.total = len(stages) + 3
     work.single_camera(_Stage("find the cameras", 12, 3, _SHAPE_GROUPS), centre=start)
     for stage in stages:
         work.complex_field(stage)
+    work.estimate_turn()
+    work.refine_homodyne()
     return work.result(start)
 
 
@@ -197,11 +207,8 @@ class _Registration:
         """Measure the direct branch on each camera by itself and fit places and slopes."""
         self._tell(stage.name)
         page = self.pages[0]
-        frames = (page.pair.in_phase, page.pair.quadrature)
-        references = (self.references.in_phase, self.references.quadrature)
         found: list[Measurement] = []
-        for camera in (0, 1):
-            sampler = FrameSampler(frames[camera], references[camera], camera, self.twin, self.parameters)
+        for camera, sampler in enumerate(self._frame_samplers(page)):
             for patch in self._where(stage):
                 found += self._measure(sampler, stage, patch, page, (camera,), 0)
         self._fit(stage, found, centre)
@@ -217,43 +224,50 @@ class _Registration:
         self._fit(stage, found, None)
 
     def estimate_turn(self) -> None:
-        """The angle between the arms, from the phase that the same patch shows on either camera."""
+        """The angle between the arms, from the phases that the same known symbols show on either camera."""
         self._tell("angle between the arms")
-        sums = np.zeros(2, dtype=complex)
-        for m in self._last:
-            rays = self.twin.trace(self.parameters, m.centre_m[None])
-            sums[m.cameras[0]] += m.significance * np.exp(1j * (m.phase - rays.phases[0, 0]))
-        self.turn = -float(np.angle(sums[1] * np.conj(sums[0])))
-        if abs(np.sin(self.turn)) < 0.5:
+        page, where = self.pages[0], _Stage("", 0, 1, (), COHERENT_BRANCHES)
+        seen = [
+            [m for patch in self.patches for m in self._measure(sampler, where, patch, page, (camera,), 0)]
+            for camera, sampler in enumerate(self._frame_samplers(page))
+        ]
+        total = 0j
+        for one, other in zip(*seen, strict=True):
+            if min(one.significance, other.significance) > SIGNIFICANT:
+                weight = 1 / (1 / one.significance + 1 / other.significance)
+                total += weight * np.exp(1j * (one.phase - other.phase))
+        self.turn = float(np.angle(total))
+        if abs(np.sin(self.turn)) < _LEAST_QUADRATURE:
             raise CalibrationError(
                 "angle between the homodyne arms", f"{np.rad2deg(self.turn):.0f} degrees", "about +90 or -90 degrees"
             )
 
     def refine_homodyne(self) -> None:
-        """Relation of the two cameras from the homodyne equations alone, no symbol known.
+        """Relation of the two cameras from the homodyne equations, which need no symbol.
 
         Angle between the arms and pose of the quadrature camera against the in-phase one: what is left of the
-        equations is least where they are right. Gauss-Newton on the residual images, by finite differences.
+        equations is least where they are right. Gauss-Newton on the residual images by finite differences; what was
+        known before has its weight, since under a strong reference the equations say little.
         """
         self._tell("relation of the cameras")
         page, chosen = self.pages[0], indices("quadrature")
-        steps = np.append(_POSE_STEPS, _TURN_STEP)
+        known = np.append(_POSE_ERRORS, _TURN_ERROR)
+        moved = np.zeros(len(known))
 
         def residual(offset: Real) -> NDArray[np.float32]:
             parameters = self.parameters.copy()
             parameters[chosen] += offset[:-1]
             return self._field(page, parameters, self.turn + float(offset[-1]))[1].ravel()
 
-        here = residual(np.zeros(len(steps)))
-        slopes = np.stack([residual(step) - here for step in np.diag(steps)], axis=1)
-        move = np.linalg.lstsq(slopes.T @ slopes, -slopes.T @ here, rcond=None)[0] * steps
-        # noise inflates the Jacobian, so the step is short: go to the vertex of the parabola along it
-        powers = [float(here @ here), *(float(np.sum(residual(reach * move) ** 2)) for reach in (1.0, 2.0))]
-        bend = powers[0] - 2 * powers[1] + powers[2]
-        move = move * (np.clip(1 - (powers[2] - powers[0]) / (2 * bend), 0, 4) if bend > 0 else 1.0)
+        for _ in range(_HOMODYNE_ROUNDS):
+            here = residual(moved)
+            slopes = np.stack([residual(moved + step) - here for step in np.diag(known)], axis=1)
+            noise = float(here @ here) / len(here) * _SAMPLES_PER_DEGREE
+            normal = slopes.T @ slopes / noise + np.eye(len(known))
+            moved = moved - known * np.linalg.solve(normal, slopes.T @ here / noise + moved / known)
         self.parameters = self.parameters.copy()
-        self.parameters[chosen] += move[:-1]
-        self.turn += float(move[-1])
+        self.parameters[chosen] += moved[:-1]
+        self.turn += float(moved[-1])
 
     def result(self, before: Real) -> Registered:
         """Judge the outcome; `before` is the geometry that it is compared with."""
@@ -283,6 +297,14 @@ class _Registration:
         turn = self.turn if turn is None else turn
         homodyne = np.array([np.cos(turn), np.sin(turn)], dtype=np.float32)
         return self.solve_field(page.pair, self.references, registration, homodyne)
+
+    def _frame_samplers(self, page: KnownPage) -> list[FrameSampler]:
+        frames = (page.pair.in_phase, page.pair.quadrature)
+        references = (self.references.in_phase, self.references.quadrature)
+        return [
+            FrameSampler(frame, reference, camera, self.twin, self.parameters)
+            for camera, (frame, reference) in enumerate(zip(frames, references, strict=True))
+        ]
 
     def _where(self, stage: _Stage) -> list[Patch]:
         if not stage.middle_only:

@@ -33,12 +33,6 @@ class FrameSampler:
         self._image = ndimage.gaussian_filter(linear, _FRAME_SMOOTHING_PX)
         self._camera, self._twin, self._parameters = camera, twin, parameters
 
-    def at(self, parameters: Real) -> FrameSampler:
-        """The same frame under other parameters."""
-        other = object.__new__(FrameSampler)
-        other.__dict__.update(self.__dict__, _parameters=parameters)
-        return other
-
     def __call__(self, places: Real) -> NDArray[np.float32]:
         """Values at camera-plane points [..., 2]."""
         pixels = self._twin.pixels(self._parameters, places.reshape(-1, 2))[self._camera]
