@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from optics.errors import InvalidInputError, LightpageError, PageError
 from optics.page import MAX_LEVELS, symbol_phases
+from optics.pilots import Pilots
 from runtime.dataplane import Answer, ReadAnswer
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.pilots import Pilots
 from runtime.recalibration import RecalibrationOutcome
 from runtime.registry import Model
 

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.errors import BusyError, FrameError, InvalidInputError
+from optics.pilots import Pilots
 from optics.recording import FramePair
 from runtime.caller import Caller
 from runtime.decoder import DecodedPage, Decoder
 from runtime.limits import Limits
 from runtime.metrics import ServiceMetrics
-from runtime.pilots import Pilots
 from runtime.receiver import PairReceiver
 from runtime.registry import Model, ModelRegistry
 from runtime.sources import FrameSource, SourcePage

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from optics.errors import BundleError, FrameError, InvalidInputError
 from optics.measures import decide_with_confidence
 from optics.page import check_levels
+from optics.pilots import Pilots, estimate_piston, remove_piston
 from optics.recording import FramePair
 from runtime.bundle import Bundle, Table
 from runtime.frames import check_pair
 from runtime.manifest import DECODER, GOLDEN
 from runtime.ort import Node, Session, open_session
-from runtime.pilots import Pilots, estimate_piston, remove_piston
 
 OUTPUTS = ("p", "phase", "concentration")
 GOLDEN_TOLERANCE = 1e-3

@@ -10,10 +10,10 @@ import numpy as np
 
 from optics.errors import InvalidInputError, RecordingError
 from optics.measures import ConcentrationBin, PageMeasures, concentration_calibration, measure
+from optics.pilots import Pilots
 from optics.recording import Recording, hash_frames
 from runtime.decoder import Decoder
 from runtime.frames import narrow
-from runtime.pilots import Pilots
 from runtime.tracking import Tracker
 
 PageDone = Callable[[], object]

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from optics.errors import CalibrationError, FrameError, InvalidInputError, RecalibrationRefusedError
 from optics.measures import measure
 from optics.page import check_symbols
+from optics.pilots import Pilots
 from optics.recording import FramePair, hash_frames
 from runtime.bundle import Bundle, Table, npz, write_bundle
 from runtime.decoder import Decoder
 from runtime.manifest import GOLDEN, TABLE, Manifest, Provenance
-from runtime.pilots import Pilots
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and how far it is, 0..1. It may raise to stop the work."""

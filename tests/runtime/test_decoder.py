@@ -11,11 +11,11 @@ from onnx import TensorProto
 
 from optics.errors import BundleError, FrameError, InvalidInputError, PageError
 from optics.measures import measure
+from optics.pilots import Pilots
 from optics.recording import FramePair
 from runtime.bundle import Bundle, npz, write_bundle
 from runtime.decoder import Decoder
 from runtime.manifest import DECODER, GOLDEN, TABLE, TWIN
-from runtime.pilots import Pilots
 from runtime.twin import Twin
 from tests.runtime import toy
 

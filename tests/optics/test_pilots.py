@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from optics.errors import PageError
+from optics.pilots import Pilots, estimate_piston, remove_piston
 from optics.recording import FramePair
 from runtime.bundle import Table
 from runtime.decoder import DecodedPage, Decoder
-from runtime.pilots import Pilots, estimate_piston, remove_piston
 from runtime.tracking import NoTracker, Shift, ShiftTracker
 from tests.runtime import toy
 
