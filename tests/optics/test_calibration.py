@@ -1,0 +1,118 @@
+"""The calibration document: read back as written, wrong documents refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics.errors import InvalidInputError, ProfileError, RecordingError
+from optics.profile import load_profile
+from optics.recording import FramePair, Recording, RecordingWriter
+from optics.registration.calibrate import Registered
+from optics.registration.calibration import Calibration, load_calibration, parse_calibration
+from optics.registration.known import known_pages
+from optics.registration.parameters import NAMES, PRIORS
+
+PROFILE = load_profile("bench")
+HASHES = ("0123456789abcdef" * 4, "f" * 64)
+
+
+@pytest.fixture
+def calibration() -> Calibration:
+    rng = np.random.default_rng(1)
+    registered = Registered(
+        parameters=rng.normal(size=len(NAMES)) * PRIORS,
+        deviations=PRIORS / 30,
+        turn=-1.55,
+        coherence_before=0.01,
+        coherence_after=0.8,
+        cost=1.3,
+        significant=0.7,
+    )
+    return Calibration.from_registered(registered, PROFILE, HASHES)
+
+
+def test_a_calibration_is_read_back_as_it_was_written(calibration: Calibration, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.toml"
+    path.write_text("an older one")
+    calibration.save(path)
+    assert load_calibration(path) == calibration
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_the_vector_is_the_fitted_one_to_the_last_bit(calibration: Calibration) -> None:
+    expected = np.random.default_rng(1).normal(size=len(NAMES)) * PRIORS
+    np.testing.assert_array_equal(parse_calibration(calibration.to_toml()).vector, expected)
+
+
+def test_the_angle_is_the_profiles_and_the_fitted_one(calibration: Calibration) -> None:
+    tilted = PROFILE.model_copy(update={"pipe": PROFILE.pipe.model_copy(update={"angle_deg": 2.0})})
+    fitted = np.rad2deg(calibration.parameters["pipe_angle_rad"])
+    assert calibration.angle_deg(tilted) == pytest.approx(2.0 + fitted, abs=1e-12)
+
+
+def test_a_calibration_of_another_profile_is_refused(calibration: Calibration) -> None:
+    calibration.check_profile(PROFILE)
+    with pytest.raises(ProfileError, match="'bench', wanted 'paper'"):
+        calibration.check_profile(load_profile("paper"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("pipe_roll_rad", "pipe_rool_rad", r"\[parameters\]: got no pipe_roll_rad; unknown pipe_rool_rad"),
+        ("turn_rad = -1.55", "turn_rad = nan", r"turn_rad = nan"),
+        ("coherence_after = 0.8", "coherence_after = 1.8", r"coherence_after = 1.8"),
+        ("schema_version = 1", "schema_version = 2", r"schema_version = 2"),
+        ("cost = ", "costs = ", r"cost = .*Field required.*costs = 1.3 \(Extra"),
+        (HASHES[1], "../../etc/passwd", r"calibrated_pages.1 = '../../etc/passwd'"),
+        ("schema_version = 1", "schema_version = ", "not TOML"),
+        ("[deviations]", "[variances]", "deviations = .*Field required"),
+    ],
+)
+def test_a_wrong_document_is_refused_by_the_name_of_its_key(
+    calibration: Calibration, old: str, new: str, complaint: str
+) -> None:
+    text = calibration.to_toml()
+    assert old in text
+    with pytest.raises(ProfileError, match=complaint):
+        parse_calibration(text.replace(old, new, 1))
+
+
+def test_a_parameter_that_is_no_number_is_refused(calibration: Calibration) -> None:
+    value = repr(calibration.parameters["pipe_roll_rad"])
+    with pytest.raises(ProfileError, match=r"parameters\.pipe_roll_rad = inf"):
+        parse_calibration(calibration.to_toml().replace(value, "inf", 1))
+
+
+def test_a_file_that_is_not_there_and_a_folder_that_is_not_there_are_named(
+    calibration: Calibration, tmp_path: Path
+) -> None:
+    with pytest.raises(ProfileError, match=r"absent\.toml"):
+        load_calibration(tmp_path / "absent.toml")
+    with pytest.raises(InvalidInputError, match="nowhere"):
+        calibration.save(tmp_path / "nowhere" / "calibration.toml")
+
+
+def _record(path: Path, levels: int, symbols: np.ndarray | None) -> None:
+    frame = np.full(PROFILE.frame_shape, 7, dtype=np.uint8)
+    pair = FramePair(frame, frame)
+    with RecordingWriter(path, PROFILE, levels, 8, pair) as writer:
+        for index in range(2):
+            writer.append(None if symbols is None else symbols[index], pair)
+
+
+def test_known_pages_hold_the_phasors_at_the_recordings_level_count(tmp_path: Path) -> None:
+    symbols = np.random.default_rng(0).integers(0, 8, (2, *PROFILE.page_shape), dtype=np.uint8)
+    _record(tmp_path / "r.h5", 8, symbols)
+    with Recording.open(tmp_path / "r.h5") as recording:
+        (page,) = known_pages(recording, PROFILE, [1])
+    np.testing.assert_allclose(page.symbols, np.exp(2j * np.pi * symbols[1] / 8), atol=1e-12)
+
+
+def test_pages_without_symbols_are_not_known(tmp_path: Path) -> None:
+    _record(tmp_path / "r.h5", 256, None)
+    with Recording.open(tmp_path / "r.h5") as recording, pytest.raises(RecordingError, match="'symbols': got none"):
+        known_pages(recording, PROFILE, [0])
