@@ -1,0 +1,53 @@
+"""A device at one eighth of the full size, for tests: the same zones, symbols and sampling as `bench`, a quarter of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optics.device import Aberration, CameraPose, Device, Drift, Geometry, Homodyne, Reference, SlmDefects
+from optics.profile import Camera, Lens, PageLayout, Pipe, Profile, load_profile
+
+PLAIN_POSE = CameraPose()
+
+
+def small_profile() -> Profile:
+    """44 x 28 symbols, f = 10 mm, pipe 9.375 mm x 0.444815 mm, cameras 684 x 456."""
+    bench = load_profile("bench")
+    return bench.model_copy(
+        update={
+            "name": "small",
+            "lens": Lens(focal_length_m=bench.lens.focal_length_m / 2),
+            "pipe": Pipe(
+                length_m=bench.pipe.length_m / 2,
+                width_m=bench.pipe.width_m / 2,
+                refractive_index=bench.pipe.refractive_index,
+            ),
+            "page": PageLayout(columns=44, rows=28, symbol_size_px=4),
+            "camera": Camera(columns_px=684, rows_px=456, pitch_m=bench.camera.pitch_m),
+        }
+    )
+
+
+def perfect_device(**tables: object) -> Device:
+    """A device as its profile says, with no defect but those given, by table: `perfect_device(slm=SlmDefects(...))`."""
+    plain = Device(
+        geometry=Geometry(pipe_angle_deg=0, page_shift_x_px=0, page_shift_y_px=0, pipe_roll_deg=0),
+        in_phase_camera=PLAIN_POSE,
+        quadrature_camera=PLAIN_POSE,
+        aberration=Aberration(distortion_relative=0, defocus_rad=0, astigmatism_rad=0, coma_rad=0),
+        reference=Reference(ripple_relative=0, tilt_x_rad=0, tilt_y_rad=0, curvature_rad=0),
+        homodyne=Homodyne(quadrature_error_deg=0, quadrature_gain=1),
+        slm=SlmDefects(phase_noise_rad=0, blur_px=0, falloff_relative=0),
+        drift=Drift(piston_rad=0, shift_px=0),
+    )
+    return plain.model_copy(update=tables)
+
+
+def random_phases(profile: Profile, seed: int = 0) -> np.ndarray:
+    """Independent uniform phases of a page's symbols, [ny, nx], radians."""
+    return np.random.default_rng(seed).uniform(0, 2 * np.pi, profile.page_shape)
+
+
+def on_slm(phases: np.ndarray, profile: Profile) -> np.ndarray:
+    """Symbol phases [ny, nx] repeated over the SLM pixels of each symbol."""
+    return np.kron(phases, np.ones((profile.page.symbol_size_px,) * 2))
