@@ -13,6 +13,7 @@ from optics.device import CameraPose, Device
 from optics.page import check_symbols, symbol_phases
 from optics.profile import Profile
 from optics.recording import FramePair
+from optics.recording_layout import frame_type
 from optics.registration.parameters import NAMES, as_vector
 from optics.waves import WaveChannel, WaveGeometry, modes_for
 
@@ -24,6 +25,8 @@ _CLIPPING_AMPLITUDE = 2.4
 amplitude exceeds it in 0.3% of the samples."""
 _GRID_MARGIN = 1.04
 """Computed camera plane over the sensor, so that rotated and shifted pixels still look inside."""
+_WALK, _RIPPLE, _NOISE = 0, 1, 2
+"""Independent random streams drawn from one seed; the last has one for each page."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +161,7 @@ class TrueOptics:
             + knobs.tilt_y_rad * y / half_height
             + knobs.curvature_rad * (x**2 + y**2) / self.corner_m**2
         )
-        rng = np.random.default_rng([seed, 1])
+        rng = np.random.default_rng([seed, _RIPPLE])
         ripple = np.zeros((len(axis_y), len(axis_x)))
         for _ in range(6):
             turns_x, turns_y = rng.uniform(-3, 3, 2)
@@ -196,9 +199,10 @@ class Simulator:
         self.optics = TrueOptics(profile, device, steps)
         self.levels = levels
         self.seed = seed
-        self._rng = np.random.default_rng([seed, 0])
-        self._piston = float(self._rng.uniform(-np.pi, np.pi))
+        self._walk = np.random.default_rng([seed, _WALK])
+        self._piston = float(self._walk.uniform(-np.pi, np.pi))
         self._shift = np.zeros(2)
+        self._page = 0
 
     @property
     def profile(self) -> Profile:
@@ -220,8 +224,9 @@ class Simulator:
         return self.optics.reference(self.seed)
 
     def skip(self, pages: int) -> None:
-        """Let `pages` pages pass unseen, as after a resume: the noise of later pages then differs, not their law."""
-        self._rng = np.random.default_rng([self.seed, 2, pages])
+        """Let `pages` pages pass unseen: what follows is what would have followed had they been simulated."""
+        for _ in range(pages):
+            self._drift()
 
     def page(self, symbols: NDArray[np.uint8]) -> FramePair:
         """Write a page of symbols [ny, nx] and record its frame pair."""
@@ -234,23 +239,29 @@ class Simulator:
             PageError: symbols of the wrong shape, type or range.
         """
         check_symbols(symbols, self.profile.page_shape, self.levels, "symbols to simulate")
-        device, rng = self.device, self._rng
-        self._piston += device.drift.piston_rad * rng.standard_normal()
-        self._shift = self._shift + device.drift.shift_px * rng.standard_normal(2)
+        device, rng = self.device, np.random.default_rng([self.seed, _NOISE, self._page])
+        self._drift()
         shift = (float(self._shift[0]), float(self._shift[1]))
         size = self.profile.page.symbol_size_px
         phase = np.kron(symbol_phases(symbols, self.levels), np.ones((size, size)))
         phase = phase + device.slm.phase_noise_rad * rng.standard_normal(phase.shape)
         exit_field = self.optics.exit_field(phase)
         field = self.optics.camera_field(exit_field) * np.complex64(np.exp(1j * self._piston))
-        frames = self._frames(field, shift, noisy=True)
+        frames = self._frames(field, shift, rng)
         return SimulatedPage(frames, exit_field, self._piston, shift)
 
     def references(self) -> FramePair:
         """Reference-only frames, the mean of so many exposures that only quantisation is left."""
-        return self._frames(np.zeros_like(self._reference), (0.0, 0.0), noisy=False)
+        return self._frames(np.zeros_like(self._reference), (0.0, 0.0), None)
 
-    def _frames(self, field: Complex, shift: tuple[float, float], *, noisy: bool) -> FramePair:
+    def _drift(self) -> None:
+        """Walk on by one page; its noise has a stream of its own, so that pages can pass without being computed."""
+        drift = self.device.drift
+        self._piston += drift.piston_rad * self._walk.standard_normal()
+        self._shift = self._shift + drift.shift_px * self._walk.standard_normal(2)
+        self._page += 1
+
+    def _frames(self, field: Complex, shift: tuple[float, float], noise: np.random.Generator | None) -> FramePair:
         device = self.device
         homodyne = device.homodyne
         intensities = (
@@ -263,11 +274,11 @@ class Simulator:
         frames = []
         for intensity, pose in zip(intensities, (device.in_phase_camera, device.quadrature_camera), strict=True):
             seen = resample(intensity, *self.optics.camera_axes_m, *self.optics.view(pose, shift))
-            if noisy:
-                counts = expose(seen, self.optics.electrons_per_unit, device.sensor, self._rng)
-            else:
+            if noise is None:
                 counts = to_counts(seen * self.optics.electrons_per_unit, device.sensor)
-            frames.append(counts.astype(np.uint8 if device.sensor.bit_depth == 8 else np.uint16))
+            else:
+                counts = expose(seen, self.optics.electrons_per_unit, device.sensor, noise)
+            frames.append(counts.astype(frame_type(device.sensor.bit_depth)))
         return FramePair(*frames)
 
 
