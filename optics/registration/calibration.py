@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, field_serializer
 
-from optics.errors import InvalidInputError, ProfileError
+from optics.errors import ProfileError
+from optics.files import replace_text
 from optics.profile import Count, Finite, Profile, Table, to_toml, validate
 from optics.registration.calibrate import Registered
 from optics.registration.parameters import NAMES, as_dict, as_vector
@@ -123,19 +122,7 @@ class Calibration(Table):
         Raises:
             InvalidInputError: the path cannot be written.
         """
-        path = Path(path)
-        try:
-            descriptor, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
-            try:
-                with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-                    file.write(self.to_toml())
-                os.chmod(name, 0o644)
-                os.replace(name, path)
-            except BaseException:
-                os.unlink(name)
-                raise
-        except OSError as error:
-            raise InvalidInputError(f"calibration file {path}", error, "a path that can be written") from None
+        replace_text(path, self.to_toml(), "calibration file")
 
 
 def parse_calibration(text: str, source: str = "calibration") -> Calibration:

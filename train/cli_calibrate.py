@@ -1,0 +1,125 @@
+"""`lightpage calibrate`: from nominal geometry to this device, with a few pages whose symbols are known."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+import numpy as np
+from tqdm import tqdm
+
+from optics.errors import InvalidInputError, RecordingError
+from optics.files import replace_text
+from optics.profile import Profile, load_profile
+from optics.recording import Recording
+from optics.registration.calibrate import calibrate as register
+from optics.registration.calibration import Calibration
+from optics.registration.known import known_pages
+from train.field import FieldRecovery, TorchFieldSolver
+from train.twin import RayTwin, TorchTwin
+
+DEFAULT_PAGES = 2
+MAX_PAGES = 4
+"""More cost time and add nothing that a decoder would notice."""
+
+
+@click.command()
+@click.option("--profile", "profile_name", required=True, metavar="P", help="Nominal device: a shipped name or a file.")
+@click.option("--recording", required=True, type=click.Path(path_type=Path), help="Pages with known symbols, R.h5.")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="Where the calibration goes, TOML.")
+@click.option(
+    "--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(1, MAX_PAGES), help="Pages used."
+)
+@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the figures to this file.")
+def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_path: Path | None) -> None:
+    """Find this device's geometry, from nominal, with the first pages of a recording."""
+    profile = load_profile(profile_name)
+    for path in (out, *([json_path] if json_path else [])):
+        if not path.absolute().parent.is_dir():
+            raise InvalidInputError(f"path {path}", "a folder that does not exist", "a folder that does")
+    start = time.perf_counter()
+    with Recording.open(recording) as file, _bar() as progress:
+        calibration = calibrate_recording(file, profile, pages, progress)
+    seconds = time.perf_counter() - start
+    calibration.save(out)
+    if json_path is not None:
+        replace_text(json_path, json.dumps(figures(calibration, profile, seconds), indent=2) + "\n", "JSON file")
+    click.echo(table(calibration, profile))
+    click.echo(
+        f"\ncoherence {calibration.coherence_before:.3f} -> {calibration.coherence_after:.3f}, "
+        f"{calibration.pages_used} known pages, {seconds:.0f} s; written to {out}"
+    )
+
+
+def calibrate_recording(
+    recording: Recording, profile: Profile, pages: int, progress: Callable[[str, float], None]
+) -> Calibration:
+    """Calibrate from nominal with the first `pages` pages of a recording.
+
+    Raises:
+        RecordingError: no symbols, too few pages, or shapes that are not the profile's.
+        CalibrationError: nothing within the capture range explains the frames.
+    """
+    recording.check_against(profile)
+    if recording.pages < pages:
+        raise RecordingError(f"recording {recording.path}", f"{recording.pages} pages", f"at least {pages} (--pages)")
+    known = known_pages(recording, profile, range(pages))
+    registered = register(
+        TorchTwin(RayTwin(profile)),
+        TorchFieldSolver(FieldRecovery(profile)),
+        profile,
+        recording.references(),
+        known,
+        progress,
+    )
+    return Calibration.from_registered(registered, profile, [recording.page_hash(page) for page in range(pages)])
+
+
+def figures(calibration: Calibration, profile: Profile, seconds: float) -> dict[str, object]:
+    """The result under the names that other programs read."""
+    return {
+        "angle_deg": calibration.angle_deg(profile),
+        "pages_used": calibration.pages_used,
+        "seconds": seconds,
+        "coherence_before": calibration.coherence_before,
+        "coherence_after": calibration.coherence_after,
+        "turn_deg": float(np.rad2deg(calibration.turn_rad)),
+        "parameters": calibration.parameters,
+    }
+
+
+def table(calibration: Calibration, profile: Profile) -> str:
+    """Fitted values with their standard deviations beside the nominal ones, for people."""
+    shown = {
+        "pipe_angle_rad": ("pipe angle, degree", profile.pipe.angle_deg, 180 / np.pi),
+        "focal_length_relative": ("focal length, mm", 1e3 * profile.lens.focal_length_m, None),
+        "pipe_length_relative": ("pipe length, mm", 1e3 * profile.pipe.length_m, None),
+        "pipe_width_relative": ("pipe width, mm", 1e3 * profile.pipe.width_m, None),
+    }
+    lines = [f"{'':<32}{'fitted':>12}   {'+-':<10}{'nominal':>10}"]
+    for name, value in calibration.parameters.items():
+        label, nominal, unit = shown.get(name, (name, 0.0, 1.0))
+        factor = nominal if unit is None else unit
+        fitted, deviation = nominal + factor * value, factor * calibration.deviations[name]
+        lines.append(f"{label:<32}{fitted:>12.6g}   {deviation:<10.2g}{nominal:>10.6g}")
+    turn = np.rad2deg(calibration.turn_rad)
+    lines.append(f"{'between the arms, degree':<32}{turn:>12.6g}   {'':<10}{'+90 or -90':>10}")
+    return "\n".join(lines)
+
+
+@contextmanager
+def _bar() -> Iterator[Callable[[str, float], None]]:
+    """A progress bar as the callback that registration calls at the start of each stage."""
+    with tqdm(total=100, unit="%", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}") as bar:
+
+        def progress(stage: str, share: float) -> None:
+            bar.set_description(stage, refresh=False)
+            bar.update(100 * share - bar.n)
+            bar.refresh()
+
+        yield progress
+        progress("done", 1.0)
