@@ -1,4 +1,4 @@
-"""A device at one eighth of the full size, for tests: the same zones, symbols and sampling as `bench`, a quarter of it."""
+"""A device for tests, an eighth of the full size: zones, symbols and sampling of `bench` on a quarter of its area."""
 
 from __future__ import annotations
 

@@ -1,0 +1,72 @@
+"""Claims about the common grid: it covers the page's image, and its filters pass the pipe's light and stop the rest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from optics.grid import FieldGrid, field_grid
+from optics.profile import Profile, load_profile
+from tests.optics.small import small_profile
+
+PROFILES = [small_profile(), load_profile("bench"), load_profile("paper")]
+
+
+@pytest.fixture(params=PROFILES, ids=lambda p: p.name)
+def profile(request: pytest.FixtureRequest) -> Profile:
+    assert isinstance(request.param, Profile)
+    return request.param
+
+
+@pytest.fixture
+def grid(profile: Profile) -> FieldGrid:
+    return field_grid(profile)
+
+
+def gain(taps: np.ndarray, cycles_per_sample: np.ndarray) -> np.ndarray:
+    """Response of symmetric taps."""
+    offsets = np.arange(len(taps)) - len(taps) // 2
+    return np.cos(2 * np.pi * np.outer(cycles_per_sample, offsets)) @ taps
+
+
+def band_edge(profile: Profile) -> float:
+    """Highest spatial frequency that leaves the pipe's facet, cycles a metre on the camera plane."""
+    return profile.pipe.width_m / 2 / (profile.light.wavelength_m * profile.lens.focal_length_m)
+
+
+def test_axes_are_uniform_centred_and_reach_past_the_page(profile: Profile, grid: FieldGrid) -> None:
+    for axis, extent in ((grid.x_m, profile.page_width_m), (grid.y_m, profile.page_height_m)):
+        np.testing.assert_allclose(np.diff(axis), grid.pitch_m)
+        assert axis[0] == pytest.approx(-axis[-1])
+        margin_px = (axis[-1] - extent / 2) / profile.camera.pitch_m
+        assert 60 < margin_px < 80
+    assert grid.shape == (len(grid.y_m), len(grid.x_m))
+
+
+def test_the_grid_samples_the_field_above_its_rate(profile: Profile, grid: FieldGrid) -> None:
+    assert grid.pitch_m == pytest.approx(2 * profile.camera.pitch_m)
+    assert 1 / grid.pitch_m > 4 * band_edge(profile)
+
+
+def test_the_band_filter_is_flat_on_the_pipes_light_and_stops_what_the_pipe_cannot_carry(
+    profile: Profile, grid: FieldGrid
+) -> None:
+    edge = band_edge(profile) * grid.pitch_m
+    assert np.abs(gain(grid.band, np.linspace(0, edge, 200)) - 1).max() < 0.02
+    assert np.abs(gain(grid.band, np.linspace(1.4 * edge, 0.5, 200))).max() < 0.03
+
+
+def test_the_prefilter_keeps_the_frames_signal_and_stops_what_would_fold_onto_the_field(
+    profile: Profile, grid: FieldGrid
+) -> None:
+    edge = band_edge(profile) * profile.camera.pitch_m
+    assert np.abs(gain(grid.prefilter, np.linspace(0, 2 * edge, 200)) - 1).max() < 0.02
+    # sampling every second pixel folds the frequencies above half a cycle minus the edge onto the field
+    assert np.abs(gain(grid.prefilter, np.linspace(max(0.5 - edge, 0.36), 0.5, 200))).max() < 0.02
+
+
+def test_filters_keep_the_mean_and_shift_nothing(grid: FieldGrid) -> None:
+    for taps in (grid.prefilter, grid.band):
+        assert taps.sum() == pytest.approx(1)
+        assert len(taps) % 2 == 1
+        np.testing.assert_allclose(taps, taps[::-1], atol=1e-12)
