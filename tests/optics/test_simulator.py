@@ -1,0 +1,289 @@
+"""Claims about the simulated device: its light, its frames, its drift, and the truth that it tells of itself."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from optics.cameras import resample
+from optics.device import Aberration, CameraPose, Device, Drift, Geometry, Homodyne, Reference, Sensor, SlmDefects
+from optics.errors import PageError
+from optics.profile import PageLayout, Profile
+from optics.registration.twin import BRANCHES
+from optics.simulator import Simulator, TrueOptics, true_parameters
+from tests.optics.small import on_slm, perfect_device, random_phases, small_profile
+from train.twin import RayTwin, TorchTwin
+
+FINE_SENSOR = Sensor(full_well_e=1e9, read_noise_e=0, bit_depth=16)
+"""Hardly any noise: one electron in thirty thousand, one count in 65,535."""
+TINY = small_profile().model_copy(
+    update={
+        "page": PageLayout(columns=8, rows=6, symbol_size_px=4, pilot_fraction=0.1),
+        "camera": small_profile().camera.model_copy(update={"columns_px": 124, "rows_px": 92}),
+    }
+)
+
+
+def symbols(profile: Profile, levels: int = 16, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(levels, size=profile.page_shape).astype(np.uint8)
+
+
+def gentle(**tables: object) -> Device:
+    """The realistic device without noise, phase noise or drift."""
+    quiet = {"sensor": FINE_SENSOR, "drift": Drift(piston_rad=0, shift_px=0), "slm": SlmDefects(phase_noise_rad=0)}
+    return Device().model_copy(update=quiet | tables)
+
+
+class TestRandomness:
+    def test_the_same_seed_gives_the_same_frames_and_another_seed_others(self) -> None:
+        pages = [symbols(TINY, seed=s) for s in (1, 2)]
+
+        def recorded(seed: int) -> list[np.ndarray]:
+            simulator = Simulator(TINY, Device(), levels=16, seed=seed, steps=8)
+            pairs = [*(simulator.page(page) for page in pages), simulator.references()]
+            return [frame for pair in pairs for frame in (pair.in_phase, pair.quadrature)]
+
+        first, again, other = recorded(5), recorded(5), recorded(6)
+        assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+        assert not any(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
+
+    def test_references_disturb_nothing(self) -> None:
+        page = symbols(TINY)
+        plain, interrupted = (Simulator(TINY, Device(), levels=16, seed=1, steps=8) for _ in range(2))
+        interrupted.references()
+        assert np.array_equal(plain.page(page).in_phase, interrupted.page(page).in_phase)
+
+    def test_after_skipping_pages_the_noise_is_new_and_the_reference_the_same(self) -> None:
+        page = symbols(TINY)
+        plain, skipped = (Simulator(TINY, Device(), levels=16, seed=1, steps=8) for _ in range(2))
+        skipped.skip(3)
+        assert np.array_equal(plain.references().in_phase, skipped.references().in_phase)
+        assert not np.array_equal(plain.page(page).in_phase, skipped.page(page).in_phase)
+
+    def test_piston_and_shift_walk_by_independent_normal_steps(self) -> None:
+        pages, law = 200, Drift(piston_rad=0.2, shift_px=0.05)
+        device = perfect_device(drift=law)
+        simulator = Simulator(TINY, device, levels=16, seed=3, steps=1)
+        seen = [simulator.simulate(symbols(TINY)) for _ in range(pages)]
+        walk = np.array([(s.piston, *s.shift_px) for s in seen])
+        steps = np.diff(walk, axis=0) / (law.piston_rad, law.shift_px, law.shift_px)
+        within = 4 / np.sqrt(pages)
+        assert np.abs(steps.mean(0)).max() < within
+        assert np.abs(steps.std(0) - 1).max() < within / np.sqrt(2)
+        assert np.abs(np.corrcoef(steps.T) - np.eye(3)).max() < within
+        neighbours = np.mean(steps[1:] * steps[:-1], axis=0)
+        assert np.abs(neighbours).max() < within
+
+    def test_a_drifted_camera_sees_what_a_shifted_camera_sees(self) -> None:
+        drifting = Simulator(TINY, gentle(drift=Drift(piston_rad=0, shift_px=2)), levels=16, seed=2, steps=8)
+        page = drifting.simulate(symbols(TINY))
+        assert np.hypot(*page.shift_px) > 0.5
+
+        def moved(pose: CameraPose) -> CameraPose:
+            shift = {"shift_x_px": pose.shift_x_px + page.shift_px[0], "shift_y_px": pose.shift_y_px + page.shift_px[1]}
+            return pose.model_copy(update=shift)
+
+        device = gentle()
+        shifted = gentle(
+            in_phase_camera=moved(device.in_phase_camera), quadrature_camera=moved(device.quadrature_camera)
+        )
+        # same seed, so the same first piston
+        still = Simulator(TINY, shifted, levels=16, seed=2, steps=8).page(symbols(TINY))
+        for one, other in zip(
+            (page.pair.in_phase, page.pair.quadrature), (still.in_phase, still.quadrature), strict=True
+        ):
+            assert np.abs(one.astype(int) - other.astype(int)).max() <= 20
+            assert one.max() > 20_000
+
+    def test_moving_to_another_state_keeps_piston_and_shift(self) -> None:
+        simulator = Simulator(TINY, Device(), levels=16, seed=4, steps=8)
+        before = simulator.simulate(symbols(TINY))
+        still = Device(drift=Drift(piston_rad=0, shift_px=0), reference=Reference(amplitude_ratio=3))
+        references = simulator.references()
+        simulator.set_device(still)
+        after = simulator.simulate(symbols(TINY))
+        assert (after.piston, after.shift_px) == (before.piston, before.shift_px)
+        assert not np.array_equal(simulator.references().in_phase, references.in_phase)
+
+
+class TestFrames:
+    def test_references_are_the_reference_beam_and_nothing_else(self) -> None:
+        device = gentle(
+            reference=Reference(amplitude_ratio=2, ripple_relative=0), homodyne=Homodyne(quadrature_gain=0.9)
+        )
+        simulator = Simulator(TINY, device, levels=16)
+        pair = simulator.references()
+        per_unit = simulator.optics.electrons_per_unit * 65_535 / FINE_SENSOR.full_well_e
+        np.testing.assert_allclose(pair.in_phase, 4 * per_unit, atol=2)
+        np.testing.assert_allclose(pair.quadrature, 0.9 * 4 * per_unit, atol=2)
+
+    def test_the_reference_ripples_by_its_share(self) -> None:
+        profile = small_profile()
+        beam = TrueOptics(profile, gentle(reference=Reference(amplitude_ratio=2, ripple_relative=0.1))).reference(
+            seed=1
+        )
+        assert np.abs(beam).std() == pytest.approx(0.2, rel=0.3)
+        assert np.abs(beam).mean() == pytest.approx(2, rel=0.05)
+
+    def test_opposite_signs_of_q_mirror_the_quadrature_frame_only(self) -> None:
+        page = symbols(TINY)
+        arms = [
+            Homodyne(quadrature_error_deg=0, quadrature_sign=1),
+            Homodyne(quadrature_error_deg=0, quadrature_sign=-1),
+        ]
+        plus, minus = (Simulator(TINY, gentle(homodyne=arm), levels=16, seed=1, steps=8) for arm in arms)
+        one, other = plus.simulate(page), minus.simulate(page)
+        assert np.abs(one.pair.in_phase.astype(int) - other.pair.in_phase).max() < 20
+        signal = np.abs(plus.optics.camera_field(one.exit_field)) ** 2 + np.abs(plus.optics.reference(1)) ** 2
+        gain = plus.device.homodyne.quadrature_gain
+        view = plus.optics.view(plus.device.quadrature_camera)
+        mean = gain * resample(signal, *plus.optics.camera_axes_m, *view)
+        per_unit = plus.optics.electrons_per_unit * 65_535 / FINE_SENSOR.full_well_e
+        summed = (one.pair.quadrature.astype(float) + other.pair.quadrature) / 2 / per_unit
+        clear = (one.pair.quadrature < 65_535) & (other.pair.quadrature < 65_535)
+        np.testing.assert_allclose(summed[clear], mean[clear], atol=0.01)
+        assert np.abs(one.pair.quadrature.astype(float) - other.pair.quadrature).max() > 10_000
+
+    def test_frames_are_field_and_reference_interfering_with_the_signals_own_light(self) -> None:
+        profile = small_profile()
+        simulator = Simulator(profile, perfect_device(sensor=FINE_SENSOR), levels=16, seed=1)
+        page, references = simulator.simulate(symbols(profile)), simulator.references()
+        optics = simulator.optics
+        field = optics.camera_field(page.exit_field) * np.exp(1j * page.piston)
+        expected = field * optics.reference(1).conj()
+        per_unit = optics.electrons_per_unit * 65_535 / FINE_SENSOR.full_well_e
+        view = optics.view(CameraPose())
+
+        def seen(image: np.ndarray) -> np.ndarray:
+            return resample(image, *optics.camera_axes_m, *view)
+
+        own_light = seen(np.abs(field) ** 2)
+        for frame, reference, part in (
+            (page.pair.in_phase, references.in_phase, expected.real),
+            (page.pair.quadrature, references.quadrature, expected.imag),
+        ):
+            clear = frame < 65_535
+            assert clear.mean() > 0.99
+            difference = (frame.astype(float) - reference) / per_unit
+            np.testing.assert_allclose(difference[clear], (2 * seen(part) + own_light)[clear], atol=0.01)
+            assert np.mean(difference[clear] - 2 * seen(part)[clear]) > 0.3
+
+    def test_bits_decide_the_type_of_a_count(self) -> None:
+        for bits, kind in ((8, np.uint8), (12, np.uint16)):
+            pair = Simulator(TINY, Device(sensor=Sensor(bit_depth=bits)), levels=16, steps=4).page(symbols(TINY))
+            assert pair.in_phase.dtype == pair.quadrature.dtype == kind
+            assert pair.in_phase.shape == TINY.frame_shape
+            assert pair.in_phase.max() < 2**bits
+
+    def test_a_page_that_does_not_fit_is_refused(self) -> None:
+        simulator = Simulator(TINY, Device(), levels=16)
+        with pytest.raises(PageError, match="shape"):
+            simulator.page(np.zeros((3, 3), np.uint8))
+        with pytest.raises(PageError, match="values"):
+            simulator.page(np.full(TINY.page_shape, 16, np.uint8))
+
+
+class TestLight:
+    @pytest.mark.parametrize("device", [perfect_device(), Device()], ids=["perfect", "realistic"])
+    def test_the_signals_mean_power_over_the_pages_image_is_one(self, device: Device) -> None:
+        profile = small_profile()
+        optics = TrueOptics(profile, device)
+        field = optics.camera_field(optics.exit_field(on_slm(random_phases(profile, 3), profile)))
+        x, y = optics.camera_axes_m
+        # samples of the facet repeat the image with this period, just wider than the page
+        geometry, cells = optics.geometry, optics.channel.cells
+        periods = np.array(cells) * geometry.wavelength_m * geometry.focal_length_m / geometry.pipe_width_m
+        image = field[np.abs(y) < periods[0] / 2][:, np.abs(x) < periods[1] / 2]
+        power = np.sum(np.abs(image) ** 2) * profile.camera.pitch_m**2
+        # what the pipe's band holds differs by a hundredth from page to page
+        assert power == pytest.approx(profile.page_width_m * profile.page_height_m, rel=0.02)
+        on_page = field[np.abs(y) < profile.page_height_m / 2][:, np.abs(x) < profile.page_width_m / 2]
+        assert np.mean(np.abs(on_page) ** 2) == pytest.approx(1, rel=0.05)
+
+    def test_hardly_any_pixel_is_clipped_and_the_range_is_used(self) -> None:
+        profile = small_profile()
+        pair = Simulator(profile, Device(), levels=16, seed=1).page(symbols(profile))
+        for frame in (pair.in_phase, pair.quadrature):
+            assert (frame == 255).mean() < 0.01
+            assert np.quantile(frame, 0.99) > 128
+
+    def test_illumination_falls_off_and_aberrations_bend_the_phase_towards_the_corner(self) -> None:
+        profile = small_profile()
+        device = perfect_device(
+            slm=SlmDefects(phase_noise_rad=0, blur_px=0, falloff_relative=0.2),
+            aberration=Aberration(distortion_relative=0, defocus_rad=0.5, astigmatism_rad=0.3, coma_rad=0.2),
+            geometry=Geometry(pipe_angle_deg=0, page_shift_x_px=5, page_shift_y_px=-3, pipe_roll_deg=0),
+        )
+        factor = TrueOptics(profile, device).slm_factor
+        half_x, half_y = profile.page_width_m / 2, profile.page_height_m / 2
+        corner2 = half_x**2 + half_y**2
+        # the outermost pixel centres lie half a pixel inside the corner
+        assert abs(factor[0, 0]) == pytest.approx(0.8, abs=0.005)
+        assert np.abs(factor).max() == pytest.approx(1, abs=0.001)
+        expected = 0.5 + 0.3 * (half_x**2 - half_y**2) / corner2 + 0.2 * half_x / np.sqrt(corner2)
+        assert np.angle(factor[-1, -1]) == pytest.approx(expected, abs=0.02)
+        assert np.angle(factor[-1, 0]) == pytest.approx(expected - 0.4 * half_x / np.sqrt(corner2), abs=0.02)
+
+
+@cache
+def mishandled() -> Device:
+    """Every knob of the geometry and the cameras at about half of its capture range."""
+    return Device(
+        geometry=Geometry(
+            pipe_angle_deg=-0.6,
+            focal_length_relative_error=0.002,
+            pipe_length_relative_error=-0.003,
+            pipe_width_relative_error=0.0003,
+            page_shift_x_px=3,
+            page_shift_y_px=-2,
+            pipe_roll_deg=0.2,
+        ),
+        aberration=Aberration(distortion_relative=0.0015, defocus_rad=1, astigmatism_rad=-1, coma_rad=0.7),
+        in_phase_camera=CameraPose(scale_relative_error=0.006, rotation_deg=0.2, shift_x_px=6, shift_y_px=-4),
+        quadrature_camera=CameraPose(scale_relative_error=-0.004, rotation_deg=-0.15, shift_x_px=-7, shift_y_px=5),
+        slm=SlmDefects(phase_noise_rad=0, falloff_relative=0),
+    )
+
+
+@cache
+def mishandled_optics() -> TrueOptics:
+    return TrueOptics(small_profile(), mishandled())
+
+
+class TestTruth:
+    @pytest.mark.parametrize(
+        ("branch", "row", "column"), [("direct", 14, 21), ("direct", 12, 24), ("x", 14, 41), ("x", 13, 2)]
+    )
+    def test_a_lone_bright_symbol_lands_on_the_pixels_that_the_truth_predicts(
+        self, branch: str, row: int, column: int
+    ) -> None:
+        profile, device, optics = small_profile(), mishandled(), mishandled_optics()
+        lone = np.zeros(profile.page_shape)
+        lone[row, column] = 1
+        # the phase pattern cannot be dark elsewhere, so the light goes in behind the modulator
+        written = optics.slm_factor * on_slm(lone, profile)
+        field = optics.camera_field(optics.channel.exit_field(written))
+        pitch = profile.symbol_pitch_m
+        rows, columns = profile.page_shape
+        centre = np.array([[(column - (columns - 1) / 2) * pitch, (row - (rows - 1) / 2) * pitch]])
+        twin, parameters = TorchTwin(RayTwin(profile)), true_parameters(profile, device)
+        landing = twin.trace(parameters, centre).places[BRANCHES.index(branch)]
+        predicted = twin.pixels(parameters, landing)[:, 0]
+        for camera, pose in enumerate((device.in_phase_camera, device.quadrature_camera)):
+            frame = resample(np.abs(field) ** 2, *optics.camera_axes_m, *optics.view(pose))
+            assert _centre_of_spot(frame) == pytest.approx(predicted[camera], abs=0.2)
+
+
+def _centre_of_spot(frame: np.ndarray, reach_px: float = 14) -> np.ndarray:
+    """Centroid (column, row) of the brightest spot, in a round window that follows it."""
+    row, column = np.unravel_index(np.argmax(frame), frame.shape)
+    centre = np.array([column, row], float)
+    columns, rows = np.meshgrid(np.arange(frame.shape[1]), np.arange(frame.shape[0]))
+    for _ in range(50):
+        away2 = (columns - centre[0]) ** 2 + (rows - centre[1]) ** 2
+        weight = frame * np.exp(-away2 / reach_px**2)
+        # the window pulls the centroid part of the way back, so iterate until it stays
+        centre = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+    return centre
