@@ -42,7 +42,7 @@ def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_pa
         if not path.absolute().parent.is_dir():
             raise InvalidInputError(f"path {path}", "a folder that does not exist", "a folder that does")
     start = time.perf_counter()
-    with Recording.open(recording) as file, _bar() as progress:
+    with Recording.open(recording) as file, calibration_bar() as progress:
         calibration = calibrate_recording(file, profile, pages, progress)
     seconds = time.perf_counter() - start
     calibration.save(out)
@@ -112,7 +112,7 @@ def table(calibration: Calibration, profile: Profile) -> str:
 
 
 @contextmanager
-def _bar() -> Iterator[Callable[[str, float], None]]:
+def calibration_bar() -> Iterator[Callable[[str, float], None]]:
     """A progress bar as the callback that registration calls at the start of each stage."""
     with tqdm(total=100, unit="%", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}") as bar:
 

@@ -43,11 +43,26 @@ def page_coherence(
             rays = twin.trace(parameters, centres + np.array([dx, dy]), centres)
             light += sampler(rays.places[chosen]) * np.exp(-1j * rays.phases[chosen])
             positions = rays.positions
-    even = np.clip(1 - np.abs(positions - 2 * np.round(positions / 2)), 0, 1)
-    odd = np.clip(1 - np.abs(positions - (2 * np.floor(positions / 2) + 1)), 0, 1)
-    shares = np.stack(
-        [(odd if name == "x" else even)[:, 0] * (odd if name == "y" else even)[:, 1] for name in COHERENT_BRANCHES]
-    )
+    shares = branch_shares(positions)
     total = np.sum(shares * light * np.conj(symbols.ravel()))
     norm = np.sqrt(np.sum(shares**2) * np.sum(np.abs(light) ** 2))
     return float(abs(total) / max(norm, 1e-30))
+
+
+def branch_shares(positions: Real) -> Real:
+    """Share of each coherent branch in a symbol's light, to first order: a triangle in the exit centroid per axis.
+
+    Args:
+        positions: exit centroid over the pipe's width, (x, y') last, [N, 2].
+
+    Returns:
+        [branches of COHERENT_BRANCHES, N].
+    """
+    even = np.clip(1 - np.abs(positions - 2 * np.round(positions / 2)), 0, 1)
+    odd = np.clip(1 - np.abs(positions - (2 * np.floor(positions / 2) + 1)), 0, 1)
+    return np.stack(
+        [
+            (odd if name == "x" else even)[:, 0] * (odd if name == "y" else even)[:, 1]
+            for name in COHERENT_BRANCHES
+        ]
+    )

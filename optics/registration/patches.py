@@ -191,7 +191,7 @@ def _incoherent(trials: Complex, rows: int, columns: int) -> Real:
     """Sum over symbols of the power of each symbol's own sum, [K]."""
     samples = trials.shape[1] // rows
     per_symbol = trials.reshape(len(trials), rows, samples, columns, samples).sum(axis=(2, 4))
-    return np.maximum(np.sum(np.abs(per_symbol) ** 2, axis=(1, 2)), 1e-30)
+    return np.asarray(np.maximum(np.sum(np.abs(per_symbol) ** 2, axis=(1, 2)), 1e-30))
 
 
 def _peak(values: NDArray[np.floating], index: int) -> float:

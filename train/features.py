@@ -1,0 +1,140 @@
+"""Features of recorded pages: field, page by page piston and shift from the known symbols, localized light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from optics.page import symbol_phases
+from optics.profile import Profile
+from optics.recording import FramePair, Recording
+from optics.registration.coherence import COHERENT_BRANCHES, branch_shares
+from optics.registration.table import Table, sampling_table
+from optics.registration.twin import BRANCHES
+from train.field import FieldRecovery, TorchFieldSolver
+from train.localizers.coherent import CoherentLocalizer
+from train.localizers.wave import WaveLocalizer
+from train.twin import RayTwin, TorchTwin
+
+Real = NDArray[np.float64]
+
+_PROBE_PX = 0.3
+_LARGEST_STEP_PX = 0.5
+_GRID_STEP_PX = 2.0
+"""Camera pixels per sample of the common grid, see `optics.grid`."""
+
+
+@dataclass(frozen=True)
+class PageFeatures:
+    """One page as a network sees it.
+
+    Attributes:
+        light: demodulated samples [2, B, S, ny, nx], float16, piston taken off.
+        phases: true phases [ny, nx], float32, radians.
+        shift_px: image shift of the page (x, y) that was taken off, camera pixels.
+    """
+
+    light: NDArray[np.float16]
+    phases: NDArray[np.float32]
+    shift_px: tuple[float, float]
+
+
+class FeatureExtractor:
+    """Turns frame pairs of one calibrated device into features.
+
+    Args:
+        profile: the nominal device.
+        parameters: [P] fitted parameters.
+        turn: angle between the homodyne arms, radians.
+        references: reference-only frames.
+        localizer: `coherent` or `wave`.
+    """
+
+    def __init__(
+        self, profile: Profile, parameters: Real, turn: float, references: FramePair, localizer: str = "coherent"
+    ) -> None:
+        self.table: Table = sampling_table(TorchTwin(RayTwin(profile)), parameters, turn, profile)
+        self._solve = TorchFieldSolver(FieldRecovery(profile))
+        self._coherent = CoherentLocalizer(profile)
+        self._wave = WaveLocalizer(profile, parameters) if localizer == "wave" else None
+        self._references = references
+        shares = branch_shares(self.table["positions"].reshape(2, -1).T.astype(float))
+        self._shares = shares.reshape(len(COHERENT_BRANCHES), *profile.page_shape)
+        self._chosen = [BRANCHES.index(name) for name in COHERENT_BRANCHES]
+
+    @property
+    def positions(self) -> NDArray[np.float32]:
+        """Exit centroids of all symbols, [2, ny, nx]."""
+        return self.table["positions"]
+
+    def field(self, pair: FramePair) -> NDArray[np.complex64]:
+        """Recovered field on the common grid."""
+        return self._solve(pair, self._references, self.table["registration"], self.table["homodyne"])[0]
+
+    def pages(self, recording: Recording, indices: list[int]) -> Iterator[PageFeatures]:
+        """Features of the given pages, in order; the shift is followed from page to page."""
+        shift = np.zeros(2)
+        for index in indices:
+            symbols = recording.symbols(index)
+            assert symbols is not None
+            phases = symbol_phases(symbols, recording.levels)
+            page, shift = self.page(self.field(recording.frames(index)), phases, shift)
+            yield page
+
+    def page(self, field: NDArray[np.complex64], phases: Real, shift: Real) -> tuple[PageFeatures, Real]:
+        """Features of one page, and its shift, found from the known phases [ny, nx] starting from `shift` (x, y)."""
+        known = np.exp(-1j * phases)
+        for _ in range(2):
+            shift = shift + self._shift_step(field, known, shift)
+        piston = np.angle(self._agreement(self._light(field, shift), known))
+        light = self._light(field, shift) if self._wave is None else self._wave(_moved(field, shift))
+        if self._wave is not None:
+            centre = light[:, 0].mean(1)
+            piston = np.angle(np.sum((centre[0] + 1j * centre[1]) * known))
+        cos, sin = np.cos(piston), np.sin(piston)
+        turned = np.stack([light[0] * cos + light[1] * sin, light[1] * cos - light[0] * sin])
+        features = PageFeatures(
+            turned.astype(np.float16), phases.astype(np.float32), (float(shift[0]), float(shift[1]))
+        )
+        return features, shift
+
+    def _light(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.float32]:
+        places = self.table["places"] + (shift / _GRID_STEP_PX).astype(np.float32)[None, :, None, None]
+        with torch.no_grad():
+            light: NDArray[np.float32] = self._coherent(
+                torch.from_numpy(np.stack([field.real, field.imag])),
+                torch.from_numpy(places),
+                torch.from_numpy(self.table["place_gradients"]),
+                torch.from_numpy(self.table["phases"]),
+            ).numpy()
+        return light
+
+    def _agreement(self, light: NDArray[np.float32], known: NDArray[np.complex128]) -> complex:
+        """Coherent sum of the branches' light with the known symbols over the page."""
+        centre = light[:, self._chosen].mean(2)
+        return complex(np.sum(self._shares * (centre[0] + 1j * centre[1]) * known))
+
+    def _shift_step(self, field: NDArray[np.complex64], known: NDArray[np.complex128], shift: Real) -> Real:
+        """Vertex of the parabola of coherent power along x and along y."""
+        here = abs(self._agreement(self._light(field, shift), known)) ** 2
+        step = np.zeros(2)
+        for axis in (0, 1):
+            probe = _PROBE_PX * np.eye(2)[axis]
+            plus = abs(self._agreement(self._light(field, shift + probe), known)) ** 2
+            minus = abs(self._agreement(self._light(field, shift - probe), known)) ** 2
+            bend = plus - 2 * here + minus
+            if bend < 0:
+                step[axis] = -_PROBE_PX * (plus - minus) / (2 * bend)
+        return np.clip(step, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
+
+
+def _moved(field: NDArray[np.complex64], shift: Real) -> NDArray[np.complex64]:
+    """The field as seen `shift` (x, y) camera pixels further on."""
+    by = -shift[::-1] / _GRID_STEP_PX
+    real, imaginary = (ndimage.shift(part, by, order=3) for part in (field.real, field.imag))
+    return np.asarray(real + 1j * imaginary, dtype=np.complex64)

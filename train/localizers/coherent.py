@@ -1,0 +1,71 @@
+"""The coherent localizer: every branch sampled where it lands and freed from the phase of its path."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from optics.grid import field_grid
+from optics.profile import Profile
+from optics.registration.twin import BRANCHES
+
+SAMPLES = 4
+"""Samples per symbol and axis: the field's own rate at four SLM pixels a symbol."""
+POSITION_FEATURES = 4
+
+
+class CoherentLocalizer(nn.Module):
+    """Field and sampling table to features at symbol pitch.
+
+    Args:
+        profile: the nominal device.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        super().__init__()
+        self.grid_shape = field_grid(profile).shape
+        self.page_shape = profile.page_shape
+        steps = (torch.arange(SAMPLES, dtype=torch.float32) + 0.5) / SAMPLES - 0.5
+        self.offset_x: Tensor
+        self.offset_y: Tensor
+        self.register_buffer("offset_x", steps.repeat(SAMPLES).reshape(1, -1, 1, 1))
+        self.register_buffer("offset_y", steps.repeat_interleave(SAMPLES).reshape(1, -1, 1, 1))
+
+    @property
+    def light_channels(self) -> int:
+        """Features that carry light: real parts of all branches' samples, then imaginary parts."""
+        return 2 * len(BRANCHES) * SAMPLES**2
+
+    def forward(self, field: Tensor, places: Tensor, gradients: Tensor, phases: Tensor) -> Tensor:
+        """Demodulated samples.
+
+        Args:
+            field: [2, Gy, Gx] on the common grid.
+            places, gradients, phases: as `optics.registration.table.sampling_table` makes them.
+
+        Returns:
+            [2, B, S, ny, nx]: real and imaginary part, S samples of each symbol row by row, over the field's root
+            mean square.
+        """
+        x, y = self.offset_x, self.offset_y
+        column = places[:, 0:1] + gradients[:, 0:1] * x + gradients[:, 1:2] * y
+        row = places[:, 1:2] + gradients[:, 2:3] * x + gradients[:, 3:4] * y
+        value, along_x, along_y, xx, xy, yy = phases.unsqueeze(2).unbind(1)
+        phase = value + along_x * x + along_y * y + xx * x * x / 2 + xy * x * y + yy * y * y / 2
+        height, width = self.grid_shape
+        where = torch.stack([2 * column / (width - 1) - 1, 2 * row / (height - 1) - 1], dim=-1)
+        ny, nx = self.page_shape
+        sampled = functional.grid_sample(
+            field[None], where.reshape(1, -1, nx, 2), mode="bicubic", padding_mode="zeros", align_corners=True
+        ).reshape(2, len(BRANCHES), SAMPLES**2, ny, nx)
+        cos, sin = torch.cos(phase), torch.sin(phase)
+        scale = torch.rsqrt((field * field).mean() * 2 + 1e-12)
+        real = (sampled[0] * cos + sampled[1] * sin) * scale
+        imaginary = (sampled[1] * cos - sampled[0] * sin) * scale
+        return torch.stack([real, imaginary])
+
+
+def position_features(positions: Tensor) -> Tensor:
+    """Where in its zone a symbol's beam leaves the pipe: q and q - round(q) per axis, [2, ny, nx] to [4, ny, nx]."""
+    return torch.cat([positions, positions - torch.round(positions)])

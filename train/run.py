@@ -1,0 +1,110 @@
+"""The folder of a training run: what was chosen, what it was trained on, and how far it came."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from optics.errors import InvalidInputError
+from optics.profile import Profile, parse_profile
+from optics.registration.calibration import Calibration, parse_calibration
+from train.fitting import DecoderTraining, Hyperparameters, fixed_features
+from train.network import SymbolUNet
+
+DESCRIPTION = "run.json"
+WEIGHTS = "decoder.pt"
+REFERENCES = "references.npz"
+GOLDEN = "golden.npz"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a finished run is, as `run.json` keeps it.
+
+    Attributes:
+        localizer: name.
+        profile_toml, calibration_toml: the device.
+        hyperparameters: the choices.
+        camera_bit_depth: of the recording.
+        frame_dtype: of the recording's frames.
+        trained_pages: hashes of the pages that were trained on or used to stop.
+        validation_air: bits per data symbol.
+        kappa_scale: factor on p that makes the claimed concentration honest on the validation pages.
+        seconds: training time.
+        provenance: command, seed, commit.
+    """
+
+    localizer: str
+    profile_toml: str
+    calibration_toml: str
+    hyperparameters: Hyperparameters
+    camera_bit_depth: int
+    frame_dtype: str
+    trained_pages: tuple[str, ...]
+    validation_air: float
+    kappa_scale: float
+    seconds: float
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def profile(self) -> Profile:
+        """The nominal device."""
+        return parse_profile(self.profile_toml, "profile of the run")
+
+    @property
+    def calibration(self) -> Calibration:
+        """The fitted device."""
+        return parse_calibration(self.calibration_toml)
+
+    def save(self, folder: Path) -> None:
+        """Write `run.json`, last of all, so that a folder with it is a finished run."""
+        partial = folder / (DESCRIPTION + ".partial")
+        partial.write_text(json.dumps(asdict(self), indent=2))
+        partial.replace(folder / DESCRIPTION)
+
+
+def load_run(folder: Path) -> Run:
+    """Read a finished run.
+
+    Raises:
+        InvalidInputError: no such run, or one that has not finished.
+    """
+    path = folder / DESCRIPTION
+    try:
+        data = json.loads(path.read_text())
+        data["hyperparameters"] = Hyperparameters(**data["hyperparameters"])
+        data["trained_pages"] = tuple(data["trained_pages"])
+        return Run(**data)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InvalidInputError(f"run {folder}", error, f"a finished training run with {DESCRIPTION}") from None
+
+
+def save_network(module: DecoderTraining, folder: Path) -> None:
+    """Write the network's weights."""
+    torch.save(module.network.state_dict(), folder / WEIGHTS)
+
+
+def load_network(folder: Path, run: Run, light_channels: int) -> SymbolUNet:
+    """The trained network of a run.
+
+    Args:
+        folder: of the run.
+        run: its description.
+        light_channels: channels of the localizer's light.
+
+    Raises:
+        InvalidInputError: no weights, or weights of another network.
+    """
+    choices = run.hyperparameters
+    fixed = len(fixed_features(np.zeros((2, 2, 2), dtype=np.float32)))
+    network = SymbolUNet(light_channels + fixed, choices.channels, choices.blocks, choices.levels)
+    try:
+        network.load_state_dict(torch.load(folder / WEIGHTS, map_location="cpu", weights_only=True))
+    except (OSError, RuntimeError) as error:
+        raise InvalidInputError(f"weights {folder / WEIGHTS}", error, "the weights of this run") from None
+    return network.eval()
