@@ -326,21 +326,30 @@ class TestTruth:
         page = on_slm(random_phases(TALL, 0), TALL)
         field = optics.camera_field(optics.exit_field(page))
 
-        def shares(angle_deg: float) -> list[float]:
+        def arriving(angle_deg: float) -> np.ndarray:
+            """Light of each order in each quadrant, demodulated, over its root mean square amplitude, [2, 4]."""
             device = perfect_device(geometry=straight.model_copy(update={"pipe_angle_deg": angle_deg}))
             rays = twin.trace(true_parameters(TALL, device), points)
             corner = (np.abs(np.abs(rays.positions) - 1) < 0.2).all(axis=1)
+            quadrant = (2 * (points[:, 0] > 0) + (points[:, 1] > 0))[corner]
             found = []
             for b in (BRANCHES.index("xy"), BRANCHES.index("yx")):
                 x, y = rays.places[b, corner].T
                 parts = (resample(part, *optics.camera_axes_m, x, y) for part in (field.real, field.imag))
                 arrived = np.array([1, 1j]) @ np.stack(list(parts))
                 light = arrived * np.exp(-1j * (rays.phases[b, corner] + page.ravel()[corner]))
-                found.append(float(abs(np.mean(light)) / np.sqrt(np.mean(np.abs(light) ** 2))))
-            return found
+                scale = np.sqrt(np.mean(np.abs(light) ** 2))
+                found.append([light[quadrant == q].mean() / scale for q in range(4)])
+            return np.array(found)
 
-        assert min(shares(-0.6)) > 0.35
-        assert max(shares(0.6)) < 0.15
+        light = arriving(-0.6)
+        assert np.abs(light).min() > 0.4
+        assert np.abs(np.angle(light)).max() < 0.6
+        # without the shear both orders would arrive alike, here with the wrong phase; with its opposite, swapped
+        assert np.abs(np.angle(arriving(0.0))).min() > 2
+        assert (np.abs(light[0]) > np.abs(light[1])).all()
+        swapped = np.abs(arriving(0.6))
+        assert (swapped[0] < swapped[1]).all()
 
 
 def _centre_of_spot(frame: np.ndarray, reach_px: float = 14) -> np.ndarray:
