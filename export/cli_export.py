@@ -1,0 +1,126 @@
+"""The command `lightpage export`: a finished training run to a bundle that the runtime loads."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+import numpy as np
+
+from export.graph import TABLE_INPUTS, DecoderGraph, table_tensors
+from export.onnx_files import decoder_onnx, twin_onnx
+from export.parity import check_parity, torch_answer
+from optics.errors import InvalidInputError
+from optics.recording import FramePair
+from optics.registration.table import sampling_table
+from runtime.bundle import Bundle, npz, write_bundle
+from runtime.decoder import Decoder
+from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest, Provenance
+from train.localizers.coherent import CoherentLocalizer
+from train.run import GOLDEN as RUN_GOLDEN
+from train.run import REFERENCES, Run, load_network, load_run
+from train.twin import RayTwin, TorchTwin
+
+_RESIDUAL_HEADROOM = 3.0
+"""Limit of the homodyne residual over the golden page's: swapped frames stand far above it."""
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="New bundle: a folder, or a .zip.")
+@click.option("--name", default=None, help="Name of the bundle; the profile's if left out.")
+@click.option("--version", "version", default="1", show_default=True)
+def export(run: Path, out: Path, name: str | None, version: str) -> None:
+    """Export a training run, proving the bundle against torch with the runtime's own decoder."""
+    bundle, error = export_run(run, out, name, version)
+    size = sum(len(data) for data in bundle.files.values())
+    click.echo(f"{out}: version {version}, p within {error:.1e} of torch, {size / 1e6:.1f} MB unpacked")
+
+
+def export_run(folder: Path, out: Path, name: str | None = None, version: str = "1") -> tuple[Bundle, float]:
+    """Write the bundle of a run.
+
+    Returns:
+        The bundle as opened again, and the relative error of p against torch on the golden page.
+
+    Raises:
+        InvalidInputError: the run is unfinished or of a localizer that has no exported graph.
+        BundleError: the exported decoder does not say what torch says; nothing stays at `out`.
+    """
+    run = load_run(folder)
+    if run.localizer != "coherent":
+        raise InvalidInputError(f"run {folder}: localizer", repr(run.localizer), "'coherent', which has a graph")
+    profile, calibration = run.profile, run.calibration
+    network = load_network(folder, run, CoherentLocalizer(profile).light_channels)
+    graph = DecoderGraph(profile, network, run.kappa_scale).eval()
+    twin = RayTwin(profile)
+    table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
+    references, golden = _arrays(folder / REFERENCES), _arrays(folder / RUN_GOLDEN)
+    defaults = table_tensors(table, references["in_phase"], references["quadrature"])
+    pair = FramePair(golden["in_phase"], golden["quadrature"])
+    expected = torch_answer(graph, pair, defaults)
+    manifest = Manifest(
+        name=name or profile.name,
+        version=version,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        profile=run.profile_toml,
+        calibration=run.calibration_toml,
+        camera_bit_depth=run.camera_bit_depth,
+        frame_dtype="uint8" if run.frame_dtype == "uint8" else "uint16",
+        metrics={"validation_air_bits_per_symbol": run.validation_air, "training_seconds": run.seconds},
+        calibrated_pages=calibration.calibrated_pages,
+        trained_pages=run.trained_pages,
+        table_inputs=TABLE_INPUTS,
+        residual_output="residual",
+        residual_limit=_residual_limit(graph, pair, defaults, run),
+        provenance=Provenance(**run.provenance),
+    )
+    files = {
+        DECODER: decoder_onnx(graph, run.frame_dtype, profile.frame_shape, defaults),
+        TWIN: twin_onnx(twin),
+        GOLDEN: npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected),
+        PILOTS: npz(mask=references["pilots"]),
+    }
+    partial = out.with_name(f".{out.stem}-unproven{out.suffix}")
+    _remove(partial)
+    try:
+        write_bundle(partial, manifest, files)
+        decoder = Decoder.load(partial)
+        error = check_parity(expected, decoder.infer(pair).p, str(out))
+    finally:
+        _remove(partial)
+    write_bundle(out, manifest, files)
+    return Bundle.open(out), error
+
+
+def _residual_limit(graph: DecoderGraph, pair: FramePair, defaults: dict[str, np.ndarray], run: Run) -> float:
+    """What the golden page leaves of the homodyne equations, with headroom."""
+    import torch
+
+    with torch.no_grad():
+        residual = graph(
+            torch.from_numpy(pair.in_phase),
+            torch.from_numpy(pair.quadrature),
+            *(torch.from_numpy(np.ascontiguousarray(defaults[name])) for name in TABLE_INPUTS),
+        )[3]
+    del run
+    return _RESIDUAL_HEADROOM * float(residual)
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of a file of the run."""
+    try:
+        with np.load(path) as kept:
+            return dict(kept)
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"run file {path}", error, "a file of a finished run") from None
+
+
+def _remove(path: Path) -> None:
+    import shutil
+
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,76 @@
+"""Torch modules to ONNX files: inputs with defaults, names that the runtime knows."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import numpy_helper
+from torch import nn
+
+from export.graph import FRAME_INPUTS, OUTPUTS, TABLE_INPUTS, DecoderGraph
+from optics.registration.parameters import nominal
+from train.twin import RayTwin
+
+OPSET = 20
+TWIN_INPUTS = ("parameters", "points", "anchors", "camera_places")
+TWIN_OUTPUTS = ("places", "phases", "positions", "pixels")
+
+
+def decoder_onnx(
+    graph: DecoderGraph, frame_dtype: str, frame_shape: tuple[int, int], defaults: dict[str, NDArray[np.generic]]
+) -> bytes:
+    """The decoder as ONNX, the calibrated table as the default of its inputs.
+
+    Args:
+        graph: the decoder, in evaluation mode.
+        frame_dtype: "uint8" or "uint16".
+        frame_shape: (rows, columns).
+        defaults: tensor of every input of `TABLE_INPUTS`.
+    """
+    frame = torch.from_numpy(np.zeros(frame_shape, dtype=frame_dtype))
+    # torch.export takes one tensor given twice for one input, hence the clone below
+    tensors = [torch.from_numpy(np.ascontiguousarray(defaults[name])) for name in TABLE_INPUTS]
+    model = _export(graph, (frame, frame.clone(), *tensors), (*FRAME_INPUTS, *TABLE_INPUTS), OUTPUTS, None)
+    for name in TABLE_INPUTS:
+        model.graph.initializer.append(numpy_helper.from_array(np.ascontiguousarray(defaults[name]), name))
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString())
+
+
+def twin_onnx(twin: RayTwin) -> bytes:
+    """The ray twin as ONNX, any number of points."""
+    example = torch.zeros(3, 2, dtype=torch.float64)
+    points, places = torch.export.Dim("points", min=1), torch.export.Dim("camera_points", min=1)
+    shapes = ({}, {0: points}, {0: points}, {0: places})
+    inputs = (torch.from_numpy(nominal()), example, example.clone(), torch.zeros(5, 2, dtype=torch.float64))
+    model = _export(twin, inputs, TWIN_INPUTS, TWIN_OUTPUTS, shapes)
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString())
+
+
+def _export(
+    module: nn.Module,
+    inputs: tuple[torch.Tensor, ...],
+    names: tuple[str, ...],
+    outputs: tuple[str, ...],
+    shapes: tuple[dict[int, object], ...] | None,
+) -> onnx.ModelProto:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            module.eval(),
+            inputs,
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=list(names),
+            output_names=list(outputs),
+            dynamic_shapes=shapes,
+            external_data=False,
+            verbose=False,
+        )
+    assert program is not None
+    return program.model_proto

@@ -1,0 +1,37 @@
+"""Proof that an exported decoder says what torch says, on real frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from export.graph import TABLE_INPUTS, DecoderGraph
+from optics.errors import BundleError
+from optics.recording import FramePair
+
+TOLERANCE = 1e-3
+"""Largest error of p relative to its norm in fp32."""
+
+
+def torch_answer(graph: DecoderGraph, pair: FramePair, defaults: dict[str, NDArray[np.generic]]) -> NDArray[np.float32]:
+    """p of a frame pair by torch, [2, ny, nx]."""
+    with torch.no_grad():
+        answer: NDArray[np.float32] = graph(
+            torch.from_numpy(pair.in_phase),
+            torch.from_numpy(pair.quadrature),
+            *(torch.from_numpy(np.ascontiguousarray(defaults[name])) for name in TABLE_INPUTS),
+        )[0].numpy()
+    return answer
+
+
+def check_parity(expected: NDArray[np.float32], got: NDArray[np.float32], thing: str) -> float:
+    """Relative error of p.
+
+    Raises:
+        BundleError: it is larger than `TOLERANCE`, or not a number.
+    """
+    error = float(np.linalg.norm(got - expected) / max(float(np.linalg.norm(expected)), 1e-30))
+    if not error <= TOLERANCE:
+        raise BundleError(f"parity of {thing} with torch", f"p off by {error:.3g} of its norm", f"<= {TOLERANCE:g}")
+    return error
