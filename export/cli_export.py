@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from export.graph import TABLE_INPUTS, DecoderGraph, table_tensors
 from export.onnx_files import decoder_onnx, twin_onnx
@@ -19,7 +22,7 @@ from runtime.decoder import Decoder
 from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest, Provenance
 from train.localizers.coherent import CoherentLocalizer
 from train.run import GOLDEN as RUN_GOLDEN
-from train.run import REFERENCES, Run, load_network, load_run
+from train.run import REFERENCES, load_network, load_run
 from train.twin import RayTwin, TorchTwin
 
 _RESIDUAL_HEADROOM = 3.0
@@ -73,13 +76,13 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
         trained_pages=run.trained_pages,
         table_inputs=TABLE_INPUTS,
         residual_output="residual",
-        residual_limit=_residual_limit(graph, pair, defaults, run),
+        residual_limit=_RESIDUAL_HEADROOM * float(expected["residual"]),
         provenance=Provenance(**run.provenance),
     )
     files = {
         DECODER: decoder_onnx(graph, run.frame_dtype, profile.frame_shape, defaults),
         TWIN: twin_onnx(twin),
-        GOLDEN: npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected),
+        GOLDEN: npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected["p"]),
         PILOTS: npz(mask=references["pilots"]),
     }
     partial = out.with_name(f".{out.stem}-unproven{out.suffix}")
@@ -87,28 +90,14 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
     try:
         write_bundle(partial, manifest, files)
         decoder = Decoder.load(partial)
-        error = check_parity(expected, decoder.infer(pair).p, str(out))
+        error = check_parity(expected["p"], decoder.infer(pair).p, str(out))
     finally:
         _remove(partial)
     write_bundle(out, manifest, files)
     return Bundle.open(out), error
 
 
-def _residual_limit(graph: DecoderGraph, pair: FramePair, defaults: dict[str, np.ndarray], run: Run) -> float:
-    """What the golden page leaves of the homodyne equations, with headroom."""
-    import torch
-
-    with torch.no_grad():
-        residual = graph(
-            torch.from_numpy(pair.in_phase),
-            torch.from_numpy(pair.quadrature),
-            *(torch.from_numpy(np.ascontiguousarray(defaults[name])) for name in TABLE_INPUTS),
-        )[3]
-    del run
-    return _RESIDUAL_HEADROOM * float(residual)
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Arrays of a file of the run."""
     try:
         with np.load(path) as kept:
@@ -118,8 +107,6 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def _remove(path: Path) -> None:
-    import shutil
-
     if path.is_dir():
         shutil.rmtree(path)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 import onnx
@@ -45,7 +46,7 @@ def twin_onnx(twin: RayTwin) -> bytes:
     """The ray twin as ONNX, any number of points."""
     example = torch.zeros(3, 2, dtype=torch.float64)
     points, places = torch.export.Dim("points", min=1), torch.export.Dim("camera_points", min=1)
-    shapes = ({}, {0: points}, {0: points}, {0: places})
+    shapes: tuple[dict[int, Any], ...] = ({}, {0: points}, {0: points}, {0: places})
     inputs = (torch.from_numpy(nominal()), example, example.clone(), torch.zeros(5, 2, dtype=torch.float64))
     model = _export(twin, inputs, TWIN_INPUTS, TWIN_OUTPUTS, shapes)
     onnx.checker.check_model(model)
@@ -57,7 +58,7 @@ def _export(
     inputs: tuple[torch.Tensor, ...],
     names: tuple[str, ...],
     outputs: tuple[str, ...],
-    shapes: tuple[dict[int, object], ...] | None,
+    shapes: tuple[dict[int, Any], ...] | None,
 ) -> onnx.ModelProto:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

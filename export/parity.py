@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from export.graph import TABLE_INPUTS, DecoderGraph
+from export.graph import OUTPUTS, TABLE_INPUTS, DecoderGraph
 from optics.errors import BundleError
 from optics.recording import FramePair
 
@@ -14,15 +14,17 @@ TOLERANCE = 1e-3
 """Largest error of p relative to its norm in fp32."""
 
 
-def torch_answer(graph: DecoderGraph, pair: FramePair, defaults: dict[str, NDArray[np.generic]]) -> NDArray[np.float32]:
-    """p of a frame pair by torch, [2, ny, nx]."""
+def torch_answer(
+    graph: DecoderGraph, pair: FramePair, defaults: dict[str, NDArray[np.generic]]
+) -> dict[str, NDArray[np.float32]]:
+    """Every output of the decoder (`OUTPUTS`) for a frame pair, by torch."""
     with torch.no_grad():
-        answer: NDArray[np.float32] = graph(
+        answers = graph(
             torch.from_numpy(pair.in_phase),
             torch.from_numpy(pair.quadrature),
             *(torch.from_numpy(np.ascontiguousarray(defaults[name])) for name in TABLE_INPUTS),
-        )[0].numpy()
-    return answer
+        )
+    return {name: answer.numpy() for name, answer in zip(OUTPUTS, answers, strict=True)}
 
 
 def check_parity(expected: NDArray[np.float32], got: NDArray[np.float32], thing: str) -> float:

@@ -79,4 +79,5 @@ def expose(intensity: Real, electrons_per_unit: float, sensor: Sensor, rng: np.r
 def to_counts(electrons: Real, sensor: Sensor) -> NDArray[np.uint16]:
     """Electrons to counts: full scale is the full well."""
     top = 2**sensor.bit_depth - 1
-    return np.clip(np.rint(electrons * (top / sensor.full_well_e)), 0, top).astype(np.uint16)
+    counts = np.clip(np.rint(electrons * (top / sensor.full_well_e)), 0, top)
+    return np.asarray(counts, dtype=np.uint16)

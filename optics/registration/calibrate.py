@@ -32,6 +32,8 @@ _SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "launch")
 _ALL_GROUPS = tuple(dict.fromkeys(p.group for p in PARAMETERS))
 _POSE_ERRORS = np.array([0.1, 0.1, 2e-4, 2e-4, 2e-4, 2e-4])
 """How well known symbols place one camera against the other: shift (pixels), scales and turns."""
+_POSE_DRIFT = np.array([0.5, 0.5, 1e-3, 1e-3, 1e-3, 1e-3])
+"""How far one camera may have drifted against the other since an earlier calibration, same units."""
 _TURN_ERROR = np.deg2rad(0.6)
 """How well they give the angle between the arms."""
 _SAMPLES_PER_DEGREE = 6.0
@@ -101,6 +103,12 @@ _PHASE = (
     *(_Stage("phases, all pages", 1.5, 0.75, _ALL_GROUPS, COHERENT_BRANCHES, all_pages=True, use_phase=True),) * 2,
 )
 """Each round halves what is left of the error, since patches are measured about the current geometry."""
+_DRIFTED = (
+    _Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, samples=2),
+    _Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True, samples=2),
+    _Stage("phases, fine", 1, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True, samples=2),
+)
+"""From an earlier calibration: the complex field is right from the start, so nothing is searched camera by camera."""
 
 
 def calibrate(
@@ -162,13 +170,10 @@ def refine(
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.turn = start.copy(), turn
-    stages = (*_COMPLEX[1:], *_PHASE)
-    work.total = len(stages) + 3
-    work.single_camera(_Stage("find the cameras", 12, 3, _SHAPE_GROUPS), centre=start)
-    for stage in stages:
+    work.total = len(_DRIFTED) + 2
+    work.refine_homodyne(_POSE_DRIFT)
+    for stage in _DRIFTED:
         work.complex_field(stage)
-    work.estimate_turn()
-    work.refine_homodyne()
     return work.result(start)
 
 
@@ -242,7 +247,7 @@ class _Registration:
                 "angle between the homodyne arms", f"{np.rad2deg(self.turn):.0f} degrees", "about +90 or -90 degrees"
             )
 
-    def refine_homodyne(self) -> None:
+    def refine_homodyne(self, pose_errors: Real = _POSE_ERRORS, rounds: int = _HOMODYNE_ROUNDS) -> None:
         """Relation of the two cameras from the homodyne equations, which need no symbol.
 
         Angle between the arms and pose of the quadrature camera against the in-phase one: what is left of the
@@ -251,7 +256,7 @@ class _Registration:
         """
         self._tell("relation of the cameras")
         page, chosen = self.pages[0], indices("quadrature")
-        known = np.append(_POSE_ERRORS, _TURN_ERROR)
+        known = np.append(pose_errors, _TURN_ERROR)
         moved = np.zeros(len(known))
 
         def residual(offset: Real) -> NDArray[np.float32]:
@@ -259,7 +264,7 @@ class _Registration:
             parameters[chosen] += offset[:-1]
             return self._field(page, parameters, self.turn + float(offset[-1]))[1].ravel()
 
-        for _ in range(_HOMODYNE_ROUNDS):
+        for _ in range(rounds):
             here = residual(moved)
             slopes = np.stack([residual(moved + step) - here for step in np.diag(known)], axis=1)
             noise = float(here @ here) / len(here) * _SAMPLES_PER_DEGREE

@@ -61,8 +61,5 @@ def branch_shares(positions: Real) -> Real:
     even = np.clip(1 - np.abs(positions - 2 * np.round(positions / 2)), 0, 1)
     odd = np.clip(1 - np.abs(positions - (2 * np.floor(positions / 2) + 1)), 0, 1)
     return np.stack(
-        [
-            (odd if name == "x" else even)[:, 0] * (odd if name == "y" else even)[:, 1]
-            for name in COHERENT_BRANCHES
-        ]
+        [(odd if name == "x" else even)[:, 0] * (odd if name == "y" else even)[:, 1] for name in COHERENT_BRANCHES]
     )

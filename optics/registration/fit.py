@@ -111,7 +111,8 @@ def fit_parameters(
     parameters, pistons, shifts = unpack(solved.x)
     data = design.residuals(parameters, pistons, shifts, use_phase=use_phase)
     deviations = scale.copy()
-    covariance = np.linalg.pinv(solved.jac.T @ solved.jac)
+    slopes = np.asarray(solved.jac, dtype=np.float64)
+    covariance = np.linalg.pinv(slopes.T @ slopes)
     deviations[free] = np.sqrt(np.clip(np.diag(covariance)[: len(free)], 0, None)) * scale[free]
     return Fit(parameters, deviations, pistons, shifts, float(np.mean(np.minimum(data**2, 25.0))))
 

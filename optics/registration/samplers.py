@@ -37,7 +37,7 @@ class FrameSampler:
         """Values at camera-plane points [..., 2]."""
         pixels = self._twin.pixels(self._parameters, places.reshape(-1, 2))[self._camera]
         values = ndimage.map_coordinates(self._image, [pixels[:, 1], pixels[:, 0]], order=1)
-        return np.asarray(values).reshape(places.shape[:-1])
+        return np.asarray(values, dtype=np.float32).reshape(places.shape[:-1])
 
 
 class FieldSampler:

@@ -1,0 +1,53 @@
+"""The strictest test: a recording made by a simulator that shares nothing with ours, through the command line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.system.foreign_device import ForeignDevice
+
+PAGES = 16
+STEPS = 150
+MINUTES = 12
+
+
+def lightpage(*arguments: str) -> None:
+    """Run the command as a user would, in a process of its own."""
+    command = [sys.executable, "-m", "runtime.cli", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60 * MINUTES, check=False)
+    assert done.returncode == 0, f"{' '.join(arguments)}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(60 * MINUTES)
+def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decoded(tmp_path: Path) -> None:
+    seed = int(np.random.SeedSequence().generate_state(1)[0])
+    print(f"foreign device, seed {seed}")
+    recording = tmp_path / "foreign.h5"
+    device = ForeignDevice.draw(seed)
+    device.write(recording, pages=PAGES, levels=256, seed=seed)
+    with h5py.File(recording) as file:
+        assert "profile" not in file.attrs
+
+    calibration, run, bundle = tmp_path / "calibration.toml", tmp_path / "run", tmp_path / "bundle.zip"
+    found, figures = tmp_path / "calibration.json", tmp_path / "evaluation.json"
+    lightpage("calibrate", "--profile", "bench", "--recording", str(recording), "--out", str(calibration),
+              "--json", str(found))  # fmt: skip
+    angle = json.loads(found.read_text())["angle_deg"]
+    assert abs(angle - device.parameters.pipe_angle_deg) <= 0.03, f"seed {seed}"
+
+    lightpage("train", "--profile", "bench", "--recording", str(recording), "--calibration", str(calibration),
+              "--localizer", "coherent", "--steps", str(STEPS), "--out", str(run))  # fmt: skip
+    lightpage("export", str(run), "--out", str(bundle))
+    lightpage("evaluate", "--bundle", str(bundle), "--recording", str(recording), "--json", str(figures))
+    evaluation = json.loads(figures.read_text())
+    assert evaluation["pages"] >= 1
+    # 150 steps on 13 pages are a start, not a decoder; unrelated light gives zero or less
+    assert evaluation["air_bits_per_symbol"] > 1.0, f"seed {seed}: {evaluation}"
