@@ -38,6 +38,14 @@ _TURN_ERROR = np.deg2rad(0.6)
 """How well they give the angle between the arms."""
 _SAMPLES_PER_DEGREE = 6.0
 """Grid samples per independent number of the residual: the grid's rate over the pipe's band, squared."""
+_LEAST_OVER_CHANCE = 8.0
+"""Coherence that a calibration must reach, in units of 1/sqrt(symbols of a page), what chance gives. Measured on the
+bench device: 34 or more where it was found, 18 with half of the symbols wrong; at most 2.3 for the right symbols at
+nominal geometry and 1.2 for unrelated symbols at the right one."""
+_LEAST_SIGNIFICANT = 0.1
+"""Share of the searched patches that must be found in the end: half are where the device was found, a quarter with half
+of the symbols wrong (no branch carries light from all of the page)."""
+_WANTED = "right symbols and profile, a device in the capture range"
 _HOMODYNE_ROUNDS = 2
 _LEAST_QUADRATURE = 0.5
 """Sine of the angle between the arms below which the two frames hardly differ."""
@@ -106,7 +114,7 @@ _PHASE = (
 _DRIFTED = (
     _Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, samples=2),
     _Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True, samples=2),
-    _Stage("phases, fine", 1, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True, samples=2),
+    *(_Stage("phases, fine", 1, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True, samples=4),) * 2,
 )
 """From an earlier calibration: the complex field is right from the start, so nothing is searched camera by camera."""
 
@@ -175,6 +183,26 @@ def refine(
     for stage in _DRIFTED:
         work.complex_field(stage)
     return work.result(start)
+
+
+def check_found(coherence: float, significant: float, symbols: int) -> None:
+    """Check that a registration ended at the device and not at a guess.
+
+    Args:
+        coherence: of the known pages with the fitted geometry.
+        significant: share of the patches that were found in the last stage.
+        symbols: number of symbols on a page.
+
+    Raises:
+        CalibrationError: unrelated light would do nearly as well.
+    """
+    least = _LEAST_OVER_CHANCE / symbols**0.5
+    if not (coherence >= least and significant >= _LEAST_SIGNIFICANT):
+        raise CalibrationError(
+            "calibration, outcome",
+            f"a coherence of {coherence:.3f} and {significant:.0%} of the patches found",
+            f"at least {least:.3f} and {_LEAST_SIGNIFICANT:.0%}: {_WANTED}",
+        )
 
 
 class _Registration:
@@ -279,6 +307,8 @@ class _Registration:
         if self.fit is None:
             raise CalibrationError("calibration", "no fit", "at least one stage")
         after = float(np.mean([self._coherence(page, self.parameters) for page in self.pages]))
+        significant = len(self._last) / self._looked
+        check_found(after, significant, self.pages[0].symbols.size)
         return Registered(
             parameters=self.parameters,
             deviations=self.fit.deviations,
@@ -286,7 +316,7 @@ class _Registration:
             coherence_before=float(np.mean([self._coherence(page, before) for page in self.pages])),
             coherence_after=after,
             cost=self.fit.cost,
-            significant=len(self._last) / self._looked,
+            significant=significant,
         )
 
     def _coherence(self, page: KnownPage, parameters: Real) -> float:
@@ -349,7 +379,7 @@ class _Registration:
             raise CalibrationError(
                 f"calibration, stage '{stage.name}'",
                 f"{len(good)} of {len(found)} patches of known symbols found (best significance {best:.1f})",
-                f"at least {_FEWEST} above {SIGNIFICANT:.0f}: right symbols and profile, a device in the capture range",
+                f"at least {_FEWEST} above {SIGNIFICANT:.0f}: {_WANTED}",
             )
         self.fit = fit_parameters(
             self.twin,

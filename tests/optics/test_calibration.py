@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.errors import InvalidInputError, ProfileError, RecordingError
+from optics.errors import CalibrationError, InvalidInputError, ProfileError, RecordingError
 from optics.profile import load_profile
 from optics.recording import FramePair, Recording, RecordingWriter
-from optics.registration.calibrate import Registered
+from optics.registration.calibrate import Registered, check_found
 from optics.registration.calibration import Calibration, load_calibration, parse_calibration
 from optics.registration.known import known_pages
 from optics.registration.parameters import NAMES, PRIORS
@@ -116,3 +116,21 @@ def test_pages_without_symbols_are_not_known(tmp_path: Path) -> None:
     _record(tmp_path / "r.h5", 256, None)
     with Recording.open(tmp_path / "r.h5") as recording, pytest.raises(RecordingError, match="'symbols': got none"):
         known_pages(recording, PROFILE, [0])
+
+
+BENCH_SYMBOLS = 56 * 87
+
+
+@pytest.mark.parametrize(("coherence", "significant"), [(0.49, 0.51), (0.26, 0.25)])
+def test_a_device_that_was_found_is_accepted(coherence: float, significant: float) -> None:
+    check_found(coherence, significant, BENCH_SYMBOLS)
+
+
+@pytest.mark.parametrize(
+    ("coherence", "significant"),
+    [(0.0165, 0.5), (0.033, 0.5), (0.49, 0.03), (float("nan"), 0.5)],
+    ids=["unrelated symbols", "nominal geometry", "a few patches by chance", "nothing at all"],
+)
+def test_an_outcome_near_chance_is_no_calibration(coherence: float, significant: float) -> None:
+    with pytest.raises(CalibrationError, match="calibration, outcome"):
+        check_found(coherence, significant, BENCH_SYMBOLS)
