@@ -144,6 +144,28 @@ class TestAccuracy:
         assert error_db(field, recorded.truth) > -22
 
 
+class TestClosedRoot:
+    @pytest.mark.parametrize("turn_deg", [70.0, 90.0, -105.0])
+    def test_an_even_weak_field_is_solved_without_any_round(
+        self, turn_deg: float, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(train.field, "_DAMPING", ())
+        turn, field = np.deg2rad(turn_deg), 0.3 - 0.2j
+        reference = np.full(PROFILE.frame_shape, 80.0)
+        frames = [reference * abs(1 + field) ** 2, reference * abs(np.exp(1j * turn) + field) ** 2]
+        got, residual = FieldRecovery(PROFILE)(
+            *(torch.tensor(frame, dtype=torch.float32) for frame in (*frames, reference, reference)),
+            torch.tensor(registration((0.0, 0.0))),
+            torch.tensor([np.cos(turn), np.sin(turn)], dtype=torch.float32),
+        )
+        # away from the edges, where the light ends
+        middle = (slice(60, -60), slice(60, -60))
+        scale = float(torch.linalg.norm(got[:, *middle]) / np.sqrt(got[0][middle].numel()) / abs(field))
+        np.testing.assert_allclose(got[0][middle] / scale, field.real, atol=2e-4)
+        np.testing.assert_allclose(got[1][middle] / scale, field.imag, atol=2e-4)
+        assert float(residual[:, *middle].abs().max()) < 1e-4 * scale
+
+
 class TestResidual:
     def test_it_rises_when_the_angle_between_the_arms_is_wrong(self, recorded: Recorded) -> None:
         right = left_over(*solve(recorded))
@@ -177,14 +199,14 @@ class TestResidual:
 
 class TestDarkness:
     def test_where_the_reference_is_dark_there_is_neither_light_nor_nan(self, recorded: Recorded) -> None:
-        def half_dark(frame: np.ndarray) -> np.ndarray:
+        def half_dark(frame: np.ndarray, stray: int) -> np.ndarray:
             dark = frame.copy()
-            dark[:, : dark.shape[1] // 2] = 0
+            dark[:, : dark.shape[1] // 2] = stray
             return dark
 
         dimmed = Recorded(
-            FramePair(half_dark(recorded.pair.in_phase), half_dark(recorded.pair.quadrature)),
-            FramePair(half_dark(recorded.references.in_phase), half_dark(recorded.references.quadrature)),
+            FramePair(half_dark(recorded.pair.in_phase, 4), half_dark(recorded.pair.quadrature, 3)),
+            FramePair(half_dark(recorded.references.in_phase, 0), half_dark(recorded.references.quadrature, 0)),
             recorded.truth,
             recorded.turn,
         )
