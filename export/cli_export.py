@@ -25,8 +25,8 @@ from train.run import GOLDEN as RUN_GOLDEN
 from train.run import REFERENCES, load_network, load_run
 from train.twin import RayTwin, TorchTwin
 
-_RESIDUAL_HEADROOM = 3.0
-"""Limit of the homodyne residual over the golden page's: swapped frames stand far above it."""
+_LEAST_CONTRAST = 2.0
+"""Residual of swapped frames over that of right ones below which the two cannot be told apart by it."""
 
 
 @click.command()
@@ -76,7 +76,7 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
         trained_pages=run.trained_pages,
         table_inputs=TABLE_INPUTS,
         residual_output="residual",
-        residual_limit=_RESIDUAL_HEADROOM * float(expected["residual"]),
+        residual_limit=_residual_limit(graph, pair, defaults),
         provenance=Provenance(**run.provenance),
     )
     files = {
@@ -95,6 +95,13 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
         _remove(partial)
     write_bundle(out, manifest, files)
     return Bundle.open(out), error
+
+
+def _residual_limit(graph: DecoderGraph, pair: FramePair, defaults: dict[str, NDArray[np.generic]]) -> float | None:
+    """Half way, in ratio, between the residual of a right pair and of the same pair swapped; None where both are alike."""
+    right = float(torch_answer(graph, pair, defaults)["residual"])
+    swapped = float(torch_answer(graph, FramePair(pair.quadrature, pair.in_phase), defaults)["residual"])
+    return float(np.sqrt(right * swapped)) if swapped > _LEAST_CONTRAST * right else None
 
 
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:

@@ -1,0 +1,142 @@
+"""An exported run says what torch says, carries its table as a default, and fails loudly where it does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from export import cli_export
+from export.cli_export import export_run
+from export.graph import TABLE_INPUTS
+from export.parity import check_parity
+from optics.device import Device
+from optics.errors import BundleError, InvalidInputError
+from optics.page import pilot_mask, random_symbols
+from optics.registration.calibrate import Registered
+from optics.registration.calibration import Calibration
+from optics.registration.parameters import NAMES
+from optics.simulator import Simulator, true_parameters
+from runtime.bundle import Bundle
+from runtime.decoder import Decoder
+from runtime.ort import open_session
+from tests.optics.small import small_profile
+from train.fitting import Hyperparameters, fixed_features
+from train.localizers.coherent import CoherentLocalizer
+from train.network import SymbolUNet
+from train.run import GOLDEN, REFERENCES, WEIGHTS, Run, load_run
+from train.twin import RayTwin, TorchTwin
+
+CHOICES = Hyperparameters(channels=8, blocks=1)
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose network was never trained: parity does not ask how well it decodes."""
+    folder = tmp_path_factory.mktemp("run")
+    profile, device = small_profile(), Device()
+    simulator = Simulator(profile, device, seed=1)
+    pair, references = (
+        simulator.page(random_symbols(profile, 256, 1, np.random.default_rng(1))[0]),
+        simulator.references(),
+    )
+    turn = np.pi / 2 + np.deg2rad(device.homodyne.quadrature_error_deg)
+    fitted = Registered(true_parameters(profile, device), np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
+    torch.manual_seed(0)
+    features = CoherentLocalizer(profile).light_channels + len(fixed_features(np.zeros((2, 2, 2), dtype=np.float32)))
+    network = SymbolUNet(features, CHOICES.channels, CHOICES.blocks, CHOICES.levels)
+    torch.save(network.state_dict(), folder / WEIGHTS)
+    np.savez(folder / GOLDEN, in_phase=pair.in_phase, quadrature=pair.quadrature)
+    np.savez(
+        folder / REFERENCES,
+        in_phase=references.in_phase,
+        quadrature=references.quadrature,
+        pilots=pilot_mask(profile),
+    )
+    Run(
+        localizer="coherent",
+        profile_toml=profile.to_toml(),
+        calibration_toml=Calibration.from_registered(fitted, profile, ["0" * 64]).to_toml(),
+        hyperparameters=CHOICES,
+        camera_bit_depth=8,
+        frame_dtype="uint8",
+        trained_pages=("1" * 64,),
+        validation_air=0.0,
+        kappa_scale=1.3,
+        seconds=0.0,
+    ).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Bundle, float, Path]:
+    path = tmp_path_factory.mktemp("bundle") / "small.zip"
+    return (*export_run(run_folder, path), path)
+
+
+def test_the_bundle_says_what_torch_says(exported: tuple[Bundle, float, Path]) -> None:
+    assert exported[1] <= 1e-3
+
+
+def test_the_table_is_a_default_that_can_be_fed_instead(exported: tuple[Bundle, float, Path]) -> None:
+    decoder = Decoder.load(exported[2])
+    golden = decoder.bundle.golden
+    plain = decoder.infer(golden.pair).p
+    phases = decoder.table_shapes["phases"]
+    fed = decoder.infer(golden.pair, {"phases": np.zeros([n or 1 for n in phases], dtype=np.float32)}).p
+    assert set(decoder.table_shapes) == set(TABLE_INPUTS)
+    assert np.linalg.norm(fed - plain) > 0.01 * np.linalg.norm(plain)
+
+
+def test_the_twin_in_the_bundle_traces_as_torch_does(exported: tuple[Bundle, float, Path]) -> None:
+    bundle = exported[0]
+    session = open_session(bundle.files["twin.onnx"], "twin", 1)
+    parameters = true_parameters(bundle.profile, Device())
+    points = np.random.default_rng(0).uniform(-5e-4, 5e-4, (17, 2))
+    names = ["places", "phases", "positions", "pixels"]
+    places, phases, positions, pixels = session.run(
+        names, {"parameters": parameters, "points": points, "anchors": points, "camera_places": points[:4]}
+    )
+    twin = TorchTwin(RayTwin(bundle.profile))
+    rays = twin.trace(parameters, points)
+    np.testing.assert_allclose(places, rays.places, atol=1e-12)
+    np.testing.assert_allclose(phases, rays.phases, atol=1e-3)
+    np.testing.assert_allclose(positions, rays.positions, atol=1e-6)
+    np.testing.assert_allclose(pixels, twin.pixels(parameters, points[:4]), atol=1e-3)
+
+
+def test_swapped_frames_are_refused(exported: tuple[Bundle, float, Path]) -> None:
+    decoder = Decoder.load(exported[2])
+    pair = decoder.bundle.golden.pair
+    with pytest.raises(InvalidInputError, match="contradict"):
+        decoder.infer(type(pair)(pair.quadrature, pair.in_phase))
+
+
+def test_a_graph_that_differs_from_torch_leaves_no_bundle(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer = cli_export.torch_answer
+
+    def off(*arguments: object) -> dict[str, np.ndarray]:
+        outputs = answer(*arguments)  # type: ignore[arg-type]
+        return {**outputs, "p": outputs["p"] * 1.01}
+
+    monkeypatch.setattr(cli_export, "torch_answer", off)
+    with pytest.raises(BundleError):
+        export_run(run_folder, tmp_path / "bad.zip")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_parity_is_judged_against_the_norm_and_never_passes_nan() -> None:
+    p = np.ones((2, 3, 4), dtype=np.float32)
+    assert check_parity(p, p * (1 + 5e-4), "x") == pytest.approx(5e-4, rel=1e-2)
+    for wrong in (p * 1.002, p * np.nan):
+        with pytest.raises(BundleError, match="parity"):
+            check_parity(p, wrong, "x")
+
+
+def test_an_unfinished_run_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"run\.json"):
+        load_run(tmp_path)
