@@ -98,7 +98,7 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
 
 
 def _residual_limit(graph: DecoderGraph, pair: FramePair, defaults: dict[str, NDArray[np.generic]]) -> float | None:
-    """Half way, in ratio, between the residual of a right pair and of the same pair swapped; None where both are alike."""
+    """Half way, in ratio, between the residuals of right and of swapped frames; None where both are alike."""
     right = float(torch_answer(graph, pair, defaults)["residual"])
     swapped = float(torch_answer(graph, FramePair(pair.quadrature, pair.in_phase), defaults)["residual"])
     return float(np.sqrt(right * swapped)) if swapped > _LEAST_CONTRAST * right else None
