@@ -20,6 +20,8 @@ from runtime.manifest import DECODER, GOLDEN
 from runtime.ort import Node, Session, open_session
 
 OUTPUTS = ("p", "phase", "concentration")
+FIELD_OUTPUTS = ("field", "unexplained")
+"""Optional outputs, [2, Gy, Gx] each: the recovered field, and what is left of the homodyne equations."""
 GOLDEN_TOLERANCE = 1e-3
 """Largest error of p on the golden page, relative to its norm: room for another CPU's rounding, not for another net."""
 
@@ -193,6 +195,32 @@ class Decoder:
                 f"an in-phase and a quadrature frame of one shot, not swapped (residual up to {limit:.3g})",
             )
         return Inference(p, phase, concentration)
+
+    def recover_field(
+        self,
+        pair: FramePair,
+        references: FramePair,
+        registration: NDArray[np.float32],
+        homodyne: NDArray[np.float32],
+    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+        """The field behind a frame pair (`optics.registration.twin.FieldSolver`), whatever its residual is.
+
+        Raises:
+            BundleError: the graph does not show its field.
+            InvalidInputError: a tensor that does not fit.
+        """
+        if missing := set(FIELD_OUTPUTS) - {node.name for node in self._session.get_outputs()}:
+            raise BundleError(f"{self._thing}: outputs", f"no {', '.join(sorted(missing))}", "a graph with its field")
+        table: Table = {
+            "reference_in_phase": references.in_phase,
+            "reference_quadrature": references.quadrature,
+            "registration": registration,
+            "homodyne": homodyne,
+        }
+        self.check_table(table)
+        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **self._table, **table}
+        (real, imaginary), left = self._session.run(FIELD_OUTPUTS, feeds)
+        return np.asarray(real + 1j * imaginary, np.complex64), left
 
     def decode(
         self, pair: FramePair, levels: int = 256, table: Table | None = None, pilots: Pilots | None = None

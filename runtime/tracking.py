@@ -6,9 +6,17 @@ import threading
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from optics.recording import FramePair
 from runtime.bundle import Table
 from runtime.decoder import DecodedPage, Decoder
+from runtime.phase_shift import PhaseShift
+
+GAIN = 0.5
+"""Share of a measured shift that is believed at once. The image walks 0.02 px a page and a page shows it to 0.03 px by
+its pilots, to 0.005 px with safe decisions; the page after then lies 0.029 or 0.023 px (root mean square) off the
+estimate, against 0.029 and 0.021 at the best gain of either, 0.5 and 1."""
 
 
 @dataclass(frozen=True)
@@ -106,5 +114,20 @@ class ShiftTracker:
 
 
 def tracker_for(decoder: Decoder) -> Tracker:
-    """The tracker that a bundle's decoder is run with, in service and in evaluation."""
-    return NoTracker()
+    """The tracker that a bundle's decoder is run with, in service and in evaluation.
+
+    Raises:
+        BundleError, CalibrationError: see `PhaseShift.of_decoder`.
+    """
+    if "places" not in decoder.table_shapes:
+        return NoTracker()
+    reader = PhaseShift.of_decoder(decoder)
+
+    def measure(pair: FramePair, page: DecodedPage, table: Table) -> Shift | None:
+        found = reader.measure(page)
+        return None if found is None else Shift(float(found[0]), float(found[1]))
+
+    def move(shift: Shift) -> Table:
+        return reader.move(np.array([shift.x_px, shift.y_px]))
+
+    return ShiftTracker(measure, move, GAIN)
