@@ -28,9 +28,7 @@ WARM_UP = 2
 
 @click.command()
 @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
-@click.option(
-    "--rounds", default=20, show_default=True, type=click.IntRange(3, 1000), help="Timed rounds of all three."
-)
+@click.option("--rounds", default=20, show_default=True, type=click.IntRange(3, 1000), help="Timed rounds.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the figures to this file.")
 def bench(bundle: str, rounds: int, threads: int | None, json_path: Path | None) -> None:

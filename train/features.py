@@ -53,13 +53,21 @@ class FeatureExtractor:
         turn: angle between the homodyne arms, radians.
         references: reference-only frames.
         localizer: `coherent` or `wave`.
+        with_signal_power: see `FieldRecovery`.
     """
 
     def __init__(
-        self, profile: Profile, parameters: Real, turn: float, references: FramePair, localizer: str = "coherent"
+        self,
+        profile: Profile,
+        parameters: Real,
+        turn: float,
+        references: FramePair,
+        localizer: str = "coherent",
+        *,
+        with_signal_power: bool = True,
     ) -> None:
         self.table: Table = sampling_table(TorchTwin(RayTwin(profile)), parameters, turn, profile)
-        self._solve = TorchFieldSolver(FieldRecovery(profile))
+        self._solve = TorchFieldSolver(FieldRecovery(profile, with_signal_power=with_signal_power))
         self._coherent = CoherentLocalizer(profile)
         self._wave = WaveLocalizer(profile, parameters) if localizer == "wave" else None
         self._references = references

@@ -34,10 +34,13 @@ class FieldRecovery(nn.Module):
 
     Args:
         profile: the nominal device.
+        with_signal_power: whether the frames hold |E|^2; an oracle takes it off beforehand, and the equations are then
+            linear.
     """
 
-    def __init__(self, profile: Profile) -> None:
+    def __init__(self, profile: Profile, *, with_signal_power: bool = True) -> None:
         super().__init__()
+        self.with_signal_power = with_signal_power
         grid = field_grid(profile)
         self.grid: FieldGrid = grid
         self.rows_px, self.columns_px = profile.frame_shape
@@ -101,6 +104,8 @@ class FieldRecovery(nn.Module):
         closed root nearer to the linear estimate, then damped Gauss-Newton steps, every round kept to the pipe's band.
         """
         start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) / amplitude
+        if not self.with_signal_power:
+            return start[0], start[1]
         # Im e = slope Re e - offset, from the difference of the equations; then a quadratic in Re e
         slope, offset = (1 - cos) / sin, (a - b) / sin
         quadratic = 1 + slope * slope
