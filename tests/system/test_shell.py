@@ -253,3 +253,16 @@ print(sorted(file.name for file in files("optics").joinpath("profiles").iterdir(
 print(all(files(package).joinpath("py.typed").is_file() for package in ("optics", "train", "export", "runtime")))
 """
     assert ask(torchless, lists_files) == "['bench.toml', 'paper.toml']\nTrue"
+
+
+def test_the_shipped_bundle_decodes_without_torch(torchless: Path) -> None:
+    decodes = """
+import sys
+import numpy as np
+from runtime.decoder import Decoder
+from runtime.shipped import bundle_path
+decoder = Decoder.load(bundle_path("bench"), threads=1)
+page = decoder.decode(decoder.bundle.golden.pair, 16)
+print(page.symbols.shape, bool(np.median(page.confidence) > 0.5), "torch" in sys.modules)
+"""
+    assert ask(torchless, decodes) == "(56, 87) True False"
