@@ -1,0 +1,66 @@
+"""`lightpage demo`: the main job on the simulated device, with the shipped bundle."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import click
+from tqdm import tqdm
+
+from optics.errors import InvalidInputError
+from runtime.demo import DemoResult, run_demo
+from runtime.report import write_json
+from runtime.shipped import DEFAULT, bundle_path
+
+
+@click.command()
+@click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+@click.option(
+    "--out", default="out/demo", show_default=True, type=click.Path(file_okay=False, path_type=Path), help="Folder."
+)
+@click.option("--pages", default=3, show_default=True, type=click.IntRange(1, 100), help="Pages in each state.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of what is written.")
+@click.option("--json", "json_path", type=click.Path(), help="Also write the figures to this file.")
+def demo(bundle: str, out: Path, pages: int, seed: int, json_path: str | None) -> None:
+    """Decode pages of the simulated device through a service, let the device drift, recalibrate, decode again.
+
+    Writes demo.json and demo.png (frames, confidence, AIR in each state) to the folder --out.
+    """
+    from runtime.demo_figure import write_figure  # matplotlib takes long to import
+
+    start = time.perf_counter()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
+    with tqdm(total=100, unit="%", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}") as bar:
+
+        def progress(what: str, share: float) -> None:
+            bar.set_description(what)
+            bar.update(max(0.0, 100 * share - bar.n))
+
+        result = run_demo(bundle_path(bundle), pages, seed, progress)
+    figures = result.to_json() | {"seconds": time.perf_counter() - start}
+    write_json(out / "demo.json", figures)
+    if json_path is not None:
+        write_json(json_path, figures)
+    write_figure(result, out / "demo.png")
+    click.echo(describe(result))
+    click.echo(f"\nwritten to {out}: demo.json, demo.png ({figures['seconds']:.0f} s)")
+
+
+def describe(result: DemoResult) -> str:
+    """The figures as a table for people."""
+    lines = [
+        f"{'device':<16}{'model':<16}{'AIR, bit/symbol':>16}{'confidence':>12}{'error rate':>12}{'decode, ms':>12}"
+    ]
+    lines += [
+        f"{phase.name:<16}{phase.model_version:<16}{phase.air_bits_per_symbol:>16.3f}{phase.confidence.mean():>12.3f}"
+        f"{phase.symbol_error_rate:>12.4f}{1e3 * phase.seconds:>12.0f}"
+        for phase in result.phases
+    ]
+    found = result.recalibrated
+    angle = "" if found.angle_deg is None else f", pipe angle {found.angle_deg:.3f} degree"
+    lines.append(f"\nrecalibrated with {found.pages_used} known pages in {found.seconds:.0f} s{angle}")
+    return "\n".join(lines)
