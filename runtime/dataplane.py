@@ -23,6 +23,7 @@ from runtime.receiver import PairReceiver
 from runtime.registry import Model, ModelRegistry
 from runtime.sources import FrameSource, SourcePage
 from runtime.store import ModelStore
+from runtime.tracking import decode_tracked
 
 
 @dataclass(frozen=True)
@@ -201,10 +202,7 @@ class DataPlane:
 
     @staticmethod
     def _decode(model: Model, pair: FramePair, levels: int, pilots: Pilots | None) -> DecodedPage:
-        table = model.tracker.table()
-        page = model.decoder.decode(pair, levels, table, pilots)
-        model.tracker.update(pair, page, table)
-        return page
+        return decode_tracked(model.decoder, model.tracker, pair, levels, pilots)
 
     @contextmanager
     def _slot(self, slots: threading.BoundedSemaphore, what: str, caller: Caller) -> Iterator[None]:

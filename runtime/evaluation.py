@@ -14,7 +14,7 @@ from optics.pilots import Pilots
 from optics.recording import Recording, hash_frames
 from runtime.decoder import Decoder
 from runtime.frames import narrow
-from runtime.tracking import Tracker
+from runtime.tracking import Tracker, decode_tracked
 
 PageDone = Callable[[], object]
 
@@ -126,9 +126,7 @@ def evaluate(
         symbols = recording.symbols(index)
         if unseen and symbols is not None:
             pair = narrow(recording.frames(index), recording.bit_depth)
-            table = tracker.table()
-            page = decoder.decode(pair, levels, table, Pilots.of_symbols(mask, symbols, levels))
-            tracker.update(pair, page, table)
+            page = decode_tracked(decoder, tracker, pair, levels, Pilots.of_symbols(mask, symbols, levels))
             phases.append(page.phase[data])
             concentrations.append(page.concentration[data])
             truths.append(symbols[data])

@@ -8,10 +8,17 @@ from typing import Protocol
 
 import numpy as np
 
+from optics.pilots import Pilots
 from optics.recording import FramePair
 from runtime.bundle import Table
 from runtime.decoder import DecodedPage, Decoder
 from runtime.phase_shift import PhaseShift
+
+JUMP_PX = 0.1
+"""Shift from one page to the next that noise (0.03 px on a bench page's pilots) and slow drift do not explain."""
+
+ATTEMPTS = 3
+"""Most decodes of one page: a jump is read to a tenth of itself, so two corrections settle any."""
 
 GAIN = 0.5
 """Share of a measured shift that is believed at once. The image walks 0.02 px a page and a page shows it to 0.03 px by
@@ -47,8 +54,8 @@ class Tracker(Protocol):
     def table(self) -> Table:
         """Tensors for the next page, empty for the bundle's own."""
 
-    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> Table:
-        """Learn from a decoded page and the table that it was decoded with; returns the next page's table."""
+    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> bool:
+        """Learn from a decoded page and the table that it was decoded with; whether decoding it again would pay."""
 
 
 class NoTracker:
@@ -58,9 +65,9 @@ class NoTracker:
         """Always empty."""
         return {}
 
-    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> Table:
+    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> bool:
         """Learns nothing."""
-        return {}
+        return False
 
 
 class ShiftTracker:
@@ -92,25 +99,45 @@ class ShiftTracker:
         with self._lock:
             return self._table
 
-    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> Table:
-        """Take in the shift that `page`, decoded with `table`, still shows.
+    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> bool:
+        """Take in the shift that `page`, decoded with `table`, still shows; whether it was a jump.
 
-        A page decoded with a table that has been replaced since is left out: its remainder is already accounted for.
+        A jump is believed at once. A page decoded with a table that has been replaced since is left out: its remainder
+        is already accounted for.
         """
         rest = self._measure(pair, page, table)
         with self._lock:
             if rest is None or table is not self._table:
-                return self._table
+                return False
             before = self._shift
-        after = Shift(self._step(before.x_px, rest.x_px), self._step(before.y_px, rest.y_px))
+        jumped = max(abs(rest.x_px), abs(rest.y_px)) > JUMP_PX
+        gain = 1.0 if jumped else self._gain
+        after = Shift(self._step(before.x_px, gain * rest.x_px), self._step(before.y_px, gain * rest.y_px))
         moved = self._move(after)
         with self._lock:
             if self._shift == before:
                 self._shift, self._table = after, moved
-            return self._table
+        return jumped and after != before
 
-    def _step(self, old: float, rest: float) -> float:
-        return min(self._limit, max(-self._limit, old + self._gain * rest))
+    def _step(self, old: float, by: float) -> float:
+        return min(self._limit, max(-self._limit, old + by))
+
+
+def decode_tracked(
+    decoder: Decoder, tracker: Tracker, pair: FramePair, levels: int, pilots: Pilots | None = None
+) -> DecodedPage:
+    """Decode a pair with the tracker's table, again where it shows that the image has jumped; the last answer counts.
+
+    Args:
+        decoder, tracker: of one model.
+        pair, levels, pilots: as for `Decoder.decode`.
+    """
+    for _ in range(ATTEMPTS - 1):
+        table = tracker.table()
+        page = decoder.decode(pair, levels, table, pilots)
+        if not tracker.update(pair, page, table):
+            return page
+    return decoder.decode(pair, levels, tracker.table(), pilots)
 
 
 def tracker_for(decoder: Decoder) -> Tracker:
