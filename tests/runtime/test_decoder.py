@@ -13,10 +13,9 @@ from optics.errors import BundleError, FrameError, InvalidInputError, PageError
 from optics.measures import measure
 from optics.pilots import Pilots
 from optics.recording import FramePair
-from runtime.bundle import Bundle, npz, write_bundle
+from runtime.bundle import npz, write_bundle
 from runtime.decoder import Decoder
-from runtime.manifest import DECODER, GOLDEN, TABLE, TWIN
-from runtime.twin import Twin
+from runtime.manifest import DECODER, GOLDEN, TABLE
 from tests.runtime import toy
 
 
@@ -195,13 +194,3 @@ def test_many_threads_share_one_decoder(decoder: Decoder) -> None:
     with ThreadPoolExecutor(4) as pool:
         results = list(pool.map(lambda page: decoder.decode(page[1], 16).symbols, pages * 4))
     assert all((got == want[0]).all() for got, want in zip(results, pages * 4, strict=True))
-
-
-def test_the_twin_runs_in_float64_and_a_foreign_one_is_refused(toy_zip: Path, tmp_path: Path) -> None:
-    twin = Twin(Bundle.open(toy_zip))
-    points = np.array([[1e-3, 2e-3]])
-    out = twin(np.array([1e-9, 0, 5]), points)
-    assert out["places"][0, 0] == 1e-3 + 1e-9
-    contents = toy.files() | {TWIN: toy.decoder_onnx()}
-    with pytest.raises(BundleError, match=r"twin\.onnx"):
-        Twin(Bundle.open(write_bundle(tmp_path / "f.zip", toy.manifest(), contents)))
