@@ -11,6 +11,7 @@ from optics.cameras import resample
 from optics.device import Aberration, CameraPose, Device, Drift, Geometry, Homodyne, Reference, Sensor, SlmDefects
 from optics.errors import PageError
 from optics.profile import PageLayout, Profile
+from optics.registration.parameters import NAMES
 from optics.registration.twin import BRANCHES
 from optics.simulator import Simulator, TrueOptics, true_parameters
 from tests.optics.small import on_slm, perfect_device, random_phases, small_profile
@@ -55,6 +56,13 @@ class TestRandomness:
         first, again, other = recorded(5), recorded(5), recorded(6)
         assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
         assert not any(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
+
+    def test_every_page_has_noise_of_its_own(self) -> None:
+        still = Device(drift=Drift(piston_rad=0, shift_px=0))
+        simulator = Simulator(TINY, still, levels=16, seed=5, steps=8)
+        one, two = simulator.page(symbols(TINY)), simulator.page(symbols(TINY))
+        assert not np.array_equal(one.in_phase, two.in_phase)
+        assert np.corrcoef(one.in_phase.ravel(), two.in_phase.ravel())[0, 1] > 0.9
 
     def test_references_disturb_nothing(self) -> None:
         page = symbols(TINY)
@@ -216,10 +224,15 @@ class TestLight:
 
     def test_hardly_any_pixel_is_clipped_and_the_range_is_used(self) -> None:
         profile = small_profile()
-        pair = Simulator(profile, Device(), levels=16, seed=1).page(symbols(profile))
+        pair = Simulator(profile, Device(), levels=16, seed=1, steps=16).page(symbols(profile))
         for frame in (pair.in_phase, pair.quadrature):
             assert (frame == 255).mean() < 0.01
             assert np.quantile(frame, 0.99) > 128
+
+    def test_a_brighter_quadrature_camera_is_exposed_so_that_it_does_not_clip(self) -> None:
+        profile, device = small_profile(), Device(homodyne=Homodyne(quadrature_gain=1.5))
+        pair = Simulator(profile, device, levels=16, seed=1, steps=16).page(symbols(profile))
+        assert (pair.quadrature == 255).mean() < 0.01
 
     def test_illumination_falls_off_and_aberrations_bend_the_phase_towards_the_corner(self) -> None:
         profile = small_profile()
@@ -265,6 +278,11 @@ def mishandled_optics() -> TrueOptics:
 
 
 class TestTruth:
+    def test_the_truth_is_told_against_the_nominal_angle(self) -> None:
+        bent = TINY.model_copy(update={"pipe": TINY.pipe.model_copy(update={"angle_deg": -0.4})})
+        angle = true_parameters(bent, Device())[NAMES.index("pipe_angle_rad")]
+        assert angle == pytest.approx(np.deg2rad(-0.2))
+
     @pytest.mark.parametrize(
         ("branch", "row", "column"), [("direct", 14, 21), ("direct", 12, 24), ("x", 14, 41), ("x", 13, 2)]
     )
