@@ -230,7 +230,7 @@ class TestLight:
             assert np.quantile(frame, 0.99) > 128
 
     def test_a_brighter_quadrature_camera_is_exposed_so_that_it_does_not_clip(self) -> None:
-        profile, device = small_profile(), Device(homodyne=Homodyne(quadrature_gain=1.5))
+        profile, device = small_profile(), Device(homodyne=Homodyne(quadrature_gain=2.5))
         pair = Simulator(profile, device, levels=16, seed=1, steps=16).page(symbols(profile))
         assert (pair.quadrature == 255).mean() < 0.01
 
