@@ -198,5 +198,5 @@ def summarise(name: str, pages: Sequence[RemotePage]) -> Phase:
         air=np.mean(rates, axis=0),
         confidence=np.mean([page.confidence for page in pages], axis=0, dtype=np.float64),
         symbol_error_rate=float(np.mean(errors)),
-        seconds=float(np.median([page.timings.total_s for page in pages])),
+        seconds=float(np.median([page.timings.decode_s for page in pages])),
     )

@@ -59,7 +59,7 @@ def fit_parameters(
     *,
     use_phase: bool,
     centre: Real | None = None,
-    prior_scale: float = 1.0,
+    prior_scale: float | Real = 1.0,
     evaluations: int = 12,
 ) -> Fit:
     """Fit the free parameters to measurements.
@@ -73,7 +73,7 @@ def fit_parameters(
         use_phase: whether the patches' phases count, beside places and slopes; needs a start whose phases are right
             to within about a radian.
         centre: [P] centre of the priors, nominal (zero) if None.
-        prior_scale: factor on the priors' standard deviations.
+        prior_scale: factor on the priors' standard deviations, one for all or [P].
         evaluations: bound on the solver's steps.
     """
     pages = 1 + max(m.page for m in measurements)
