@@ -21,8 +21,8 @@ Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
 
 _CLIPPING_AMPLITUDE = 2.4
-"""Signal amplitude over its root mean square that, in phase with the reference, just fills the well: a Rayleigh
-amplitude exceeds it in 0.3% of the samples."""
+"""Signal amplitude over its root mean square that, in phase with the reference, just fills the well: about one sample
+in twenty thousand clips."""
 _GRID_MARGIN = 1.04
 """Computed camera plane over the sensor, so that rotated and shifted pixels still look inside."""
 _WALK, _RIPPLE, _NOISE = 0, 1, 2

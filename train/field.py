@@ -5,7 +5,7 @@ With the reference-only frame R of a camera and e = E/r, E the signal against a 
     A = (I - R_I) / (2 R_I) = Re e + |e|^2 / 2
     B = (Q - R_Q) / (2 R_Q) = Re(e exp(-i turn)) + |e|^2 / 2
 
-where `turn` is 90 degrees, plus the quadrature error, or minus, by the sign of Q. The cameras' gains cancel.
+where `turn` is +90 or -90 degrees, by the sign of Q, plus the quadrature error. The cameras' gains cancel.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class FieldRecovery(nn.Module):
             homodyne: [2], cosine and sine of the turn between the two arms.
 
         Returns:
-            field: [2, ny, nx], real and imaginary part of E over the mean reference amplitude.
+            field: [2, ny, nx], real and imaginary part of E over the reference amplitude's mean on the grid.
             residual: [2, ny, nx], what is left of the two equations inside the pipe's band, over the mean reference
                 amplitude; large against the field when the frames do not belong to this calibration.
         """
