@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from optics.profile import Profile
 from optics.registration.parameters import NAMES
+from optics.registration.phases import camera_phase, launch_phase
 from optics.registration.twin import BRANCHES, Rays
 
 _WIDEST_SPREAD = 1.05
@@ -89,7 +90,7 @@ class RayTwin(nn.Module):
         k = wave_vector(points)
         squared = (k * k).sum(-1)
         glass = -squared / (torch.sqrt(nk**2 - squared) + nk) * length
-        launch = glass + self._launch_phase(value, points)
+        launch = glass + launch_phase(value, points[:, 0] / self.corner, points[:, 1] / self.corner)
         cells = exit_centroid(wave_vector(anchors)).detach()
         even = 2 * torch.round(cells / 2)
         odd = 2 * torch.floor(cells / 2) + 1
@@ -105,7 +106,9 @@ class RayTwin(nn.Module):
                 )
             landing = _turn(-(focal / self.wave_number) * bent, roll)
             landings.append(landing)
-            phases.append(phase + self._camera_phase(value, landing))
+            x, y = landing[:, 0] / self.corner, landing[:, 1] / self.corner
+            edges = self.half_width / self.corner, self.half_height / self.corner
+            phases.append(phase + camera_phase(value, x, y, *edges))
         return torch.stack(landings), torch.stack(phases), exit_centroid(k)
 
     def _reflect(
@@ -119,27 +122,6 @@ class RayTwin(nn.Module):
             phase = phase + 2 * along * wall + math.pi * hit
             k = k - 2 * along[:, None] * normal
         return k, phase
-
-    def _launch_phase(self, value: dict[str, Tensor], points: Tensor) -> Tensor:
-        x, y = points[:, 0] / self.corner, points[:, 1] / self.corner
-        radius2 = x * x + y * y
-        return (
-            value["launch_defocus_rad"] * radius2
-            + value["launch_astigmatism_0_rad"] * (x * x - y * y)
-            + value["launch_astigmatism_45_rad"] * 2 * x * y
-            + value["launch_coma_x_rad"] * radius2 * x
-            + value["launch_coma_y_rad"] * radius2 * y
-        )
-
-    def _camera_phase(self, value: dict[str, Tensor], places: Tensor) -> Tensor:
-        x, y = places[:, 0] / self.corner, places[:, 1] / self.corner
-        return (
-            value["camera_tilt_x_rad"] * places[:, 0] / self.half_width
-            + value["camera_tilt_y_rad"] * places[:, 1] / self.half_height
-            + value["camera_curvature_rad"] * (x * x + y * y)
-            + value["camera_astigmatism_0_rad"] * (x * x - y * y)
-            + value["camera_astigmatism_45_rad"] * 2 * x * y
-        )
 
     def _pixels(self, value: dict[str, Tensor], places: Tensor) -> Tensor:
         radius2 = (places * places).sum(-1, keepdim=True) / self.corner**2

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from optics.grid import field_grid
 from optics.profile import Profile
 from optics.registration.parameters import as_dict
+from optics.registration.phases import camera_phase, launch_phase
 from optics.waves import WaveChannel, WaveGeometry, modes_for
 from train.localizers.coherent import SAMPLES
 
@@ -56,8 +57,10 @@ class WaveLocalizer:
         self._shape = (rows, columns)
         half_width, half_height = profile.page_width_m / 2, profile.page_height_m / 2
         corner = np.hypot(half_width, half_height)
-        self._camera_phase = _camera_phase(value, grid.x_m, grid.y_m, half_width, half_height, corner)
-        self._launch_phase = _launch_phase(value, x / corner, y / corner)
+        self._camera_phase = camera_phase(
+            value, grid.x_m[None, :] / corner, grid.y_m[:, None] / corner, half_width / corner, half_height / corner
+        )
+        self._launch_phase = launch_phase(value, x[None, :] / corner, y[:, None] / corner)
         offset = geometry.wave_number / geometry.focal_length_m
         facet_ramp = offset * (value["pipe_centre_x_m"] * x[None, :] + value["pipe_centre_y_m"] * y[:, None])
         camera_ramp = offset * (
@@ -73,28 +76,3 @@ class WaveLocalizer:
         rows, columns = self._shape
         split = at_slm.reshape(rows, SAMPLES, columns, SAMPLES).transpose(1, 3, 0, 2).reshape(1, -1, rows, columns)
         return np.stack([split.real, split.imag]).astype(np.float32)
-
-
-def _camera_phase(
-    value: dict[str, float], x_m: Real, y_m: Real, half_width: float, half_height: float, corner: float
-) -> Real:
-    x, y = x_m[None, :], y_m[:, None]
-    return np.asarray(
-        value["camera_tilt_x_rad"] * x / half_width
-        + value["camera_tilt_y_rad"] * y / half_height
-        + value["camera_curvature_rad"] * (x**2 + y**2) / corner**2
-        + value["camera_astigmatism_0_rad"] * (x**2 - y**2) / corner**2
-        + value["camera_astigmatism_45_rad"] * 2 * x * y / corner**2
-    )
-
-
-def _launch_phase(value: dict[str, float], x_axis: Real, y_axis: Real) -> Real:
-    x, y = x_axis[None, :], y_axis[:, None]
-    radius2 = x**2 + y**2
-    return np.asarray(
-        value["launch_defocus_rad"] * radius2
-        + value["launch_astigmatism_0_rad"] * (x**2 - y**2)
-        + value["launch_astigmatism_45_rad"] * 2 * x * y
-        + value["launch_coma_x_rad"] * radius2 * x
-        + value["launch_coma_y_rad"] * radius2 * y
-    )
