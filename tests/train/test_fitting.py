@@ -1,0 +1,69 @@
+"""Training: it learns, takes up its last checkpoint, and counts no pilot as data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from train.fitting import Hyperparameters, PageDataset, best_kappa_scale, fit_network, held_out_air
+
+PAGE = (8, 12)
+CHOICES = Hyperparameters(channels=16, blocks=1, steps=120, batch=2, precision="32-true", learning_rate=5e-3)
+POSITIONS = np.zeros((2, *PAGE), dtype=np.float32)
+
+
+def pages(count: int, seed: int) -> PageDataset:
+    """Light that shows its symbol, in noise."""
+    rng = np.random.default_rng(seed)
+    phases = rng.uniform(0, 2 * np.pi, (count, *PAGE))
+    light = np.stack([np.cos(phases), np.sin(phases)], axis=1)[:, :, None, None]
+    light = light + 0.2 * rng.standard_normal(light.shape)
+    return PageDataset(light.astype(np.float16), phases.astype(np.float32))
+
+
+@pytest.fixture
+def mask() -> np.ndarray:
+    mask = np.zeros(PAGE, dtype=bool)
+    mask[::4, ::4] = True
+    return mask
+
+
+def test_it_learns_and_a_finished_run_is_taken_up_at_its_last_step(tmp_path: Path, mask: np.ndarray) -> None:
+    training, validation = pages(12, 0), pages(3, 1)
+    run = tmp_path / "run"
+    first, early = fit_network(run, CHOICES, POSITIONS, mask, training, validation, progress=False)
+    assert early > 1.0
+    again, same = fit_network(run, CHOICES, POSITIONS, mask, training, validation, progress=False)
+    assert same == pytest.approx(early, abs=1e-6)
+    for one, other in zip(first.parameters(), again.parameters(), strict=True):
+        torch.testing.assert_close(one, other)
+    checkpoint = torch.load(run / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=False)
+    assert checkpoint["global_step"] == CHOICES.steps
+
+
+def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarray) -> None:
+    training, validation = pages(12, 0), pages(3, 1)
+    module, _ = fit_network(tmp_path, replace(CHOICES, steps=60), POSITIONS, mask, training, validation, progress=False)
+    honest = best_kappa_scale(module, validation, mask)
+    with torch.no_grad():
+        module.network.head.weight *= 3
+        assert module.network.head.bias is not None
+        module.network.head.bias *= 3
+    assert best_kappa_scale(module, validation, mask) == pytest.approx(honest / 3, rel=0.02)
+
+
+def test_air_does_not_see_the_piston_and_leaves_pilots_out(mask: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 2 * np.pi, (1, *PAGE)).astype(np.float32)
+    p = 30 * np.stack([np.cos(truth + 1.0), np.sin(truth + 1.0)], axis=1).astype(np.float32)
+    exact = held_out_air(p, truth, mask)
+    wrong_data, wrong_pilots = truth.copy(), p.copy()
+    wrong_data[0][~mask] = rng.uniform(0, 2 * np.pi, int((~mask).sum()))
+    wrong_pilots[0, :, mask] *= 0.5
+    assert exact > 3.5
+    assert held_out_air(wrong_pilots, truth, mask) == pytest.approx(exact, abs=0.02)
+    assert held_out_air(p, wrong_data, mask) < 0
