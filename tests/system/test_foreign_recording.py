@@ -14,7 +14,7 @@ import pytest
 from tests.system.foreign_device import ForeignDevice
 
 PAGES = 16
-STEPS = 150
+STEPS = 300
 MINUTES = 12
 
 
@@ -39,7 +39,7 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
     calibration, run, bundle = tmp_path / "calibration.toml", tmp_path / "run", tmp_path / "bundle.zip"
     found, figures = tmp_path / "calibration.json", tmp_path / "evaluation.json"
     lightpage("calibrate", "--profile", "bench", "--recording", str(recording), "--out", str(calibration),
-              "--json", str(found))  # fmt: skip
+              "--pages", "4", "--json", str(found))  # fmt: skip
     angle = json.loads(found.read_text())["angle_deg"]
     assert abs(angle - device.parameters.pipe_angle_deg) <= 0.03, f"seed {seed}"
 
@@ -48,6 +48,9 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
     lightpage("export", str(run), "--out", str(bundle))
     lightpage("evaluate", "--bundle", str(bundle), "--recording", str(recording), "--json", str(figures))
     evaluation = json.loads(figures.read_text())
+    print(
+        f"angle {angle:.4f}, true {device.parameters.pipe_angle_deg:.4f}; AIR {evaluation['air_bits_per_symbol']:.2f}"
+    )
     assert evaluation["pages"] >= 1
-    # 150 steps on 13 pages are a start, not a decoder; unrelated light gives zero or less
+    # 300 steps on 14 pages are a start, not a decoder; unrelated light gives zero or less
     assert evaluation["air_bits_per_symbol"] > 1.0, f"seed {seed}: {evaluation}"
