@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from optics.profile import Profile
 from train.field import FieldRecovery, unexplained
-from train.localizers.coherent import CoherentLocalizer
+from train.localizers.coherent import CoherentLocalizer, page_features, position_features
 from train.network import SymbolUNet
 
 FRAME_INPUTS = ("in_phase", "quadrature")
@@ -44,9 +44,7 @@ class DecoderGraph(nn.Module):
         self.kappa_scale = kappa_scale
         ny, nx = profile.page_shape
         self.page: Tensor
-        rows = torch.linspace(-1, 1, ny)[:, None].expand(ny, nx)
-        columns = torch.linspace(-1, 1, nx)[None, :].expand(ny, nx)
-        self.register_buffer("page", torch.stack([columns, rows]))
+        self.register_buffer("page", page_features(ny, nx))
 
     def forward(
         self,
@@ -72,8 +70,7 @@ class DecoderGraph(nn.Module):
         )
         light = self.localizer(field, places, place_gradients, phases)
         ny, nx = self.page.shape[1:]
-        within = positions - torch.round(positions)
-        features = torch.cat([light.reshape(-1, ny, nx), positions, within, self.page])
+        features = torch.cat([light.reshape(-1, ny, nx), position_features(positions), self.page])
         p = self.network(features[None])[0] * self.kappa_scale
         phase = torch.atan2(p[1], p[0])
         concentration = torch.sqrt((p * p).sum(0))

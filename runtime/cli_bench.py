@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,6 @@ import click
 import numpy as np
 from tqdm import tqdm
 
-from optics.files import replace_text
 from runtime.client import LightpageClient
 from runtime.cpus import available_cpus
 from runtime.dataplane import DataPlane
@@ -19,6 +17,7 @@ from runtime.decoder import Decoder
 from runtime.recalibrator import Recalibrator
 from runtime.refit import refit
 from runtime.registry import ModelRegistry
+from runtime.report import write_json
 from runtime.server import LightpageServer
 from runtime.shipped import DEFAULT, bundle_path
 
@@ -60,6 +59,6 @@ def bench(bundle: str, rounds: int, threads: int | None, json_path: Path | None)
         "grpc_over_inference": median["grpc"] / median["inference"],
     }
     if json_path is not None:
-        replace_text(json_path, json.dumps(figures, indent=2) + "\n", "JSON file")
+        write_json(json_path, figures)
     for name, label in (("inference", "ONNX Runtime alone"), ("decode", "whole decode"), ("grpc", "through gRPC")):
         click.echo(f"{label:<20} p50 {1e3 * median[name]:8.1f} ms   {median[name] / median['inference']:5.2f} x")

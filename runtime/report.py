@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
-from optics.errors import InvalidInputError
+from optics.files import replace_text
 
 
 def write_json(path: str | Path, data: Any) -> None:
@@ -18,20 +16,7 @@ def write_json(path: str | Path, data: Any) -> None:
     Raises:
         InvalidInputError: the path cannot be written.
     """
-    path = Path(path)
-    text = json.dumps(_plain(data), indent=2, allow_nan=False) + "\n"
-    try:
-        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
-        try:
-            with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-                file.write(text)
-            os.chmod(name, 0o644)
-            os.replace(name, path)
-        except BaseException:
-            os.unlink(name)
-            raise
-    except OSError as error:
-        raise InvalidInputError(f"JSON file {path}", error, "a path that can be written") from None
+    replace_text(path, json.dumps(_plain(data), indent=2, allow_nan=False) + "\n", "JSON file")
 
 
 def _plain(value: Any) -> Any:

@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 
 from optics.measures import achievable_rate
 from optics.pilots import Pilots, estimate_piston, remove_piston
-from train.localizers.coherent import position_features
+from train.localizers.coherent import page_features, position_features
 from train.loss import von_mises_nll
 from train.network import SymbolUNet
 
@@ -212,11 +212,7 @@ def fit_network(
 
 def fixed_features(positions: NDArray[np.float32]) -> Tensor:
     """Features that every page shares: position within the zone, position on the page, [6, ny, nx]."""
-    at = torch.from_numpy(positions)
-    ny, nx = positions.shape[1:]
-    rows = torch.linspace(-1, 1, ny)[:, None].expand(ny, nx)
-    columns = torch.linspace(-1, 1, nx)[None, :].expand(ny, nx)
-    return torch.cat([position_features(at), torch.stack([columns, rows])])
+    return torch.cat([position_features(torch.from_numpy(positions)), page_features(*positions.shape[1:])])
 
 
 def best_kappa_scale(module: DecoderTraining, pages: PageDataset, mask: NDArray[np.bool_]) -> float:

@@ -99,8 +99,7 @@ class RayTwin(nn.Module):
         for branch in BRANCHES:
             crossed = {"x": (odd if "x" in branch else even)[:, 0], "y": (odd if "y" in branch else even)[:, 1]}
             bent, phase = k, launch
-            for axis, name in enumerate("yx" if branch == "yx" else "xy"):
-                del axis
+            for name in "yx" if branch == "yx" else "xy":
                 bent, phase = self._reflect(
                     bent, phase, normals[name], crossed[name], width, wall_offset["xy".index(name)]
                 )

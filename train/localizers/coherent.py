@@ -12,7 +12,6 @@ from optics.registration.twin import BRANCHES
 
 SAMPLES = 4
 """Samples per symbol and axis: the field's own rate at four SLM pixels a symbol."""
-POSITION_FEATURES = 4
 
 
 class CoherentLocalizer(nn.Module):
@@ -69,3 +68,10 @@ class CoherentLocalizer(nn.Module):
 def position_features(positions: Tensor) -> Tensor:
     """Where in its zone a symbol's beam leaves the pipe: q and q - round(q) per axis, [2, ny, nx] to [4, ny, nx]."""
     return torch.cat([positions, positions - torch.round(positions)])
+
+
+def page_features(ny: int, nx: int) -> Tensor:
+    """Where on the page a symbol lies: column and row from -1 to 1, [2, ny, nx]."""
+    rows = torch.linspace(-1, 1, ny)[:, None].expand(ny, nx)
+    columns = torch.linspace(-1, 1, nx)[None, :].expand(ny, nx)
+    return torch.stack([columns, rows])
