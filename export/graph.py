@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from optics.profile import Profile
 from train.field import FieldRecovery, unexplained
-from train.localizers.coherent import CoherentLocalizer, page_features, position_features
+from train.localizers.coherent import CoherentLocalizer, network_features
 from train.network import SymbolUNet
 
 FRAME_INPUTS = ("in_phase", "quadrature")
@@ -42,9 +42,6 @@ class DecoderGraph(nn.Module):
         self.localizer = CoherentLocalizer(profile)
         self.network = network
         self.kappa_scale = kappa_scale
-        ny, nx = profile.page_shape
-        self.page: Tensor
-        self.register_buffer("page", page_features(ny, nx))
 
     def forward(
         self,
@@ -69,9 +66,8 @@ class DecoderGraph(nn.Module):
             homodyne,
         )
         light = self.localizer(field, places, place_gradients, phases)
-        ny, nx = self.page.shape[1:]
-        features = torch.cat([light.reshape(-1, ny, nx), position_features(positions), self.page])
-        p = self.network(features[None])[0] * self.kappa_scale
+        features = network_features(light.flatten(0, 2)[None], positions[None])
+        p = self.network(features)[0] * self.kappa_scale
         phase = torch.atan2(p[1], p[0])
         concentration = torch.sqrt((p * p).sum(0))
         return p, phase, concentration, unexplained(field, left), field, left

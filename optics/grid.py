@@ -12,7 +12,7 @@ from optics.profile import Profile
 
 Real = NDArray[np.float64]
 
-_STEP_PX = 2
+GRID_STEP_PX = 2
 """Grid pitch in camera pixels: twice the Nyquist rate of the field, just above that of its intensity."""
 _MARGIN_PX = 70
 """Grid beyond the nominal image of the page, camera pixels on each side: page shift and diffraction."""
@@ -51,7 +51,7 @@ class FieldGrid:
 def field_grid(profile: Profile) -> FieldGrid:
     """The grid for a device: covers the nominal page image and a margin, pitch two camera pixels."""
     pixel = profile.camera.pitch_m
-    pitch = _STEP_PX * pixel
+    pitch = GRID_STEP_PX * pixel
 
     def axis(extent_m: float) -> Real:
         count = int(np.ceil((extent_m + 2 * _MARGIN_PX * pixel) / pitch / 2)) * 2
@@ -61,7 +61,7 @@ def field_grid(profile: Profile) -> FieldGrid:
     return FieldGrid(
         x_m=axis(profile.page_width_m),
         y_m=axis(profile.page_height_m),
-        prefilter=_low_pass(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / _STEP_PX - edge * pixel, 0.36)),
+        prefilter=_low_pass(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / GRID_STEP_PX - edge * pixel, 0.36)),
         band=_low_pass(_BAND_TAPS, _BAND_HEADROOM * edge * pitch, 1.36 * edge * pitch),
     )
 

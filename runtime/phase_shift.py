@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from optics.grid import GRID_STEP_PX
 from optics.pilots import Pilots
 from optics.registration.table import sampling_table
 from runtime.bundle import Table
@@ -24,9 +25,6 @@ PROBE_PX = 0.25
 SMOOTHING = 5
 """Side of the median filter over the sensitivity, symbols: another page shows the same map to a few percent (their
 correlation rises from 0.95 to 0.995), and the zones' borders stay sharp."""
-
-SAMPLES_PER_PX = 0.5
-"""Grid samples per camera pixel, see `optics.grid`."""
 
 LEAST_COHERENCE = 0.6
 """Agreement of the pilots below which a page says nothing of shift: pilots that are not this page's give 0.2, a
@@ -146,7 +144,7 @@ def default_places(decoder: Decoder) -> NDArray[np.float32]:
 
 
 def _moved(places: NDArray[np.float32], shift_px: Real) -> Table:
-    step = (SAMPLES_PER_PX * np.asarray(shift_px)).astype(np.float32)
+    step = (np.asarray(shift_px) / GRID_STEP_PX).astype(np.float32)
     return {"places": places + step[None, :, None, None]}
 
 

@@ -10,23 +10,27 @@ from pathlib import Path
 
 import click
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from tqdm import tqdm
+from torch.utils.data import ConcatDataset
 
 from optics.errors import InvalidInputError, RecordingError
 from optics.page import pilot_mask
-from optics.profile import load_profile
+from optics.profile import Profile, load_profile
 from optics.recording import Recording
 from optics.registration.calibration import Calibration, load_calibration
+from optics.registration.known import known_pages
 from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording, calibration_bar
+from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor
-from train.fitting import Hyperparameters, PageDataset, best_kappa_scale, fit_network
+from train.fitting import Hyperparameters, Page, best_kappa_scale, fit_network
 from train.run import GOLDEN, REFERENCES, Run, save_network
+from train.synthetic import MOST_NOISE, SyntheticPages, likeness
 
 PUBLISHED = ("none", "mode", "ray")
 TRAINABLE = ("coherent", "wave")
+DEFAULT_SYNTHETIC_PAGES = 160
 _FEWEST_PAGES = 6
+_LIKENESS_PAGES = 2
+"""Recorded pages that the wave model is compared with: each has thousands of symbols."""
 
 
 @click.command()
@@ -46,6 +50,13 @@ _FEWEST_PAGES = 6
 @click.option("--precision", default=Hyperparameters.precision, show_default=True, help="Lightning's precision.")
 @click.option("--validation-share", type=click.FloatRange(0.01, 0.5), default=0.08, show_default=True)
 @click.option("--test-share", type=click.FloatRange(0, 0.5), default=0.08, show_default=True, help="Left for evaluate.")
+@click.option(
+    "--synthetic-pages",
+    type=click.IntRange(min=0),
+    default=DEFAULT_SYNTHETIC_PAGES,
+    show_default=True,
+    help="Pages that the fitted device would show after drifts, trained on beside the recorded ones.",
+)
 @click.option("--seed", type=int, default=0, show_default=True)
 def train(
     profile_name: str,
@@ -62,6 +73,7 @@ def train(
     precision: str,
     validation_share: float,
     test_share: float,
+    synthetic_pages: int,
     seed: int,
 ) -> None:
     """Train a decoder on known pages; the last pages of the recording stay unseen for `lightpage evaluate`."""
@@ -92,22 +104,20 @@ def train(
         extractor = FeatureExtractor(
             profile, calibration.vector, calibration.turn_rad, recording.references(), localizer
         )
-        light, phases = _features(recording, extractor, [*groups[0], *groups[1]], out, calibration, localizer)
+        recorded = _recorded(recording, extractor, [*groups[0], *groups[1]], out, calibration, localizer)
+        synthetic = _synthetic(recording, extractor, synthetic_pages, out, calibration, profile, localizer, seed)
         mask = recording.pilots()
         mask = pilot_mask(profile) if mask is None else mask
         count = len(groups[0])
-        started = time.monotonic()
-        module, air = fit_network(
-            out,
-            choices,
-            extractor.positions,
-            mask,
-            PageDataset(light[:count], phases[:count]),
-            PageDataset(light[count:], phases[count:]),
+        training: ConcatDataset[Page] = ConcatDataset(
+            [FeatureStore(recorded, range(count)), *map(FeatureStore, synthetic)]
         )
+        validation = FeatureStore(recorded, range(count, count + len(groups[1])))
+        started = time.monotonic()
+        module, air = fit_network(out, choices, mask, training, validation)
         seconds = time.monotonic() - started
         module = module.float()
-        scale = best_kappa_scale(module, PageDataset(light[count:], phases[count:]), mask)
+        scale = best_kappa_scale(module, validation, mask)
         save_network(module, out)
         references = recording.references()
         np.savez_compressed(
@@ -126,10 +136,12 @@ def train(
             validation_air=air,
             kappa_scale=scale,
             seconds=seconds,
+            synthetic_pages=sum(len(FeatureStore(folder)) for folder in synthetic),
             provenance={"command": shlex.join(["lightpage", *sys.argv[1:]]), "seed": seed, "commit": _commit()},
         ).save(out)
     click.echo(
-        f"validation AIR {air:.3f} bits/symbol, {len(groups[0])} training and {len(groups[1])} validation pages, "
+        f"validation AIR {air:.3f} bits/symbol, {len(groups[0])} recorded and {len(training) - count} synthetic "
+        f"pages trained on, {len(groups[1])} validation pages, "
         f"{len(groups[2])} left for evaluate, kappa scaled by {scale:.3f}; run in {out}"
     )
 
@@ -163,31 +175,53 @@ def _split(
     return list(range(first)), list(range(first, first + validation)), list(range(first + validation, pages))
 
 
-def _features(
+def _recorded(
     recording: Recording,
     extractor: FeatureExtractor,
     indices: list[int],
     out: Path,
     calibration: Calibration,
     localizer: str,
-) -> tuple[NDArray[np.float16], NDArray[np.float32]]:
-    """Features of all pages, kept beside the run and taken from there when the run goes on."""
-    path = out / "features.npz"
+) -> Path:
+    """Folder with the features of recorded pages, kept beside the run and taken from there when the run goes on."""
+    folder = out / "features"
     key = f"{localizer} {recording.path.resolve()} {indices} {calibration.to_toml()}"
-    if path.exists():
-        with np.load(path) as kept:
-            if str(kept["key"]) == key:
-                return kept["light"], kept["phases"]
-    light, phases = [], []
-    with torch.inference_mode():
-        for page in tqdm(extractor.pages(recording, indices), total=len(indices), desc="features", unit="page"):
-            light.append(page.light)
-            phases.append(page.phases)
-    stacked = np.stack(light), np.stack(phases)
-    partial = path.with_suffix(".partial.npz")
-    np.savez(partial, key=np.array(key), light=stacked[0], phases=stacked[1])
-    partial.replace(path)
-    return stacked
+    fill(
+        folder,
+        key,
+        len(indices),
+        lambda first, shift: extractor.pages(recording, indices[first:], shift),
+        "recorded pages",
+    )
+    return folder
+
+
+def _synthetic(
+    recording: Recording,
+    extractor: FeatureExtractor,
+    count: int,
+    out: Path,
+    calibration: Calibration,
+    profile: Profile,
+    localizer: str,
+    seed: int,
+) -> list[Path]:
+    """Folder with the features of synthetic pages; none where the wave model is not like the device."""
+    if count == 0:
+        return []
+    known = known_pages(recording, profile, range(_LIKENESS_PAGES))
+    phases = [np.angle(page.symbols) for page in known]
+    fields = [extractor.known_field(page.pair, written) for page, written in zip(known, phases, strict=True)]
+    like = likeness(profile, calibration.vector, fields, phases)
+    if like.noise > MOST_NOISE:
+        click.echo(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
+        return []
+    click.echo(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
+    folder = out / "synthetic"
+    pages = SyntheticPages(profile, calibration.vector, like, localizer, seed)
+    key = f"{localizer} {seed} {calibration.to_toml()} {like.noise:.6f} {np.round(like.illumination, 6).tolist()}"
+    fill(folder, key, count, lambda first, shift: pages.pages(first), "synthetic pages")
+    return [folder]
 
 
 def _commit() -> str:

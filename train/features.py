@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from optics.grid import GRID_STEP_PX
 from optics.page import symbol_phases
 from optics.profile import Profile
 from optics.recording import FramePair, Recording
@@ -25,8 +26,6 @@ Real = NDArray[np.float64]
 
 _PROBE_PX = 0.3
 _LARGEST_STEP_PX = 0.5
-_GRID_STEP_PX = 2.0
-"""Camera pixels per sample of the common grid, see `optics.grid`."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +34,13 @@ class PageFeatures:
 
     Attributes:
         light: demodulated samples [2, B, S, ny, nx], float16, piston taken off.
+        positions: exit centroids [2, ny, nx], float32, over the pipe's width.
         phases: true phases [ny, nx], float32, radians.
         shift_px: image shift of the page (x, y) that was taken off, camera pixels.
     """
 
     light: NDArray[np.float16]
+    positions: NDArray[np.float32]
     phases: NDArray[np.float32]
     shift_px: tuple[float, float]
 
@@ -75,18 +76,20 @@ class FeatureExtractor:
         self._shares = shares.reshape(len(COHERENT_BRANCHES), *profile.page_shape)
         self._chosen = [BRANCHES.index(name) for name in COHERENT_BRANCHES]
 
-    @property
-    def positions(self) -> NDArray[np.float32]:
-        """Exit centroids of all symbols, [2, ny, nx]."""
-        return self.table["positions"]
-
     def field(self, pair: FramePair) -> NDArray[np.complex64]:
         """Recovered field on the common grid."""
         return self._solve(pair, self._references, self.table["registration"], self.table["homodyne"])[0]
 
-    def pages(self, recording: Recording, indices: list[int]) -> Iterator[PageFeatures]:
-        """Features of the given pages, in order; the shift is followed from page to page."""
-        shift = np.zeros(2)
+    def known_field(self, pair: FramePair, phases: Real) -> NDArray[np.complex64]:
+        """Recovered field of a known page, its image shift taken off."""
+        field = self.field(pair)
+        return moved(field, np.array(self.page(field, phases, np.zeros(2))[0].shift_px))
+
+    def pages(
+        self, recording: Recording, indices: Sequence[int], shift_px: tuple[float, float] = (0.0, 0.0)
+    ) -> Iterator[PageFeatures]:
+        """Features of the given pages, in order; the shift is followed from page to page, from `shift_px` on."""
+        shift = np.array(shift_px)
         for index in indices:
             symbols = recording.symbols(index)
             assert symbols is not None
@@ -100,27 +103,22 @@ class FeatureExtractor:
         for _ in range(2):
             shift = shift + self._shift_step(field, known, shift)
         piston = np.angle(self._agreement(self._light(field, shift), known))
-        light = self._light(field, shift) if self._wave is None else self._wave(_moved(field, shift))
+        light = self._light(field, shift) if self._wave is None else self._wave(moved(field, shift))
         if self._wave is not None:
             centre = light[:, 0].mean(1)
             piston = np.angle(np.sum((centre[0] + 1j * centre[1]) * known))
         cos, sin = np.cos(piston), np.sin(piston)
         turned = np.stack([light[0] * cos + light[1] * sin, light[1] * cos - light[0] * sin])
         features = PageFeatures(
-            turned.astype(np.float16), phases.astype(np.float32), (float(shift[0]), float(shift[1]))
+            turned.astype(np.float16),
+            self.table["positions"],
+            phases.astype(np.float32),
+            (float(shift[0]), float(shift[1])),
         )
         return features, shift
 
     def _light(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.float32]:
-        places = self.table["places"] + (shift / _GRID_STEP_PX).astype(np.float32)[None, :, None, None]
-        with torch.no_grad():
-            light: NDArray[np.float32] = self._coherent(
-                torch.from_numpy(np.stack([field.real, field.imag])),
-                torch.from_numpy(places),
-                torch.from_numpy(self.table["place_gradients"]),
-                torch.from_numpy(self.table["phases"]),
-            ).numpy()
-        return light
+        return demodulate(self._coherent, field, self.table, shift)
 
     def _agreement(self, light: NDArray[np.float32], known: NDArray[np.complex128]) -> complex:
         """Coherent sum of the branches' light with the known symbols over the page."""
@@ -141,8 +139,25 @@ class FeatureExtractor:
         return np.clip(step, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
 
 
-def _moved(field: NDArray[np.complex64], shift: Real) -> NDArray[np.complex64]:
+def demodulate(
+    localizer: CoherentLocalizer, field: NDArray[np.complexfloating], table: Table, shift: Real | None = None
+) -> NDArray[np.float32]:
+    """The coherent localizer's light [2, B, S, ny, nx] of a field [Gy, Gx], seen `shift` (x, y) camera pixels on."""
+    places = table["places"]
+    if shift is not None:
+        places = places + (shift / GRID_STEP_PX).astype(np.float32)[None, :, None, None]
+    with torch.no_grad():
+        light: NDArray[np.float32] = localizer(
+            torch.from_numpy(np.stack([field.real, field.imag]).astype(np.float32, copy=False)),
+            torch.from_numpy(places),
+            torch.from_numpy(table["place_gradients"]),
+            torch.from_numpy(table["phases"]),
+        ).numpy()
+    return light
+
+
+def moved(field: NDArray[np.complex64], shift: Real) -> NDArray[np.complex64]:
     """The field as seen `shift` (x, y) camera pixels further on."""
-    by = -shift[::-1] / _GRID_STEP_PX
+    by = -shift[::-1] / GRID_STEP_PX
     real, imaginary = (ndimage.shift(part, by, order=3) for part in (field.real, field.imag))
     return np.asarray(real + 1j * imaginary, dtype=np.complex64)

@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 
 from optics.measures import achievable_rate
 from optics.pilots import Pilots, estimate_piston, remove_piston
-from train.localizers.coherent import page_features, position_features
+from train.localizers.coherent import POSITION_CHANNELS, network_features
 from train.loss import von_mises_nll
 from train.network import SymbolUNet
 
@@ -51,20 +51,8 @@ class Hyperparameters:
     precision: str = "bf16-mixed"
 
 
-class PageDataset(Dataset[tuple[Tensor, Tensor]]):
-    """Pages of features [2 C, ny, nx] with their phases [ny, nx]."""
-
-    def __init__(self, light: NDArray[np.float16], phases: NDArray[np.float32]) -> None:
-        self._light, self._phases = light, phases
-
-    def __len__(self) -> int:
-        """Pages."""
-        return len(self._light)
-
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        """One page."""
-        light = np.array(self._light[index]).reshape(-1, *self._light.shape[-2:])
-        return torch.from_numpy(light), torch.from_numpy(np.array(self._phases[index]))
+Page = tuple[Tensor, Tensor, Tensor]
+"""One page, or a batch of them: light [2 C, ny, nx], exit centroids [2, ny, nx], true phases [ny, nx]."""
 
 
 class DecoderTraining(L.LightningModule):
@@ -73,43 +61,37 @@ class DecoderTraining(L.LightningModule):
     Args:
         network: features to p.
         hyperparameters: the run's choices.
-        fixed: features that are the same for every page, [F, ny, nx].
         pilot_mask: bool [ny, nx]; pilots are no data: neither loss nor figure counts them.
     """
 
-    def __init__(
-        self, network: SymbolUNet, hyperparameters: Hyperparameters, fixed: Tensor, pilot_mask: NDArray[np.bool_]
-    ) -> None:
+    def __init__(self, network: SymbolUNet, hyperparameters: Hyperparameters, pilot_mask: NDArray[np.bool_]) -> None:
         super().__init__()
         self.network = network
         self.choices = hyperparameters
-        self.fixed: Tensor
         self.data: Tensor
-        self.register_buffer("fixed", fixed)
         self.register_buffer("data", torch.from_numpy(~pilot_mask))
         self._pilot_mask = pilot_mask
         self._seen: list[tuple[Tensor, Tensor]] = []
 
-    def forward(self, light: Tensor) -> Tensor:
-        """Light [N, 2 C, ny, nx] to p [N, 2, ny, nx]."""
-        fixed = self.fixed.expand(len(light), *self.fixed.shape)
-        return torch.as_tensor(self.network(torch.cat([light, fixed], dim=1)))
+    def forward(self, light: Tensor, positions: Tensor) -> Tensor:
+        """Light [N, 2 C, ny, nx] and exit centroids [N, 2, ny, nx] to p [N, 2, ny, nx]."""
+        return torch.as_tensor(self.network(network_features(light.float(), positions)))
 
-    def training_step(self, batch: tuple[Tensor, Tensor], index: int) -> Tensor:
+    def training_step(self, batch: Page, index: int) -> Tensor:
         """Loss of pages whose field and symbols were turned by one random angle each: piston is no information."""
-        light, phases = batch[0].float(), batch[1]
+        light, positions, phases = batch[0].float(), batch[1], batch[2]
         turn = 2 * math.pi * torch.rand(len(light), 1, 1, device=light.device)
         real, imaginary = light.chunk(2, dim=1)
         cos, sin = torch.cos(turn)[:, None], torch.sin(turn)[:, None]
         turned = torch.cat([real * cos - imaginary * sin, real * sin + imaginary * cos], dim=1)
-        loss = von_mises_nll(self(turned), phases + turn)[:, self.data].mean()
+        loss = von_mises_nll(self(turned, positions), phases + turn)[:, self.data].mean()
         self.log("train_nll", loss, prog_bar=True)
         self.log("train_air", air_of_nll(loss), prog_bar=True)
         return loss
 
-    def validation_step(self, batch: tuple[Tensor, Tensor], index: int) -> None:
+    def validation_step(self, batch: Page, index: int) -> None:
         """Collect what the network says of held-out pages."""
-        self._seen.append((self(batch[0].float()).float().cpu(), batch[1].cpu()))
+        self._seen.append((self(batch[0], batch[1]).float().cpu(), batch[2].cpu()))
 
     def on_validation_epoch_end(self) -> None:
         """AIR of the held-out pages, piston taken off by the pilots as the runtime does it."""
@@ -156,10 +138,9 @@ def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDAr
 def fit_network(
     run: Path,
     hyperparameters: Hyperparameters,
-    positions: NDArray[np.float32],
     pilot_mask: NDArray[np.bool_],
-    training: PageDataset,
-    validation: PageDataset,
+    training: Dataset[Page],
+    validation: Dataset[Page],
     callbacks: list[Callback] | None = None,
     *,
     progress: bool = True,
@@ -169,21 +150,19 @@ def fit_network(
     Args:
         run: folder of the run; checkpoints and TensorBoard logs go there, and `last.ckpt` is resumed from.
         hyperparameters: the run's choices.
-        positions: [2, ny, nx] exit centroids.
         pilot_mask: bool [ny, nx].
         training, validation: pages.
         callbacks: further Lightning callbacks.
         progress: whether to show a bar.
     """
     L.seed_everything(hyperparameters.seed, verbose=False)
-    fixed = fixed_features(positions)
-    channels = training[0][0].shape[0] + len(fixed)
+    channels = training[0][0].shape[0] + POSITION_CHANNELS
     network = SymbolUNet(channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.levels)
-    module = DecoderTraining(network, hyperparameters, fixed, pilot_mask)
+    module = DecoderTraining(network, hyperparameters, pilot_mask)
     best = ModelCheckpoint(run / "checkpoints", "best", monitor="val_air", mode="max", save_last=True)
     # about sixty looks at the validation pages, each on a multiple of a pass over the data
     draws = hyperparameters.batch * max(1, hyperparameters.steps // 60)
-    sampler = RandomSampler(training, replacement=True, num_samples=draws)
+    sampler = RandomSampler(training, replacement=True, num_samples=draws)  # type: ignore[arg-type]  # it has a length
     trainer = L.Trainer(
         max_steps=hyperparameters.steps,
         precision=hyperparameters.precision,  # type: ignore[arg-type]
@@ -210,20 +189,15 @@ def fit_network(
     return module.eval(), float(score) if score is not None else float("nan")
 
 
-def fixed_features(positions: NDArray[np.float32]) -> Tensor:
-    """Features that every page shares: position within the zone, position on the page, [6, ny, nx]."""
-    return torch.cat([position_features(torch.from_numpy(positions)), page_features(*positions.shape[1:])])
-
-
-def best_kappa_scale(module: DecoderTraining, pages: PageDataset, mask: NDArray[np.bool_]) -> float:
+def best_kappa_scale(module: DecoderTraining, pages: Dataset[Page], mask: NDArray[np.bool_]) -> float:
     """Factor on p under which held-out pages are most likely: the network's claim, made honest.
 
     Piston is taken off by the pilots first, as the runtime does it.
     """
     outputs, truths = [], []
     with torch.no_grad():
-        for light, phases in (pages[index] for index in range(len(pages))):
-            p = module(light.float()[None])[0].float().numpy()
+        for light, positions, phases in DataLoader(pages, batch_size=None):
+            p = module(light[None], positions[None])[0].float().numpy()
             truth = phases.numpy()
             pilots = Pilots(mask, truth[mask].astype(np.float64))
             turn = estimate_piston(p, pilots).angle_rad

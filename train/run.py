@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from optics.errors import InvalidInputError
 from optics.profile import Profile, parse_profile
 from optics.registration.calibration import Calibration, parse_calibration
-from train.fitting import DecoderTraining, Hyperparameters, fixed_features
+from train.fitting import DecoderTraining, Hyperparameters
+from train.localizers.coherent import POSITION_CHANNELS
 from train.network import SymbolUNet
 
 DESCRIPTION = "run.json"
@@ -34,6 +34,7 @@ class Run:
         frame_dtype: of the recording's frames.
         trained_pages: hashes of the pages that were trained on or used to stop.
         validation_air: bits per data symbol.
+        synthetic_pages: synthetic pages trained on beside the recorded ones.
         kappa_scale: factor on p that makes the claimed concentration honest on the validation pages.
         seconds: training time.
         provenance: command, seed, commit.
@@ -49,6 +50,7 @@ class Run:
     validation_air: float
     kappa_scale: float
     seconds: float
+    synthetic_pages: int = 0
     provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -101,8 +103,7 @@ def load_network(folder: Path, run: Run, light_channels: int) -> SymbolUNet:
         InvalidInputError: no weights, or weights of another network.
     """
     choices = run.hyperparameters
-    fixed = len(fixed_features(np.zeros((2, 2, 2), dtype=np.float32)))
-    network = SymbolUNet(light_channels + fixed, choices.channels, choices.blocks, choices.levels)
+    network = SymbolUNet(light_channels + POSITION_CHANNELS, choices.channels, choices.blocks, choices.levels)
     try:
         network.load_state_dict(torch.load(folder / WEIGHTS, map_location="cpu", weights_only=True))
     except (OSError, RuntimeError) as error:

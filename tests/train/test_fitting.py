@@ -8,21 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.utils.data import TensorDataset
 
-from train.fitting import Hyperparameters, PageDataset, best_kappa_scale, fit_network, held_out_air
+from train.fitting import Hyperparameters, best_kappa_scale, fit_network, held_out_air
 
 PAGE = (8, 12)
 CHOICES = Hyperparameters(channels=16, blocks=1, steps=120, batch=2, precision="32-true", learning_rate=5e-3)
-POSITIONS = np.zeros((2, *PAGE), dtype=np.float32)
 
 
-def pages(count: int, seed: int) -> PageDataset:
+def pages(count: int, seed: int) -> TensorDataset:
     """Light that shows its symbol, in noise."""
     rng = np.random.default_rng(seed)
     phases = rng.uniform(0, 2 * np.pi, (count, *PAGE))
     light = np.stack([np.cos(phases), np.sin(phases)], axis=1)[:, :, None, None]
     light = light + 0.2 * rng.standard_normal(light.shape)
-    return PageDataset(light.astype(np.float16), phases.astype(np.float32))
+    light = torch.from_numpy(light.astype(np.float16)).flatten(1, 3)
+    return TensorDataset(light, torch.zeros(count, 2, *PAGE), torch.from_numpy(phases.astype(np.float32)))
 
 
 @pytest.fixture
@@ -35,9 +36,9 @@ def mask() -> np.ndarray:
 def test_it_learns_and_a_finished_run_is_taken_up_at_its_last_step(tmp_path: Path, mask: np.ndarray) -> None:
     training, validation = pages(12, 0), pages(3, 1)
     run = tmp_path / "run"
-    first, early = fit_network(run, CHOICES, POSITIONS, mask, training, validation, progress=False)
+    first, early = fit_network(run, CHOICES, mask, training, validation, progress=False)
     assert early > 1.0
-    again, same = fit_network(run, CHOICES, POSITIONS, mask, training, validation, progress=False)
+    again, same = fit_network(run, CHOICES, mask, training, validation, progress=False)
     assert same == pytest.approx(early, abs=1e-6)
     for one, other in zip(first.parameters(), again.parameters(), strict=True):
         torch.testing.assert_close(one, other)
@@ -47,7 +48,7 @@ def test_it_learns_and_a_finished_run_is_taken_up_at_its_last_step(tmp_path: Pat
 
 def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarray) -> None:
     training, validation = pages(12, 0), pages(3, 1)
-    module, _ = fit_network(tmp_path, replace(CHOICES, steps=60), POSITIONS, mask, training, validation, progress=False)
+    module, _ = fit_network(tmp_path, replace(CHOICES, steps=60), mask, training, validation, progress=False)
     honest = best_kappa_scale(module, validation, mask)
     with torch.no_grad():
         module.network.head.weight *= 3

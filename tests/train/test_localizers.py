@@ -37,7 +37,7 @@ def test_the_coherent_localizer_brings_out_each_symbol_where_its_branch_has_the_
     phases, features, extractor = page
     light = features["coherent"]
     symbol = (light[0] + 1j * light[1]).mean(1)[: len(COHERENT_BRANCHES)]
-    shares = branch_shares(extractor.positions.reshape(2, -1).T.astype(float)).reshape(symbol.shape)
+    shares = branch_shares(extractor.table["positions"].reshape(2, -1).T.astype(float)).reshape(symbol.shape)
     for branch in range(len(COHERENT_BRANCHES)):
         clean = shares[branch] > 0.7
         if clean.sum() < 20:

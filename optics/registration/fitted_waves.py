@@ -1,0 +1,84 @@
+"""The wave model of a calibrated device: the simulation's channel with the ray twin's fitted parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optics.grid import field_grid
+from optics.profile import Profile
+from optics.registration.parameters import as_dict
+from optics.registration.phases import camera_phase, launch_phase
+from optics.waves import WaveChannel, WaveGeometry, modes_for
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+_STEPS = 24
+"""Splitting steps; more change the result by less than the fit's own error."""
+_REACH = 1.08
+"""Modes beyond the nominal page's edge: page shift, roll and shear."""
+
+
+class FittedWaves:
+    """Modulator to common grid and back, with fitted geometry and smooth phases.
+
+    Args:
+        profile: the nominal device.
+        parameters: [P] fitted (or, for an oracle, true) parameters of the ray twin.
+        samples: samples per symbol and axis on the modulator's side.
+        filled: whether each sample stands for a pixel of that size; else for a point.
+
+    Attributes:
+        x, y: places of the modulator's samples over the page's half width and half height, [nx samples], [ny samples].
+    """
+
+    def __init__(self, profile: Profile, parameters: Real, samples: int, *, filled: bool = False) -> None:
+        value = as_dict(parameters)
+        geometry = WaveGeometry(
+            wavelength_m=profile.light.wavelength_m,
+            focal_length_m=profile.lens.focal_length_m * (1 + value["focal_length_relative"]),
+            pipe_length_m=profile.pipe.length_m * (1 + value["pipe_length_relative"]),
+            pipe_width_m=profile.pipe.width_m * (1 + value["pipe_width_relative"]),
+            refractive_index=profile.pipe.refractive_index,
+            pipe_angle=np.deg2rad(profile.pipe.angle_deg) + value["pipe_angle_rad"],
+            pipe_roll=value["pipe_roll_rad"],
+        )
+        grid = field_grid(profile)
+        rows, columns = profile.page_shape
+        pitch = profile.symbol_pitch_m / samples
+        x = (np.arange(columns * samples) - (columns * samples - 1) / 2) * pitch
+        y = (np.arange(rows * samples) - (rows * samples - 1) / 2) * pitch
+        half_width, half_height = profile.page_width_m / 2, profile.page_height_m / 2
+        self.x, self.y = x / half_width, y / half_height
+        self._channel = WaveChannel(
+            geometry,
+            x + value["page_centre_x_m"],
+            y + value["page_centre_y_m"],
+            grid.x_m,
+            grid.y_m,
+            cells=(modes_for(half_height * _REACH, geometry), modes_for(half_width * _REACH, geometry)),
+            steps=_STEPS,
+            envelope_m=pitch if filled else 0.0,
+        )
+        corner = np.hypot(half_width, half_height)
+        edges = half_width / corner, half_height / corner
+        at_camera = camera_phase(value, grid.x_m[None, :] / corner, grid.y_m[:, None] / corner, *edges)
+        at_launch = launch_phase(value, x[None, :] / corner, y[:, None] / corner)
+        ramp = (
+            geometry.wave_number
+            / geometry.focal_length_m
+            * np.array([value["pipe_centre_x_m"], value["pipe_centre_y_m"]])
+        )
+        at_launch = at_launch - ramp[0] * x[None, :] - ramp[1] * y[:, None]
+        at_camera = at_camera + ramp[0] * grid.x_m[None, :] + ramp[1] * grid.y_m[:, None]
+        self._launch: Complex = np.exp(1j * at_launch)
+        self._camera: Complex = np.exp(1j * at_camera)
+
+    def to_camera(self, field: Complex) -> Complex:
+        """Field on the modulator [ny samples, nx samples] to the common grid [Gy, Gx], against the reference."""
+        return np.asarray(self._channel.forward(field * self._launch) * self._camera)
+
+    def to_page(self, field: Complex) -> Complex:
+        """Field on the common grid [Gy, Gx] back to the modulator, by the adjoint."""
+        return np.asarray(self._channel.adjoint(field * self._camera.conj()) * self._launch.conj())

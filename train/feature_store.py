@@ -1,0 +1,99 @@
+"""Page features on disk, kept page by page: interrupted work goes on where it was, and training reads what it needs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.lib.format import open_memmap
+from torch import Tensor
+from torch.utils.data import Dataset
+from tqdm import tqdm
+
+from optics.files import replace_text
+from train.features import PageFeatures
+
+_STATE = "state.json"
+
+Maker = Callable[[int, tuple[float, float]], Iterator[PageFeatures]]
+"""Makes the features from a page number on; told of the shift of the page before it."""
+
+
+class FeatureStore(Dataset[tuple[Tensor, Tensor, Tensor]]):
+    """Pages of features in a folder, as arrays that are mapped and not loaded.
+
+    An item is a page's light [2 C, ny, nx] float16, positions [2, ny, nx] and true phases [ny, nx].
+
+    Args:
+        folder: with arrays that `fill` has completed.
+        pages: which of them, all if left out.
+    """
+
+    def __init__(self, folder: Path, pages: range | None = None) -> None:
+        self._light, self._positions, self._phases = (
+            np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("light", "positions", "phases")
+        )
+        self._pages = range(len(self._light)) if pages is None else pages
+
+    def __len__(self) -> int:
+        """Pages."""
+        return len(self._pages)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
+        """One page."""
+        page = self._pages[index]
+        light = np.array(self._light[page])
+        return (
+            torch.from_numpy(light.reshape(-1, *light.shape[-2:])),
+            torch.from_numpy(np.array(self._positions[page])),
+            torch.from_numpy(np.array(self._phases[page])),
+        )
+
+
+def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> None:
+    """Make the features of `count` pages and keep them in `folder`, or go on with those that are there.
+
+    Args:
+        folder: made if missing; what it holds under another key is made anew.
+        key: everything that the features depend on.
+        count: pages.
+        make: makes them, from a page on.
+        what: for the progress bar.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    key = f"{count} pages {key}"
+    done, shift = _kept(folder, key)
+    if done >= count:
+        return
+    arrays: dict[str, np.memmap[Any, Any]] = {}
+    with torch.inference_mode():
+        pages = tqdm(make(done, shift), desc=what, unit="page", initial=done, total=count)
+        for number, page in zip(range(done, count), pages, strict=False):
+            for name in ("light", "positions", "phases"):
+                value = getattr(page, name)
+                if name not in arrays:
+                    path = folder / f"{name}.npy"
+                    arrays[name] = (
+                        open_memmap(path, "r+")
+                        if number
+                        else open_memmap(path, "w+", dtype=value.dtype, shape=(count, *value.shape))
+                    )
+                arrays[name][number] = value
+                arrays[name].flush()
+            state = {"key": key, "done": number + 1, "shift_px": page.shift_px}
+            replace_text(folder / _STATE, json.dumps(state), "state of the features")
+
+
+def _kept(folder: Path, key: str) -> tuple[int, tuple[float, float]]:
+    """Pages that an earlier call completed under the same key, and the last one's shift."""
+    try:
+        state = json.loads((folder / _STATE).read_text())
+        if state["key"] == key:
+            return int(state["done"]), (float(state["shift_px"][0]), float(state["shift_px"][1]))
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return 0, (0.0, 0.0)

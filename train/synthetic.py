@@ -1,0 +1,153 @@
+"""Synthetic pages of a calibrated device: its fitted wave model, where it stands and where it may drift to.
+
+A network that has seen a single geometry carries part of its skill to no other. The fitted wave model shows it the same
+device after a thousand drifts, with the illumination and the noise that recorded pages have over the model.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from optics.grid import field_grid
+from optics.page import random_symbols, symbol_phases
+from optics.profile import Profile
+from optics.registration.fitted_waves import FittedWaves
+from optics.registration.parameters import NAMES
+from optics.registration.table import sampling_table
+from train.features import PageFeatures, demodulate
+from train.localizers.coherent import SAMPLES, CoherentLocalizer
+from train.localizers.wave import WaveLocalizer
+from train.twin import RayTwin, TorchTwin
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+PAGES_PER_STATE = 4
+"""Pages of each drifted state: setting up a state costs as much as a few pages."""
+LEVELS = 256
+MOST_NOISE = 0.3
+"""Unexplained power over the light's above which synthetic light teaches nothing of the device."""
+_DRIFT = {
+    "pipe_angle_rad": np.deg2rad(0.06),
+    "focal_length_relative": 6e-4,
+    "pipe_length_relative": 3e-4,
+    "pipe_width_relative": 1e-5,
+    "page_centre_x_m": 5e-6,
+    "page_centre_y_m": 5e-6,
+    "pipe_roll_rad": np.deg2rad(0.02),
+    "pipe_centre_x_m": 0.5e-6,
+    "pipe_centre_y_m": 0.5e-6,
+    "launch_defocus_rad": 0.3,
+    "launch_astigmatism_0_rad": 0.1,
+    "launch_astigmatism_45_rad": 0.1,
+    "launch_coma_x_rad": 0.1,
+    "launch_coma_y_rad": 0.1,
+    "camera_tilt_x_rad": 0.5,
+    "camera_tilt_y_rad": 0.5,
+    "camera_curvature_rad": 0.3,
+}
+"""Most that a device is expected to drift between two trainings, either way: twice what costs an untrained decoder most
+of its rate. The cameras' poses are left out: registration takes them off before the network sees anything."""
+_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+"""Powers of (x, y) in the illumination."""
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """What recorded pages show over the fitted geometry.
+
+    Attributes:
+        illumination: complex factor on the modulator as a quadratic in the page's coordinates (-1 to 1), [6].
+        noise: power of what is left unexplained over the field's power.
+    """
+
+    illumination: Complex
+    noise: float
+
+
+def likeness(profile: Profile, parameters: Real, fields: Sequence[Complex], phases: Sequence[Real]) -> Likeness:
+    """Compare recorded fields with the fitted wave model of what was written, by least squares.
+
+    Args:
+        profile: the nominal device.
+        parameters: [P] fitted.
+        fields: recovered fields [Gy, Gx] of known pages, image shift taken off.
+        phases: what was written, [ny, nx] radians, one a field.
+    """
+    waves = FittedWaves(profile, parameters, SAMPLES, filled=True)
+    found, left = [], []
+    for field, written in zip(fields, phases, strict=True):
+        page = _on_modulator(written)
+        shown = np.stack([waves.to_camera(page * term).ravel() for term in _illumination_terms(waves)], axis=1)
+        factors = np.linalg.lstsq(shown, field.ravel(), rcond=None)[0]
+        found.append(factors / factors[0])
+        left.append(float(np.mean(np.abs(field.ravel() - shown @ factors) ** 2) / np.mean(np.abs(field) ** 2)))
+    return Likeness(np.mean(found, axis=0), float(np.mean(left)))
+
+
+class SyntheticPages:
+    """Features of pages that the fitted device would show after drifts of its own.
+
+    Args:
+        profile: the nominal device.
+        parameters: [P] fitted.
+        like: what recorded pages show over that geometry.
+        localizer: `coherent` or `wave`.
+        seed: of drifts, symbols and noise.
+    """
+
+    def __init__(self, profile: Profile, parameters: Real, like: Likeness, localizer: str, seed: int) -> None:
+        self._profile, self._parameters, self._like, self._seed = profile, parameters, like, seed
+        self._twin = TorchTwin(RayTwin(profile))
+        self._coherent = CoherentLocalizer(profile)
+        self._by_waves = localizer == "wave"
+
+    def pages(self, first: int = 0) -> Iterator[PageFeatures]:
+        """Features of page `first` and all after it, without end; the same pages from wherever it starts."""
+        state = first // PAGES_PER_STATE
+        skipped = first % PAGES_PER_STATE
+        while True:
+            yield from itertools.islice(self._state(state), skipped, None)
+            state, skipped = state + 1, 0
+
+    def _state(self, number: int) -> Iterator[PageFeatures]:
+        """All pages of one drifted state."""
+        profile = self._profile
+        rng = np.random.default_rng([self._seed, number])
+        drift = np.array([_DRIFT.get(name, 0.0) for name in NAMES]) * rng.uniform(-1, 1, len(NAMES))
+        parameters = self._parameters + drift
+        waves = FittedWaves(profile, parameters, SAMPLES, filled=True)
+        wave_localizer = WaveLocalizer(profile, parameters) if self._by_waves else None
+        table = sampling_table(self._twin, parameters, np.pi / 2, profile)
+        light_on = sum(
+            factor * term for factor, term in zip(self._like.illumination, _illumination_terms(waves), strict=True)
+        )
+        for symbols in random_symbols(profile, LEVELS, PAGES_PER_STATE, rng):
+            phases = symbol_phases(symbols, LEVELS)
+            field = waves.to_camera(_on_modulator(phases) * light_on)
+            field = (field + self._noise(field, rng)).astype(np.complex64)
+            light = demodulate(self._coherent, field, table) if wave_localizer is None else wave_localizer(field)
+            yield PageFeatures(light.astype(np.float16), table["positions"], phases.astype(np.float32), (0.0, 0.0))
+
+    def _noise(self, field: Complex, rng: np.random.Generator) -> Complex:
+        """White noise in the pipe's band with the power that the model leaves unexplained."""
+        band = field_grid(self._profile).band
+        white = rng.standard_normal((2, *field.shape))
+        noise = signal.oaconvolve(white, band[None, :, None], mode="same", axes=1)
+        noise = signal.oaconvolve(noise, band[None, None, :], mode="same", axes=2)
+        level = np.sqrt(self._like.noise * np.mean(np.abs(field) ** 2) / np.sum(np.mean(noise**2, axis=(1, 2))))
+        return np.asarray(level * (noise[0] + 1j * noise[1]))
+
+
+def _on_modulator(phases: Real) -> Complex:
+    return np.asarray(np.exp(1j * np.kron(phases, np.ones((SAMPLES, SAMPLES)))))
+
+
+def _illumination_terms(waves: FittedWaves) -> list[Real]:
+    return [waves.x[None, :] ** i * waves.y[:, None] ** j for i, j in _TERMS]
