@@ -37,7 +37,7 @@ AIR_LEVELS = 256
 PAGES_PER_SEED = 10_000
 """Another seed writes other pages, on the same device."""
 
-RECALIBRATION_PAGES = 3
+RECALIBRATION_PAGES = 2
 
 
 @dataclass(frozen=True)

@@ -189,21 +189,28 @@ def fit_network(
     return module.eval(), float(score) if score is not None else float("nan")
 
 
+def decode_pages(module: DecoderTraining, pages: Dataset[Page]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What a trained module says of pages, p [pages, 2, ny, nx], and their true phases [pages, ny, nx]."""
+    outputs, truths = [], []
+    with torch.no_grad():
+        for light, positions, phases in DataLoader(pages, batch_size=None):
+            outputs.append(module(light[None], positions[None])[0].float().numpy())
+            truths.append(phases.numpy())
+    return np.stack(outputs), np.stack(truths)
+
+
 def best_kappa_scale(module: DecoderTraining, pages: Dataset[Page], mask: NDArray[np.bool_]) -> float:
     """Factor on p under which held-out pages are most likely: the network's claim, made honest.
 
     Piston is taken off by the pilots first, as the runtime does it.
     """
     outputs, truths = [], []
-    with torch.no_grad():
-        for light, positions, phases in DataLoader(pages, batch_size=None):
-            p = module(light[None], positions[None])[0].float().numpy()
-            truth = phases.numpy()
-            pilots = Pilots(mask, truth[mask].astype(np.float64))
-            turn = estimate_piston(p, pilots).angle_rad
-            cos, sin = np.cos(turn), np.sin(turn)
-            outputs.append(np.stack([p[0] * cos + p[1] * sin, p[1] * cos - p[0] * sin])[:, ~mask])
-            truths.append(truth[~mask])
+    for p, truth in zip(*decode_pages(module, pages), strict=True):
+        pilots = Pilots(mask, truth[mask].astype(np.float64))
+        turn = estimate_piston(p, pilots).angle_rad
+        cos, sin = np.cos(turn), np.sin(turn)
+        outputs.append(np.stack([p[0] * cos + p[1] * sin, p[1] * cos - p[0] * sin])[:, ~mask])
+        truths.append(truth[~mask])
     p_all = torch.from_numpy(np.concatenate(outputs, axis=1))[None]
     truth_all = torch.from_numpy(np.concatenate(truths))[None]
 

@@ -65,10 +65,12 @@ class Likeness:
     Attributes:
         illumination: complex factor on the modulator as a quadratic in the page's coordinates (-1 to 1), [6].
         noise: power of what is left unexplained over the field's power.
+        seen: where both cameras look at the common grid, bool [Gy, Gx].
     """
 
     illumination: Complex
     noise: float
+    seen: NDArray[np.bool_]
 
 
 def likeness(profile: Profile, parameters: Real, fields: Sequence[Complex], phases: Sequence[Real]) -> Likeness:
@@ -81,14 +83,16 @@ def likeness(profile: Profile, parameters: Real, fields: Sequence[Complex], phas
         phases: what was written, [ny, nx] radians, one a field.
     """
     waves = FittedWaves(profile, parameters, SAMPLES, filled=True)
+    seen = _seen(profile, parameters)
     found, left = [], []
     for field, written in zip(fields, phases, strict=True):
         page = _on_modulator(written)
-        shown = np.stack([waves.to_camera(page * term).ravel() for term in _illumination_terms(waves)], axis=1)
-        factors = np.linalg.lstsq(shown, field.ravel(), rcond=None)[0]
+        shown = np.stack([waves.to_camera(page * term)[seen] for term in _illumination_terms(waves)], axis=1)
+        light = field[seen]
+        factors = np.linalg.lstsq(shown, light, rcond=None)[0]
         found.append(factors / factors[0])
-        left.append(float(np.mean(np.abs(field.ravel() - shown @ factors) ** 2) / np.mean(np.abs(field) ** 2)))
-    return Likeness(np.mean(found, axis=0), float(np.mean(left)))
+        left.append(float(np.mean(np.abs(light - shown @ factors) ** 2) / np.mean(np.abs(light) ** 2)))
+    return Likeness(np.mean(found, axis=0), float(np.mean(left)), seen)
 
 
 class SyntheticPages:
@@ -131,7 +135,7 @@ class SyntheticPages:
         for symbols in random_symbols(profile, LEVELS, PAGES_PER_STATE, rng):
             phases = symbol_phases(symbols, LEVELS)
             field = waves.to_camera(_on_modulator(phases) * light_on)
-            field = (field + self._noise(field, rng)).astype(np.complex64)
+            field = (self._like.seen * (field + self._noise(field, rng))).astype(np.complex64)
             light = demodulate(self._coherent, field, table) if wave_localizer is None else wave_localizer(field)
             yield PageFeatures(light.astype(np.float16), table["positions"], phases.astype(np.float32), (0.0, 0.0))
 
@@ -141,8 +145,19 @@ class SyntheticPages:
         white = rng.standard_normal((2, *field.shape))
         noise = signal.oaconvolve(white, band[None, :, None], mode="same", axes=1)
         noise = signal.oaconvolve(noise, band[None, None, :], mode="same", axes=2)
-        level = np.sqrt(self._like.noise * np.mean(np.abs(field) ** 2) / np.sum(np.mean(noise**2, axis=(1, 2))))
+        level = np.sqrt(
+            self._like.noise * np.mean(np.abs(field[self._like.seen]) ** 2) / np.sum(np.mean(noise**2, axis=(1, 2)))
+        )
         return np.asarray(level * (noise[0] + 1j * noise[1]))
+
+
+def _seen(profile: Profile, parameters: Real) -> NDArray[np.bool_]:
+    """Where both cameras look at the common grid."""
+    grid = field_grid(profile)
+    places = np.stack(np.meshgrid(grid.x_m, grid.y_m), axis=-1).reshape(-1, 2)
+    pixels = TorchTwin(RayTwin(profile)).pixels(parameters, places)
+    last = np.array([profile.camera.columns_px - 1, profile.camera.rows_px - 1])
+    return np.asarray(np.all((pixels >= 0) & (pixels <= last), axis=(0, 2)).reshape(grid.shape))
 
 
 def _on_modulator(phases: Real) -> Complex:
