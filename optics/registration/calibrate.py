@@ -186,7 +186,7 @@ def refine(
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.turn = start.copy(), turn
     work.total = len(_DRIFTED) + 2
-    work.refine_homodyne(_POSE_DRIFT)
+    work.refine_homodyne(_POSE_DRIFT, rounds=1)
     for stage in _DRIFTED:
         work.complex_field(stage, start, _DRIFT_SCALE)
     return work.result(start)
