@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -22,12 +23,12 @@ from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording, calibration_
 from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor
 from train.fitting import Hyperparameters, Page, best_kappa_scale, fit_network
-from train.run import GOLDEN, REFERENCES, Run, save_network
+from train.run import GOLDEN, REFERENCES, Run, begin, save_network
 from train.synthetic import MOST_NOISE, SyntheticPages, likeness
 
 PUBLISHED = ("none", "mode", "ray")
 TRAINABLE = ("coherent", "wave")
-DEFAULT_SYNTHETIC_PAGES = 160
+DEFAULT_SYNTHETIC_PAGES = 96
 _FEWEST_PAGES = 6
 _LIKENESS_PAGES = 2
 """Recorded pages that the wave model is compared with: each has thousands of symbols."""
@@ -101,6 +102,18 @@ def train(
         calibration = _calibration(recording, profile_name, calibration_path, out)
         calibration.check_profile(profile)
         groups = _split(recording, calibration, validation_share, test_share)
+        begin(
+            out,
+            {
+                "--recording": str(recording_path.resolve()),
+                "--localizer": localizer,
+                "calibration": calibration.to_toml(),
+                "--validation-share": validation_share,
+                "--test-share": test_share,
+                "--synthetic-pages": synthetic_pages,
+                **{f"--{name.replace('_', '-')}": value for name, value in asdict(choices).items()},
+            },
+        )
         extractor = FeatureExtractor(
             profile, calibration.vector, calibration.turn_rad, recording.references(), localizer
         )

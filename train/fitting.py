@@ -147,6 +147,8 @@ def fit_network(
 ) -> tuple[DecoderTraining, float]:
     """Train, or go on with, the network of a run; returns the best checkpoint's module and its validation AIR.
 
+    Raises KeyboardInterrupt after Ctrl-C, with the last checkpoint in place.
+
     Args:
         run: folder of the run; checkpoints and TensorBoard logs go there, and `last.ckpt` is resumed from.
         hyperparameters: the run's choices.
@@ -176,13 +178,16 @@ def fit_network(
         default_root_dir=run,
     )
     last = run / "checkpoints" / "last.ckpt"
-    trainer.fit(
-        module,
-        DataLoader(training, batch_size=hyperparameters.batch, sampler=sampler),
-        DataLoader(validation, batch_size=1),
-        ckpt_path=last if last.exists() else None,
-        weights_only=False,
-    )
+    try:
+        trainer.fit(
+            module,
+            DataLoader(training, batch_size=hyperparameters.batch, sampler=sampler),
+            DataLoader(validation, batch_size=1),
+            ckpt_path=last if last.exists() else None,
+            weights_only=False,
+        )
+    except SystemExit:  # Lightning's answer to Ctrl-C, once it has closed its files
+        raise KeyboardInterrupt from None
     state = torch.load(best.best_model_path or last, map_location="cpu", weights_only=False)
     module.load_state_dict(state["state_dict"])
     score = best.best_model_score

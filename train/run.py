@@ -10,12 +10,14 @@ from typing import Any
 import torch
 
 from optics.errors import InvalidInputError
+from optics.files import replace_text
 from optics.profile import Profile, parse_profile
 from optics.registration.calibration import Calibration, parse_calibration
 from train.fitting import DecoderTraining, Hyperparameters
 from train.localizers.coherent import POSITION_CHANNELS
 from train.network import SymbolUNet
 
+BEGUN = "begun.json"
 DESCRIPTION = "run.json"
 WEIGHTS = "decoder.pt"
 REFERENCES = "references.npz"
@@ -65,9 +67,30 @@ class Run:
 
     def save(self, folder: Path) -> None:
         """Write `run.json`, last of all, so that a folder with it is a finished run."""
-        partial = folder / (DESCRIPTION + ".partial")
-        partial.write_text(json.dumps(asdict(self), indent=2))
-        partial.replace(folder / DESCRIPTION)
+        replace_text(folder / DESCRIPTION, json.dumps(asdict(self), indent=2), "description of the run")
+
+
+def begin(folder: Path, options: dict[str, Any]) -> None:
+    """Note what a run is begun with, or check that it goes on with just that.
+
+    Args:
+        folder: of the run.
+        options: by name, as JSON can keep them.
+
+    Raises:
+        InvalidInputError: the folder holds a run that was begun with other options.
+    """
+    path = folder / BEGUN
+    try:
+        kept = json.loads(path.read_text())
+    except (OSError, ValueError):
+        replace_text(path, json.dumps(options, indent=2), "options of the run")
+        return
+    for name, value in options.items():
+        if kept.get(name) != value:
+            raise InvalidInputError(
+                f"run {folder}: {name}", value, f"{kept.get(name)!r}, with which it was begun, or another --out"
+            )
 
 
 def load_run(folder: Path) -> Run:

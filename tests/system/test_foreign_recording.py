@@ -15,6 +15,7 @@ from tests.system.foreign_device import ForeignDevice
 
 PAGES = 16
 STEPS = 300
+SYNTHETIC = 48
 MINUTES = 12
 
 
@@ -44,7 +45,8 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
     assert abs(angle - device.parameters.pipe_angle_deg) <= 0.03, f"seed {seed}"
 
     lightpage("train", "--profile", "bench", "--recording", str(recording), "--calibration", str(calibration),
-              "--localizer", "coherent", "--steps", str(STEPS), "--out", str(run))  # fmt: skip
+              "--localizer", "coherent", "--steps", str(STEPS), "--synthetic-pages", str(SYNTHETIC),
+              "--out", str(run))  # fmt: skip
     lightpage("export", str(run), "--out", str(bundle))
     lightpage("evaluate", "--bundle", str(bundle), "--recording", str(recording), "--json", str(figures))
     evaluation = json.loads(figures.read_text())

@@ -1,0 +1,92 @@
+"""`lightpage train` on a small device: a run, its interruption, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+from optics.cli import simulate
+from optics.device import Device
+from optics.errors import InvalidInputError
+from optics.registration.calibrate import Registered
+from optics.registration.calibration import Calibration
+from optics.registration.parameters import NAMES
+from optics.simulator import true_parameters
+from tests.optics.small import small_profile
+from train.cli_train import train
+from train.run import begin
+
+PAGES = 8
+SECONDS = 120
+
+
+@pytest.fixture(scope="module")
+def device(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Options that name a small device's profile, recording and (right) calibration."""
+    folder = tmp_path_factory.mktemp("device")
+    profile, state = small_profile(), Device()
+    (folder / "small.toml").write_text(profile.to_toml())
+    arguments = ["--profile", str(folder / "small.toml"), "--recording", str(folder / "R.h5")]
+    made = f"--profile {folder}/small.toml --pages {PAGES} --seed 4 --out {folder}/R.h5"
+    CliRunner().invoke(simulate, made.split(), standalone_mode=False, catch_exceptions=False)
+    turn = np.pi / 2 + np.deg2rad(state.homodyne.quadrature_error_deg)
+    perfect = Registered(true_parameters(profile, state), np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
+    Calibration.from_registered(perfect, profile, ["0" * 64]).save(folder / "C.toml")
+    return [*arguments, "--calibration", str(folder / "C.toml"), "--channels", "8", "--blocks", "1"]
+
+
+def run(arguments: list[str]) -> str:
+    done = CliRunner().invoke(train, arguments, standalone_mode=False, catch_exceptions=False)
+    return done.output
+
+
+def test_recorded_and_synthetic_pages_are_trained_on_and_the_last_are_left(device: list[str], tmp_path: Path) -> None:
+    output = run([*device, "--steps", "60", "--synthetic-pages", "5", "--out", str(tmp_path / "run")])
+    assert "6 recorded and 5 synthetic pages" in output
+    described = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert described["synthetic_pages"] == 5
+    assert len(described["trained_pages"]) == PAGES - 1
+
+
+def test_ctrl_c_in_training_loses_nothing_and_the_same_command_goes_on(device: list[str], tmp_path: Path) -> None:
+    out, steps = (
+        tmp_path / "run",
+        360,
+    )  # a multiple of sixty: the last look at the validation pages is after the last step
+    arguments = [*device, "--steps", str(steps), "--synthetic-pages", "0", "--out", str(out)]
+    command = [sys.executable, "-m", "runtime.cli", "train", *arguments]
+    last = out / "checkpoints" / "last.ckpt"
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        end = time.monotonic() + SECONDS
+        while not last.exists() and time.monotonic() < end and process.poll() is None:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=SECONDS)
+    finally:
+        process.kill()
+    assert process.returncode == 130, output
+    assert "run the same command again" in output
+    assert not (out / "run.json").exists()
+    reached = torch.load(last, map_location="cpu", weights_only=False)["global_step"]
+    assert 0 < reached < steps
+    run(arguments)
+    assert torch.load(last, map_location="cpu", weights_only=False)["global_step"] == steps
+    assert (out / "run.json").exists()
+
+
+def test_a_run_does_not_go_on_with_other_options(tmp_path: Path) -> None:
+    options = {"--channels": 8, "--steps": 60}
+    begin(tmp_path, options)
+    begin(tmp_path, options)
+    with pytest.raises(InvalidInputError, match=r"--channels.*16.*8, with which it was begun"):
+        begin(tmp_path, options | {"--channels": 16})
