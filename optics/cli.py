@@ -13,6 +13,7 @@ from optics.errors import InvalidInputError
 from optics.page import MAX_LEVELS, MIN_LEVELS, random_symbols
 from optics.profile import Profile, load_profile, to_toml
 from optics.recording import RecordingWriter
+from optics.recording_writer import discard_partial, partial_path
 from optics.simulator import Simulator
 
 _SYMBOLS = 3
@@ -59,14 +60,14 @@ class _Job:
     def __init__(self, profile: Profile, device: Device, levels: int, seed: int, truth: bool, out: Path) -> None:
         self.profile, self.device, self.levels, self.seed, self.truth = profile, device, levels, seed, truth
         self.out = out
-        self.partial = out.with_name(out.name + ".partial")
+        self.partial = partial_path(out)
         self.settings = out.with_name(out.name + ".partial.toml")
 
     def claim(self, force: bool) -> None:
         """Note the settings, unless pages begun with others are there.
 
         Raises:
-            InvalidInputError: they are there and `force` is not given, or the folder cannot be written.
+            InvalidInputError: they are there and `force` is not given, they are being written, or the folder cannot be.
         """
         # references alone would not tell two devices apart: the pipe does not show in them
         text = f"levels = {self.levels}\nseed = {self.seed}\ntruth = {str(self.truth).lower()}\n"
@@ -80,7 +81,7 @@ class _Job:
                         f"pages begun with other settings ({self.partial.name})",
                         "the same settings, to go on with them, or --force, to start anew",
                     )
-                self.partial.unlink()
+                discard_partial(self.out)
             self.settings.write_text(text, "utf-8")
         except OSError as error:
             raise InvalidInputError(f"--out {self.out}", error, "a place that can be written") from None

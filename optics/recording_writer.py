@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,42 @@ from optics.errors import PageError, RecordingError
 from optics.page import check_levels, check_symbols
 from optics.profile import Profile
 from optics.recording_layout import FORMAT, FRAMES, MAX_BIT_DEPTH, MIN_BIT_DEPTH, VERSION, FramePair, frame_type
+
+
+def partial_path(path: Path) -> Path:
+    """Where a recording lies until it is complete and gets its name `path`."""
+    return path.with_name(path.name + ".partial")
+
+
+def discard_partial(path: Path) -> None:
+    """Remove the unfinished pages of the recording `path`, if there are any.
+
+    Raises:
+        RecordingError: another process is writing them, or they cannot be removed.
+    """
+    _take(partial_path(path), remove=True)
+
+
+def _take(partial: Path, *, remove: bool) -> bool:
+    """Whether `partial` is there, writable and written by nobody else; `remove` unlinks it while that is certain.
+
+    HDF5 holds this same lock on a file as long as it is open for writing.
+    """
+    thing = f"recording {partial}"
+    try:
+        with partial.open("rb+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if remove:
+                partial.unlink()
+    except FileNotFoundError:
+        return False
+    except BlockingIOError:
+        raise RecordingError(
+            thing, "pages that another process is writing now", "another name, or to wait for its end"
+        ) from None
+    except OSError as error:
+        raise RecordingError(thing, error, "a file that can be read and written") from None
+    return True
 
 
 class RecordingWriter:
@@ -34,7 +71,7 @@ class RecordingWriter:
         references: FramePair,
         pilots: ArrayLike | None = None,
     ) -> None:
-        """Start a new recording; a partial file of the same name is overwritten.
+        """Start a new recording; a partial file of the same name that nobody is writing is overwritten.
 
         Args:
             path: final name.
@@ -45,7 +82,7 @@ class RecordingWriter:
             pilots: boolean [ny, nx]; None leaves the profile's default positions in force.
 
         Raises:
-            RecordingError: wrong bit depth, frames or pilots, or the file cannot be written.
+            RecordingError: wrong bit depth, frames or pilots, or the file cannot be written or is being written.
             PageError: a level count outside 2..256.
         """
         self._prepare(path, profile, levels, bit_depth)
@@ -146,7 +183,7 @@ class RecordingWriter:
     def _prepare(self, path: str | Path, profile: Profile, levels: int, bit_depth: int) -> None:
         self.path = Path(path)
         self._thing = f"recording {self.path}"
-        self._partial = self.path.with_name(self.path.name + ".partial")
+        self._partial = partial_path(self.path)
         check_levels(levels, f"{self._thing}: levels")
         if not MIN_BIT_DEPTH <= bit_depth <= MAX_BIT_DEPTH:
             raise RecordingError(f"{self._thing}: bit depth", bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}")
@@ -190,8 +227,9 @@ class RecordingWriter:
 
     def _create(self, references: FramePair, pilots: ArrayLike | None) -> None:
         fixed = self._checked_fixed(references, pilots)
+        discard_partial(self.path)
         try:
-            self._file = h5py.File(str(self._partial), "w")
+            self._file = h5py.File(str(self._partial), "w-")
         except OSError as error:
             raise RecordingError(f"recording {self._partial}", error, "a file that can be written") from None
         for name, value in self._header().items():
@@ -204,12 +242,20 @@ class RecordingWriter:
         self._file.flush()
 
     def _continue(self, references: FramePair, pilots: ArrayLike | None) -> bool:
-        """Open the partial file if it is sound and was started with the same arguments."""
+        """Open the partial file if it is sound and was started with the same arguments.
+
+        Raises:
+            RecordingError: another process is writing it, or the system does not let it be read.
+        """
         fixed = self._checked_fixed(references, pilots)
+        if not _take(self._partial, remove=False):
+            return False
         try:
             file = h5py.File(str(self._partial), "r+")
-        except OSError:
-            return False
+        except OSError as error:
+            if error.errno is None:  # not the system but HDF5: the file was cut off or is none of its own
+                return False
+            raise RecordingError(f"recording {self._partial}", error, "a file that can be read and written") from None
         try:
             pages = int(file.attrs["pages_complete"])
             same = (

@@ -13,9 +13,9 @@ from click.testing import CliRunner
 import optics.cli
 from optics.cli import simulate
 from optics.device import Device, load_device
-from optics.errors import InvalidInputError, ProfileError
+from optics.errors import InvalidInputError, ProfileError, RecordingError
 from optics.profile import Camera, PageLayout, load_profile
-from optics.recording import Recording
+from optics.recording import FramePair, Recording, RecordingWriter
 from optics.simulator import SimulatedPage, Simulator
 
 PAGES = 3
@@ -128,6 +128,17 @@ def test_pages_of_another_device_are_not_mixed_in(
     run(profile_file, out, *other, "--force", pages=1)
     with h5py.File(out) as file:
         assert "pipe_angle_deg = 0.5" in file["truth"].attrs["device"]
+
+
+def test_pages_that_are_being_written_are_not_destroyed_even_if_forced(profile_file: Path, tmp_path: Path) -> None:
+    out, profile = tmp_path / "R.h5", load_profile(profile_file)
+    frame = np.ones(profile.frame_shape, np.uint8)
+    with RecordingWriter(out, profile, 16, 8, FramePair(frame, frame)) as running:
+        running.append(None, FramePair(frame, frame))
+        with pytest.raises(RecordingError, match="another process is writing now"):
+            run(profile_file, out, "--force", pages=1)
+    with Recording.open(out) as recording:
+        assert recording.pages == 1
 
 
 def test_a_file_that_exists_is_kept_unless_forced(profile_file: Path, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -510,3 +512,42 @@ class TestInterruption:
             writer.append(None, random_frames(0))
         with Recording.open(path) as recording:
             assert recording.pages == 1
+
+    @pytest.mark.parametrize("begin", [RecordingWriter, RecordingWriter.resume])
+    def test_pages_that_are_being_written_are_neither_gone_on_with_nor_destroyed(
+        self, tmp_path: Path, begin: Callable[..., RecordingWriter]
+    ) -> None:
+        path, profile = tmp_path / "own.h5", small_profile()
+        with RecordingWriter(path, profile, LEVELS, 12, random_frames(100)) as writer:
+            writer.append(None, random_frames(0))
+            with pytest.raises(
+                RecordingError, match=r"own\.h5\.partial: got pages that another process is writing now"
+            ):
+                begin(path, profile, LEVELS, 12, random_frames(100))
+            writer.append(None, random_frames(1))
+        with Recording.open(path) as recording:
+            assert recording.pages == 2
+            assert np.array_equal(recording.frames(0).in_phase, random_frames(0).in_phase)
+
+    def test_pages_that_another_process_is_writing_outlive_a_second_writer(self, tmp_path: Path) -> None:
+        path, profile = tmp_path / "own.h5", small_profile()
+        again = (
+            "import sys; from tests.optics.test_recording import *\n"
+            "RecordingWriter.resume(Path(sys.argv[1]), small_profile(), LEVELS, 12, random_frames(100))"
+        )
+        with RecordingWriter(path, profile, LEVELS, 12, random_frames(100)) as writer:
+            writer.append(None, random_frames(0))
+            ended = subprocess.run(
+                [sys.executable, "-c", again, str(path)], capture_output=True, text=True, check=False, timeout=60
+            )
+            assert "RecordingError" in ended.stderr
+            assert "another process is writing now" in ended.stderr
+        with Recording.open(path) as recording:
+            assert recording.pages == 1
+
+    def test_a_partial_file_that_cannot_be_read_is_left_alone(self, tmp_path: Path) -> None:
+        partial = tmp_path / "own.h5.partial"
+        partial.mkdir()
+        with pytest.raises(RecordingError, match=r"own\.h5\.partial.*wanted a file that can be read and written"):
+            RecordingWriter.resume(tmp_path / "own.h5", small_profile(), LEVELS, 12, random_frames(100))
+        assert partial.exists()
