@@ -294,6 +294,7 @@ class Recording:
             data: NDArray[Any] = np.asarray(self._file[name][where])
         except OSError as error:
             raise RecordingError(self._thing(f"dataset '{name}'"), error, "data that can be read") from None
+        data = data.astype(data.dtype.newbyteorder("="), copy=False)  # torch takes no other byte order
         if name in REFERENCES:
             self._check_counts(name, data, "")
         return data

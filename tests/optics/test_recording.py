@@ -129,6 +129,25 @@ class TestReading:
         with Recording.open(foreign) as recording:
             assert int(recording.frames(0).in_phase.max()) <= 255
 
+    def test_counts_of_the_other_byte_order_come_back_in_this_machines(self, foreign: Path) -> None:
+        names = ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature")
+        with Recording.open(foreign) as recording:
+            before, references = recording.frames(1), recording.references()
+            page_hash = recording.page_hash(1)
+        with h5py.File(foreign, "r+") as file:
+            other = np.dtype(np.uint16).newbyteorder("S")
+            for name in names:
+                data = file[name][()]
+                del file[name]
+                file.create_dataset(name, data=data, dtype=other)
+            assert not file["in_phase"].dtype.isnative
+        with Recording.open(foreign) as recording:
+            for got, wanted in ((recording.frames(1), before), (recording.references(), references)):
+                for name in ("in_phase", "quadrature"):
+                    assert getattr(got, name).dtype.isnative
+                    assert np.array_equal(getattr(got, name), getattr(wanted, name))
+            assert recording.page_hash(1) == page_hash
+
     def test_a_page_that_is_not_there_is_refused(self, foreign: Path) -> None:
         with Recording.open(foreign) as recording:
             for page in (-1, PAGES):
