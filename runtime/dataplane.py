@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,30 +170,28 @@ class DataPlane:
         answer = self.decode(found.pair, levels, caller, pilots, start=start, received=time.perf_counter())
         return ReadAnswer(answer, found, mask)
 
-    def adopt(self, decoder: Decoder, path: Path | None, expected: Model | None = None) -> Model:
-        """Put a loaded decoder in service and remember it.
+    def adopt(self, decoder: Decoder, expected: Model | None = None) -> Model:
+        """Remember a loaded decoder and put it in service: both or neither.
 
         Raises:
-            BundleError, RecalibrationRefusedError: see `ModelRegistry.swap`.
+            BundleError: it cannot be remembered, or see `ModelRegistry.swap`.
+            RecalibrationRefusedError: see `ModelRegistry.swap`.
         """
-        model = self.registry.swap(decoder, expected)
-        self._remember(path)
-        return model
+        return self.registry.swap(decoder, expected, self._remember)
 
     def rollback(self) -> tuple[Model, Model]:
-        """Go back to the model before; returns (now current, dropped).
+        """Remember the model before and go back to it; returns (now current, dropped).
 
         Raises:
-            BundleError: there is none.
+            BundleError: there is none, or it cannot be remembered; then nothing changes.
         """
-        current, dropped = self.registry.rollback()
-        self._remember(current.decoder.bundle.path)
-        return current, dropped
+        return self.registry.rollback(self._remember)
 
-    def _remember(self, path: Path | None) -> None:
-        self.metrics.in_service(self.registry.current.version)
+    def _remember(self, model: Model) -> None:
+        path = model.decoder.bundle.path
         if self.store is not None:
-            self.store.remember(path if path is not None and path.parent == self.store.folder else None)
+            self.store.remember(path if path.parent == self.store.folder else None)
+        self.metrics.in_service(model.version)
 
     @staticmethod
     def _mask(found: SourcePage, decoder: Decoder) -> NDArray[np.bool_]:

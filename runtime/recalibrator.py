@@ -126,7 +126,7 @@ class Recalibrator:
         outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress)
         try:
             progress("put the new model in service", 1.0)
-            plane.adopt(Decoder(Bundle.open(path)), path, expected=model)
+            plane.adopt(Decoder(Bundle.open(path)), expected=model)
         except BaseException:
             path.unlink(missing_ok=True)
             raise

@@ -14,6 +14,12 @@ KEPT_MODELS = 4
 """Models held loaded, the current one included: enough to step back over a bad day, little enough to bound memory."""
 
 TrackerFactory = Callable[[Decoder], Tracker]
+ModelNote = Callable[["Model"], None]
+"""Writes down the model that is about to be in service; raises where it cannot, and then nothing changes."""
+
+
+def no_note(model: Model) -> None:
+    """Writes nothing down."""
 
 
 def no_tracker(decoder: Decoder) -> Tracker:
@@ -45,8 +51,10 @@ class ModelRegistry:
 
     def __init__(self, first: Decoder, make_tracker: TrackerFactory = no_tracker, kept: int = KEPT_MODELS) -> None:
         self._make_tracker, self._kept = make_tracker, kept
+        self._changing = threading.Lock()
+        """Held from the checks of a change to its end, its note included; taken before the lock below."""
         self._lock = threading.Lock()
-        """Guards the list; never held while a model is loaded or decodes."""
+        """Guards the list; never held while a model is loaded, noted or decodes."""
         self._models = [Model(first, make_tracker(first))]
 
     @property
@@ -61,41 +69,51 @@ class ModelRegistry:
         with self._lock:
             return tuple(self._models)
 
-    def swap(self, decoder: Decoder, expected: Model | None = None) -> Model:
+    def swap(self, decoder: Decoder, expected: Model | None = None, note: ModelNote = no_note) -> Model:
         """Put a loaded decoder in service and return its model; the previous one is kept for `rollback`.
 
         Args:
             decoder: loaded and checked.
             expected: if given, the model that must still be current: a result derived from another is out of date.
+            note: called with the new model before it is in service; what it raises leaves the old one there.
 
         Raises:
             BundleError: the decoder is for another device, or its version is held already.
             RecalibrationRefusedError: `expected` is no longer current.
         """
         model = Model(decoder, self._make_tracker(decoder))
-        with self._lock:
-            current = self._models[-1]
+        with self._changing:
+            held = self.models
+            current = held[-1]
             if expected is not None and current is not expected:
                 raise RecalibrationRefusedError(
                     "model in service", f"{current.version} by now", f"{expected.version}, which was recalibrated"
                 )
             self._check_replaces(decoder, current.decoder)
-            if any(held.version == decoder.version for held in self._models):
+            if any(other.version == decoder.version for other in held):
                 raise BundleError(f"{decoder.bundle.thing}: version", decoder.version, "a version not held already")
-            self._models = [*self._models, model][-self._kept :]
+            note(model)
+            with self._lock:
+                self._models = [*held, model][-self._kept :]
         return model
 
-    def rollback(self) -> tuple[Model, Model]:
+    def rollback(self, note: ModelNote = no_note) -> tuple[Model, Model]:
         """Put the model before the current one back in service; returns (now current, dropped).
+
+        Args:
+            note: called with the earlier model before it is in service; what it raises leaves the later one there.
 
         Raises:
             BundleError: there is no earlier model.
         """
-        with self._lock:
-            if len(self._models) < 2:
-                raise BundleError("rollback", f"only {self._models[-1].version}", "an earlier model to go back to")
-            dropped = self._models.pop()
-            return self._models[-1], dropped
+        with self._changing:
+            held = self.models
+            if len(held) < 2:
+                raise BundleError("rollback", f"only {held[-1].version}", "an earlier model to go back to")
+            note(held[-2])
+            with self._lock:
+                self._models = list(held[:-1])
+            return held[-2], held[-1]
 
     @staticmethod
     def _check_replaces(new: Decoder, old: Decoder) -> None:

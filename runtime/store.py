@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from optics.errors import BundleError
@@ -52,6 +53,8 @@ class ModelStore:
             temporary.write_text(json.dumps(note), "utf-8")
             os.replace(temporary, self.folder / CURRENT)
         except OSError as error:
+            with suppress(OSError):
+                temporary.unlink()
             raise BundleError(f"model store {self.folder}", error, "a folder that can be written") from None
 
     def last(self) -> Path | None:

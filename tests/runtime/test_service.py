@@ -38,6 +38,7 @@ from runtime.recalibration import Fit, FitResult
 from runtime.recalibrator import Recalibrator
 from runtime.registry import ModelRegistry
 from runtime.server import SERVICE, LightpageServer
+from runtime.store import ModelStore
 from tests.runtime import toy
 
 DRIFTED = (150.0, 62.0)
@@ -69,9 +70,16 @@ def start(toy_zip: Path, tmp_path: Path) -> Iterator[Start]:
     """Starts services on free loopback ports and ends them."""
     running: list[Running] = []
 
-    def begin(limits: Limits | None = None, fit: Fit = toy.fit_references, bundle: Path = toy_zip) -> Running:
+    def begin(
+        limits: Limits | None = None,
+        fit: Fit = toy.fit_references,
+        bundle: Path = toy_zip,
+        store: Path | None = None,
+    ) -> Running:
         source = toy.ToySource(toy.ToyDevice())
-        plane = DataPlane(ModelRegistry(Decoder(Bundle.open(bundle), threads=1)), source, limits=limits)
+        registry = ModelRegistry(Decoder(Bundle.open(bundle), threads=1))
+        models = ModelStore(store, registry.current.decoder.bundle) if store is not None else None
+        plane = DataPlane(registry, source, models, limits)
         recalibrator = Recalibrator(plane, fit, tmp_path)
         server = LightpageServer(plane, recalibrator).start()
         client = LightpageClient(server.target, timeout_s=20)
@@ -470,6 +478,32 @@ def test_a_rollback_during_recalibration_makes_its_result_out_of_date(start: Sta
     thread.join(10)
     assert len(errors) == 1
     assert service.client.describe().model.version == "toy-1"
+
+
+def test_a_change_of_model_that_cannot_be_noted_is_not_made(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = start(store=tmp_path / "store")
+    store = service.plane.store
+    assert store is not None
+    assert service.client.recalibrate(count=2).model_version == "toy-1+r1"
+
+    def full(*_: object) -> None:
+        raise OSError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("runtime.store.os.replace", full)
+        with pytest.raises(BundleError, match="disk full"):
+            service.client.rollback()
+        assert service.client.describe().model.version == "toy-1+r1"
+        with pytest.raises(BundleError, match="disk full"):
+            service.client.recalibrate(count=2)
+    assert service.client.describe().model.version == "toy-1+r1"
+    assert service.plane.metrics.model.labels("toy-1+r1")._value.get() == 1
+    assert sorted(path.name for path in store.folder.iterdir()) == ["current.json", "toy-1+r1.zip"]
+    assert store.last() == store.path_of("toy-1+r1")
+    assert service.client.rollback()[0] == "toy-1"
+    assert store.last() is None
 
 
 def test_recalibration_from_a_recording_on_the_server(start: Start, tmp_path: Path) -> None:
