@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import click
@@ -32,6 +32,7 @@ from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
 from train.field import FieldRecovery, TorchFieldSolver
 from train.fitting import Hyperparameters, decode_pages, fit_network, held_out_air
+from train.run import begin
 from train.twin import RayTwin, TorchTwin
 
 LEVELS = 256
@@ -147,9 +148,11 @@ def main(
     out: Path,
 ) -> None:
     """Train every arm on the same pages and print held-out AIR."""
-    out.mkdir(parents=True, exist_ok=True)
     profile = load_profile(profile_name)
     device = Device(sensor=Sensor(full_well_e=full_well)).with_settings([f"geometry.pipe_angle_deg={angle_deg}"])
+    choices = Hyperparameters(steps=steps, seed=seed, channels=channels)
+    options = {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, **asdict(choices)}
+    begin(out, options)
     written = list(random_symbols(profile, LEVELS, pages + CALIBRATED, np.random.default_rng([seed, 7])))
 
     def simulator() -> Simulator:
@@ -179,14 +182,13 @@ def main(
             lambda start, shift, arm=arm: arm.features(simulator(), written[CALIBRATED:], start, shift),  # type: ignore[misc]
             f"features of {arm.name}",
         )
-        choices = Hyperparameters(steps=steps, seed=seed, channels=channels)
         training, validation, unseen = (
             FeatureStore(folder / "features", part)
             for part in (range(first), range(first, first + held), range(first + held, pages))
         )
-        module, best = fit_network(folder, choices, mask, training, validation)
-        p, phases = decode_pages(module.float(), unseen)
-        rates[arm.name] = held_out_air(p, phases, mask)
+        module, best = fit_network(folder, choices, mask, LEVELS, training, validation)
+        p, phases = decode_pages(module, unseen)
+        rates[arm.name] = held_out_air(p, phases, mask, LEVELS)
         figures |= {
             f"{arm.name}_air": rates[arm.name],
             f"{arm.name}_validation_air": best,

@@ -14,17 +14,20 @@ from numpy.typing import NDArray
 from export.graph import TABLE_INPUTS, DecoderGraph, table_tensors
 from export.onnx_files import decoder_onnx, twin_onnx
 from export.parity import check_parity, torch_answer
-from optics.errors import InvalidInputError
+from optics.errors import BundleError, InvalidInputError
 from optics.recording import FramePair
 from optics.registration.table import sampling_table
 from runtime.bundle import Bundle, npz, write_bundle
 from runtime.decoder import Decoder
+from runtime.frames import narrow
 from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest, Provenance
 from train.localizers.coherent import CoherentLocalizer
 from train.run import GOLDEN as RUN_GOLDEN
 from train.run import REFERENCES, load_network, load_run
 from train.twin import RayTwin, TorchTwin
 
+PILOT_ARRAYS = {"mask": "pilots", "phases": "pilot_phases"}
+"""Arrays of the bundle's pilots by their name in the run; phases only where the device has fixed ones of its own."""
 _LEAST_CONTRAST = 2.0
 """Residual of swapped frames over that of right ones below which the two cannot be told apart by it."""
 
@@ -51,6 +54,8 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
         InvalidInputError: the run is unfinished or of a localizer that has no exported graph.
         BundleError: the exported decoder does not say what torch says; nothing stays at `out`.
     """
+    if out.exists():
+        raise BundleError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     run = load_run(folder)
     if run.localizer != "coherent":
         raise InvalidInputError(f"run {folder}: localizer", repr(run.localizer), "'coherent', which has a graph")
@@ -59,9 +64,12 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
     graph = DecoderGraph(profile, network, run.kappa_scale).eval()
     twin = RayTwin(profile)
     table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
-    references, golden = _arrays(folder / REFERENCES), _arrays(folder / RUN_GOLDEN)
-    defaults = table_tensors(table, references["in_phase"], references["quadrature"])
-    pair = FramePair(golden["in_phase"], golden["quadrature"])
+    kept, golden = _arrays(folder / REFERENCES), _arrays(folder / RUN_GOLDEN)
+    references, pair = (
+        narrow(FramePair(arrays["in_phase"], arrays["quadrature"]), run.camera_bit_depth) for arrays in (kept, golden)
+    )
+    frame_dtype = pair.in_phase.dtype.name
+    defaults = table_tensors(table, references.in_phase, references.quadrature)
     expected = torch_answer(graph, pair, defaults)
     manifest = Manifest(
         name=name or profile.name,
@@ -70,7 +78,7 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
         profile=run.profile_toml,
         calibration=run.calibration_toml,
         camera_bit_depth=run.camera_bit_depth,
-        frame_dtype="uint8" if run.frame_dtype == "uint8" else "uint16",
+        frame_dtype="uint8" if frame_dtype == "uint8" else "uint16",
         metrics={"validation_air_bits_per_symbol": run.validation_air, "training_seconds": run.seconds},
         calibrated_pages=calibration.calibrated_pages,
         trained_pages=run.trained_pages,
@@ -80,10 +88,10 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
         provenance=Provenance(**run.provenance),
     )
     files = {
-        DECODER: decoder_onnx(graph, run.frame_dtype, profile.frame_shape, defaults),
+        DECODER: decoder_onnx(graph, frame_dtype, profile.frame_shape, defaults),
         TWIN: twin_onnx(twin),
         GOLDEN: npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected["p"]),
-        PILOTS: npz(mask=references["pilots"]),
+        PILOTS: npz(**{name: kept[key] for name, key in PILOT_ARRAYS.items() if key in kept}),
     }
     partial = out.with_name(f".{out.stem}-unproven{out.suffix}")
     _remove(partial)

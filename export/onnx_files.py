@@ -74,4 +74,15 @@ def _export(
             verbose=False,
         )
     assert program is not None
-    return program.model_proto
+    return _anonymous(program.model_proto)
+
+
+def _anonymous(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The model without the exporter's notes: they name the files of the machine that exported it."""
+    graphs: list[Any] = [model.graph, *model.functions]
+    parts = [part for graph in graphs for part in (*graph.node, *graph.value_info)]
+    noted = [model, *graphs, *parts, *model.graph.input, *model.graph.output, *model.graph.initializer]
+    for owner in noted:
+        owner.doc_string = ""
+        del owner.metadata_props[:]
+    return model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shlex
 import subprocess
 import sys
@@ -11,12 +12,13 @@ from pathlib import Path
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 from torch.utils.data import ConcatDataset
 
 from optics.errors import InvalidInputError, RecordingError
-from optics.page import pilot_mask
+from optics.page import pilot_mask, pilot_symbols, symbol_phases
 from optics.profile import Profile, load_profile
-from optics.recording import Recording
+from optics.recording import Recording, hash_frames
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.known import known_pages
 from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording, calibration_bar
@@ -101,41 +103,46 @@ def train(
             raise RecordingError(f"recording {recording_path}", "no dataset 'symbols'", "known symbols to train on")
         calibration = _calibration(recording, profile_name, calibration_path, out)
         calibration.check_profile(profile)
-        groups = _split(recording, calibration, validation_share, test_share)
-        begin(
-            out,
-            {
-                "--recording": str(recording_path.resolve()),
-                "--localizer": localizer,
-                "calibration": calibration.to_toml(),
-                "--validation-share": validation_share,
-                "--test-share": test_share,
-                "--synthetic-pages": synthetic_pages,
-                **{f"--{name.replace('_', '-')}": value for name, value in asdict(choices).items()},
-            },
+        groups = _split(recording, validation_share, test_share)
+        hashes = [recording.page_hash(page) for page in range(recording.pages)]
+        references = recording.references()
+        options = {
+            "--profile": profile.to_toml(),
+            "--recording (SHA-256 of its frames)": _digest([*hashes, hash_frames(references)]),
+            "--localizer": localizer,
+            "calibration": calibration.to_toml(),
+            "--validation-share": validation_share,
+            "--test-share": test_share,
+            "--synthetic-pages": synthetic_pages,
+            **{f"--{name.replace('_', '-')}": value for name, value in asdict(choices).items()},
+        }
+        begin(out, options)
+        key = _digest([options[name] for name in ("--profile", "--recording (SHA-256 of its frames)", "calibration")])
+        extractor = FeatureExtractor(profile, calibration.vector, calibration.turn_rad, references, localizer)
+        known = [*groups[0], *groups[1]]
+        fill(
+            out / "features",
+            f"{key} {localizer}",
+            len(known),
+            lambda first, shift: extractor.pages(recording, known[first:], shift),
+            "recorded pages",
         )
-        extractor = FeatureExtractor(
-            profile, calibration.vector, calibration.turn_rad, recording.references(), localizer
-        )
-        recorded = _recorded(recording, extractor, [*groups[0], *groups[1]], out, calibration, localizer)
         synthetic = _synthetic(recording, extractor, synthetic_pages, out, calibration, profile, localizer, seed)
         mask = recording.pilots()
         mask = pilot_mask(profile) if mask is None else mask
         count = len(groups[0])
         training: ConcatDataset[Page] = ConcatDataset(
-            [FeatureStore(recorded, range(count)), *map(FeatureStore, synthetic)]
+            [FeatureStore(out / "features", range(count)), *map(FeatureStore, synthetic)]
         )
-        validation = FeatureStore(recorded, range(count, count + len(groups[1])))
+        validation = FeatureStore(out / "features", range(count, len(known)))
         started = time.monotonic()
-        module, air = fit_network(out, choices, mask, training, validation)
+        module, air = fit_network(out, choices, mask, recording.levels, training, validation)
         seconds = time.monotonic() - started
-        module = module.float()
         scale = best_kappa_scale(module, validation, mask)
         save_network(module, out)
-        references = recording.references()
-        np.savez_compressed(
-            out / REFERENCES, in_phase=references.in_phase, quadrature=references.quadrature, pilots=mask
-        )
+        own = _own_pilots(recording, profile, mask, known)
+        kept = {"in_phase": references.in_phase, "quadrature": references.quadrature, "pilots": mask}
+        np.savez_compressed(out / REFERENCES, **kept, **({} if own is None else {"pilot_phases": own}))  # type: ignore[arg-type]
         golden = recording.frames(groups[1][0])
         np.savez_compressed(out / GOLDEN, in_phase=golden.in_phase, quadrature=golden.quadrature)
         Run(
@@ -144,8 +151,7 @@ def train(
             calibration_toml=calibration.to_toml(),
             hyperparameters=choices,
             camera_bit_depth=recording.bit_depth,
-            frame_dtype=str(golden.in_phase.dtype),
-            trained_pages=tuple(recording.page_hash(index) for group in groups[:2] for index in group),
+            trained_pages=tuple(hashes[page] for page in known),
             validation_air=air,
             kappa_scale=scale,
             seconds=seconds,
@@ -160,7 +166,7 @@ def train(
 
 
 def _calibration(recording: Recording, profile_name: str, path: Path | None, out: Path) -> Calibration:
-    """The calibration that was named, or was made before, or is made now from the first pages."""
+    """The calibration that was named, or was made for this run before, or is made now from the first pages."""
     out.mkdir(parents=True, exist_ok=True)
     kept = out / "calibration.toml"
     if path is not None:
@@ -173,10 +179,8 @@ def _calibration(recording: Recording, profile_name: str, path: Path | None, out
     return calibration
 
 
-def _split(
-    recording: Recording, calibration: Calibration, validation_share: float, test_share: float
-) -> tuple[list[int], list[int], list[int]]:
-    """Pages for training, validation and, last, for nobody here; calibrated pages are trained on at most."""
+def _split(recording: Recording, validation_share: float, test_share: float) -> tuple[list[int], list[int], list[int]]:
+    """Pages for training, validation and, last, for nobody here."""
     pages = recording.pages
     if pages < _FEWEST_PAGES:
         raise RecordingError(
@@ -185,28 +189,28 @@ def _split(
     test = round(pages * test_share) if test_share == 0 else max(1, round(pages * test_share))
     validation = max(1, round(pages * validation_share))
     first = pages - test - validation
+    if first < _LIKENESS_PAGES:
+        got = f"{validation} validation and {test} test pages of {pages}"
+        raise InvalidInputError("--validation-share and --test-share", got, f"{_LIKENESS_PAGES} pages left to train on")
     return list(range(first)), list(range(first, first + validation)), list(range(first + validation, pages))
 
 
-def _recorded(
-    recording: Recording,
-    extractor: FeatureExtractor,
-    indices: list[int],
-    out: Path,
-    calibration: Calibration,
-    localizer: str,
-) -> Path:
-    """Folder with the features of recorded pages, kept beside the run and taken from there when the run goes on."""
-    folder = out / "features"
-    key = f"{localizer} {recording.path.resolve()} {indices} {calibration.to_toml()}"
-    fill(
-        folder,
-        key,
-        len(indices),
-        lambda first, shift: extractor.pages(recording, indices[first:], shift),
-        "recorded pages",
-    )
-    return folder
+def _own_pilots(
+    recording: Recording, profile: Profile, mask: NDArray[np.bool_], pages: list[int]
+) -> NDArray[np.float32] | None:
+    """Phases of the device's own fixed pilots, [pilots], radians; None where they are those of the profile.
+
+    Says so where there are none: on pages whose symbols are unknown, nothing then shows the piston.
+    """
+    seen = np.stack([symbols[mask] for page in pages if (symbols := recording.symbols(page)) is not None])
+    if np.any(seen != seen[0]):
+        click.echo(
+            "the symbols at the pilots differ from page to page: without symbols, such pages have no piston", err=True
+        )
+        return None
+    if np.array_equal(seen[0], pilot_symbols(profile, recording.levels)[mask]):
+        return None
+    return symbol_phases(seen[0], recording.levels).astype(np.float32)
 
 
 def _synthetic(
@@ -232,13 +236,23 @@ def _synthetic(
     click.echo(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
     folder = out / "synthetic"
     pages = SyntheticPages(profile, calibration.vector, like, localizer, seed)
-    key = f"{localizer} {seed} {calibration.to_toml()} {like.noise:.6f} {np.round(like.illumination, 6).tolist()}"
+    key = f"{localizer} {seed} {profile.to_toml()} {calibration.to_toml()} {like.noise:.6f} "
+    key += f"{np.round(like.illumination, 6).tolist()}"
     fill(folder, key, count, lambda first, shift: pages.pages(first), "synthetic pages")
     return [folder]
 
 
+def _digest(parts: list[object]) -> str:
+    return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()
+
+
 def _commit() -> str:
-    """The commit of the working tree, empty outside one."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return done.stdout.strip() if done.returncode == 0 else ""
+    """The commit of this source tree, empty where it is not one."""
+    tree = Path(__file__).parent.parent
+    command = ["git", "-C", str(tree), "rev-parse", "--show-toplevel", "HEAD"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:  # no git
+        return ""
+    toplevel, _, commit = done.stdout.strip().partition("\n")
+    return commit if done.returncode == 0 and Path(toplevel) == tree.resolve() else ""

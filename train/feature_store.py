@@ -69,6 +69,8 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> None:
     done, shift = _kept(folder, key)
     if done >= count:
         return
+    if done == 0:
+        (folder / _STATE).unlink(missing_ok=True)  # before its arrays are
     arrays: dict[str, np.memmap[Any, Any]] = {}
     with torch.inference_mode():
         pages = tqdm(make(done, shift), desc=what, unit="page", initial=done, total=count)

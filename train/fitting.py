@@ -23,7 +23,10 @@ from train.localizers.coherent import POSITION_CHANNELS, network_features
 from train.loss import von_mises_nll
 from train.network import SymbolUNet
 
-AIR_LEVELS = 256
+CHECKPOINTS = "checkpoints"
+"""Folder of a run's checkpoints."""
+LOOKS = 60
+"""How often a run looks at its validation pages."""
 
 
 @dataclass(frozen=True)
@@ -62,15 +65,18 @@ class DecoderTraining(L.LightningModule):
         network: features to p.
         hyperparameters: the run's choices.
         pilot_mask: bool [ny, nx]; pilots are no data: neither loss nor figure counts them.
+        levels: M of the pages, which bounds their AIR.
     """
 
-    def __init__(self, network: SymbolUNet, hyperparameters: Hyperparameters, pilot_mask: NDArray[np.bool_]) -> None:
+    def __init__(
+        self, network: SymbolUNet, hyperparameters: Hyperparameters, pilot_mask: NDArray[np.bool_], levels: int
+    ) -> None:
         super().__init__()
         self.network = network
         self.choices = hyperparameters
         self.data: Tensor
         self.register_buffer("data", torch.from_numpy(~pilot_mask))
-        self._pilot_mask = pilot_mask
+        self._pilot_mask, self._levels = pilot_mask, levels
         self._seen: list[tuple[Tensor, Tensor]] = []
 
     def forward(self, light: Tensor, positions: Tensor) -> Tensor:
@@ -98,7 +104,7 @@ class DecoderTraining(L.LightningModule):
         p = torch.cat([seen[0] for seen in self._seen]).numpy()
         phases = torch.cat([seen[1] for seen in self._seen]).numpy()
         self._seen.clear()
-        self.log("val_air", held_out_air(p, phases, self._pilot_mask), prog_bar=True)
+        self.log("val_air", held_out_air(p, phases, self._pilot_mask, self._levels), prog_bar=True)
 
     def configure_optimizers(self) -> Any:
         """AdamW under a one-cycle schedule."""
@@ -116,21 +122,22 @@ def air_of_nll(nll: Tensor) -> Tensor:
     return math.log2(2 * math.pi) - nll.detach() / math.log(2)
 
 
-def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_]) -> float:
+def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> float:
     """AIR in bits per data symbol of decoded pages.
 
     Args:
         p: [pages, 2, ny, nx].
         phases: true phases [pages, ny, nx].
         mask: pilots, bool [ny, nx].
+        levels: M of the pages.
     """
     rates = []
     for decoded, truth in zip(p, phases, strict=True):
         pilots = Pilots(mask, truth[mask].astype(np.float64))
         phase = remove_piston(np.arctan2(decoded[1], decoded[0]), estimate_piston(decoded, pilots).angle_rad)
         concentration = np.hypot(decoded[0], decoded[1])
-        true_level = np.rint(truth * (AIR_LEVELS / (2 * np.pi))).astype(np.int64) % AIR_LEVELS
-        air = achievable_rate(phase[~mask], concentration[~mask], true_level[~mask].astype(np.uint8), AIR_LEVELS)
+        true_level = np.rint(truth * (levels / (2 * np.pi))).astype(np.int64) % levels
+        air = achievable_rate(phase[~mask], concentration[~mask], true_level[~mask].astype(np.uint8), levels)
         rates.append(float(np.mean(air)))
     return float(np.mean(rates))
 
@@ -139,37 +146,44 @@ def fit_network(
     run: Path,
     hyperparameters: Hyperparameters,
     pilot_mask: NDArray[np.bool_],
+    levels: int,
     training: Dataset[Page],
     validation: Dataset[Page],
     callbacks: list[Callback] | None = None,
     *,
     progress: bool = True,
 ) -> tuple[DecoderTraining, float]:
-    """Train, or go on with, the network of a run; returns the best checkpoint's module and its validation AIR.
+    """Train, or go on with, the network of a run; returns the best module, in float32, and its validation AIR.
 
     Raises KeyboardInterrupt after Ctrl-C, with the last checkpoint in place.
 
     Args:
-        run: folder of the run; checkpoints and TensorBoard logs go there, and `last.ckpt` is resumed from.
+        run: folder of the run; checkpoints and TensorBoard logs go there, and the last checkpoint is resumed from: the
+            caller sees to it that it belongs to these pages and choices (`train.run.begin`).
         hyperparameters: the run's choices.
         pilot_mask: bool [ny, nx].
+        levels: M of the pages.
         training, validation: pages.
         callbacks: further Lightning callbacks.
         progress: whether to show a bar.
     """
-    L.seed_everything(hyperparameters.seed, verbose=False)
+    folder = run / CHECKPOINTS
+    last = folder / "last.ckpt"
+    reached = int(_checkpoint(last)["global_step"]) if last.exists() else 0
+    # another stretch of the run draws other pages and turns
+    L.seed_everything(hyperparameters.seed + reached, verbose=False)
     channels = training[0][0].shape[0] + POSITION_CHANNELS
     network = SymbolUNet(channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.levels)
-    module = DecoderTraining(network, hyperparameters, pilot_mask)
-    best = ModelCheckpoint(run / "checkpoints", "best", monitor="val_air", mode="max", save_last=True)
-    # about sixty looks at the validation pages, each on a multiple of a pass over the data
-    draws = hyperparameters.batch * max(1, hyperparameters.steps // 60)
+    module = DecoderTraining(network, hyperparameters, pilot_mask, levels)
+    best = ModelCheckpoint(folder, "best", monitor="val_air", mode="max")
+    newest = ModelCheckpoint(folder, "last", save_on_train_epoch_end=True, enable_version_counter=False)
+    draws = hyperparameters.batch * max(1, hyperparameters.steps // LOOKS)
     sampler = RandomSampler(training, replacement=True, num_samples=draws)  # type: ignore[arg-type]  # it has a length
     trainer = L.Trainer(
         max_steps=hyperparameters.steps,
         precision=hyperparameters.precision,  # type: ignore[arg-type]
         logger=TensorBoardLogger(str(run), name="", version="tensorboard"),
-        callbacks=[best, *(callbacks or [])],
+        callbacks=[best, newest, *(callbacks or [])],
         enable_progress_bar=progress,
         enable_model_summary=False,
         gradient_clip_val=1.0,
@@ -177,7 +191,6 @@ def fit_network(
         log_every_n_steps=10,
         default_root_dir=run,
     )
-    last = run / "checkpoints" / "last.ckpt"
     try:
         trainer.fit(
             module,
@@ -188,10 +201,18 @@ def fit_network(
         )
     except SystemExit:  # Lightning's answer to Ctrl-C, once it has closed its files
         raise KeyboardInterrupt from None
-    state = torch.load(best.best_model_path or last, map_location="cpu", weights_only=False)
-    module.load_state_dict(state["state_dict"])
-    score = best.best_model_score
-    return module.eval(), float(score) if score is not None else float("nan")
+    # the last steps are the quietest, and no look need have followed them
+    rates = {}
+    for path in {last, Path(best.best_model_path or last)}:
+        module.load_state_dict(_checkpoint(path)["state_dict"])
+        rates[path] = held_out_air(*decode_pages(module.float().eval(), validation), pilot_mask, levels)
+    chosen = max(rates, key=lambda path: rates[path])
+    module.load_state_dict(_checkpoint(chosen)["state_dict"])
+    return module, rates[chosen]
+
+
+def _checkpoint(path: Path) -> dict[str, Any]:
+    return dict(torch.load(path, map_location="cpu", weights_only=False))
 
 
 def decode_pages(module: DecoderTraining, pages: Dataset[Page]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -13,7 +13,7 @@ from optics.errors import InvalidInputError
 from optics.files import replace_text
 from optics.profile import Profile, parse_profile
 from optics.registration.calibration import Calibration, parse_calibration
-from train.fitting import DecoderTraining, Hyperparameters
+from train.fitting import CHECKPOINTS, DecoderTraining, Hyperparameters
 from train.localizers.coherent import POSITION_CHANNELS
 from train.network import SymbolUNet
 
@@ -33,7 +33,6 @@ class Run:
         profile_toml, calibration_toml: the device.
         hyperparameters: the choices.
         camera_bit_depth: of the recording.
-        frame_dtype: of the recording's frames.
         trained_pages: hashes of the pages that were trained on or used to stop.
         validation_air: bits per data symbol.
         synthetic_pages: synthetic pages trained on beside the recorded ones.
@@ -47,7 +46,6 @@ class Run:
     calibration_toml: str
     hyperparameters: Hyperparameters
     camera_bit_depth: int
-    frame_dtype: str
     trained_pages: tuple[str, ...]
     validation_air: float
     kappa_scale: float
@@ -84,6 +82,10 @@ def begin(folder: Path, options: dict[str, Any]) -> None:
     try:
         kept = json.loads(path.read_text())
     except (OSError, ValueError):
+        if (folder / CHECKPOINTS).exists():
+            wanted = f"a run that says in {BEGUN} what it was begun with, or another --out"
+            raise InvalidInputError(f"run {folder}", "checkpoints of unknown origin", wanted) from None
+        folder.mkdir(parents=True, exist_ok=True)
         replace_text(path, json.dumps(options, indent=2), "options of the run")
         return
     for name, value in options.items():

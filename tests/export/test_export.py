@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,6 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         calibration_toml=Calibration.from_registered(fitted, profile, ["0" * 64]).to_toml(),
         hyperparameters=CHOICES,
         camera_bit_depth=8,
-        frame_dtype="uint8",
         trained_pages=("1" * 64,),
         validation_air=0.0,
         kappa_scale=1.3,
@@ -74,6 +74,27 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def exported(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Bundle, float, Path]:
     path = tmp_path_factory.mktemp("bundle") / "small.zip"
     return (*export_run(run_folder, path), path)
+
+
+def test_eight_bit_counts_that_came_in_sixteen_bits_make_an_eight_bit_bundle(run_folder: Path, tmp_path: Path) -> None:
+    wide = tmp_path / "run"
+    shutil.copytree(run_folder, wide)
+    for name in (GOLDEN, REFERENCES):
+        with np.load(wide / name) as kept:
+            arrays = dict(kept)
+        for key in ("in_phase", "quadrature"):
+            arrays[key] = arrays[key].astype(">u2")
+        np.savez(wide / name, **arrays)
+    bundle, error = export_run(wide, tmp_path / "wide.zip")
+    assert bundle.manifest.frame_dtype == "uint8"
+    assert error <= 1e-3
+
+
+def test_the_bundle_does_not_tell_where_it_was_made(exported: tuple[Bundle, float, Path]) -> None:
+    root = str(Path(cli_export.__file__).parent.parent).encode()
+    for name, data in exported[0].files.items():
+        assert root not in data, name
+        assert b"site-packages" not in data, name
 
 
 def test_the_bundle_says_what_torch_says(exported: tuple[Bundle, float, Path]) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -17,12 +19,14 @@ from click.testing import CliRunner
 from optics.cli import simulate
 from optics.device import Device
 from optics.errors import InvalidInputError
+from optics.page import pilot_mask
+from optics.recording import Recording
 from optics.registration.calibrate import Registered
 from optics.registration.calibration import Calibration
 from optics.registration.parameters import NAMES
 from optics.simulator import true_parameters
 from tests.optics.small import small_profile
-from train.cli_train import train
+from train.cli_train import _commit, _own_pilots, train
 from train.run import begin
 
 PAGES = 8
@@ -82,6 +86,47 @@ def test_ctrl_c_in_training_loses_nothing_and_the_same_command_goes_on(device: l
     run(arguments)
     assert torch.load(last, map_location="cpu", weights_only=False)["global_step"] == steps
     assert (out / "run.json").exists()
+
+
+def test_pilots_of_the_devices_own_are_found(
+    device: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile = small_profile()
+    mask = pilot_mask(profile)
+    path = tmp_path / "R.h5"
+    shutil.copy(device[3], path)
+    with Recording.open(path) as recording:
+        assert _own_pilots(recording, profile, mask, [0, 1, 2]) is None
+        assert not capsys.readouterr().err
+    with h5py.File(path, "r+") as file:
+        symbols = file["symbols"][:]
+        symbols[:, mask] = 64
+        file["symbols"][:] = symbols
+    with Recording.open(path) as recording:
+        own = _own_pilots(recording, profile, mask, [0, 1, 2])
+    np.testing.assert_allclose(own, np.full(mask.sum(), np.pi / 2), rtol=1e-6)
+    with h5py.File(path, "r+") as file:
+        symbols[1][mask] = 65
+        file["symbols"][:] = symbols
+    with Recording.open(path) as recording:
+        assert _own_pilots(recording, profile, mask, [0, 1, 2]) is None
+    assert "no piston" in capsys.readouterr().err
+
+
+def test_shares_that_leave_nothing_to_train_on_are_named(device: list[str], tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"validation-share and --test-share.*4 validation and 4 test pages"):
+        run([*device, "--validation-share", "0.5", "--test-share", "0.5", "--out", str(tmp_path / "run")])
+
+
+def test_checkpoints_of_unknown_origin_are_not_taken_up(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    with pytest.raises(InvalidInputError, match="unknown origin"):
+        begin(tmp_path, {"--steps": 60})
+
+
+def test_without_git_there_is_no_commit_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert _commit() == ""
 
 
 def test_a_run_does_not_go_on_with_other_options(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from torch.utils.data import TensorDataset
 from train.fitting import Hyperparameters, best_kappa_scale, fit_network, held_out_air
 
 PAGE = (8, 12)
+LEVELS = 256
 CHOICES = Hyperparameters(channels=16, blocks=1, steps=120, batch=2, precision="32-true", learning_rate=5e-3)
 
 
@@ -36,9 +37,9 @@ def mask() -> np.ndarray:
 def test_it_learns_and_a_finished_run_is_taken_up_at_its_last_step(tmp_path: Path, mask: np.ndarray) -> None:
     training, validation = pages(12, 0), pages(3, 1)
     run = tmp_path / "run"
-    first, early = fit_network(run, CHOICES, mask, training, validation, progress=False)
+    first, early = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
     assert early > 1.0
-    again, same = fit_network(run, CHOICES, mask, training, validation, progress=False)
+    again, same = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
     assert same == pytest.approx(early, abs=1e-6)
     for one, other in zip(first.parameters(), again.parameters(), strict=True):
         torch.testing.assert_close(one, other)
@@ -48,7 +49,7 @@ def test_it_learns_and_a_finished_run_is_taken_up_at_its_last_step(tmp_path: Pat
 
 def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarray) -> None:
     training, validation = pages(12, 0), pages(3, 1)
-    module, _ = fit_network(tmp_path, replace(CHOICES, steps=60), mask, training, validation, progress=False)
+    module, _ = fit_network(tmp_path, replace(CHOICES, steps=60), mask, LEVELS, training, validation, progress=False)
     honest = best_kappa_scale(module, validation, mask)
     with torch.no_grad():
         module.network.head.weight *= 3
@@ -61,10 +62,10 @@ def test_air_does_not_see_the_piston_and_leaves_pilots_out(mask: np.ndarray) -> 
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 2 * np.pi, (1, *PAGE)).astype(np.float32)
     p = 30 * np.stack([np.cos(truth + 1.0), np.sin(truth + 1.0)], axis=1).astype(np.float32)
-    exact = held_out_air(p, truth, mask)
+    exact = held_out_air(p, truth, mask, LEVELS)
     wrong_data, wrong_pilots = truth.copy(), p.copy()
     wrong_data[0][~mask] = rng.uniform(0, 2 * np.pi, int((~mask).sum()))
     wrong_pilots[0, :, mask] *= 0.5
     assert exact > 3.5
-    assert held_out_air(wrong_pilots, truth, mask) == pytest.approx(exact, abs=0.02)
-    assert held_out_air(p, wrong_data, mask) < 0
+    assert held_out_air(wrong_pilots, truth, mask, LEVELS) == pytest.approx(exact, abs=0.02)
+    assert held_out_air(p, wrong_data, mask, LEVELS) < 0
