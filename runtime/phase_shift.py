@@ -67,7 +67,7 @@ class PhaseShift:
         places: the table's places without shift, float32 [B, 2, ny, nx], grid samples.
         sensitivity: change of each symbol's decoded phase with the places' shift along x and y, [2, ny, nx], radians
             a camera pixel.
-        pilots: the known symbols of pages of M levels.
+        pilots: the known symbols of pages of M levels that come without their own.
     """
 
     def __init__(self, places: NDArray[np.float32], sensitivity: Real, pilots: Callable[[int], Pilots]) -> None:
@@ -95,19 +95,20 @@ class PhaseShift:
         """The table of an image that lies `shift_px` (x, y) from where calibration saw it."""
         return _moved(self._places, shift_px) if np.any(shift_px) else {}
 
-    def measure(self, page: DecodedPage) -> Real | None:
+    def measure(self, page: DecodedPage, pilots: Pilots | None = None) -> Real | None:
         """Remaining shift (x, y) of a page, camera pixels, or None where it does not show it reliably."""
-        estimate = self.estimate(page)
+        estimate = self.estimate(page, pilots)
         if estimate is None or np.any(estimate.error_px > LARGEST_ERROR_PX):
             return None
         return estimate.shift_px
 
-    def estimate(self, page: DecodedPage) -> Estimate | None:
+    def estimate(self, page: DecodedPage, pilots: Pilots | None = None) -> Estimate | None:
         """Shift from the pilots, then, freed from it, from safe decisions too; None where the pilots disagree.
 
         A page of the bench device has 54 pilots: 0.03 px per axis. With the safe decisions of 16 levels it is 0.005.
+        `pilots` are the page's known symbols where they differ from the device's.
         """
-        pilots = self._pilots(page.levels)
+        pilots = self._pilots(page.levels) if pilots is None else pilots
         residual = _wrapped(page.phase[pilots.mask] - pilots.phases)
         weight = np.minimum(page.concentration[pilots.mask], _CAP).astype(np.float64)
         if not weight.sum() > 0 or abs(np.sum(weight * np.exp(1j * residual))) < LEAST_COHERENCE * weight.sum():

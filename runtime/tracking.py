@@ -37,7 +37,7 @@ class Shift:
 class MeasureShift(Protocol):
     """Measures from one decoded page how far the image lies from where the table in use looks for it."""
 
-    def __call__(self, pair: FramePair, page: DecodedPage, table: Table) -> Shift | None:
+    def __call__(self, pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None) -> Shift | None:
         """The remaining shift, or None where the page does not show it reliably."""
 
 
@@ -54,8 +54,11 @@ class Tracker(Protocol):
     def table(self) -> Table:
         """Tensors for the next page, empty for the bundle's own."""
 
-    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> bool:
-        """Learn from a decoded page and the table that it was decoded with; whether decoding it again would pay."""
+    def update(self, pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> bool:
+        """Learn from a decoded page and the table that it was decoded with; whether decoding it again would pay.
+
+        `pilots` are the page's known symbols where they differ from the device's.
+        """
 
 
 class NoTracker:
@@ -65,7 +68,7 @@ class NoTracker:
         """Always empty."""
         return {}
 
-    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> bool:
+    def update(self, pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> bool:
         """Learns nothing."""
         return False
 
@@ -99,13 +102,13 @@ class ShiftTracker:
         with self._lock:
             return self._table
 
-    def update(self, pair: FramePair, page: DecodedPage, table: Table) -> bool:
+    def update(self, pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> bool:
         """Take in the shift that `page`, decoded with `table`, still shows; whether it was a jump.
 
         A jump is believed at once. A page decoded with a table that has been replaced since is left out: its remainder
         is already accounted for.
         """
-        rest = self._measure(pair, page, table)
+        rest = self._measure(pair, page, table, pilots)
         with self._lock:
             if rest is None or table is not self._table:
                 return False
@@ -135,7 +138,7 @@ def decode_tracked(
     for _ in range(ATTEMPTS - 1):
         table = tracker.table()
         page = decoder.decode(pair, levels, table, pilots)
-        if not tracker.update(pair, page, table):
+        if not tracker.update(pair, page, table, pilots):
             return page
     return decoder.decode(pair, levels, tracker.table(), pilots)
 
@@ -150,8 +153,8 @@ def tracker_for(decoder: Decoder) -> Tracker:
         return NoTracker()
     reader = PhaseShift.of_decoder(decoder)
 
-    def measure(pair: FramePair, page: DecodedPage, table: Table) -> Shift | None:
-        found = reader.measure(page)
+    def measure(pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None) -> Shift | None:
+        found = reader.measure(page, pilots)
         return None if found is None else Shift(float(found[0]), float(found[1]))
 
     def move(shift: Shift) -> Table:

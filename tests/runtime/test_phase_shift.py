@@ -68,6 +68,19 @@ def test_pilots_that_are_not_this_pages_say_nothing() -> None:
     assert reader().measure(lost) is None
 
 
+def test_a_pages_own_pilots_take_the_place_of_the_devices() -> None:
+    written = page((0.1, -0.05))
+    symbols = np.random.default_rng(8).integers(16, size=toy.PAGE).astype(np.uint8)
+    turn = symbol_phases(symbols, 16) - symbol_phases(written.symbols, 16)
+    foreign = DecodedPage(**{**written.__dict__, "phase": np.angle(np.exp(1j * (written.phase + turn)))})
+    mask = np.zeros(toy.PAGE, bool)
+    mask[::3, ::4] = True
+    assert reader().measure(foreign) is None
+    found = reader().measure(foreign, Pilots.of_symbols(mask, symbols, 16))
+    assert found is not None
+    assert np.all(np.abs(found - (0.1, -0.05)) < 0.03)
+
+
 def test_a_page_too_noisy_to_tell_is_left_out() -> None:
     noisy = page((0.0, 0.0), levels=256, kappa=8.0)
     estimate = reader().estimate(noisy)

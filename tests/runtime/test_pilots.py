@@ -10,7 +10,7 @@ from optics.pilots import Pilots, estimate_piston, remove_piston
 from optics.recording import FramePair
 from runtime.bundle import Table
 from runtime.decoder import DecodedPage, Decoder
-from runtime.tracking import NoTracker, Shift, ShiftTracker
+from runtime.tracking import NoTracker, Shift, ShiftTracker, decode_tracked
 from tests.runtime import toy
 
 
@@ -68,8 +68,10 @@ class ShiftedImage:
     def __init__(self, x: float, y: float) -> None:
         self.truth = Shift(x, y)
         self.silent = False
+        self.pilots: Pilots | None = None
 
-    def measure(self, pair: FramePair, page: DecodedPage, table: Table) -> Shift | None:
+    def measure(self, pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None) -> Shift | None:
+        self.pilots = pilots
         held = table.get("shift", np.zeros(2))
         return None if self.silent else Shift(self.truth.x_px - held[0], self.truth.y_px - held[1])
 
@@ -105,3 +107,13 @@ def test_the_tracker_ignores_silent_pages_and_late_answers(seen: tuple[FramePair
     tracker.update(*seen, tracker.table())
     assert tracker.shift == Shift(1.0, 0.0)
     assert not NoTracker().update(*seen, {})
+
+
+def test_the_tracker_measures_a_page_by_the_pilots_that_came_with_it(decoder: Decoder) -> None:
+    symbols = np.random.default_rng(4).integers(16, size=toy.PAGE).astype(np.uint8)
+    mask = np.zeros(toy.PAGE, bool)
+    mask[::3, ::4] = True
+    own = Pilots.of_symbols(mask, symbols, 16)
+    image = ShiftedImage(0.0, 0.0)
+    decode_tracked(decoder, ShiftTracker(image.measure, image.move), toy.ToyDevice().page(symbols, 16), 16, own)
+    assert image.pilots is own
