@@ -138,11 +138,34 @@ class Bundle:
         """
         if PILOTS not in self.files:
             return pilot_mask(self.profile)
-        mask = self._arrays(PILOTS).get("mask")
+        mask = self._pilots.get("mask")
         if mask is None or mask.shape != self.profile.page_shape or mask.dtype != np.bool_ or not mask.any():
             got = "nothing" if mask is None else f"{mask.dtype} {mask.shape}, {np.count_nonzero(mask)} pilots"
             raise BundleError(f"{self.thing}: {PILOTS}: mask", got, f"bool {self.profile.page_shape} with pilots")
         return mask
+
+    @cached_property
+    def pilot_phases(self) -> NDArray[np.float32] | None:
+        """The device's own fixed pilot phases, radians, one a True of `pilot_mask` in row order.
+
+        None where the pilots follow the profile's seeded pattern.
+
+        Raises:
+            BundleError: another number of phases, another type, or values that are not finite.
+        """
+        phases = self._pilots.get("phases")
+        if phases is None:
+            return None
+        thing, count = f"{self.thing}: {PILOTS}: phases", int(np.count_nonzero(self.pilot_mask))
+        if phases.shape != (count,) or phases.dtype != np.float32:
+            raise BundleError(thing, f"{phases.dtype} {phases.shape}", f"float32 ({count},), one a pilot")
+        if not np.isfinite(phases).all():
+            raise BundleError(thing, "NaN or infinity", "finite numbers")
+        return phases
+
+    @cached_property
+    def _pilots(self) -> dict[str, NDArray[Any]]:
+        return self._arrays(PILOTS) if PILOTS in self.files else {}
 
     def _arrays(self, name: str) -> dict[str, NDArray[Any]]:
         try:

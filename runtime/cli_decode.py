@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import click
+import numpy as np
 from tqdm import tqdm
 
 from optics.errors import InvalidInputError
@@ -19,6 +20,7 @@ from runtime.client import LightpageClient
 from runtime.convert import KnownPilots, RemotePage
 from runtime.decoded import DecodedWriter
 from runtime.frames import narrow
+from runtime.phase_shift import LEAST_COHERENCE
 from runtime.report import write_json
 
 
@@ -62,6 +64,8 @@ def decode(
     if json_path is not None:
         write_json(json_path, {"target": target, "levels": levels, "pages": results})
     click.echo(table(results))
+    if doubtful := [result for result in results if result["pilot_coherence"] < LEAST_COHERENCE]:
+        click.echo(warning(doubtful), err=True)
 
 
 def page_report(page: RemotePage) -> dict[str, Any]:
@@ -77,6 +81,15 @@ def page_report(page: RemotePage) -> dict[str, Any]:
         "symbol_error_rate": figures.symbol_error_rate if figures is not None else None,
         **asdict(page.timings),
     }
+
+
+def warning(doubtful: list[dict[str, Any]]) -> str:
+    """What to think of pages whose pilots disagree."""
+    pages = ", ".join(f"{result['page']} ({result['pilot_coherence']:.2f})" for result in doubtful)
+    return (
+        f"lightpage: warning: pilots agree to less than {LEAST_COHERENCE:g} on page {pages}: the piston is unknown, "
+        "and all symbols of such a page may be turned by the same amount"
+    )
 
 
 def table(results: list[dict[str, Any]]) -> str:
@@ -116,14 +129,17 @@ def _sent(client: LightpageClient, file: Recording, count: int, levels: int) -> 
     own = file.pilots()
     mask = description.pilot_mask if own is None else own
     pattern = pilot_symbols(parse_profile(description.profile_toml, "profile of the service"), file.levels)
+    fixed = description.pilot_phases is not None and np.array_equal(mask, description.pilot_mask)
     for index in range(count):
         symbols = file.symbols(index)
         known = symbols is not None and file.levels == levels
+        values = pattern if symbols is None else symbols
         page = client.decode(
             narrow(file.frames(index), file.bit_depth),
             levels,
             bit_depth=file.bit_depth,
-            pilots=KnownPilots(mask, pattern if symbols is None else symbols, file.levels),
+            # Fixed phases are the service's to know: no level count need hold them.
+            pilots=None if symbols is None and fixed else KnownPilots(mask, values, file.levels),
             want_phase=known,
             want_concentration=known,
         )

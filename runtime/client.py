@@ -52,6 +52,8 @@ class Description:
     profile_toml: str
     calibration_toml: str
     pilot_mask: NDArray[np.bool_]
+    pilot_phases: NDArray[np.float32] | None
+    """Radians, one a True of `pilot_mask` in row order; None for the profile's pattern."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,7 @@ class LightpageClient:
             profile_toml=reply.profile_toml,
             calibration_toml=reply.calibration_toml,
             pilot_mask=np.frombuffer(reply.pilot_mask, np.uint8).reshape(reply.page.rows, reply.page.columns) != 0,
+            pilot_phases=np.array(reply.pilot_phases, np.float32) if reply.pilot_phases else None,
         )
         return self._description
 
@@ -139,7 +142,7 @@ class LightpageClient:
             pair: both frames, uint8 or uint16.
             levels: M, 2..256.
             bit_depth: bits of a camera count; by default those of the service's camera.
-            pilots: known symbols, where they differ from the profile's pattern.
+            pilots: known symbols, where they differ from the device's pilots.
             want_concentration: also get kappa.
             want_phase: also get the phase.
             quantised: get the confidence in one byte a symbol.

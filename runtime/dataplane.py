@@ -158,15 +158,15 @@ class DataPlane:
             InvalidInputError: no source, or no such page; else as `decode`.
         """
         start = time.perf_counter()
-        source = self.source
+        source, decoder = self.source, self.registry.current.decoder
         levels = source.levels if levels is None else levels
         found = source.read(page)
-        mask = self._mask(found, self.registry.current.decoder)
+        mask = self._mask(found, decoder)
         # Pilots are what was written, whatever level count the caller wants to see.
         if found.symbols is not None:
             pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
         else:
-            pilots = Pilots.of_profile(self.registry.current.decoder.bundle.profile, source.levels, mask)
+            pilots = decoder.pilots(source.levels, mask)
         answer = self.decode(found.pair, levels, caller, pilots, start=start, received=time.perf_counter())
         return ReadAnswer(answer, found, mask)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from optics.errors import BundleError, FrameError, InvalidInputError
 from optics.measures import decide_with_confidence
-from optics.page import check_levels
+from optics.page import MAX_LEVELS, check_levels
 from optics.pilots import Pilots, estimate_piston, remove_piston
 from optics.recording import FramePair
 from runtime.bundle import Bundle, Table
@@ -111,8 +111,8 @@ class Decoder:
         threads: threads of one inference; by default the cores that this process may use.
 
     Raises:
-        BundleError: the graph is not a decoder of this profile, the table does not fit it, or the golden page comes
-            out differently.
+        BundleError: the graph is not a decoder of this profile, table or pilots do not fit it, or the golden page
+            comes out differently.
     """
 
     def __init__(self, bundle: Bundle, threads: int | None = None) -> None:
@@ -124,6 +124,7 @@ class Decoder:
         self._outputs = [*OUTPUTS, *([residual] if residual else [])]
         self._table = self._checked_defaults(bundle.table)
         self._pilots: dict[int, Pilots] = {}
+        self.pilots(MAX_LEVELS)  # damaged pilots are noticed now, not with the first page
         self._check_golden()
 
     @classmethod
@@ -141,11 +142,25 @@ class Decoder:
         """Shape of every tensor that may be fed instead of its default."""
         return {name: port.shape for name, port in self._ports.items()}
 
-    def pilots(self, levels: int) -> Pilots:
-        """The pilots that this device's pages carry at `levels` levels."""
+    def pilots(self, levels: int, mask: NDArray[np.bool_] | None = None) -> Pilots:
+        """The pilots that this device's pages carry at `levels` levels.
+
+        The device's own phases where the bundle holds them, whatever `levels` is, else the profile's seeded pattern.
+
+        Args:
+            levels: M.
+            mask: where a page's pilots are, bool [ny, nx], if not where the bundle has them: then the pattern holds.
+        """
+        if mask is not None and not np.array_equal(mask, self.bundle.pilot_mask):
+            return Pilots.of_profile(self.bundle.profile, levels, mask)
         if levels not in self._pilots:
             # Two threads may both do this; the results are equal and either may stay.
-            self._pilots[levels] = Pilots.of_profile(self.bundle.profile, levels, self.bundle.pilot_mask)
+            own, phases = self.bundle.pilot_mask, self.bundle.pilot_phases
+            self._pilots[levels] = (
+                Pilots.of_profile(self.bundle.profile, levels, own)
+                if phases is None
+                else Pilots(own, phases.astype(np.float64))
+            )
         return self._pilots[levels]
 
     def check(self, pair: FramePair) -> None:

@@ -65,6 +65,7 @@ class LightpageServicer(pb_grpc.LightpageServicer):
                 profile_toml=bundle.manifest.profile,
                 calibration_toml=bundle.manifest.calibration,
                 pilot_mask=bundle.pilot_mask.astype("uint8").tobytes(),
+                pilot_phases=() if bundle.pilot_phases is None else bundle.pilot_phases.tolist(),
             )
 
     def DecodeFrames(

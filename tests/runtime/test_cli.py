@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 import pytest
 
-from optics.recording import FramePair, Recording
+from optics.recording import FramePair, Recording, RecordingWriter
 from runtime import cli, cli_recalibrate
 from runtime.bundle import Bundle
 from runtime.cli import RESUME_KEY, LazyGroup, lightpage
@@ -28,6 +28,7 @@ from runtime.decoder import Decoder
 from runtime.recalibrator import Recalibrator
 from runtime.registry import ModelRegistry
 from runtime.server import LightpageServer
+from runtime.sources import open_source
 from tests.runtime import toy
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -280,6 +281,35 @@ def test_decode_reads_the_services_source(service: LightpageServer, tmp_path: Pa
     pages = json.loads(report.read_text())["pages"]
     assert [page["page"] for page in pages] == [0, 1, 2]
     assert all(page["symbol_error_rate"] == 0 for page in pages)
+
+
+def test_decode_uses_the_devices_own_pilots_and_warns_where_they_disagree(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Pages of a device whose pilots are fixed phases, sent and read, without a word of what was written."""
+    device, path = toy.ToyDevice(noise=2.0), tmp_path / "own.h5"
+    symbols = np.random.default_rng(3).integers(16, size=(2, *toy.PAGE)).astype(np.uint8)
+    good = toy.own_pilots_page(device, symbols[0], 16, 2.0)
+    lost = device.page(symbols[1], 16, 2.0)
+    with RecordingWriter(path, toy.PROFILE, 16, 8, device.references()) as writer:
+        for page, pair in zip(symbols, (good, lost), strict=True):
+            writer.append(page, pair)
+    with h5py.File(path, "r+") as file:
+        for name in ("symbols", "pilots"):
+            if name in file:
+                del file[name]
+    decoder = Decoder.load(toy.write_own_pilots_bundle(tmp_path / "own.zip"), threads=1)
+    plane = DataPlane(ModelRegistry(decoder), open_source(f"recording:{path}"))
+    out = tmp_path / "out.h5"
+    with LightpageServer(plane, Recalibrator(plane, toy.fit_references)) as server:
+        for where in (["--recording", path], ["--source", "--pages", "2"]):
+            assert run(["decode", "--target", server.target, *where, "--out", out]) == 0
+            with h5py.File(out) as file:
+                assert (file["symbols"][0] == symbols[0])[~toy.OWN_MASK].all()
+            warnings = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+            assert len(warnings) == 1
+            assert "page 1 (0." in warnings[0]
+            assert "piston is unknown" in warnings[0]
 
 
 def test_recalibrate_and_rollback_work_on_a_running_service(service: LightpageServer, tmp_path: Path) -> None:

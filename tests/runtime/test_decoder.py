@@ -66,6 +66,41 @@ def test_pilots_of_another_pattern_can_be_given(decoder: Decoder) -> None:
     assert (decoder.decode(pair, 16).symbols != symbols).mean() > 0.5
 
 
+@pytest.mark.parametrize("levels", [4, 16, 256])
+def test_the_devices_own_pilot_phases_hold_at_any_level_count(levels: int, tmp_path: Path) -> None:
+    own = Decoder.load(toy.write_own_pilots_bundle(tmp_path / "own.zip"), threads=1)
+    symbols = np.random.default_rng(5).integers(16, size=toy.PAGE).astype(np.uint8)
+    pair = toy.own_pilots_page(toy.ToyDevice(noise=2.0), symbols, 16, 2.0)
+    page = own.decode(pair, levels)
+    assert page.pilot_coherence > 0.98
+    assert page.piston_rad == pytest.approx(2.0, abs=0.02)
+    assert own.pilots(levels).phases == pytest.approx(toy.OWN_PHASES)
+    if levels == 16:
+        assert (page.symbols == symbols)[~toy.OWN_MASK].all()
+
+
+def test_pilots_without_phases_follow_the_profiles_pattern_at_their_own_places(tmp_path: Path) -> None:
+    older = Decoder.load(toy.write_own_pilots_bundle(tmp_path / "older.zip", mask=toy.OWN_MASK), threads=1)
+    assert older.bundle.pilot_phases is None
+    wanted = Pilots.of_profile(toy.PROFILE, 16, toy.OWN_MASK)
+    assert (older.pilots(16).mask == wanted.mask).all()
+    assert (older.pilots(16).phases == wanted.phases).all()
+
+
+@pytest.mark.parametrize(
+    ("phases", "named"),
+    [
+        (toy.OWN_PHASES[1:], r"float32 \(19,\)"),
+        (toy.OWN_PHASES.astype(np.float64), "float64"),
+        (np.full_like(toy.OWN_PHASES, np.nan), "NaN"),
+    ],
+)
+def test_pilot_phases_that_do_not_fit_are_refused_when_loading(phases: np.ndarray, named: str, tmp_path: Path) -> None:
+    path = toy.write_own_pilots_bundle(tmp_path / "odd.zip", mask=toy.OWN_MASK, phases=phases)
+    with pytest.raises(BundleError, match=rf"phases: got {named}"):
+        Decoder.load(path, threads=1)
+
+
 def test_a_fed_table_replaces_the_default(decoder: Decoder) -> None:
     symbols, pair = pair_of(offsets=(150.0, 65.0))
     assert (decoder.decode(pair, 16).symbols != symbols).mean() > 0.05

@@ -19,7 +19,7 @@ from optics.profile import Profile, parse_profile
 from optics.recording import FramePair, RecordingWriter
 from runtime.bundle import Bundle, npz, write_bundle
 from runtime.decoder import Decoder
-from runtime.manifest import DECODER, GOLDEN, TWIN, Manifest
+from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
 from runtime.recalibration import FitReport, FitResult, KnownPages, Progress
 from runtime.sources import SourcePage
 
@@ -212,6 +212,24 @@ def files(kappa: float = 400.0) -> dict[str, bytes]:
     pair = ToyDevice(seed=99).page(symbols_of(16, 99)[0], 16)
     golden = npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected_p(pair, kappa))
     return {DECODER: decoder_onnx(kappa), TWIN: twin_onnx(), GOLDEN: golden}
+
+
+OWN_MASK = np.zeros(PAGE, bool)
+OWN_MASK[1::4, 2::5] = True
+OWN_PHASES = np.random.default_rng(77).uniform(-np.pi, np.pi, np.count_nonzero(OWN_MASK)).astype(np.float32)
+
+
+def own_pilots_page(device: ToyDevice, symbols: np.ndarray, levels: int, piston: float) -> FramePair:
+    """A page whose pilots are the fixed phases OWN_PHASES at OWN_MASK, of no level count."""
+    places = symbols.astype(np.float64)
+    places[OWN_MASK] = OWN_PHASES * levels / (2 * np.pi)
+    return device.page(places, levels, piston)
+
+
+def write_own_pilots_bundle(path: Path, **pilots: np.ndarray) -> Path:
+    """A toy bundle whose device has pilots of its own, or the given arrays in their place."""
+    arrays = pilots or {"mask": OWN_MASK, "phases": OWN_PHASES}
+    return write_bundle(path, manifest(), files() | {PILOTS: npz(**arrays)})
 
 
 def write_toy_bundle(path: Path, kappa: float = 400.0, **changes: object) -> Path:

@@ -31,7 +31,7 @@ class DescribeRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class DescribeReply(_message.Message):
-    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml", "pilot_mask")
+    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml", "pilot_mask", "pilot_phases")
     SERVICE_VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -42,6 +42,7 @@ class DescribeReply(_message.Message):
     PROFILE_TOML_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_TOML_FIELD_NUMBER: _ClassVar[int]
     PILOT_MASK_FIELD_NUMBER: _ClassVar[int]
+    PILOT_PHASES_FIELD_NUMBER: _ClassVar[int]
     service_version: str
     model: Model
     camera: Camera
@@ -52,7 +53,8 @@ class DescribeReply(_message.Message):
     profile_toml: str
     calibration_toml: str
     pilot_mask: bytes
-    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ..., pilot_mask: _Optional[bytes] = ...) -> None: ...
+    pilot_phases: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ..., pilot_mask: _Optional[bytes] = ..., pilot_phases: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Model(_message.Message):
     __slots__ = ("name", "version", "created", "current", "metrics")
