@@ -116,7 +116,7 @@ class Decoder:
     """
 
     def __init__(self, bundle: Bundle, threads: int | None = None) -> None:
-        self.bundle = bundle
+        self.bundle, self.threads = bundle, threads
         self._thing = f"{bundle.thing}: {DECODER}"
         self._session = open_session(bundle.files[DECODER], self._thing, threads)
         self._ports = self._check_graph(self._session)

@@ -138,7 +138,13 @@ class RecalibrationOutcome:
 
 
 def recalibrate(
-    decoder: Decoder, pages: KnownPages, out: Path, version: str, fit: Fit, progress: Progress
+    decoder: Decoder,
+    pages: KnownPages,
+    out: Path,
+    version: str,
+    fit: Fit,
+    progress: Progress,
+    table: Table | None = None,
 ) -> RecalibrationOutcome:
     """Fit on the first pages, judge on the others, and write a new bundle to `out` if it is not worse.
 
@@ -149,6 +155,7 @@ def recalibrate(
         version: version of the new bundle.
         fit: how to fit.
         progress: told of every step.
+        table: tensors that the model in service is fed now, as its tracker has them; the bundle's own by default.
 
     Raises:
         RecalibrationRefusedError: the pages do not fit, or the new model would decode the held-back pages worse.
@@ -160,7 +167,10 @@ def recalibrate(
     fitted_count = min(FIT_PAGES, len(pages.pairs) - 1)
     fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))
     progress("measure the model in service", 0.0)
-    before = _air(decoder, held_back, None)
+    try:
+        before = _air(decoder, held_back, table)
+    except FrameError:
+        before = -math.inf  # any model that takes the frames is better
     try:
         result = fit(decoder.bundle, fitted, lambda step, share: progress(step, 0.05 + 0.85 * share), decoder)
         progress("judge by the held-back pages", 0.9)
@@ -195,17 +205,12 @@ def next_version(version: str, taken: Sequence[str] = ()) -> str:
 
 
 def _air(decoder: Decoder, pages: KnownPages, table: Table | None) -> float:
-    """AIR over the data symbols of all `pages`, bits per symbol; -inf where the old model refuses the frames."""
+    """AIR over the data symbols of all `pages`, bits per symbol; `FrameError` where the model refuses the frames."""
     mask = decoder.bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
     data = ~mask
     phases, concentrations, truths = [], [], []
     for pair, symbols in zip(pages.pairs, pages.symbols, strict=True):
-        try:
-            page = decoder.decode(pair, pages.levels, table, Pilots.of_symbols(mask, symbols, pages.levels))
-        except FrameError:
-            if table is not None:
-                raise
-            return -math.inf
+        page = decoder.decode(pair, pages.levels, table, Pilots.of_symbols(mask, symbols, pages.levels))
         phases.append(page.phase[data])
         concentrations.append(page.concentration[data])
         truths.append(symbols[data])

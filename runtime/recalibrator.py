@@ -123,10 +123,11 @@ class Recalibrator:
         taken = [*held, *(plane.store.versions() if plane.store is not None else [])]
         version = next_version(model.version, taken)
         path = plane.store.path_of(version) if plane.store is not None else self._folder() / f"{version}.zip"
-        outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress)
+        # Judged against what is in service now: the model with what its tracker has learnt.
+        outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker.table())
         try:
             progress("put the new model in service", 1.0)
-            plane.adopt(Decoder(Bundle.open(path)), expected=model)
+            plane.adopt(Decoder(Bundle.open(path), model.decoder.threads), expected=model)
         except BaseException:
             path.unlink(missing_ok=True)
             raise

@@ -26,7 +26,7 @@ from optics.errors import (
 from optics.measures import measure
 from optics.page import pilot_mask
 from optics.recording import FramePair
-from runtime.bundle import Bundle
+from runtime.bundle import Bundle, Table
 from runtime.client import LightpageClient
 from runtime.convert import KnownPilots
 from runtime.dataplane import DataPlane
@@ -36,9 +36,10 @@ from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.recalibration import Fit, FitResult
 from runtime.recalibrator import Recalibrator
-from runtime.registry import ModelRegistry
+from runtime.registry import ModelRegistry, TrackerFactory, no_tracker
 from runtime.server import SERVICE, LightpageServer
 from runtime.store import ModelStore
+from runtime.tracking import NoTracker
 from tests.runtime import toy
 
 DRIFTED = (150.0, 62.0)
@@ -75,9 +76,10 @@ def start(toy_zip: Path, tmp_path: Path) -> Iterator[Start]:
         fit: Fit = toy.fit_references,
         bundle: Path = toy_zip,
         store: Path | None = None,
+        tracker: TrackerFactory = no_tracker,
     ) -> Running:
         source = toy.ToySource(toy.ToyDevice())
-        registry = ModelRegistry(Decoder(Bundle.open(bundle), threads=1))
+        registry = ModelRegistry(Decoder(Bundle.open(bundle), threads=1), tracker)
         models = ModelStore(store, registry.current.decoder.bundle) if store is not None else None
         plane = DataPlane(registry, source, models, limits)
         recalibrator = Recalibrator(plane, fit, tmp_path)
@@ -397,6 +399,39 @@ def test_recalibration_that_would_decode_worse_is_refused(start: Start) -> None:
     with pytest.raises(RecalibrationRefusedError, match="model in service"):
         service.client.recalibrate(count=2)
     assert service.client.describe().model.version == "toy-1"
+
+
+class DriftTracker(NoTracker):
+    """Has learnt where the drifted device's offsets are."""
+
+    def table(self) -> Table:
+        references = toy.ToyDevice(DRIFTED).references()
+        return {
+            "reference_in_phase": references.in_phase.astype(np.float32),
+            "reference_quadrature": references.quadrature.astype(np.float32),
+        }
+
+
+def test_a_re_fit_is_judged_against_what_the_tracker_makes_of_the_old_model(start: Start) -> None:
+    def half_way(*arguments: object) -> FitResult:
+        good = toy.fit_references(*arguments)  # type: ignore[arg-type]
+        table = {name: values - 8 for name, values in good.table.items()}
+        return FitResult(table, good.calibration_toml, good.report)
+
+    tracked = start(fit=half_way, tracker=lambda decoder: DriftTracker())
+    tracked.device.offsets = DRIFTED
+    with pytest.raises(RecalibrationRefusedError, match="model in service"):
+        tracked.client.recalibrate(count=2)
+    assert tracked.client.describe().model.version == "toy-1"
+    untracked = start(fit=half_way)
+    untracked.device.offsets = DRIFTED
+    assert untracked.client.recalibrate(count=2).model_version == "toy-1+r1"
+
+
+def test_a_recalibrated_model_keeps_the_threads_of_the_one_before(start: Start) -> None:
+    service = start()
+    service.client.recalibrate(count=2)
+    assert [model.decoder.threads for model in service.plane.registry.models] == [1, 1]
 
 
 @dataclass
