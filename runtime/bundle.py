@@ -31,6 +31,7 @@ from runtime.manifest import (
     TABLE,
     TWIN,
     Manifest,
+    check_version,
     parse_manifest,
     sha256,
 )
@@ -194,7 +195,8 @@ def write_bundle(path: str | Path, manifest: Manifest, files: Mapping[str, bytes
         `path`.
 
     Raises:
-        BundleError: something is at `path` already, a required file is missing, or a name is not allowed.
+        BundleError: something is at `path` already, a required file is missing, a name is not allowed, or the manifest
+            could not be read again.
     """
     path = Path(path)
     thing = f"bundle {path}"
@@ -202,6 +204,9 @@ def write_bundle(path: str | Path, manifest: Manifest, files: Mapping[str, bytes
     if path.exists() or path.is_symlink():
         raise BundleError(thing, "something that exists", "a new path: bundles are never overwritten")
     full = manifest.model_copy(update={"files": {name: sha256(data) for name, data in files.items()}})
+    # A manifest changed by `model_copy` has not been validated, and a bundle that cannot be read must not be written.
+    check_version(full.version, f"{thing}: version")
+    parse_manifest(full.to_json(), f"{thing}: {MANIFEST}")
     contents = {MANIFEST: full.to_json(), **dict(sorted(files.items()))}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

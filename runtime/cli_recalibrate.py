@@ -15,6 +15,7 @@ from optics.recording import Recording
 from runtime.client import LightpageClient, Recalibrated
 from runtime.decoder import Decoder
 from runtime.evaluation import check_recording
+from runtime.manifest import check_version
 from runtime.recalibration import KnownPages, RecalibrationOutcome, next_version
 from runtime.recalibration import recalibrate as recalibrate_bundle
 from runtime.recalibrator import known_pages
@@ -49,7 +50,7 @@ def recalibrate(
     """
     start = time.perf_counter()
     if target is not None:
-        if bundle or out or version:
+        if bundle or out or version is not None:
             raise InvalidInputError("--target", "with --bundle, --out or --version", "either a service or a bundle")
         result: RecalibrationOutcome | Recalibrated = _remote(target, recording, pages)
     else:
@@ -99,10 +100,13 @@ def _remote(target: str, recording: str | None, pages: int) -> Recalibrated:
 def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> RecalibrationOutcome:
     if out.exists():
         raise InvalidInputError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
+    if version is not None:
+        check_version(version, "--version")
     decoder = Decoder.load(bundle_path(bundle))
     with _bar() as progress:
         known = _read(decoder, recording, pages)
-        return recalibrate_bundle(decoder, known, out, version or next_version(decoder.version), refit, progress)
+        new = next_version(decoder.version) if version is None else version
+        return recalibrate_bundle(decoder, known, out, new, refit, progress)
 
 
 def _read(decoder: Decoder, recording: str, pages: int) -> KnownPages:

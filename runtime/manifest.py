@@ -6,7 +6,7 @@ import hashlib
 import json
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from optics.errors import BundleError
 
@@ -102,6 +102,19 @@ def parse_manifest(text: bytes, thing: str) -> Manifest:
     except ValidationError as error:
         problems = "; ".join(f"{'.'.join(map(str, e['loc']))} = {e['input']!r} ({e['msg']})" for e in error.errors())
         raise BundleError(thing, problems, "a valid manifest") from None
+
+
+def check_version(version: str, thing: str) -> None:
+    """Check the version of a bundle that is to be made.
+
+    Raises:
+        BundleError: empty, too long, or with characters that a version may not have.
+    """
+    try:
+        TypeAdapter(Version).validate_python(version)
+    except ValidationError:
+        wanted = "1 to 100 letters, digits and _ . + -, a letter or digit first"
+        raise BundleError(thing, repr(version), wanted) from None
 
 
 def sha256(data: bytes) -> str:

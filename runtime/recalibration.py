@@ -21,7 +21,7 @@ from optics.pilots import Pilots
 from optics.recording import FramePair, hash_frames
 from runtime.bundle import Bundle, Table, npz, write_bundle
 from runtime.decoder import Decoder
-from runtime.manifest import GOLDEN, TABLE, Manifest, Provenance
+from runtime.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and how far it is, 0..1. It may raise to stop the work."""
@@ -160,9 +160,10 @@ def recalibrate(
     Raises:
         RecalibrationRefusedError: the pages do not fit, or the new model would decode the held-back pages worse.
         InvalidInputError, FrameError, PageError: unusable pages.
-        BundleError: `out` cannot be written.
+        BundleError: `version` is none, or `out` cannot be written.
     """
     start = time.perf_counter()
+    check_version(version, "version of the new bundle")
     pages.check(decoder)
     fitted_count = min(FIT_PAGES, len(pages.pairs) - 1)
     fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))

@@ -216,6 +216,13 @@ def test_only_the_files_of_a_bundle_can_be_written(edit: dict[str, bytes | None]
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("change", [{"version": "v 2"}, {"version": ""}, {"camera_bit_depth": 99}])
+def test_a_manifest_that_could_not_be_read_again_is_not_written(change: dict[str, object], tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match=next(iter(change))):
+        write_bundle(tmp_path / "odd.zip", toy.manifest().model_copy(update=change), toy.files())
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_table_may_hold_only_named_inputs(tmp_path: Path) -> None:
     table = npz(other=np.zeros(2, np.float32))
     path = write_bundle(tmp_path / "t.zip", toy.manifest(), toy.files() | {TABLE: table})

@@ -252,6 +252,18 @@ def test_offline_recalibration_with_wrong_pilots_is_refused(
     assert not (tmp_path / "new.zip").exists()
 
 
+def test_an_impossible_version_is_refused_before_anything_is_read(
+    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def never(path: object) -> None:
+        raise AssertionError("read")
+
+    monkeypatch.setattr(cli_recalibrate.Decoder, "load", never)
+    arguments = ["recalibrate", "--bundle", toy_zip, "--recording", tmp_path / "d.h5", "--out", tmp_path / "new.zip"]
+    assert run([*arguments, "--version", "v 2"]) == 2
+    assert "--version: got 'v 2'" in capsys.readouterr().err
+
+
 @pytest.fixture
 def service(toy_zip: Path) -> Iterator[LightpageServer]:
     plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), toy.ToySource(toy.ToyDevice()))

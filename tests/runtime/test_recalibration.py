@@ -98,6 +98,16 @@ def test_a_table_worse_than_the_one_in_use_is_refused(decoder: Decoder, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_version_that_is_none_is_refused_before_the_fit(decoder: Decoder, tmp_path: Path) -> None:
+    def never(*_: object) -> FitResult:
+        raise AssertionError("fitted")
+
+    for version in ("v 2", "", "+r1", "x" * 101):
+        with pytest.raises(BundleError, match="version"):
+            recalibrate(decoder, known(), tmp_path / "n.zip", version, never, quiet)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_interrupted_recalibration_leaves_nothing(decoder: Decoder, tmp_path: Path) -> None:
     def interrupt(step: str, share: float) -> None:
         if share >= 0.95:
