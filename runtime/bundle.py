@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +20,7 @@ from optics.errors import BundleError, ProfileError
 from optics.page import pilot_mask
 from optics.profile import Profile, parse_profile
 from optics.recording import FramePair
-from runtime.archive import MAX_BYTES, check_name, read_files
+from runtime.archive import MAX_BYTES, MAX_FILES, check_name, read_files
 from runtime.manifest import (
     DECODER,
     GOLDEN,
@@ -38,6 +38,9 @@ from runtime.manifest import (
 
 Table = dict[str, NDArray[Any]]
 """Tensors fed to the decoder instead of its defaults, by input name."""
+
+MAX_ARRAY_BYTES = MAX_BYTES
+"""All arrays of one .npz file, unpacked: it is compressed by itself, and may be a bomb inside a small bundle."""
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Fixed time in the zip, so that the same contents give the same bytes."""
@@ -113,10 +116,7 @@ class Bundle:
         """
         if TABLE not in self.files:
             return {}
-        table = self._arrays(TABLE)
-        if unknown := set(table) - set(self.manifest.table_inputs):
-            raise BundleError(f"{self.thing}: {TABLE}", sorted(unknown), f"some of {list(self.manifest.table_inputs)}")
-        return table
+        return self._arrays(TABLE, self.manifest.table_inputs)
 
     @cached_property
     def golden(self) -> Golden:
@@ -125,9 +125,10 @@ class Bundle:
         Raises:
             BundleError: unreadable or incomplete.
         """
-        arrays = self._arrays(GOLDEN)
-        if set(arrays) != {"in_phase", "quadrature", "p"}:
-            raise BundleError(f"{self.thing}: {GOLDEN}", sorted(arrays), "in_phase, quadrature and p")
+        names = ("in_phase", "quadrature", "p")
+        arrays = self._arrays(GOLDEN, names)
+        if missing := set(names) - set(arrays):
+            raise BundleError(f"{self.thing}: {GOLDEN}", f"no {', '.join(sorted(missing))}", f"all of {list(names)}")
         return Golden(FramePair(arrays["in_phase"], arrays["quadrature"]), arrays["p"])
 
     @cached_property
@@ -166,14 +167,28 @@ class Bundle:
 
     @cached_property
     def _pilots(self) -> dict[str, NDArray[Any]]:
-        return self._arrays(PILOTS) if PILOTS in self.files else {}
+        return self._arrays(PILOTS, ("mask", "phases")) if PILOTS in self.files else {}
 
-    def _arrays(self, name: str) -> dict[str, NDArray[Any]]:
+    def _arrays(self, name: str, expected: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """The arrays of one .npz file, each at most once and none but those `expected`, bounded before any is unpacked.
+
+        zipfile reads no more of a member than the size in its header, so those sizes bound what is unpacked.
+        """
+        thing = f"{self.thing}: {name}"
         try:
-            with np.load(io.BytesIO(self.files[name]), allow_pickle=False) as archive:
-                return {key: archive[key] for key in archive.files}
+            with zipfile.ZipFile(io.BytesIO(self.files[name])) as archive:
+                entries = archive.infolist()
+            found = [entry.filename for entry in entries]
+            if set(found) - {f"{key}.npy" for key in expected} or len(found) != len(set(found)):
+                raise BundleError(thing, f"members {found[:MAX_FILES]}", f"{list(expected)} only, each once, as .npy")
+            if (size := sum(entry.file_size for entry in entries)) > MAX_ARRAY_BYTES:
+                raise BundleError(thing, f"{size} bytes unpacked", f"at most {MAX_ARRAY_BYTES}")
+            with np.load(io.BytesIO(self.files[name]), allow_pickle=False) as arrays:
+                return {key: arrays[key] for key in arrays.files}
+        except BundleError:
+            raise
         except Exception as error:  # numpy and zipfile raise many kinds on damaged data
-            raise BundleError(f"{self.thing}: {name}", error, "arrays in .npz format") from None
+            raise BundleError(thing, error, "arrays in .npz format") from None
 
 
 def npz(**arrays: NDArray[Any]) -> bytes:

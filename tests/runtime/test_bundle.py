@@ -16,7 +16,7 @@ import pytest
 from optics.errors import BundleError
 from runtime.archive import read_files
 from runtime.bundle import Bundle, npz, write_bundle
-from runtime.manifest import MANIFEST, TABLE, parse_manifest
+from runtime.manifest import GOLDEN, MANIFEST, PILOTS, TABLE, parse_manifest
 from tests.runtime import toy
 
 
@@ -173,6 +173,32 @@ def test_a_zip_bomb_is_stopped_at_the_limit(toy_zip: Path, tmp_path: Path) -> No
     many = rewrite_zip(toy_zip, tmp_path / "many.zip", {f"f{index}": b"" for index in range(100)})
     with pytest.raises(BundleError, match="104 files"):
         read_files(many)
+
+
+@pytest.mark.parametrize("name", [TABLE, GOLDEN, PILOTS])
+def test_a_bomb_inside_a_file_is_stopped_before_it_unpacks(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    member = {TABLE: "homodyne", GOLDEN: "p", PILOTS: "mask"}[name]
+    bomb = npz(**{member: np.zeros(20_000_000, np.uint8)})
+    assert len(bomb) < 100_000
+    bundle = Bundle.open(write_bundle(tmp_path / "bomb.zip", toy.manifest(), toy.files() | {name: bomb}))
+    monkeypatch.setattr("runtime.bundle.MAX_ARRAY_BYTES", 1_000_000)
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("unpacked"))
+    with pytest.raises(BundleError, match=rf"{name}: got 20000\d\d\d bytes unpacked, wanted at most 1000000"):
+        arrays_of(bundle, name)
+
+
+@pytest.mark.parametrize("name", [TABLE, GOLDEN, PILOTS])
+def test_an_array_of_no_known_name_is_refused(name: str, tmp_path: Path) -> None:
+    odd = npz(mask=np.ones(toy.PAGE, bool), homodyne=np.zeros(2, np.float32), extra=np.zeros(2))
+    bundle = Bundle.open(write_bundle(tmp_path / "odd.zip", toy.manifest(), toy.files() | {name: odd}))
+    with pytest.raises(BundleError, match="extra"):
+        arrays_of(bundle, name)
+
+
+def arrays_of(bundle: Bundle, name: str) -> object:
+    return {TABLE: lambda: bundle.table, GOLDEN: lambda: bundle.golden, PILOTS: lambda: bundle.pilot_mask}[name]()
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip at all", b"PK\x03\x04 but no more"])
