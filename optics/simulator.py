@@ -15,7 +15,7 @@ from optics.profile import Profile
 from optics.recording import FramePair
 from optics.recording_layout import frame_type
 from optics.registration.parameters import NAMES, as_vector
-from optics.waves import WaveChannel, WaveGeometry, modes_for
+from optics.waves import WaveChannel, WaveGeometry, cells_for
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
@@ -97,20 +97,14 @@ class TrueOptics:
     def channel(self) -> WaveChannel:
         """SLM to camera plane."""
         page_x, page_y = self.page_axes_m
-        roll = abs(self.geometry.pipe_roll)
-        reach_x, reach_y = float(np.abs(page_x).max()), float(np.abs(page_y).max())
-        shear = roll + 2 * abs(self.geometry.pipe_angle)
-        cells = (
-            modes_for(reach_y + shear * reach_x, self.geometry, margin=1.04),
-            modes_for(reach_x + shear * reach_y, self.geometry, margin=1.04),
-        )
-        pitch = self.profile.slm.pitch_m
+        camera, pitch = self.profile.camera, self.profile.slm.pitch_m
+        sensor = camera.columns_px * camera.pitch_m / 2, camera.rows_px * camera.pitch_m / 2
         return WaveChannel(
             self.geometry,
             page_x,
             page_y,
             *self.camera_axes_m,
-            cells=cells,
+            cells=cells_for(self.geometry, page_x, page_y, *sensor),
             steps=self._steps,
             envelope_m=pitch,
             blur_m=self.device.slm.blur_px * pitch,

@@ -18,6 +18,9 @@ Real = NDArray[np.floating]
 _RANK_TOLERANCE = 1e-7
 """Singular values of the roll's coupling below this share of the largest are dropped (field error of the same size)."""
 
+_MODE_MARGIN = 1.04
+"""Modes beyond the one that the page's edge excites: an edge of the facet spreads it."""
+
 
 @dataclass(frozen=True)
 class WaveGeometry:
@@ -43,6 +46,29 @@ def modes_for(half_extent_m: float, geometry: WaveGeometry, margin: float = 1.03
     """Cells per pipe axis such that the sine modes reach the plane wave of an SLM point at `half_extent_m`."""
     cells = 2 * half_extent_m * geometry.pipe_width_m / (geometry.wavelength_m * geometry.focal_length_m)
     return int(np.ceil(cells * margin))
+
+
+def cells_for(
+    geometry: WaveGeometry, page_x_m: Real, page_y_m: Real, seen_x_m: float, seen_y_m: float
+) -> tuple[int, int]:
+    """Cells of the pipe along (y', x) such that its modes carry all of the page's light.
+
+    Reflections between walls that are sheared by t turn the light by 2 t, a roll of the pipe turns it once more: the
+    page's long edge then reaches further along the short one. And since the facet is sampled, the camera plane shows
+    the page's image again, one period (2 modes' reach) further; the period must keep that out of what is looked at.
+
+    Args:
+        geometry: the device, with its true or fitted angle and roll.
+        page_x_m, page_y_m: SLM sample positions against the optical axis, shift of the page included, [nx] and [ny].
+        seen_x_m, seen_y_m: half extents of what is looked at on the camera plane.
+    """
+    reach_x, reach_y = float(np.abs(page_x_m).max()), float(np.abs(page_y_m).max())
+    shear = abs(geometry.pipe_roll) + 2 * abs(geometry.pipe_angle)
+
+    def cells(reach: float, seen: float) -> int:
+        return max(modes_for(reach, geometry, _MODE_MARGIN), modes_for((reach + seen) / 2, geometry, margin=1))
+
+    return cells(reach_y + shear * reach_x, seen_y_m), cells(reach_x + shear * reach_y, seen_x_m)
 
 
 def sine_matrix(cells: int) -> Real:

@@ -9,15 +9,13 @@ from optics.grid import field_grid
 from optics.profile import Profile
 from optics.registration.parameters import as_dict
 from optics.registration.phases import camera_phase, launch_phase
-from optics.waves import WaveChannel, WaveGeometry, modes_for
+from optics.waves import WaveChannel, WaveGeometry, cells_for
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 _STEPS = 24
 """Splitting steps; more change the result by less than the fit's own error."""
-_REACH = 1.08
-"""Modes beyond the nominal page's edge: page shift, roll and shear."""
 
 
 class FittedWaves:
@@ -51,13 +49,13 @@ class FittedWaves:
         y = (np.arange(rows * samples) - (rows * samples - 1) / 2) * pitch
         half_width, half_height = profile.page_width_m / 2, profile.page_height_m / 2
         self.x, self.y = x / half_width, y / half_height
+        page = x + value["page_centre_x_m"], y + value["page_centre_y_m"]
         self._channel = WaveChannel(
             geometry,
-            x + value["page_centre_x_m"],
-            y + value["page_centre_y_m"],
+            *page,
             grid.x_m,
             grid.y_m,
-            cells=(modes_for(half_height * _REACH, geometry), modes_for(half_width * _REACH, geometry)),
+            cells=cells_for(geometry, *page, float(grid.x_m[-1]), float(grid.y_m[-1])),
             steps=_STEPS,
             envelope_m=pitch if filled else 0.0,
         )

@@ -10,7 +10,7 @@ import pytest
 from optics.cameras import resample
 from optics.device import Aberration, CameraPose, Device, Drift, Geometry, Homodyne, Reference, Sensor, SlmDefects
 from optics.errors import PageError
-from optics.profile import PageLayout, Profile
+from optics.profile import PageLayout, Profile, load_profile
 from optics.registration.parameters import NAMES
 from optics.registration.twin import BRANCHES
 from optics.simulator import Simulator, TrueOptics, true_parameters
@@ -42,6 +42,14 @@ def gentle(**tables: object) -> Device:
     """The realistic device without noise, phase noise or drift."""
     quiet = {"sensor": FINE_SENSOR, "drift": Drift(piston_rad=0, shift_px=0), "slm": SlmDefects(phase_noise_rad=0)}
     return Device().model_copy(update=quiet | tables)
+
+
+@pytest.mark.parametrize(("name", "cells"), [("bench", (188, 285)), ("paper", (748, 1139))])
+def test_the_shipped_devices_are_computed_with_the_modes_that_their_recordings_were_made_with(
+    name: str, cells: tuple[int, int]
+) -> None:
+    # other numbers would change recordings, and with them every figure that was measured on one
+    assert TrueOptics(load_profile(name), Device()).channel.cells == cells
 
 
 class TestRandomness:

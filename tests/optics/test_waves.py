@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import fft, integrate, linalg, ndimage
 
-from optics.waves import FourierLens, PipePropagator, WaveChannel, WaveGeometry, modes_for, sine_matrix
+from optics.waves import FourierLens, PipePropagator, WaveChannel, WaveGeometry, cells_for, modes_for, sine_matrix
 
 DEVICE = WaveGeometry(
     wavelength_m=532e-9,
@@ -184,6 +184,27 @@ class TestLens:
         # a mode is half a period in the pipe's width
         mode_edge = strongest * DEVICE.wavelength_m * DEVICE.focal_length_m / (2 * DEVICE.pipe_width_m)
         assert mode_edge == pytest.approx(edge, rel=0.01)
+
+    def test_the_cells_reach_past_the_page_by_what_shear_roll_and_shift_add(self) -> None:
+        x, y = axis(87, 36.8e-6), axis(56, 36.8e-6)
+        straight = cells_for(device(0.0), x, y, 0.0, 0.0)
+        turned = cells_for(device(-3.0, 0.4), x, y, 0.0, 0.0)
+        moved = cells_for(device(0.0), x + 60e-6, y - 40e-6, 0.0, 0.0)
+        half_x, half_y = float(x[-1]), float(y[-1])
+        shear = np.deg2rad(0.4 + 2 * 3.0)
+        for cells, reach_y, reach_x in (
+            (straight, half_y, half_x),
+            (turned, half_y + shear * half_x, half_x + shear * half_y),
+            (moved, half_y + 40e-6, half_x + 60e-6),
+        ):
+            assert cells == (modes_for(reach_y, DEVICE, 1.04), modes_for(reach_x, DEVICE, 1.04))
+
+    def test_the_cells_keep_the_next_image_of_the_page_out_of_what_is_seen(self) -> None:
+        x, y, seen = axis(44, 36.8e-6), axis(28, 36.8e-6), 0.8e-3
+        cells, _ = cells_for(DEVICE, x, y, 0.0, seen)
+        # the facet's sampling repeats the camera plane with this period
+        period = cells * DEVICE.wavelength_m * DEVICE.focal_length_m / DEVICE.pipe_width_m
+        assert period - float(y[-1]) >= seen
 
 
 class TestChannel:
