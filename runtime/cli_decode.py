@@ -21,6 +21,7 @@ from runtime.convert import KnownPilots, RemotePage
 from runtime.decoded import DecodedWriter
 from runtime.frames import narrow
 from runtime.phase_shift import LEAST_COHERENCE
+from runtime.refused import RefusedPage, refusal
 from runtime.report import write_json
 
 
@@ -41,31 +42,43 @@ def decode(
     out: str | None,
     json_path: str | None,
 ) -> None:
-    """Decode a recording, or pages of the service's source."""
+    """Decode a recording, or pages of the service's source.
+
+    Pages that are refused are left out of the results, named, and make the exit status 2.
+    """
     if (recording is None) == (not source):
         raise InvalidInputError("options", "both or none", "either --recording or --source")
     results: list[dict[str, Any]] = []
+    refused: list[RefusedPage] = []
     with ExitStack() as stack:
         client = stack.enter_context(LightpageClient(target))
         if recording is not None:
             file = stack.enter_context(Recording.open(recording))
             count, levels = min(pages or file.pages, file.pages), levels or file.levels
-            decoded = _sent(client, file, count, levels)
+            thing, decoded = f"recording {recording}", _sent(client, file, count, levels)
         else:
             count, levels = pages or 1, levels or client.describe().source_levels
             if not levels:
                 raise InvalidInputError(f"service at {target}", "no source", "a service started with --source")
-            decoded = _read(client, count, levels)
+            thing, decoded = f"source of {target}", _read(client, count, levels)
         writer = stack.enter_context(DecodedWriter(out, levels)) if out is not None else None
         for page in tqdm(decoded, total=count, unit="page", desc="decode"):
+            if isinstance(page, RefusedPage):
+                refused.append(page)
+                continue
             if writer is not None:
                 writer.append(page)
             results.append(page_report(page))
+        if refused and not results:
+            raise refusal(thing, refused, count)
     if json_path is not None:
-        write_json(json_path, {"target": target, "levels": levels, "pages": results})
+        data = {"target": target, "levels": levels, "pages": results, "refused_pages": [asdict(r) for r in refused]}
+        write_json(json_path, data)
     click.echo(table(results))
     if doubtful := [result for result in results if result["pilot_coherence"] < LEAST_COHERENCE]:
         click.echo(warning(doubtful), err=True)
+    if refused:
+        raise refusal(thing, refused, count)
 
 
 def page_report(page: RemotePage) -> dict[str, Any]:
@@ -118,29 +131,38 @@ def _measured(page: RemotePage) -> PageMeasures | None:
     return measure(page.phase[data], page.concentration[data], page.written[data], page.levels)
 
 
-def _read(client: LightpageClient, count: int, levels: int) -> Iterator[RemotePage]:
+def _read(client: LightpageClient, count: int, levels: int) -> Iterator[RemotePage | RefusedPage]:
     known = client.describe().source_levels == levels
     for _ in range(count):
-        yield client.read_page(levels=levels, want_phase=known, want_concentration=known, want_written=known)
+        try:
+            page = client.read_page(levels=levels, want_phase=known, want_concentration=known, want_written=known)
+        except InvalidInputError as error:
+            yield RefusedPage(None, str(error))
+        else:
+            yield page
 
 
-def _sent(client: LightpageClient, file: Recording, count: int, levels: int) -> Iterator[RemotePage]:
+def _sent(client: LightpageClient, file: Recording, count: int, levels: int) -> Iterator[RemotePage | RefusedPage]:
     description = client.describe()
     own = file.pilots()
     mask = description.pilot_mask if own is None else own
     pattern = pilot_symbols(parse_profile(description.profile_toml, "profile of the service"), file.levels)
     fixed = description.pilot_phases is not None and np.array_equal(mask, description.pilot_mask)
     for index in range(count):
-        symbols = file.symbols(index)
-        known = symbols is not None and file.levels == levels
-        values = pattern if symbols is None else symbols
-        page = client.decode(
-            narrow(file.frames(index), file.bit_depth),
-            levels,
-            bit_depth=file.bit_depth,
-            # Fixed phases are the service's to know: no level count need hold them.
-            pilots=None if symbols is None and fixed else KnownPilots(mask, values, file.levels),
-            want_phase=known,
-            want_concentration=known,
-        )
-        yield replace(page, page=index, written=symbols if known else None, pilot_mask=mask)
+        try:
+            symbols = file.symbols(index)
+            known = symbols is not None and file.levels == levels
+            values = pattern if symbols is None else symbols
+            page = client.decode(
+                narrow(file.frames(index), file.bit_depth),
+                levels,
+                bit_depth=file.bit_depth,
+                # Fixed phases are the service's to know: no level count need hold them.
+                pilots=None if symbols is None and fixed else KnownPilots(mask, values, file.levels),
+                want_phase=known,
+                want_concentration=known,
+            )
+        except InvalidInputError as error:
+            yield RefusedPage(index, str(error))
+        else:
+            yield replace(page, page=index, written=symbols if known else None, pilot_mask=mask)

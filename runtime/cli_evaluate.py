@@ -9,6 +9,7 @@ from optics.recording import Recording
 from runtime.decoder import Decoder
 from runtime.evaluation import Evaluation
 from runtime.evaluation import evaluate as evaluate_recording
+from runtime.refused import refusal
 from runtime.report import write_json
 from runtime.shipped import DEFAULT, bundle_path
 from runtime.tracking import NoTracker, tracker_for
@@ -21,14 +22,19 @@ from runtime.tracking import NoTracker, tracker_for
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow slow shift page by page.")
 def evaluate(bundle: str, recording: str, json_path: str | None, threads: int | None, tracking: bool) -> None:
-    """Measure a bundle on the pages of a recording that it has not seen."""
+    """Measure a bundle on the pages of a recording that it has not seen.
+
+    Pages that cannot be decoded are left out of the figures, named, and make the exit status 2.
+    """
     decoder = Decoder.load(bundle_path(bundle), threads)
     with Recording.open(recording) as pages, tqdm(total=pages.pages, unit="page", desc="evaluate") as bar:
         tracker = tracker_for(decoder) if tracking else NoTracker()
-        result = evaluate_recording(decoder, pages, tracker, bar.update)
+        count, result = pages.pages, evaluate_recording(decoder, pages, tracker, bar.update)
     if json_path is not None:
         write_json(json_path, result.to_json())
     click.echo(describe(result))
+    if result.refused:
+        raise refusal(f"recording {recording}", result.refused, count)
 
 
 def describe(result: Evaluation) -> str:
@@ -39,6 +45,7 @@ def describe(result: Evaluation) -> str:
         ("bundle", result.bundle_version),
         ("pages", f"{result.pages} of {figures.levels} levels"),
         ("left out", f"{result.pages_left_out} that the bundle was calibrated or trained on"),
+        ("refused", f"{len(result.refused)} that cannot be decoded"),
         ("data symbols a page", f"{result.symbols_per_page}"),
         ("AIR", f"{figures.air_bits_per_symbol:.3f} bit/symbol"),
         ("own MI", f"{figures.own_mi_bits_per_symbol:.3f} bit/symbol"),

@@ -20,6 +20,8 @@ VERSION = 1
 class DecodedWriter:
     """Writes `symbols` uint8 and `confidence` float32, both [page, ny, nx], with `levels` and the model versions.
 
+    `pages` int64 [page] holds the pages' numbers: those that were refused are missing.
+
     Args:
         path: final name; replaced only when the `with` statement ends well.
         levels: M.
@@ -37,6 +39,7 @@ class DecodedWriter:
             raise InvalidInputError(f"output {self.path}", error, "a path that can be written") from None
         self._file.attrs.update({"format": FORMAT, "version": VERSION, "levels": levels})
         self._versions: list[str] = []
+        self._pages: list[int] = []
 
     def append(self, page: RemotePage) -> None:
         """Add one page."""
@@ -44,6 +47,7 @@ class DecodedWriter:
             dataset = self._dataset(name, values.shape, values.dtype)
             dataset.resize(len(self._versions) + 1, axis=0)
             dataset[-1] = values
+        self._pages.append(len(self._pages) if page.page is None else page.page)
         self._versions.append(page.model_version)
 
     def __enter__(self) -> Self:
@@ -54,6 +58,7 @@ class DecodedWriter:
     ) -> None:
         if kind is None:
             self._file["model_versions"] = np.array(self._versions, dtype=h5py.string_dtype())
+            self._file["pages"] = np.array(self._pages, np.int64)
         self._file.close()
         if kind is None:
             os.replace(self._partial, self.path)

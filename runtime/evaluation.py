@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,9 +11,10 @@ import numpy as np
 from optics.errors import InvalidInputError, RecordingError
 from optics.measures import ConcentrationBin, PageMeasures, concentration_calibration, measure
 from optics.pilots import Pilots
-from optics.recording import Recording, hash_frames
+from optics.recording import FramePair, Recording, hash_frames
 from runtime.decoder import Decoder
 from runtime.frames import narrow
+from runtime.refused import RefusedPage, refusal
 from runtime.tracking import Tracker, decode_tracked
 
 PageDone = Callable[[], object]
@@ -33,6 +34,7 @@ class Evaluation:
         inference_seconds_per_page: median of the inference alone.
         air_per_page: AIR of each page, bits per symbol.
         concentration_bins: what concentrations promise against what happened.
+        refused: pages that could not be decoded; no figure counts them.
     """
 
     bundle_version: str
@@ -44,6 +46,7 @@ class Evaluation:
     inference_seconds_per_page: float
     air_per_page: tuple[float, ...]
     concentration_bins: tuple[ConcentrationBin, ...]
+    refused: tuple[RefusedPage, ...] = ()
 
     @property
     def page_kb(self) -> float:
@@ -70,18 +73,16 @@ class Evaluation:
             "inference_seconds_per_page": self.inference_seconds_per_page,
             "air_per_page": list(self.air_per_page),
             "concentration_bins": [asdict(part) for part in self.concentration_bins],
+            "refused_pages": [asdict(page) for page in self.refused],
         }
 
 
-def unseen_pages(decoder: Decoder, recording: Recording) -> Iterator[tuple[int, bool]]:
-    """Every page's number, and whether the bundle was neither calibrated nor trained on it."""
+def was_seen(decoder: Decoder, frames: FramePair, bit_depth: int) -> bool:
+    """Whether the bundle was calibrated or trained on a page."""
     manifest = decoder.bundle.manifest
     seen = {*manifest.calibrated_pages, *manifest.trained_pages}
-    for index in range(recording.pages):
-        # The same page may have been hashed in the camera's narrowest type, or as it lies in the file.
-        frames = recording.frames(index)
-        hashes = {hash_frames(frames), hash_frames(narrow(frames, recording.bit_depth))}
-        yield index, not (seen and hashes & seen)
+    # The same page may have been hashed in the camera's narrowest type, or as it lies in the file.
+    return bool(seen) and bool(seen & {hash_frames(frames), hash_frames(narrow(frames, bit_depth))})
 
 
 def check_recording(decoder: Decoder, recording: Recording) -> None:
@@ -101,18 +102,17 @@ def check_recording(decoder: Decoder, recording: Recording) -> None:
 def evaluate(
     decoder: Decoder, recording: Recording, tracker: Tracker, page_done: PageDone = lambda: None
 ) -> Evaluation:
-    """Decode all unseen pages in their order and measure them against their symbols.
+    """Decode all unseen pages in their order and measure them against their symbols; a bad page is left out and told.
 
     Args:
         decoder: what to measure.
         recording: pages with known symbols.
         tracker: follows the device from page to page.
-        page_done: told after every page, seen ones too.
+        page_done: told after every page, seen and refused ones too.
 
     Raises:
         RecordingError: another device's recording, or one without symbols.
-        InvalidInputError: the bundle has seen every page.
-        FrameError: a page whose frames cannot be decoded.
+        InvalidInputError: the bundle has seen every page, or none of the others can be decoded.
     """
     check_recording(decoder, recording)
     if not recording.has_symbols:
@@ -122,16 +122,22 @@ def evaluate(
     mask = decoder.bundle.pilot_mask if own is None else own
     data = ~mask
     phases, concentrations, truths, timings = [], [], [], []
-    for index, unseen in unseen_pages(decoder, recording):
-        symbols = recording.symbols(index)
-        if unseen and symbols is not None:
-            pair = narrow(recording.frames(index), recording.bit_depth)
-            page = decode_tracked(decoder, tracker, pair, levels, Pilots.of_symbols(mask, symbols, levels))
-            phases.append(page.phase[data])
-            concentrations.append(page.concentration[data])
-            truths.append(symbols[data])
-            timings.append(page.timings)
+    refused: list[RefusedPage] = []
+    for index in range(recording.pages):
+        try:
+            frames, symbols = recording.frames(index), recording.symbols(index)
+            if symbols is not None and not was_seen(decoder, frames, recording.bit_depth):
+                pair, pilots = narrow(frames, recording.bit_depth), Pilots.of_symbols(mask, symbols, levels)
+                page = decode_tracked(decoder, tracker, pair, levels, pilots)
+                phases.append(page.phase[data])
+                concentrations.append(page.concentration[data])
+                truths.append(symbols[data])
+                timings.append(page.timings)
+        except InvalidInputError as error:
+            refused.append(RefusedPage(index, str(error)))
         page_done()
+    if not truths and refused:
+        raise refusal(f"recording {recording.path}", refused, recording.pages)
     if not truths:
         raise InvalidInputError(
             f"recording {recording.path}",
@@ -143,7 +149,7 @@ def evaluate(
         bundle_version=decoder.version,
         figures=measure(phase, concentration, truth, levels),
         pages=len(truths),
-        pages_left_out=recording.pages - len(truths),
+        pages_left_out=recording.pages - len(truths) - len(refused),
         symbols_per_page=int(np.count_nonzero(data)),
         seconds_per_page=float(np.median([t.total_s for t in timings])),
         inference_seconds_per_page=float(np.median([t.inference_s for t in timings])),
@@ -151,4 +157,5 @@ def evaluate(
             measure(*page, levels).air_bits_per_symbol for page in zip(phases, concentrations, truths, strict=True)
         ),
         concentration_bins=tuple(concentration_calibration(phase, concentration, truth, levels)),
+        refused=tuple(refused),
     )

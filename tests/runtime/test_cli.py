@@ -184,7 +184,13 @@ def test_evaluate_uses_the_recordings_own_pilots(toy_zip: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("edit", "named"),
-    [("symbols", "no symbols"), ("depth", "10 bits"), ("truncate", "HDF5"), ("black", "black"), ("shape", "pixels")],
+    [
+        ("symbols", "no symbols"),
+        ("depth", "10 bits"),
+        ("truncate", "HDF5"),
+        ("black", "page 1: quad.*black"),
+        ("shape", "pixels"),
+    ],
 )
 def test_evaluate_refuses_what_it_cannot_measure_in_one_line(
     edit: str,
@@ -202,7 +208,7 @@ def test_evaluate_refuses_what_it_cannot_measure_in_one_line(
             if edit == "symbols":
                 del file["symbols"]
             elif edit == "black":
-                file["quadrature"][2] = 0
+                file["quadrature"][...] = 0
             elif edit == "shape":
                 for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
                     data = file[name][..., :90]
@@ -217,8 +223,37 @@ def test_evaluate_refuses_what_it_cannot_measure_in_one_line(
     assert run(["evaluate", "--bundle", toy_zip, "--recording", path, "--json", out]) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if "error:" in line]
     assert len(lines) == 1
-    assert named in lines[0]
+    assert re.search(named, lines[0])
     assert not out.exists()
+
+
+@pytest.fixture
+def with_bad_pages(recording: tuple[Path, np.ndarray]) -> Path:
+    """The recording with a black page and one whose counts lie in no 8 bits."""
+    with h5py.File(recording[0], "r+") as file:
+        for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+            data = file[name][()].astype(np.uint16)
+            del file[name]
+            file[name] = data
+        file["quadrature"][1] = 0
+        file["in_phase"][3, 5, 5] = 256
+    return recording[0]
+
+
+def test_evaluate_goes_on_after_bad_pages_and_ends_with_their_names(
+    toy_zip: Path, with_bad_pages: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "e.json"
+    assert run(["evaluate", "--bundle", toy_zip, "--recording", with_bad_pages, "--json", out, "--threads", "1"]) == 2
+    data = json.loads(out.read_text())
+    assert (data["pages"], data["pages_left_out"], len(data["air_per_page"])) == (2, 0, 2)
+    assert [page["page"] for page in data["refused_pages"]] == [1, 3]
+    assert "black" in data["refused_pages"][0]["reason"]
+    assert "256" in data["refused_pages"][1]["reason"]
+    shown = capsys.readouterr()
+    assert "AIR" in shown.out
+    assert f"recording {with_bad_pages}: got 2 of 4 pages that were refused (page 1: " in shown.err
+    assert "; page 3: " in shown.err
 
 
 def test_offline_recalibration_writes_a_better_bundle(
@@ -285,6 +320,32 @@ def test_decode_sends_a_recording_and_keeps_the_symbols(
     assert [page["page"] for page in pages] == [0, 1, 2, 3]
     assert all(0 < page["air_bits_per_symbol"] <= 4 and page["total_s"] > 0 for page in pages)
     assert "toy-1" in capsys.readouterr().out
+
+
+def test_decode_goes_on_after_bad_pages_and_ends_with_their_names(
+    service: LightpageServer, with_bad_pages: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, report = tmp_path / "decoded.h5", tmp_path / "d.json"
+    where = ["--target", service.target, "--recording", with_bad_pages]
+    assert run(["decode", *where, "--out", out, "--json", report]) == 2
+    data = json.loads(report.read_text())
+    assert [page["page"] for page in data["pages"]] == [0, 2]
+    assert [page["page"] for page in data["refused_pages"]] == [1, 3]
+    with h5py.File(out) as file:
+        assert file["symbols"].shape == (2, *toy.PAGE)
+        assert list(file["pages"]) == [0, 2]
+    assert f"recording {with_bad_pages}: got 2 of 4 pages that were refused (page 1: " in capsys.readouterr().err
+
+
+def test_decode_of_bad_pages_alone_writes_nothing(
+    service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with h5py.File(recording[0], "r+") as file:
+        file["quadrature"][...] = 0
+    where = ["--target", service.target, "--recording", recording[0]]
+    assert run(["decode", *where, "--out", tmp_path / "decoded.h5", "--json", tmp_path / "d.json"]) == 2
+    assert "4 of 4 pages" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
 
 
 def test_decode_reads_the_services_source(service: LightpageServer, tmp_path: Path) -> None:
