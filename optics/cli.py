@@ -60,6 +60,7 @@ class _Job:
     def __init__(self, profile: Profile, device: Device, levels: int, seed: int, truth: bool, out: Path) -> None:
         self.profile, self.device, self.levels, self.seed, self.truth = profile, device, levels, seed, truth
         self.out = out
+        self._simulator = Simulator(profile, device, levels, seed)
         self.partial = partial_path(out)
         self.settings = out.with_name(out.name + ".partial.toml")
 
@@ -93,7 +94,7 @@ class _Job:
             InvalidInputError: more pages are there already.
             RecordingError: the file cannot be written.
         """
-        simulator = Simulator(self.profile, self.device, self.levels, self.seed)
+        simulator = self._simulator
         bits = self.device.sensor.bit_depth
         with RecordingWriter.resume(self.out, self.profile, self.levels, bits, simulator.references()) as writer:
             if writer.pages > pages:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from optics.errors import ProfileError
 from optics.profile import Profile
 
 Real = NDArray[np.float64]
@@ -20,6 +21,8 @@ _PREFILTER_TAPS = 11
 _BAND_TAPS = 31
 _BAND_HEADROOM = 1.06
 """Pass band over the pipe's nominal band, for misalignment of the pipe against the lens axes."""
+
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,40 @@ class FieldGrid:
         return float(self.x_m[1] - self.x_m[0])
 
 
+def check_camera(profile: Profile) -> None:
+    """Check that the cameras see all of the page's image, and the pipe's light finely enough.
+
+    The image has the page's own size, since both lenses have the same focal length. The intensity of light from a pipe
+    of width w has frequencies up to w / (lambda f), twice the field's; two samples a period on a grid of
+    `GRID_STEP_PX` pixels need pixels of at most lambda f / (2 GRID_STEP_PX w).
+
+    Raises:
+        ProfileError: the camera's pixels are too coarse or too few; the message says what would do.
+    """
+    camera, thing = profile.camera, f"profile {profile.name}: camera"
+    coarsest = profile.light.wavelength_m * profile.lens.focal_length_m / (2 * GRID_STEP_PX * profile.pipe.width_m)
+    if camera.pitch_m > coarsest * (1 + _ROUNDING):
+        raise ProfileError(
+            f"{thing}.pitch_m", f"{camera.pitch_m:.4g} m", f"at most {coarsest:.4g} m, to resolve the pipe's light"
+        )
+    for key, count, extent in (
+        ("columns_px", camera.columns_px, profile.page_width_m),
+        ("rows_px", camera.rows_px, profile.page_height_m),
+    ):
+        least = int(np.ceil(extent / camera.pitch_m * (1 - _ROUNDING)))
+        if count < least:
+            raise ProfileError(
+                f"{thing}.{key}", count, f"at least {least}, to see the page's image of {extent * 1e3:.4g} mm"
+            )
+
+
 def field_grid(profile: Profile) -> FieldGrid:
-    """The grid for a device: covers the nominal page image and a margin, pitch two camera pixels."""
+    """The grid for a device: covers the nominal page image and a margin, pitch two camera pixels.
+
+    Raises:
+        ProfileError: the camera is too coarse or too small (`check_camera`).
+    """
+    check_camera(profile)
     pixel = profile.camera.pitch_m
     pitch = GRID_STEP_PX * pixel
 

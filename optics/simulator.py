@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from optics.cameras import CameraView, expose, in_phase_intensity, quadrature_intensity, resample, to_counts
 from optics.device import CameraPose, Device
+from optics.grid import check_camera
 from optics.page import check_symbols, symbol_phases
 from optics.profile import Profile
 from optics.recording import FramePair
@@ -187,9 +188,13 @@ class Simulator:
         levels: levels M of the symbols it will be given.
         seed: everything random comes from it; the same seed and calls give the same frames.
         steps: splitting steps of a sheared pipe.
+
+    Raises:
+        ProfileError: the profile's camera is too coarse or too small for its page.
     """
 
     def __init__(self, profile: Profile, device: Device, levels: int = 256, seed: int = 0, steps: int = 64) -> None:
+        check_camera(profile)
         self.optics = TrueOptics(profile, device, steps)
         self.levels = levels
         self.seed = seed

@@ -141,6 +141,14 @@ def test_pages_that_are_being_written_are_not_destroyed_even_if_forced(profile_f
         assert recording.pages == 1
 
 
+def test_a_profile_that_cannot_be_simulated_leaves_nothing_behind(profile_file: Path, tmp_path: Path) -> None:
+    coarse = tmp_path / "coarse.toml"
+    coarse.write_text(profile_file.read_text().replace("pitch_m = 2.4e-06", "pitch_m = 4.8e-06"))
+    with pytest.raises(ProfileError, match=r"camera\.pitch_m: got 4\.8e-06 m"):
+        run(coarse, tmp_path / "R.h5")
+    assert list(tmp_path.iterdir()) == [coarse]
+
+
 def test_a_file_that_exists_is_kept_unless_forced(profile_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "R.h5"
     out.write_bytes(b"precious")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from optics.grid import FieldGrid, field_grid
+from optics.errors import ProfileError
+from optics.grid import FieldGrid, check_camera, field_grid
 from optics.profile import Profile, load_profile
 from tests.optics.small import small_profile
 
@@ -70,3 +71,29 @@ def test_filters_keep_the_mean_and_shift_nothing(grid: FieldGrid) -> None:
         assert taps.sum() == pytest.approx(1)
         assert len(taps) % 2 == 1
         np.testing.assert_allclose(taps, taps[::-1], atol=1e-12)
+
+
+def with_camera(**changes: float) -> Profile:
+    bench = load_profile("bench")
+    return bench.model_copy(update={"camera": bench.camera.model_copy(update=changes)})
+
+
+def test_a_camera_too_coarse_for_the_pipes_light_is_refused_with_the_pitch_that_would_do() -> None:
+    with pytest.raises(
+        ProfileError, match=r"profile bench: camera\.pitch_m: got 4\.8e-06 m, wanted at most 2\.99e-06 m"
+    ):
+        field_grid(with_camera(pitch_m=4.8e-6))
+    coarsest = 532e-9 * 20e-3 / (4 * 0.88963e-3)
+    with pytest.raises(ProfileError):
+        check_camera(with_camera(pitch_m=1.001 * coarsest))
+    grid = field_grid(with_camera(pitch_m=coarsest))
+    # two samples for each period of the intensity, whose frequencies are twice the field's
+    assert grid.pitch_m == pytest.approx(1 / (2 * 2 * band_edge(load_profile("bench"))))
+
+
+def test_a_camera_that_does_not_see_the_whole_page_is_refused_with_the_pixels_that_would_do() -> None:
+    # 87 x 56 symbols of 36.8 um on pixels of 2.4 um: 1334 x 858.7
+    for key, least in (("columns_px", 1334), ("rows_px", 859)):
+        check_camera(with_camera(**{key: least}))
+        with pytest.raises(ProfileError, match=rf"camera\.{key}: got {least - 1}, wanted at least {least}"):
+            field_grid(with_camera(**{key: least - 1}))

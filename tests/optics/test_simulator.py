@@ -9,7 +9,7 @@ import pytest
 
 from optics.cameras import resample
 from optics.device import Aberration, CameraPose, Device, Drift, Geometry, Homodyne, Reference, Sensor, SlmDefects
-from optics.errors import PageError
+from optics.errors import PageError, ProfileError
 from optics.profile import PageLayout, Profile, load_profile
 from optics.registration.parameters import NAMES
 from optics.registration.twin import BRANCHES
@@ -50,6 +50,12 @@ def test_the_shipped_devices_are_computed_with_the_modes_that_their_recordings_w
 ) -> None:
     # other numbers would change recordings, and with them every figure that was measured on one
     assert TrueOptics(load_profile(name), Device()).channel.cells == cells
+
+
+def test_a_camera_that_cannot_see_the_page_is_refused_before_anything_is_computed() -> None:
+    narrow = TINY.model_copy(update={"camera": TINY.camera.model_copy(update={"columns_px": 100})})
+    with pytest.raises(ProfileError, match=r"camera\.columns_px: got 100, wanted at least 123"):
+        Simulator(narrow, Device())
 
 
 class TestRandomness:
