@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from optics.cameras import CameraView, expose, in_phase_intensity, quadrature_intensity, resample, to_counts
 from optics.device import CameraPose, Device
 from optics.grid import check_camera
-from optics.page import check_symbols, symbol_phases
+from optics.page import check_levels, check_symbols, symbol_phases
 from optics.profile import Profile
 from optics.recording import FramePair
 from optics.recording_layout import frame_type
@@ -190,10 +190,12 @@ class Simulator:
         steps: splitting steps of a sheared pipe.
 
     Raises:
+        PageError: a level count outside 2..256.
         ProfileError: the profile's camera is too coarse or too small for its page.
     """
 
     def __init__(self, profile: Profile, device: Device, levels: int = 256, seed: int = 0, steps: int = 64) -> None:
+        check_levels(levels)
         check_camera(profile)
         self.optics = TrueOptics(profile, device, steps)
         self.levels = levels

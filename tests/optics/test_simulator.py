@@ -52,6 +52,12 @@ def test_the_shipped_devices_are_computed_with_the_modes_that_their_recordings_w
     assert TrueOptics(load_profile(name), Device()).channel.cells == cells
 
 
+@pytest.mark.parametrize("levels", [-1, 0, 1, 257, 16.0, True])
+def test_a_level_count_that_no_page_can_have_is_refused_at_once(levels: int) -> None:
+    with pytest.raises(PageError, match="levels: got .*, wanted a whole number from 2 to 256"):
+        Simulator(TINY, Device(), levels=levels)
+
+
 def test_a_camera_that_cannot_see_the_page_is_refused_before_anything_is_computed() -> None:
     narrow = TINY.model_copy(update={"camera": TINY.camera.model_copy(update={"columns_px": 100})})
     with pytest.raises(ProfileError, match=r"camera\.columns_px: got 100, wanted at least 123"):
