@@ -94,7 +94,7 @@ def _bar() -> Iterator[Callable[[str, float], None]]:
 
 def _remote(target: str, recording: str | None, pages: int) -> Recalibrated:
     with LightpageClient(target) as client, _bar() as progress:
-        return client.recalibrate(count=0 if recording else pages, recording=recording, progress=progress)
+        return client.recalibrate(count=pages, recording=recording, progress=progress)
 
 
 def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> RecalibrationOutcome:

@@ -201,13 +201,15 @@ class LightpageClient:
     ) -> Recalibrated:
         """Recalibrate with pages of the source (`pages`, or the next `count`) or with a recording on the server.
 
+        Of a recording the first `count` pages are used, all of them where it is 0.
+
         Raises:
             RecalibrationRefusedError: the new model would not be better; the old one stays.
             BusyError: another recalibration runs.
         """
         request = pb.RecalibrateRequest()
         if recording is not None:
-            request.recording = recording
+            request.recording, request.recording_count = recording, count
         else:
             request.source.CopyFrom(pb.SourcePages(count=count, pages=pages))
         call = self._stub.Recalibrate(request, timeout=timeout_s)

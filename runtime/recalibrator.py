@@ -9,13 +9,21 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from optics.errors import BusyError, InvalidInputError, LimitError, PageError, RecalibrationRefusedError
+from optics.errors import (
+    BusyError,
+    InvalidInputError,
+    LimitError,
+    PageError,
+    RecalibrationRefusedError,
+    RecordingError,
+)
 from optics.recording import Recording
 from runtime.archive import check_name
 from runtime.bundle import Bundle
 from runtime.caller import Caller, CallerLeft
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
+from runtime.evaluation import check_recording
 from runtime.frames import narrow
 from runtime.recalibration import Fit, KnownPages, Progress, RecalibrationOutcome, next_version, recalibrate
 from runtime.sources import FrameSource
@@ -62,14 +70,21 @@ class Recalibrator:
         wanted: list[int | None] = list(pages) or [None] * count
         return self._run(lambda: read_known(source, wanted), caller)
 
-    def from_recording(self, name: str, caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
-        """Recalibrate with a recording in the recordings folder; yields and raises as `from_source`."""
+    def from_recording(self, name: str, count: int, caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
+        """Recalibrate with the first `count` pages (0: all) of a recording in the recordings folder.
+
+        Yields and raises as `from_source`, and `RecordingError` for another device's recording or too short a one.
+        """
         path = self._path(name)
+        self._check_count(count)
 
         def read() -> KnownPages:
             with Recording.open(path) as recording:
-                self._check_count(recording.pages)
-                return known_pages(recording)
+                check_recording(self._plane.registry.current.decoder, recording)
+                if recording.pages < count:
+                    raise RecordingError(f"recording {name}", f"{recording.pages} pages", f"at least {count}")
+                self._check_count(count or recording.pages)
+                return known_pages(recording, range(count or recording.pages))
 
         return self._run(read, caller)
 

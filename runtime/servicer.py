@@ -109,7 +109,7 @@ class LightpageServicer(pb_grpc.LightpageServicer):
             if kind == "source":
                 steps = self._recalibrator.from_source(request.source.count, list(request.source.pages), caller)
             elif kind == "recording":
-                steps = self._recalibrator.from_recording(request.recording, caller)
+                steps = self._recalibrator.from_recording(request.recording, request.recording_count, caller)
             else:
                 raise InvalidInputError("pages to recalibrate with", "none", "pages of the source or a recording")
             for step in steps:

@@ -393,6 +393,18 @@ def test_recalibrate_and_rollback_work_on_a_running_service(service: LightpageSe
     assert run(["rollback", "--target", service.target]) == 2
 
 
+def test_recalibrate_asks_a_service_for_as_many_pages_of_a_recording_as_it_is_told(
+    toy_zip: Path, tmp_path: Path
+) -> None:
+    toy.write_toy_recording(tmp_path / "known.h5", toy.ToyDevice((150.0, 62.0)), 16, 5)
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)))
+    report = tmp_path / "r.json"
+    with LightpageServer(plane, Recalibrator(plane, toy.fit_references, tmp_path)) as server:
+        where = ["--target", server.target, "--recording", "known.h5"]
+        assert run(["recalibrate", *where, "--pages", "3", "--json", report]) == 0
+    assert json.loads(report.read_text())["pages_used"] == 3
+
+
 def test_an_interrupted_decode_leaves_nothing_half_written(
     service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

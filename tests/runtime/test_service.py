@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import grpc
+import h5py
 import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
@@ -22,6 +23,7 @@ from optics.errors import (
     LimitError,
     PageError,
     RecalibrationRefusedError,
+    RecordingError,
 )
 from optics.measures import measure
 from optics.page import pilot_mask
@@ -550,6 +552,34 @@ def test_recalibration_from_a_recording_on_the_server(start: Start, tmp_path: Pa
             service.client.recalibrate(recording=name)
     with pytest.raises(LimitError, match="at most 16"):
         service.client.recalibrate(count=17)
+
+
+def test_of_a_recording_on_the_server_the_first_pages_asked_for_are_used(start: Start, tmp_path: Path) -> None:
+    service = start()
+    symbols = toy.write_toy_recording(tmp_path / "long.h5", toy.ToyDevice(DRIFTED), 16, 18)
+    with h5py.File(tmp_path / "long.h5", "r+") as file:
+        file["symbols"][3:] = 15 - symbols[3:]
+    with pytest.raises(LimitError, match="18, wanted at most 16"):
+        service.client.recalibrate(recording="long.h5")
+    with pytest.raises(LimitError, match="17, wanted at most 16"):
+        service.client.recalibrate(recording="long.h5", count=17)
+    result = service.client.recalibrate(recording="long.h5", count=3)
+    assert (result.pages_used, result.pages_held_back) == (3, 2)
+    toy.write_toy_recording(tmp_path / "short.h5", toy.ToyDevice(DRIFTED), 16, 2)
+    with pytest.raises(RecordingError, match="2 pages, wanted at least 3"):
+        service.client.recalibrate(recording="short.h5", count=3)
+
+
+def test_another_devices_recording_on_the_server_is_refused_by_its_shape(start: Start, tmp_path: Path) -> None:
+    service = start()
+    toy.write_toy_recording(tmp_path / "narrow.h5", toy.ToyDevice(DRIFTED), 16, 2)
+    with h5py.File(tmp_path / "narrow.h5", "r+") as file:
+        for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+            data = file[name][..., :90]
+            del file[name]
+            file[name] = data
+    with pytest.raises(RecordingError, match="in_phase: got frames of 64 x 90 pixels"):
+        service.client.recalibrate(recording="narrow.h5")
 
 
 def test_a_swap_under_load_loses_no_request(start: Start) -> None:

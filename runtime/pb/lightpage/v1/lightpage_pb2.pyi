@@ -218,12 +218,14 @@ class ReadPageReply(_message.Message):
     def __init__(self, decoded: _Optional[_Union[DecodeReply, _Mapping]] = ..., page: _Optional[int] = ..., written: _Optional[bytes] = ..., pilot_mask: _Optional[bytes] = ...) -> None: ...
 
 class RecalibrateRequest(_message.Message):
-    __slots__ = ("source", "recording")
+    __slots__ = ("source", "recording", "recording_count")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     RECORDING_FIELD_NUMBER: _ClassVar[int]
+    RECORDING_COUNT_FIELD_NUMBER: _ClassVar[int]
     source: SourcePages
     recording: str
-    def __init__(self, source: _Optional[_Union[SourcePages, _Mapping]] = ..., recording: _Optional[str] = ...) -> None: ...
+    recording_count: int
+    def __init__(self, source: _Optional[_Union[SourcePages, _Mapping]] = ..., recording: _Optional[str] = ..., recording_count: _Optional[int] = ...) -> None: ...
 
 class SourcePages(_message.Message):
     __slots__ = ("count", "pages")
