@@ -158,16 +158,23 @@ class DataPlane:
             InvalidInputError: no source, or no such page; else as `decode`.
         """
         start = time.perf_counter()
-        source, decoder = self.source, self.registry.current.decoder
+        source = self.source
         levels = source.levels if levels is None else levels
-        found = source.read(page)
-        mask = self._mask(found, decoder)
-        # Pilots are what was written, whatever level count the caller wants to see.
-        if found.symbols is not None:
-            pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
-        else:
-            pilots = decoder.pilots(source.levels, mask)
-        answer = self.decode(found.pair, levels, caller, pilots, start=start, received=time.perf_counter())
+        # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
+        with self._slot(self._decodes, "decodes", caller):
+            caller.check()
+            model, begun = self.registry.current, time.perf_counter()
+            found = source.read(page)
+            received = time.perf_counter()
+            mask = self._mask(found, model.decoder)
+            # Pilots are what was written, whatever level count the caller wants to see.
+            if found.symbols is not None:
+                pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
+            else:
+                pilots = model.decoder.pilots(source.levels, mask)
+            decoded = self._decode(model, found.pair, levels, pilots)
+        self.metrics.page(decoded, model.version)
+        answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start)
         return ReadAnswer(answer, found, mask)
 
     def adopt(self, decoder: Decoder, expected: Model | None = None) -> Model:

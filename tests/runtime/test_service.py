@@ -307,6 +307,18 @@ def test_too_many_at_once_are_told_to_come_back(start: Start) -> None:
     assert service.client.decode(a_page()[1], 16).levels == 16
 
 
+def test_a_page_is_not_read_from_the_source_before_there_is_room_to_decode_it(start: Start) -> None:
+    service = start(Limits(concurrent_decodes=1, deadline_s=0.2))
+    assert service.plane._decodes.acquire(timeout=1)
+    for _ in range(3):
+        with pytest.raises(BusyError, match="try again"):
+            service.client.read_page()
+    service.plane._decodes.release()
+    page = service.client.read_page()
+    assert page.page == 0  # none was taken from the source in vain
+    assert 0 < page.timings.receive_s + page.timings.decode_s < page.timings.total_s
+
+
 def test_health_is_served_beside_the_service_and_ends_first(start: Start) -> None:
     service = start()
     with grpc.insecure_channel(service.server.target) as channel:
