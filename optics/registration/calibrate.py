@@ -15,7 +15,7 @@ from optics.recording import FramePair
 from optics.registration.coherence import COHERENT_BRANCHES, page_coherence
 from optics.registration.fit import Fit, fit_parameters
 from optics.registration.parameters import PARAMETERS, indices, nominal
-from optics.registration.patches import Measurement, Patch, measure, patches, search_window
+from optics.registration.patches import Measurement, Patch, measure, middle_patches, patches, search_window
 from optics.registration.samplers import FieldSampler, FrameSampler
 from optics.registration.table import registration_coefficients
 from optics.registration.twin import FieldSolver, Twin
@@ -27,6 +27,7 @@ Progress = Callable[[str, float], None]
 SIGNIFICANT = 16.0
 """A patch counts from here: unrelated light reaches it in fewer than one search in a hundred, the widest included."""
 _FEWEST = 5
+"""Patches that must be looked for, and measurements that must be found, to fit anything."""
 _CAMERA_GROUPS = ("in_phase", "quadrature", "centre", "camera_phase")
 _SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "launch")
 _ALL_GROUPS = tuple(dict.fromkeys(p.group for p in PARAMETERS))
@@ -145,7 +146,7 @@ def calibrate(
         progress: told of every stage.
 
     Raises:
-        CalibrationError: nothing within the capture range explains the frames.
+        CalibrationError: nothing within the capture range explains the frames, or the page is too small to tell.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASE) + 5
@@ -229,6 +230,13 @@ class _Registration:
         self.twin, self.solve_field, self.profile = twin, solve_field, profile
         self.references, self.pages, self.progress = references, pages, progress
         self.patches = patches(profile)
+        if len(self.patches) < _FEWEST:
+            rows, columns = profile.page_shape
+            raise CalibrationError(
+                f"calibration, profile {profile.name}",
+                f"a page of {columns} x {rows} symbols, which makes {len(self.patches)} patches to look for",
+                f"at least {_FEWEST} patches of about 10 x 10 symbols",
+            )
         self.grid = field_grid(profile)
         self.parameters = nominal()
         self.turn = np.pi / 2
@@ -352,8 +360,7 @@ class _Registration:
     def _where(self, stage: _Stage) -> list[Patch]:
         if not stage.middle_only:
             return self.patches
-        width, height = self.profile.page_width_m, self.profile.page_height_m
-        return [p for p in self.patches if abs(p.centre_m[0]) < 0.16 * width and abs(p.centre_m[1]) < 0.2 * height]
+        return middle_patches(self.profile, self.patches, _FEWEST)
 
     def _measure(
         self,

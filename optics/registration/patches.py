@@ -21,6 +21,10 @@ _SLOPES = np.linspace(-2.4, 2.4, 17)
 _CARRIER_PROBE = 0.3
 """Reach of the finite difference that finds the carrier, samples."""
 
+_MIDDLE_X, _MIDDLE_Y = 0.16, 0.2
+"""The page's middle, where most of the light takes the direct way: half its extents over the page's."""
+_ROUNDING = 1e-9
+
 
 @dataclass(frozen=True)
 class Patch:
@@ -82,6 +86,19 @@ def patches(profile: Profile, edge: int = 10) -> list[Patch]:
         for r0, r1 in cuts(rows)
         for c0, c1 in cuts(columns)
     ]
+
+
+def middle_patches(profile: Profile, all_patches: list[Patch], least: int) -> list[Patch]:
+    """The patches in the middle third of the page, or as many around them, whole rings, as make `least`."""
+
+    def distance(patch: Patch) -> float:
+        """From the page's centre; 1 on the middle's border."""
+        x, y = patch.centre_m
+        return max(abs(x) / (_MIDDLE_X * profile.page_width_m), abs(y) / (_MIDDLE_Y * profile.page_height_m))
+
+    distances = [distance(patch) for patch in all_patches]
+    border = max(1.0, sorted(distances)[min(least, len(distances)) - 1])
+    return [patch for patch, far in zip(all_patches, distances, strict=True) if far <= border * (1 + _ROUNDING)]
 
 
 def search_window(reach_m: float, step_m: float) -> Real:

@@ -10,10 +10,11 @@ import pytest
 from optics.errors import CalibrationError, InvalidInputError, ProfileError, RecordingError
 from optics.profile import load_profile
 from optics.recording import FramePair, Recording, RecordingWriter
-from optics.registration.calibrate import Registered, check_found
+from optics.registration.calibrate import KnownPage, Registered, calibrate, check_found
 from optics.registration.calibration import Calibration, load_calibration, parse_calibration
 from optics.registration.known import known_pages
 from optics.registration.parameters import NAMES, PRIORS
+from tests.optics.registration.flat_twin import FlatTwin
 
 PROFILE = load_profile("bench")
 HASHES = ("0123456789abcdef" * 4, "f" * 64)
@@ -134,3 +135,18 @@ def test_a_device_that_was_found_is_accepted(coherence: float, significant: floa
 def test_an_outcome_near_chance_is_no_calibration(coherence: float, significant: float) -> None:
     with pytest.raises(CalibrationError, match="calibration, outcome"):
         check_found(coherence, significant, BENCH_SYMBOLS)
+
+
+def test_a_page_too_small_to_be_found_is_refused_before_anything_is_searched() -> None:
+    profile = PROFILE.model_copy(update={"page": PROFILE.page.model_copy(update={"columns": 20, "rows": 24})})
+    frame = np.ones(profile.frame_shape, np.uint8)
+    page = KnownPage(FramePair(frame, frame), np.ones(profile.page_shape, complex))
+
+    def solve(*_: object) -> tuple[np.ndarray, np.ndarray]:
+        raise AssertionError("nothing may be computed")
+
+    with pytest.raises(
+        CalibrationError,
+        match=r"profile bench: got a page of 20 x 24 symbols, which makes 4 patches to look for, wanted at least 5",
+    ):
+        calibrate(FlatTwin(profile), solve, profile, page.pair, [page])

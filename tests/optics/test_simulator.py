@@ -54,7 +54,7 @@ def test_the_shipped_devices_are_computed_with_the_modes_that_their_recordings_w
 
 @pytest.mark.parametrize("levels", [-1, 0, 1, 257, 16.0, True])
 def test_a_level_count_that_no_page_can_have_is_refused_at_once(levels: int) -> None:
-    with pytest.raises(PageError, match="levels: got .*, wanted a whole number from 2 to 256"):
+    with pytest.raises(PageError, match=r"levels: got .*, wanted a whole number from 2 to 256"):
         Simulator(TINY, Device(), levels=levels)
 
 

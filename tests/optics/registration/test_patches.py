@@ -8,7 +8,7 @@ import pytest
 from optics.registration import patches as module
 from optics.registration.calibrate import SIGNIFICANT
 from optics.registration.parameters import nominal
-from optics.registration.patches import Measurement, Patch, Sampler, measure, patches, search_window
+from optics.registration.patches import Measurement, Patch, Sampler, measure, middle_patches, patches, search_window
 from tests.optics.registration.flat_twin import FlatTwin, Picture
 from tests.optics.small import random_phases, small_profile
 
@@ -51,6 +51,20 @@ class TestCutting:
         for patch in patches(PROFILE, 10):
             assert 8 <= patch.rows.stop - patch.rows.start <= 12
             assert 8 <= patch.columns.stop - patch.columns.start <= 12
+
+    @pytest.mark.parametrize(
+        ("columns", "rows", "count"), [(87, 56, 6), (60, 40, 8), (48, 32, 9), (44, 28, 6), (30, 30, 9), (20, 20, 4)]
+    )
+    def test_the_middle_is_widened_by_whole_rings_until_it_holds_enough(
+        self, columns: int, rows: int, count: int
+    ) -> None:
+        page = PROFILE.page.model_copy(update={"columns": columns, "rows": rows})
+        profile = PROFILE.model_copy(update={"page": page})
+        everywhere = patches(profile)
+        middle = middle_patches(profile, everywhere, 5)
+        assert len(middle) == count
+        assert len(middle) >= min(5, len(everywhere))
+        assert np.abs(np.mean([patch.centre_m for patch in middle], axis=0)).max() < 0.5 * profile.symbol_pitch_m
 
     def test_the_window_is_a_square_lattice_about_nothing_that_reaches_far_enough(self) -> None:
         window = search_window(10e-6, 3e-6)
