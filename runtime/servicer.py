@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version as installed_version
 
@@ -73,19 +73,23 @@ class LightpageServicer(pb_grpc.LightpageServicer):
     ) -> pb.DecodeReply:
         """Receive a frame pair and decode it."""
         start = time.perf_counter()
-        with self._call("DecodeFrames", context), _stall_guard(context, self._plane.limits.receive_s) as in_time:
-            header = _header(request_iterator)
+        receive_s = self._plane.limits.receive_s
+        with self._call("DecodeFrames", context):
+            with _stall_guard(context, receive_s):
+                header = _header(request_iterator)
             caller, levels = _caller(context), levels_of(header.options)
             shape = (header.rows_px, header.columns_px)
             with self._plane.receiving(shape, pixel_type(header.pixel_type), header.bit_depth, caller) as receiver:
-                for part in request_iterator:
-                    if part.WhichOneof("part") != "chunk":
-                        raise InvalidInputError("message of DecodeFrames", "a second header", "chunks after the first")
-                    if len(part.chunk) > self._plane.limits.chunk_bytes:
-                        limit = self._plane.limits.chunk_bytes
-                        raise LimitError("chunk", f"{len(part.chunk)} bytes", f"at most {limit}")
-                    receiver.add(part.chunk)
-                in_time()
+                with _stall_guard(context, receive_s):  # from here: waiting for the slot is not the client's doing
+                    for part in request_iterator:
+                        if part.WhichOneof("part") != "chunk":
+                            raise InvalidInputError(
+                                "message of DecodeFrames", "a second header", "chunks from there on"
+                            )
+                        if len(part.chunk) > self._plane.limits.chunk_bytes:
+                            limit = self._plane.limits.chunk_bytes
+                            raise LimitError("chunk", f"{len(part.chunk)} bytes", f"at most {limit}")
+                        receiver.add(part.chunk)
                 pair = receiver.pair()
                 received = time.perf_counter()
                 page_shape = self._plane.registry.current.decoder.bundle.profile.page_shape
@@ -166,8 +170,8 @@ def _caller(context: grpc.ServicerContext) -> Caller:
 
 
 @contextmanager
-def _stall_guard(context: grpc.ServicerContext, seconds: float) -> Iterator[Callable[[], None]]:
-    """Cancel the call unless the function that this yields is called within `seconds`.
+def _stall_guard(context: grpc.ServicerContext, seconds: float) -> Iterator[None]:
+    """Cancel the call unless the `with` block ends within `seconds`.
 
     Reading the next message blocks without a deadline of its own; only ending the call wakes it.
     """
@@ -175,6 +179,6 @@ def _stall_guard(context: grpc.ServicerContext, seconds: float) -> Iterator[Call
     timer.daemon = True
     timer.start()
     try:
-        yield timer.cancel
+        yield
     finally:
         timer.cancel()

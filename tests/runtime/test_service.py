@@ -298,6 +298,15 @@ def test_a_client_that_stalls_is_cut_off_and_gives_its_slot_back(start: Start) -
         over.set()
 
 
+def test_waiting_for_a_slot_is_not_stalling(start: Start) -> None:
+    service = start(Limits(concurrent_receives=1, receive_s=0.3))
+    assert service.plane._receives.acquire(timeout=1)
+    free = threading.Timer(0.8, service.plane._receives.release)
+    free.start()
+    assert (service.client.decode(a_page()[1], 16).symbols == a_page()[0]).all()
+    free.join(5)
+
+
 def test_too_many_at_once_are_told_to_come_back(start: Start) -> None:
     service = start(Limits(concurrent_decodes=1, deadline_s=0.2))
     assert service.plane._decodes.acquire(timeout=1)
