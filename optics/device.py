@@ -53,6 +53,8 @@ class Reference(Table):
     amplitude_ratio: Positive = 1.6
     """Mean reference amplitude over the signal's root mean square amplitude."""
     ripple_relative: NonNegative = 0.04
+    ripple_seed: Annotated[int, Field(ge=0)] = 1
+    """Draws the ripple's pattern, which belongs to the device and not to what is written."""
     tilt_x_rad: Finite = 1.0
     """Phase at the right edge of the page's image."""
     tilt_y_rad: Finite = 1.0
@@ -151,7 +153,7 @@ def draw_device(rng: np.random.Generator) -> Device:
             scale_relative_error=within(0.01), rotation_deg=within(0.3), shift_x_px=within(12), shift_y_px=within(12)
         )
 
-    return Device(
+    device = Device(
         geometry=Geometry(
             pipe_angle_deg=within(1),
             focal_length_relative_error=within(0.003),
@@ -190,3 +192,5 @@ def draw_device(rng: np.random.Generator) -> Device:
         ),
         drift=Drift(piston_rad=float(rng.uniform(0, 0.5)), shift_px=float(rng.uniform(0, 0.2))),
     )
+    ripple = device.reference.model_copy(update={"ripple_seed": int(rng.integers(2**31))})
+    return device.model_copy(update={"reference": ripple})

@@ -145,8 +145,8 @@ class TrueOptics:
         """Field on the exit facet to the computed camera plane."""
         return self.channel.delaunch_lens.to_plane(exit_field)
 
-    def reference(self, seed: int) -> Complex:
-        """Reference beam on the computed camera plane; the seed draws its ripple."""
+    def reference(self) -> Complex:
+        """Reference beam on the computed camera plane."""
         knobs = self.device.reference
         axis_x, axis_y = self.camera_axes_m
         half_width, half_height = self.profile.page_width_m / 2, self.profile.page_height_m / 2
@@ -156,7 +156,7 @@ class TrueOptics:
             + knobs.tilt_y_rad * y / half_height
             + knobs.curvature_rad * (x**2 + y**2) / self.corner_m**2
         )
-        rng = np.random.default_rng([seed, _RIPPLE])
+        rng = np.random.default_rng([knobs.ripple_seed, _RIPPLE])
         ripple = np.zeros((len(axis_y), len(axis_x)))
         for _ in range(6):
             turns_x, turns_y = rng.uniform(-3, 3, 2)
@@ -222,7 +222,7 @@ class Simulator:
 
     @cached_property
     def _reference(self) -> Complex:
-        return self.optics.reference(self.seed)
+        return self.optics.reference()
 
     def skip(self, pages: int) -> None:
         """Let `pages` pages pass unseen: what follows is what would have followed had they been simulated."""

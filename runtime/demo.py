@@ -27,9 +27,6 @@ from runtime.tracking import tracker_for
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-DEVICE_SEED = 1
-"""Seed of the device that the shipped bundle was trained for: its reference beam's ripple comes from it."""
-
 LEVELS = 16
 AIR_LEVELS = 256
 """Level count of the AIR: fine enough that it does not bound what a phase carries."""
@@ -152,7 +149,7 @@ def run_demo(bundle: Path, pages: int, seed: int, progress: Progress = lambda wh
     progress("load the bundle", 0.0)
     decoder = Decoder.load(bundle)
     device = Device()
-    source = SimulatorSource(decoder.bundle.profile, device, LEVELS, DEVICE_SEED)
+    source = SimulatorSource(decoder.bundle.profile, device, LEVELS)
     plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
     first = PAGES_PER_SEED * (1 + seed)
     known = first + 3 * pages

@@ -14,7 +14,7 @@ import pytest
 from optics.errors import PageError, RecordingError
 from optics.page import pilot_mask, random_symbols
 from optics.profile import Profile, load_profile, parse_profile
-from optics.recording import FramePair, Recording, RecordingWriter
+from optics.recording import FramePair, Recording, RecordingWriter, hash_frames
 
 LEVELS = 16
 PAGES = 3
@@ -148,6 +148,44 @@ class TestReading:
                     assert np.array_equal(getattr(got, name), getattr(wanted, name))
             assert recording.page_hash(1) == page_hash
 
+    @pytest.mark.parametrize("black", [0, 200, 4094])
+    def test_the_black_level_is_taken_off_frames_and_references(self, foreign: Path, black: int) -> None:
+        with h5py.File(foreign, "r+") as file:
+            file.attrs["black_level"] = black
+        with Recording.open(foreign) as recording, h5py.File(foreign) as file:
+            assert recording.black_level == black
+            for got, prefix, where in ((recording.frames(1), "", 1), (recording.references(), "reference_", ())):
+                for name in ("in_phase", "quadrature"):
+                    counts = file[prefix + name][where].astype(int)
+                    assert getattr(got, name).dtype == np.uint16
+                    assert np.array_equal(getattr(got, name), np.clip(counts - black, 0, None))
+
+    def test_a_recording_without_a_black_level_keeps_its_counts_and_its_hashes(self, foreign: Path) -> None:
+        with Recording.open(foreign) as recording, h5py.File(foreign) as file:
+            assert recording.black_level == 0
+            stored = FramePair(file["in_phase"][0], file["quadrature"][0])
+            assert np.array_equal(recording.frames(0).in_phase, stored.in_phase)
+            assert recording.page_hash(0) == hash_frames(stored)
+            assert recording.page_hash(0) == ("57c2f4abdcaafa11965f6992bf7c1820bab85ff13fb5cb69c75309ec5f375f3c")
+        with h5py.File(foreign, "r+") as file:
+            file.attrs["black_level"] = 100
+        with Recording.open(foreign) as recording:
+            # the identity of what a decoder is given
+            assert recording.page_hash(0) == hash_frames(recording.frames(0)) != hash_frames(stored)
+
+    def test_a_pedestal_that_is_declared_leaves_no_trace(self, foreign: Path, tmp_path: Path) -> None:
+        raised = write_foreign(tmp_path / "raised.h5")
+        for path in (foreign, raised):
+            with h5py.File(path, "r+") as file:
+                for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+                    file[name][...] = file[name][...] // 2 + (128 if path == raised else 0)
+        with h5py.File(raised, "r+") as file:
+            file.attrs["black_level"] = np.uint16(128)
+        with Recording.open(foreign) as plain, Recording.open(raised) as recording:
+            for page in range(PAGES):
+                assert recording.page_hash(page) == plain.page_hash(page)
+            assert np.array_equal(recording.references().quadrature, plain.references().quadrature)
+
     def test_a_page_that_is_not_there_is_refused(self, foreign: Path) -> None:
         with Recording.open(foreign) as recording:
             for page in (-1, PAGES):
@@ -216,6 +254,9 @@ BAD = {
     "newer version": (attribute("version", 2), "attribute 'version'", "2"),
     "version of text": (attribute("version", "1"), "attribute 'version'", "'1'"),
     "no bit depth": (attribute("camera_bit_depth", None), "attribute 'camera_bit_depth'", "none"),
+    "a black level below zero": (attribute("black_level", -1), "attribute 'black_level'", "-1"),
+    "a black level at full scale": (attribute("black_level", 4095), "attribute 'black_level'", "4095"),
+    "a black level between counts": (attribute("black_level", 12.5), "attribute 'black_level'", "12.5"),
     "7 bits": (attribute("camera_bit_depth", 7), "attribute 'camera_bit_depth'", "7"),
     "17 bits": (attribute("camera_bit_depth", 17), "attribute 'camera_bit_depth'", "17"),
     "half a bit": (attribute("camera_bit_depth", 12.5), "attribute 'camera_bit_depth'", "12.5"),

@@ -75,7 +75,8 @@ class TestRandomness:
 
         first, again, other = recorded(5), recorded(5), recorded(6)
         assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
-        assert not any(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
+        # the references, last, are the device's own
+        assert not any(np.array_equal(a, b) for a, b in zip(first[:-2], other[:-2], strict=True))
 
     def test_every_page_has_noise_of_its_own(self) -> None:
         still = Device(drift=Drift(piston_rad=0, shift_px=0))
@@ -161,11 +162,17 @@ class TestFrames:
 
     def test_the_reference_ripples_by_its_share(self) -> None:
         profile = small_profile()
-        beam = TrueOptics(profile, gentle(reference=Reference(amplitude_ratio=2, ripple_relative=0.1))).reference(
-            seed=1
-        )
+        beam = TrueOptics(profile, gentle(reference=Reference(amplitude_ratio=2, ripple_relative=0.1))).reference()
         assert np.abs(beam).std() == pytest.approx(0.2, rel=0.3)
         assert np.abs(beam).mean() == pytest.approx(2, rel=0.05)
+
+    def test_the_ripple_belongs_to_the_device_and_not_to_what_is_written(self) -> None:
+        profile, device = small_profile(), Device()
+        one, other = (Simulator(profile, device, seed=seed).references() for seed in (1, 2))
+        np.testing.assert_array_equal(one.in_phase, other.in_phase)
+        reference = device.reference.model_copy(update={"ripple_seed": 2})
+        another = Simulator(profile, device.model_copy(update={"reference": reference}), seed=1).references()
+        assert np.any(another.in_phase != one.in_phase)
 
     def test_opposite_signs_of_q_mirror_the_quadrature_frame_only(self) -> None:
         page = symbols(TINY)
@@ -176,7 +183,7 @@ class TestFrames:
         plus, minus = (Simulator(TINY, gentle(homodyne=arm), levels=16, seed=1, steps=8) for arm in arms)
         one, other = plus.simulate(page), minus.simulate(page)
         assert np.abs(one.pair.in_phase.astype(int) - other.pair.in_phase).max() < 20
-        signal = np.abs(plus.optics.camera_field(one.exit_field)) ** 2 + np.abs(plus.optics.reference(1)) ** 2
+        signal = np.abs(plus.optics.camera_field(one.exit_field)) ** 2 + np.abs(plus.optics.reference()) ** 2
         gain = plus.device.homodyne.quadrature_gain
         view = plus.optics.view(plus.device.quadrature_camera)
         mean = gain * resample(signal, *plus.optics.camera_axes_m, *view)
@@ -192,7 +199,7 @@ class TestFrames:
         page, references = simulator.simulate(symbols(profile)), simulator.references()
         optics = simulator.optics
         field = optics.camera_field(page.exit_field) * np.exp(1j * page.piston)
-        expected = field * optics.reference(1).conj()
+        expected = field * optics.reference().conj()
         per_unit = optics.electrons_per_unit * 65_535 / FINE_SENSOR.full_well_e
         view = optics.view(CameraPose())
 
@@ -338,7 +345,7 @@ class TestTruth:
         page_x, page_y = optics.page_axes_m
         points = np.stack(np.meshgrid(page_x - page_x.mean(), page_y - page_y.mean()), axis=-1).reshape(-1, 2)
         rays = twin.trace(true_parameters(TALL, device), points)
-        reference = optics.reference(0)
+        reference = optics.reference()
         away = np.abs(rays.positions)
         pages = [on_slm(random_phases(TALL, seed), TALL) for seed in range(3)]
         # the field is known against the reference

@@ -45,7 +45,7 @@ def record(sign: int = 1, ratio: float = 1.6) -> Recorded:
     simulator = Simulator(PROFILE, device, seed=1, steps=16)
     symbols = np.random.default_rng(0).integers(256, size=PROFILE.page_shape).astype(np.uint8)
     page, optics, grid = simulator.simulate(symbols), simulator.optics, field_grid(PROFILE)
-    reference = optics.reference(1)
+    reference = optics.reference()
     field = optics.camera_field(page.exit_field) * np.exp(1j * page.piston) * np.exp(-1j * np.angle(reference))
     x, y = np.meshgrid(grid.x_m, grid.y_m)
     real, imaginary = (resample(part, *optics.camera_axes_m, x, y) for part in (field.real, field.imag))

@@ -66,7 +66,7 @@ class TestFrameSampler:
         sampler = FrameSampler(frame, reference, camera, TWIN, true_parameters(PROFILE, device))
         half = 0.9 * np.array([PROFILE.page_width_m, PROFILE.page_height_m]) / 2
         places = np.random.default_rng(2).uniform(-half, half, (2000, 2))
-        beam = optics.reference(1)
+        beam = optics.reference()
         against = optics.camera_field(page.exit_field) * np.exp(1j * (page.piston - np.angle(beam)))
         # Q is mounted the other way round, so it shows minus the imaginary part
         part = against.real if camera == 0 else -against.imag
