@@ -19,6 +19,7 @@ from optics.recording import Recording
 from runtime.client import LightpageClient
 from runtime.convert import KnownPilots, RemotePage
 from runtime.decoded import DecodedWriter
+from runtime.errors import SourceError
 from runtime.frames import narrow
 from runtime.phase_shift import LEAST_COHERENCE
 from runtime.refused import RefusedPage, refusal
@@ -136,7 +137,7 @@ def _read(client: LightpageClient, count: int, levels: int) -> Iterator[RemotePa
     for _ in range(count):
         try:
             page = client.read_page(levels=levels, want_phase=known, want_concentration=known, want_written=known)
-        except InvalidInputError as error:
+        except (InvalidInputError, SourceError) as error:
             yield RefusedPage(None, str(error))
         else:
             yield page

@@ -11,16 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from optics.errors import BusyError, FrameError, InvalidInputError
+from optics.errors import FrameError, InvalidInputError
 from optics.pilots import Pilots
 from optics.recording import FramePair
 from runtime.caller import Caller
 from runtime.decoder import DecodedPage, Decoder
+from runtime.errors import SlotsTakenError, SourceError
 from runtime.limits import Limits
 from runtime.metrics import ServiceMetrics
 from runtime.receiver import PairReceiver
 from runtime.registry import Model, ModelRegistry
-from runtime.sources import FrameSource, SourcePage
+from runtime.sources import FrameSource, SourcePage, own_fault
 from runtime.store import ModelStore
 from runtime.tracking import decode_tracked
 
@@ -81,10 +82,10 @@ class DataPlane:
         """The source of pages.
 
         Raises:
-            InvalidInputError: this service has none.
+            SourceError: this service has none.
         """
         if self._source is None:
-            raise InvalidInputError("source", "none", "a service started with --source")
+            raise SourceError("source", "none", "a service started with --source")
         return self._source
 
     @property
@@ -99,7 +100,7 @@ class DataPlane:
         Raises:
             LimitError: the pair is larger than the service accepts.
             FrameError: not this device's size, type or bit depth.
-            BusyError: too many are being received until the caller's time is up.
+            SlotsTakenError: too many are being received until the caller's time is up.
         """
         # Size first: a header may claim anything, and a limit is the service's, not the camera's.
         if 2 * shape[0] * shape[1] * np.dtype(dtype).itemsize > self.limits.pair_bytes:
@@ -136,7 +137,7 @@ class DataPlane:
             received: when the pair was complete, likewise.
 
         Raises:
-            BusyError: no slot until the caller's time is up.
+            SlotsTakenError: no slot until the caller's time is up.
             CallerLeft: the caller has gone.
             FrameError, PageError: see `Decoder.decode`.
         """
@@ -155,7 +156,8 @@ class DataPlane:
         """Read a page from the source and decode it; `levels` None stands for the source's own.
 
         Raises:
-            InvalidInputError: no source, or no such page; else as `decode`.
+            SourceError: no source, or one that is damaged or dark.
+            PageError: no such page, or an impossible level count; else as `decode`.
         """
         start = time.perf_counter()
         source = self.source
@@ -164,7 +166,8 @@ class DataPlane:
         with self._slot(self._decodes, "decodes", caller):
             caller.check()
             model, begun = self.registry.current, time.perf_counter()
-            found = source.read(page)
+            with own_fault():
+                found = source.read(page)
             received = time.perf_counter()
             mask = self._mask(found, model.decoder)
             # Pilots are what was written, whatever level count the caller wants to see.
@@ -172,7 +175,8 @@ class DataPlane:
                 pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
             else:
                 pilots = model.decoder.pilots(source.levels, mask)
-            decoded = self._decode(model, found.pair, levels, pilots)
+            with own_fault(f"page {found.page_index} of {source.name}: "):
+                decoded = self._decode(model, found.pair, levels, pilots)
         self.metrics.page(decoded, model.version)
         answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start)
         return ReadAnswer(answer, found, mask)
@@ -215,7 +219,9 @@ class DataPlane:
         while not slots.acquire(timeout=min(0.5, max(0.0, until - time.monotonic()))):
             caller.check()
             if time.monotonic() >= until:
-                raise BusyError(f"concurrent {what}", "all taken", "a free one within the deadline; try again later")
+                raise SlotsTakenError(
+                    f"concurrent {what}", "all taken", "a free one within the deadline; try again later"
+                )
         try:
             yield
         finally:

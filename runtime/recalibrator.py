@@ -23,10 +23,11 @@ from runtime.bundle import Bundle
 from runtime.caller import Caller, CallerLeft
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
+from runtime.errors import SourceError
 from runtime.evaluation import check_recording
 from runtime.frames import narrow
 from runtime.recalibration import Fit, KnownPages, Progress, RecalibrationOutcome, next_version, recalibrate
-from runtime.sources import FrameSource
+from runtime.sources import FrameSource, own_fault
 
 _POLL_S = 0.25
 """How often a silent recalibration looks whether its caller is still there."""
@@ -63,7 +64,8 @@ class Recalibrator:
             BusyError: another recalibration runs.
             LimitError: more pages than the service takes.
             RecalibrationRefusedError: the new model would not be better; the old one stays.
-            InvalidInputError: no source, or pages without known symbols.
+            SourceError: no source, or a damaged one.
+            InvalidInputError: pages without known symbols.
         """
         source = self._plane.source
         self._check_count(len(pages) or count)
@@ -169,13 +171,19 @@ class Recalibrator:
 
     def _path(self, name: str) -> Path:
         if self._recordings is None:
-            raise InvalidInputError("recording to recalibrate with", name, "a service started with --recordings")
+            raise SourceError("recording to recalibrate with", name, "a service started with --recordings")
         try:
             check_name(name, "recording to recalibrate with")
         except Exception as error:
-            raise InvalidInputError("recording to recalibrate with", repr(name), "a plain file name") from error
+            raise InvalidInputError(
+                "recording to recalibrate with", repr(name), "a plain file name without folders"
+            ) from error
         path = self._recordings / name
-        if path.is_symlink() or not path.is_file():
+        try:
+            is_there = not path.is_symlink() and path.is_file()
+        except OSError:  # a name longer than the file system takes
+            is_there = False
+        if not is_there:
             raise InvalidInputError("recording to recalibrate with", repr(name), "a file in the recordings folder")
         return path
 
@@ -184,14 +192,16 @@ def read_known(source: FrameSource, pages: Sequence[int | None]) -> KnownPages:
     """Pages of a source with their symbols.
 
     Raises:
-        PageError: the source does not know what was written.
+        PageError: no such page, or the source does not know what was written.
+        SourceError: the source is damaged.
     """
-    found = [source.read(page) for page in pages]
+    with own_fault():
+        found, references = [source.read(page) for page in pages], source.references()
     symbols = [page.symbols for page in found if page.symbols is not None]
     if len(symbols) != len(found):
         raise PageError(f"pages of {source.name}", "unknown symbols", "pages whose symbols are known")
     mask = found[0].pilot_mask if found else None
-    return KnownPages(tuple(p.pair for p in found), tuple(symbols), source.levels, source.references(), mask)
+    return KnownPages(tuple(p.pair for p in found), tuple(symbols), source.levels, references, mask)
 
 
 def known_pages(recording: Recording, pages: Sequence[int] | None = None) -> KnownPages:

@@ -27,7 +27,7 @@ from runtime.dataplane import DataPlane
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.recalibrator import Recalibrator, Step
-from runtime.status import abort, status_of
+from runtime.status import abort, status_of, without_folders
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class LightpageServicer(pb_grpc.LightpageServicer):
                     pair_bytes=limits.pair_bytes,
                     concurrent_decodes=limits.concurrent_decodes,
                 ),
-                source=plane.source.name if plane.has_source else "",
+                source=without_folders(plane.source.name) if plane.has_source else "",
                 source_levels=plane.source.levels if plane.has_source else 0,
                 profile_toml=bundle.manifest.profile,
                 calibration_toml=bundle.manifest.calibration,

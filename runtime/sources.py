@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -12,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.device import Device, load_device
-from optics.errors import InvalidInputError, PageError
+from optics.errors import FrameError, InvalidInputError, PageError, RecordingError
 from optics.page import pilot_mask, random_symbols
 from optics.profile import Profile, load_profile
 from optics.recording import FramePair, Recording
+from runtime.errors import SourceError
 from runtime.frames import narrow
 
 
@@ -64,6 +67,19 @@ class FrameSource(Protocol):
         """Let go of files and devices."""
 
 
+@contextmanager
+def own_fault(thing: str = "") -> Iterator[None]:
+    """Turn what is wrong with a source's file or frames into the service's fault; a page that is not there stays.
+
+    Raises:
+        SourceError: in place of a `RecordingError` or `FrameError`; `thing` goes before what it names.
+    """
+    try:
+        yield
+    except (RecordingError, FrameError) as error:
+        raise SourceError(thing + error.thing, error.got, error.wanted) from error
+
+
 class RecordingSource:
     """Pages of a recording, over and over again: after the last page the next one is the first.
 
@@ -96,9 +112,11 @@ class RecordingSource:
                 page, self._next = self._next, (self._next + 1) % max(1, recording.pages)
             if not 0 <= page < recording.pages:
                 raise PageError(f"page of {self.name}", page, f"0..{recording.pages - 1}")
-            return SourcePage(
-                narrow(recording.frames(page), self.bit_depth), page, recording.symbols(page), recording.pilots()
-            )
+            try:
+                pair, symbols = narrow(recording.frames(page), self.bit_depth), recording.symbols(page)
+                return SourcePage(pair, page, symbols, recording.pilots())
+            except RecordingError as error:
+                raise RecordingError(f"page {page}, {error.thing}", error.got, error.wanted) from None
 
     def references(self) -> FramePair:
         """The recording's reference frames."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import grpc
@@ -16,7 +17,9 @@ from optics.errors import (
     LimitError,
     RecalibrationRefusedError,
 )
+from runtime import errors as service_errors
 from runtime.caller import CallerLeft
+from runtime.errors import SlotsTakenError, SourceError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 DETAIL_KEY = "lightpage-error-bin"
@@ -24,7 +27,9 @@ DETAIL_KEY = "lightpage-error-bin"
 _CODES: tuple[tuple[type[BaseException], grpc.StatusCode], ...] = (
     (InvalidInputError, grpc.StatusCode.INVALID_ARGUMENT),
     (LimitError, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    (SlotsTakenError, grpc.StatusCode.RESOURCE_EXHAUSTED),
     (BusyError, grpc.StatusCode.ABORTED),
+    (SourceError, grpc.StatusCode.FAILED_PRECONDITION),
     (BundleError, grpc.StatusCode.FAILED_PRECONDITION),
     (RecalibrationRefusedError, grpc.StatusCode.FAILED_PRECONDITION),
     (CalibrationError, grpc.StatusCode.FAILED_PRECONDITION),
@@ -33,8 +38,13 @@ _CODES: tuple[tuple[type[BaseException], grpc.StatusCode], ...] = (
 )
 
 _BY_NAME: dict[str, type[LightpageError]] = {
-    name: kind for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, LightpageError)
+    name: kind
+    for name, kind in {**vars(errors), **vars(service_errors)}.items()
+    if isinstance(kind, type) and issubclass(kind, LightpageError)
 }
+
+_FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")
+"""The folders of an absolute path, up to its last name."""
 
 
 def status_of(error: BaseException) -> grpc.StatusCode:
@@ -45,18 +55,23 @@ def status_of(error: BaseException) -> grpc.StatusCode:
     return grpc.StatusCode.INTERNAL
 
 
+def without_folders(text: str) -> str:
+    """`text` with every absolute path in it cut to its last name: where the service keeps its files is its own."""
+    return _FOLDERS.sub("", text)
+
+
 def abort(context: grpc.ServicerContext, error: BaseException) -> None:
     """End the call with the status of `error`. Always raises, as `context.abort` does.
 
-    An unforeseen error gives its class only: its text may hold paths or data that are nobody's business.
+    A foreseen error names files without their folders. An unforeseen one gives its class only: its text may hold
+    anything.
     """
     code = status_of(error)
     if isinstance(error, LightpageError):
-        detail = pb.ErrorDetail(
-            kind=type(error).__name__, thing=error.thing, got=error.got[:1000], wanted=error.wanted[:1000]
-        )
+        thing, got, wanted = (without_folders(text)[:1000] for text in (error.thing, error.got, error.wanted))
+        detail = pb.ErrorDetail(kind=type(error).__name__, thing=thing, got=got, wanted=wanted)
         context.set_trailing_metadata(((DETAIL_KEY, detail.SerializeToString()),))
-        context.abort(code, str(error)[:2000])
+        context.abort(code, f"{thing}: got {got}, wanted {wanted}"[:2000])
     context.abort(code, f"{type(error).__name__} in the service; its log says more")
 
 

@@ -33,6 +33,7 @@ from runtime.client import LightpageClient
 from runtime.convert import KnownPilots
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
+from runtime.errors import SourceError
 from runtime.limits import Limits
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
@@ -40,6 +41,8 @@ from runtime.recalibration import Fit, FitResult
 from runtime.recalibrator import Recalibrator
 from runtime.registry import ModelRegistry, TrackerFactory, no_tracker
 from runtime.server import SERVICE, LightpageServer
+from runtime.sources import open_source
+from runtime.status import without_folders
 from runtime.store import ModelStore
 from runtime.tracking import NoTracker
 from tests.runtime import toy
@@ -328,6 +331,68 @@ def test_a_page_is_not_read_from_the_source_before_there_is_room_to_decode_it(st
     assert 0 < page.timings.receive_s + page.timings.decode_s < page.timings.total_s
 
 
+def status(call: Callable[[], object]) -> tuple[grpc.StatusCode, str]:
+    with pytest.raises(grpc.RpcError) as error:
+        call()
+    return error.value.code(), error.value.details()
+
+
+def test_a_call_without_a_slot_is_resource_exhausted(start: Start) -> None:
+    service = start(Limits(concurrent_decodes=1, deadline_s=0.2))
+    assert service.plane._decodes.acquire(timeout=1)
+    with grpc.insecure_channel(service.server.target) as channel:
+        code, text = status(lambda: service.stub(channel).ReadPage(pb.ReadPageRequest(), timeout=20))
+    service.plane._decodes.release()
+    assert code == grpc.StatusCode.RESOURCE_EXHAUSTED
+    assert "try again later" in text
+
+
+def test_a_damaged_page_of_the_source_is_the_services_own_fault(toy_zip: Path, tmp_path: Path) -> None:
+    path = tmp_path / "source.h5"
+    toy.write_toy_recording(path, toy.ToyDevice(), 16, 4)
+    with h5py.File(path, "r+") as file:
+        for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+            data = file[name][()].astype(np.uint16)
+            del file[name]
+            file[name] = data
+        file["quadrature"][1] = 0
+        file["in_phase"][2, 5, 5] = 256
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), open_source(f"recording:{path}"))
+    server = LightpageServer(plane, Recalibrator(plane, toy.fit_references))
+    with server, grpc.insecure_channel(server.target) as channel, LightpageClient(server.target) as client:
+        stub = pb_grpc.LightpageStub(channel)
+        for page, named in ((1, "page 1 of recording:source.h5: quadrature frame"), (2, "page 2, recording source.h5")):
+            code, text = status(lambda page=page: stub.ReadPage(pb.ReadPageRequest(page=page), timeout=20))  # type: ignore[misc]
+            assert code == grpc.StatusCode.FAILED_PRECONDITION
+            assert text.startswith(named)
+            assert str(tmp_path) not in text
+            with pytest.raises(SourceError) as error:
+                client.read_page(page)
+            assert str(tmp_path) not in str(error.value)
+        options = pb.DecodeOptions(levels=1)
+        for request in (pb.ReadPageRequest(page=9), pb.ReadPageRequest(page=0, options=options)):
+            code, _ = status(lambda request=request: stub.ReadPage(request, timeout=20))  # type: ignore[misc]
+            assert code == grpc.StatusCode.INVALID_ARGUMENT
+        recalibrate = pb.RecalibrateRequest(source=pb.SourcePages(pages=[0, 2]))
+        code, text = status(lambda: list(stub.Recalibrate(recalibrate, timeout=20)))
+        assert code == grpc.StatusCode.FAILED_PRECONDITION
+        assert client.describe().source == "recording:source.h5"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("recording /srv/data/R.h5: in_phase", "recording R.h5: in_phase"),
+        ("bundle /srv/a/b/c.zip: golden.npz", "bundle c.zip: golden.npz"),
+        ("recording:/srv/R.h5", "recording:R.h5"),
+        ("unable to open file (name = '/srv/R.h5', errno = 2)", "unable to open file (name = 'R.h5', errno = 2)"),
+        ("an AIR of 3.1 bit/symbol, uint8/uint16 / 2", "an AIR of 3.1 bit/symbol, uint8/uint16 / 2"),
+    ],
+)
+def test_errors_name_files_without_their_folders(text: str, told: str) -> None:
+    assert without_folders(text) == told
+
+
 def test_health_is_served_beside_the_service_and_ends_first(start: Start) -> None:
     service = start()
     with grpc.insecure_channel(service.server.target) as channel:
@@ -568,7 +633,7 @@ def test_recalibration_from_a_recording_on_the_server(start: Start, tmp_path: Pa
     service = start()
     toy.write_toy_recording(tmp_path / "known.h5", toy.ToyDevice(DRIFTED), 16, 3)
     assert service.client.recalibrate(recording="known.h5").pages_used == 3
-    for name in ("absent.h5", "../known.h5", str(tmp_path / "known.h5"), ""):
+    for name in ("absent.h5", "../known.h5", str(tmp_path / "known.h5"), "", "x" * 300):
         with pytest.raises(InvalidInputError, match="recording"):
             service.client.recalibrate(recording=name)
     with pytest.raises(LimitError, match="at most 16"):
@@ -661,9 +726,11 @@ def test_a_service_without_a_source_says_so(toy_zip: Path) -> None:
     server = LightpageServer(plane, Recalibrator(plane, toy.fit_references))
     with server, LightpageClient(server.target) as client:
         assert client.describe().source == ""
-        with pytest.raises(InvalidInputError, match="--source"):
+        with pytest.raises(SourceError, match="--source"):
             client.read_page()
-        with pytest.raises(InvalidInputError, match="--recordings"):
+        with pytest.raises(SourceError, match="--source"):
+            client.recalibrate(count=2)
+        with pytest.raises(SourceError, match="--recordings"):
             client.recalibrate(recording="R.h5")
 
 

@@ -27,7 +27,10 @@ if _version_not_supported:
 
 
 class LightpageStub:
-    """Missing associated documentation comment in .proto file."""
+    """
+    INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
+    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it.
+    """
 
     def __init__(self, channel):
         """Constructor.
@@ -68,7 +71,10 @@ class LightpageStub:
 
 
 class LightpageServicer:
-    """Missing associated documentation comment in .proto file."""
+    """
+    INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
+    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it.
+    """
 
     def Describe(self, request, context):
         """What the service is: device, model, limits.
@@ -157,7 +163,10 @@ def add_LightpageServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class Lightpage:
-    """Missing associated documentation comment in .proto file."""
+    """
+    INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
+    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it.
+    """
 
     @staticmethod
     def Describe(request,
