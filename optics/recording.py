@@ -1,7 +1,8 @@
 """Recordings: frame pairs, reference frames and, where they are known, symbols, in one HDF5 file.
 
 The layout is the contract with other people's devices. Root attributes: `format` = "lightpage-recording",
-`version` = 1, `camera_bit_depth`, `levels` (256 if absent), optionally `profile` (the nominal profile as TOML text).
+`version` = 1, `camera_bit_depth`, `levels` (256 if absent), optionally `profile` (the nominal profile as TOML text) and
+`black_level` (counts of a camera in the dark, 0 if absent; taken off when frames are read).
 Datasets: `in_phase` and `quadrature` [page, row, column], `reference_in_phase` and `reference_quadrature`
 [row, column], uint8 or uint16, counts right-aligned; optionally `symbols` uint8 [page, ny, nx] and `pilots`, boolean
 [ny, nx]. A simulator adds the group `truth`, which no decoder reads.
@@ -101,6 +102,11 @@ class Recording:
         return self._bit_depth
 
     @property
+    def black_level(self) -> int:
+        """Counts of a camera in the dark; `frames` and `references` are free of them."""
+        return self._black_level
+
+    @property
     def frame_shape(self) -> tuple[int, int]:
         """Camera pixels as (rows, columns)."""
         _, rows, columns = self._file["in_phase"].shape
@@ -126,7 +132,7 @@ class Recording:
         return self._profile_text
 
     def frames(self, page: int) -> FramePair:
-        """The frame pair of one page.
+        """The frame pair of one page, its black level taken off.
 
         Raises:
             RecordingError: no such page, or its data cannot be read.
@@ -134,7 +140,7 @@ class Recording:
         return FramePair(*(self._read_page(name, page) for name in FRAMES))
 
     def references(self) -> FramePair:
-        """The two reference-only frames.
+        """The two reference-only frames, their black level taken off.
 
         Raises:
             RecordingError: the data cannot be read.
@@ -220,6 +226,12 @@ class Recording:
             raise RecordingError(
                 self._thing("attribute 'levels'"), self._levels, f"a whole number from {MIN_LEVELS} to {MAX_LEVELS}"
             )
+        self._black_level = self._whole("black_level", 0)
+        full_scale = 2**self._bit_depth - 1
+        if not 0 <= self._black_level < full_scale:
+            raise RecordingError(
+                self._thing("attribute 'black_level'"), self._black_level, f"0 to {full_scale - 1} counts"
+            )
         text = self._attribute("profile")
         if text is not None and not isinstance(text, str):
             raise RecordingError(self._thing("attribute 'profile'"), type(text).__name__, "TOML text")
@@ -287,6 +299,7 @@ class Recording:
         frame = self._read(name, page)
         if name in FRAMES:
             self._check_counts(name, frame, f" page {page}")
+            frame = self._without_black(frame)
         return frame
 
     def _read(self, name: str, where: Any) -> NDArray[Any]:
@@ -297,7 +310,13 @@ class Recording:
         data = data.astype(data.dtype.newbyteorder("="), copy=False)  # torch takes no other byte order
         if name in REFERENCES:
             self._check_counts(name, data, "")
+            data = self._without_black(data)
         return data
+
+    def _without_black(self, frame: NDArray[Any]) -> NDArray[Any]:
+        """Counts above the black level, of the same type; noise below it becomes 0."""
+        black = frame.dtype.type(self._black_level)
+        return np.asarray(np.maximum(frame, black) - black)
 
     def _check_counts(self, name: str, frame: NDArray[Any], where: str) -> None:
         full_scale = 2**self._bit_depth - 1
