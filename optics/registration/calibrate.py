@@ -47,6 +47,7 @@ _LEAST_SIGNIFICANT = 0.1
 """Share of the searched patches that must be found in the end: half are where the device was found, a quarter with half
 of the symbols wrong (no branch carries light from all of the page)."""
 _WANTED = "right symbols and profile, a device in the capture range"
+_WANTED_REFLECTIONS = f"{_WANTED}, a page wide enough for its light to meet the pipe's walls"
 _HOMODYNE_ROUNDS = 2
 _HOMODYNE_LIMIT = 2.0
 """Most that the equations may move what symbols said, in its standard deviations: under a reference of 2.8 times the
@@ -98,6 +99,7 @@ class _Stage:
     all_pages: bool = False
     use_phase: bool = False
     samples: int = 4
+    wanted: str = _WANTED
 
 
 _SINGLE_CAMERA = (
@@ -106,7 +108,7 @@ _SINGLE_CAMERA = (
     _Stage("settle the cameras", 6, 2, _SHAPE_GROUPS),
 )
 _COMPLEX = (
-    _Stage("find the reflections", 32, 4, _ALL_GROUPS, ("x", "y"), samples=2),
+    _Stage("find the reflections", 32, 4, _ALL_GROUPS, ("x", "y"), samples=2, wanted=_WANTED_REFLECTIONS),
     _Stage("all branches, coarse", 8, 2, _ALL_GROUPS, COHERENT_BRANCHES),
     _Stage("all branches, fine", 3, 1, _ALL_GROUPS, COHERENT_BRANCHES),
 )
@@ -396,7 +398,7 @@ class _Registration:
             raise CalibrationError(
                 f"calibration, stage '{stage.name}'",
                 f"{len(good)} of {len(found)} patches of known symbols found (best significance {best:.1f})",
-                f"at least {_FEWEST} above {SIGNIFICANT:.0f}: {_WANTED}",
+                f"at least {_FEWEST} above {SIGNIFICANT:.0f}: {stage.wanted}",
             )
         self.fit = fit_parameters(
             self.twin,
