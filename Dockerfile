@@ -1,4 +1,4 @@
-# The decoder as a service: `runtime` without torch, `deep` on top of it with torch for deep recalibration.
+# The decoder as a service: `runtime` without torch, `deep` on top of it with torch, to train and export in the device.
 #
 #   docker build --target runtime -t lightpage:runtime .
 #   docker run --read-only --tmpfs /tmp -v bundles:/bundles -v state:/state -p 50051:50051 lightpage:runtime

@@ -25,7 +25,9 @@ from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording, calibration_
 from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor
 from train.fitting import Hyperparameters, Page, best_kappa_scale, fit_network
-from train.run import GOLDEN, REFERENCES, Run, begin, save_network
+from train.localizers.coherent import SAMPLES, CoherentLocalizer
+from train.network import SymbolUNet
+from train.run import GOLDEN, REFERENCES, Run, begin, load_network, load_run, save_network
 from train.synthetic import MOST_NOISE, SyntheticPages, likeness
 
 PUBLISHED = ("none", "mode", "ray")
@@ -60,6 +62,7 @@ _LIKENESS_PAGES = 2
     show_default=True,
     help="Pages that the fitted device would show after drifts, trained on beside the recorded ones.",
 )
+@click.option("--start", type=click.Path(path_type=Path), help="Finished run whose weights this one begins with.")
 @click.option("--seed", type=int, default=0, show_default=True)
 def train(
     profile_name: str,
@@ -77,6 +80,7 @@ def train(
     validation_share: float,
     test_share: float,
     synthetic_pages: int,
+    start: Path | None,
     seed: int,
 ) -> None:
     """Train a decoder on known pages; the last pages of the recording stay unseen for `lightpage evaluate`."""
@@ -103,6 +107,7 @@ def train(
             raise RecordingError(f"recording {recording_path}", "no dataset 'symbols'", "known symbols to train on")
         calibration = _calibration(recording, profile_name, calibration_path, out)
         calibration.check_profile(profile)
+        first = None if start is None else _first_network(start, profile, localizer, choices)
         groups = _split(recording, validation_share, test_share)
         hashes = [recording.page_hash(page) for page in range(recording.pages)]
         references = recording.references()
@@ -114,6 +119,7 @@ def train(
             "--validation-share": validation_share,
             "--test-share": test_share,
             "--synthetic-pages": synthetic_pages,
+            "--start": None if start is None else str(start.resolve()),
             **{f"--{name.replace('_', '-')}": value for name, value in asdict(choices).items()},
         }
         begin(out, options)
@@ -136,7 +142,7 @@ def train(
         )
         validation = FeatureStore(out / "features", range(count, len(known)))
         started = time.monotonic()
-        module, air = fit_network(out, choices, mask, recording.levels, training, validation)
+        module, air = fit_network(out, choices, mask, recording.levels, training, validation, start=first)
         seconds = time.monotonic() - started
         scale = best_kappa_scale(module, validation, mask)
         save_network(module, out)
@@ -177,6 +183,21 @@ def _calibration(recording: Recording, profile_name: str, path: Path | None, out
         calibration = calibrate_recording(recording, load_profile(profile_name), DEFAULT_PAGES, progress)
     calibration.save(kept)
     return calibration
+
+
+def _first_network(start: Path, profile: Profile, localizer: str, choices: Hyperparameters) -> SymbolUNet:
+    """The network of a finished run, checked to be of the size that this run wants."""
+    run = load_run(start)
+    size = (run.localizer, run.profile.page_shape, *_size(run.hyperparameters))
+    wanted = (localizer, profile.page_shape, *_size(choices))
+    if size != wanted:
+        raise InvalidInputError(f"--start {start}: localizer, page, channels, blocks, levels", size, f"{wanted}")
+    coherent = CoherentLocalizer(profile).light_channels
+    return load_network(start, run, coherent if localizer == "coherent" else 2 * SAMPLES**2)
+
+
+def _size(choices: Hyperparameters) -> tuple[int, int, int]:
+    return choices.channels, choices.blocks, choices.levels
 
 
 def _split(recording: Recording, validation_share: float, test_share: float) -> tuple[list[int], list[int], list[int]]:

@@ -111,8 +111,9 @@ class DecoderTraining(L.LightningModule):
         optimizer = torch.optim.AdamW(
             self.parameters(), lr=self.choices.learning_rate, weight_decay=self.choices.weight_decay
         )
+        warm_up = max(0.1, 2 / self.choices.steps)  # of less than two steps, the schedule divides by zero
         schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, self.choices.learning_rate, total_steps=self.choices.steps, pct_start=0.1
+            optimizer, self.choices.learning_rate, total_steps=self.choices.steps, pct_start=warm_up
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
@@ -151,6 +152,7 @@ def fit_network(
     validation: Dataset[Page],
     callbacks: list[Callback] | None = None,
     *,
+    start: SymbolUNet | None = None,
     progress: bool = True,
 ) -> tuple[DecoderTraining, float]:
     """Train, or go on with, the network of a run; returns the best module, in float32, and its validation AIR.
@@ -165,6 +167,7 @@ def fit_network(
         levels: M of the pages.
         training, validation: pages.
         callbacks: further Lightning callbacks.
+        start: network of the same size whose weights a new run begins with; random ones if left out.
         progress: whether to show a bar.
     """
     folder = run / CHECKPOINTS
@@ -174,6 +177,8 @@ def fit_network(
     L.seed_everything(hyperparameters.seed + reached, verbose=False)
     channels = training[0][0].shape[0] + POSITION_CHANNELS
     network = SymbolUNet(channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.levels)
+    if start is not None:
+        network.load_state_dict(start.state_dict())
     module = DecoderTraining(network, hyperparameters, pilot_mask, levels)
     best = ModelCheckpoint(folder, "best", monitor="val_air", mode="max")
     newest = ModelCheckpoint(folder, "last", save_on_train_epoch_end=True, enable_version_counter=False)

@@ -59,6 +59,23 @@ def test_recorded_and_synthetic_pages_are_trained_on_and_the_last_are_left(devic
     described = json.loads((tmp_path / "run" / "run.json").read_text())
     assert described["synthetic_pages"] == 5
     assert len(described["trained_pages"]) == PAGES - 1
+    # another run begins where this one ended, and one of another size says why it cannot
+    again = [
+        *device,
+        "--steps",
+        "10",
+        "--learning-rate",
+        "1e-9",
+        "--synthetic-pages",
+        "0",
+        "--start",
+        str(tmp_path / "run"),
+    ]
+    run([*again, "--out", str(tmp_path / "again")])
+    air = json.loads((tmp_path / "again" / "run.json").read_text())["validation_air"]
+    assert air == pytest.approx(described["validation_air"], abs=1e-3)
+    with pytest.raises(InvalidInputError, match=r"channels, blocks, levels.*16"):
+        run([*again, "--channels", "16", "--out", str(tmp_path / "other")])
 
 
 def test_ctrl_c_in_training_loses_nothing_and_the_same_command_goes_on(device: list[str], tmp_path: Path) -> None:
