@@ -18,7 +18,6 @@ from runtime.decoder import Decoder
 from runtime.demo import drifted, run_demo, summarise
 from runtime.recalibration import KnownPages
 from runtime.refit import refit
-from runtime.shipped import DEFAULT, bundle_path
 from tests.runtime import toy
 
 TIMINGS = RemoteTimings(0.0, 0.2, 0.1, 0.3)
@@ -78,13 +77,13 @@ def test_no_pages_are_no_demo(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_drift_is_lost_and_won_back_with_the_shipped_bundle(tmp_path: Path) -> None:
-    if not bundle_path(DEFAULT).is_file():
-        pytest.skip("no shipped bundle in this checkout")
-    result = CliRunner().invoke(demo, ["--out", str(tmp_path), "--pages", "2"], standalone_mode=False)
+    result = CliRunner().invoke(demo, ["--out", str(tmp_path), "--pages", "3"], standalone_mode=False)
     assert result.exception is None
-    fresh, lost, again = json.loads((tmp_path / "demo.json").read_text())["phases"]
+    figures = json.loads((tmp_path / "demo.json").read_text())
+    fresh, lost, again = figures["phases"]
+    assert figures["recalibration"]["pages_used"] <= 2
     assert lost["air_bits_per_symbol"] < 0.8 * fresh["air_bits_per_symbol"]
     assert lost["mean_confidence"] < fresh["mean_confidence"]
-    assert again["air_bits_per_symbol"] > 0.7 * fresh["air_bits_per_symbol"]
+    assert again["air_bits_per_symbol"] >= 0.98 * fresh["air_bits_per_symbol"]
     assert again["model_version"] != fresh["model_version"] == lost["model_version"]
     assert (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")
