@@ -12,7 +12,8 @@ cd "$(dirname "$0")/.."
 
 tag="${1:-lightpage:runtime}"
 bundle="${2:-}"
-port="${LIGHTPAGE_CHECK_PORT:-50951}"
+# a free one, unless told: another service may listen on any fixed port
+port="${LIGHTPAGE_CHECK_PORT:-$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')}"
 storage="$(realpath -m "${LIGHTPAGE_STORAGE:-build/containers}")"
 
 if [ "${1:-}" != --inside ]; then
