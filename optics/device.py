@@ -10,71 +10,75 @@ import numpy as np
 from pydantic import Field
 
 from optics.errors import ProfileError
-from optics.profile import Finite, Positive, Table, validate
+from optics.profile import Table, validate
 
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+# Bounds lie far beyond any device that can be built; they keep a slip of the pen from filling the machine's memory.
+Angle = Annotated[float, Field(ge=-5, le=5, allow_inf_nan=False)]
+Phase = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]
+Pixels = Annotated[float, Field(ge=-500, le=500, allow_inf_nan=False)]
+Few = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 
 
 class Geometry(Table):
     """Pipe, lenses and page against their nominal values."""
 
-    pipe_angle_deg: Finite = -0.6
+    pipe_angle_deg: Angle = -0.6
     focal_length_relative_error: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
     pipe_length_relative_error: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
     pipe_width_relative_error: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
-    page_shift_x_px: Finite = 2.0
+    page_shift_x_px: Pixels = 2.0
     """Centre of the page off the optical axis, SLM pixels."""
-    page_shift_y_px: Finite = 2.0
-    pipe_roll_deg: Finite = 0.1
+    page_shift_y_px: Pixels = 2.0
+    pipe_roll_deg: Angle = 0.1
 
 
 class CameraPose(Table):
     """Where one camera truly sits: similarity transform about its centre, shift in camera pixels."""
 
     scale_relative_error: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
-    rotation_deg: Finite = 0.0
-    shift_x_px: Finite = 0.0
-    shift_y_px: Finite = 0.0
+    rotation_deg: Angle = 0.0
+    shift_x_px: Pixels = 0.0
+    shift_y_px: Pixels = 0.0
 
 
 class Aberration(Table):
     """Phase at the page's corner, and radial distortion of the image, common to both cameras."""
 
-    distortion_relative: Finite = 0.001
+    distortion_relative: Annotated[float, Field(ge=-0.2, le=0.2, allow_inf_nan=False)] = 0.001
     """Relative radial displacement at the page's corner."""
-    defocus_rad: Finite = 1.0
-    astigmatism_rad: Finite = 1.0
-    coma_rad: Finite = 1.0
+    defocus_rad: Phase = 1.0
+    astigmatism_rad: Phase = 1.0
+    coma_rad: Phase = 1.0
 
 
 class Reference(Table):
     """The reference beam at the cameras."""
 
-    amplitude_ratio: Positive = 1.6
+    amplitude_ratio: Annotated[float, Field(ge=0.01, le=1000, allow_inf_nan=False)] = 1.6
     """Mean reference amplitude over the signal's root mean square amplitude."""
-    ripple_relative: NonNegative = 0.04
+    ripple_relative: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.04
     ripple_seed: Annotated[int, Field(ge=0)] = 1
     """Draws the ripple's pattern, which belongs to the device and not to what is written."""
-    tilt_x_rad: Finite = 1.0
+    tilt_x_rad: Phase = 1.0
     """Phase at the right edge of the page's image."""
-    tilt_y_rad: Finite = 1.0
-    curvature_rad: Finite = 1.0
+    tilt_y_rad: Phase = 1.0
+    curvature_rad: Phase = 1.0
     """Phase at the corner of the page's image."""
 
 
 class Homodyne(Table):
     """The quadrature arm against the in-phase arm."""
 
-    quadrature_error_deg: Finite = 3.0
-    quadrature_gain: Positive = 0.95
+    quadrature_error_deg: Annotated[float, Field(ge=-89, le=89, allow_inf_nan=False)] = 3.0
+    quadrature_gain: Annotated[float, Field(ge=0.01, le=100, allow_inf_nan=False)] = 0.95
     quadrature_sign: Literal[-1, 1] = 1
 
 
 class SlmDefects(Table):
     """The modulator and its illumination."""
 
-    phase_noise_rad: NonNegative = 0.05
-    blur_px: NonNegative = 0.3
+    phase_noise_rad: Few = 0.05
+    blur_px: Few = 0.3
     falloff_relative: Annotated[float, Field(ge=0, lt=1)] = 0.15
     """Loss of illumination amplitude at the page's corner."""
 
@@ -82,16 +86,16 @@ class SlmDefects(Table):
 class Sensor(Table):
     """Both cameras' electronics."""
 
-    full_well_e: Positive = 15_000.0
-    read_noise_e: NonNegative = 2.5
+    full_well_e: Annotated[float, Field(ge=1, le=1e12, allow_inf_nan=False)] = 15_000.0
+    read_noise_e: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 2.5
     bit_depth: Annotated[int, Field(ge=8, le=16)] = 8
 
 
 class Drift(Table):
     """Standard deviation of the change from one page to the next (a random walk)."""
 
-    piston_rad: NonNegative = 0.2
-    shift_px: NonNegative = 0.02
+    piston_rad: Few = 0.2
+    shift_px: Few = 0.02
 
 
 class Device(Table):

@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 
 from optics.errors import BundleError, InvalidInputError
+from runtime.address import check_address
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
 from runtime.metrics import MetricsServer, ServiceMetrics
@@ -61,6 +62,7 @@ def serve(
     tracking: bool,
 ) -> None:
     """Run the service until SIGTERM or Ctrl-C; calls in flight are finished first."""
+    check_address("--address", address, least_port=0)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     with stop_signals() as stop:
         base = Decoder.load(bundle_path(bundle), threads)

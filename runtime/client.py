@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from optics.errors import FrameError, LightpageError
 from optics.recording import FramePair
+from runtime.address import check_address
 from runtime.convert import PIXEL_CODES, PIXEL_TYPES, KnownPilots, RemotePage, pilots_message, remote_page
 from runtime.limits import CHUNK_BYTES, REPLY_BYTES
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -83,6 +84,7 @@ class LightpageClient:
     """
 
     def __init__(self, target: str, timeout_s: float = CALL_S) -> None:
+        check_address("target", target)
         self.target, self._timeout = target, timeout_s
         self._channel = grpc.insecure_channel(
             target,

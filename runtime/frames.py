@@ -8,14 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.errors import FrameError
+from optics.frames import check_light
 from optics.recording import FramePair
 from optics.recording_layout import frame_type
-
-BLACK_FRACTION = 0.02
-"""A frame whose brightest pixel is below this share of full scale is dark: its laser or its shutter is off."""
-
-SATURATED_FRACTION = 0.05
-"""Share of pixels at full scale from which on a frame is overexposed; speckle peaks clip about one in a hundred."""
 
 
 def check_pair(pair: FramePair, shape: tuple[int, int], dtype: str, bit_depth: int) -> None:
@@ -39,16 +34,7 @@ def _check_frame(name: str, frame: NDArray[Any], shape: tuple[int, int], dtype: 
         raise FrameError(name, f"shape {getattr(frame, 'shape', type(frame).__name__)}", f"shape {shape}")
     if frame.dtype != np.dtype(dtype):
         raise FrameError(name, f"type {frame.dtype}", dtype)
-    full_scale = (1 << bit_depth) - 1
-    peak = int(frame.max())
-    if peak > full_scale:
-        raise FrameError(name, f"a count of {peak}", f"at most {full_scale} ({bit_depth} bits)")
-    if peak <= BLACK_FRACTION * full_scale:
-        raise FrameError(name, f"black: no count above {peak}", f"counts above {BLACK_FRACTION * full_scale:.0f}")
-    if peak == full_scale:
-        clipped = np.count_nonzero(frame == full_scale) / frame.size
-        if clipped > SATURATED_FRACTION:
-            raise FrameError(name, f"saturated: {clipped:.1%} at full scale", f"at most {SATURATED_FRACTION:.0%}")
+    check_light(name, frame, bit_depth)
 
 
 def narrow(pair: FramePair, bit_depth: int) -> FramePair:

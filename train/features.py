@@ -10,11 +10,14 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from optics.grid import GRID_STEP_PX
+from optics.errors import CalibrationError
+from optics.grid import GRID_STEP_PX, field_grid
 from optics.page import symbol_phases
 from optics.profile import Profile
 from optics.recording import FramePair, Recording
-from optics.registration.coherence import COHERENT_BRANCHES, branch_shares
+from optics.registration.calibrate import KnownPage, least_coherence
+from optics.registration.coherence import COHERENT_BRANCHES, branch_shares, page_coherence
+from optics.registration.samplers import FieldSampler
 from optics.registration.table import Table, sampling_table
 from optics.registration.twin import BRANCHES
 from train.field import FieldRecovery, TorchFieldSolver
@@ -67,7 +70,8 @@ class FeatureExtractor:
         *,
         with_signal_power: bool = True,
     ) -> None:
-        self.table: Table = sampling_table(TorchTwin(RayTwin(profile)), parameters, turn, profile)
+        self._profile, self._parameters, self._twin = profile, parameters, TorchTwin(RayTwin(profile))
+        self.table: Table = sampling_table(self._twin, parameters, turn, profile)
         self._solve = TorchFieldSolver(FieldRecovery(profile, with_signal_power=with_signal_power))
         self._coherent = CoherentLocalizer(profile)
         self._wave = WaveLocalizer(profile, parameters) if localizer == "wave" else None
@@ -79,6 +83,23 @@ class FeatureExtractor:
     def field(self, pair: FramePair) -> NDArray[np.complex64]:
         """Recovered field on the common grid."""
         return self._solve(pair, self._references, self.table["registration"], self.table["homodyne"])[0]
+
+    def check(self, page: KnownPage) -> None:
+        """Check that a known page shows its symbols where this calibration says.
+
+        Raises:
+            CalibrationError: it shows hardly more of them than chance does.
+        """
+        field = self.known_field(page.pair, np.angle(page.symbols))
+        sampler = FieldSampler(field, field_grid(self._profile))
+        found = page_coherence(sampler, self._twin, self._parameters, self._profile, page.symbols)
+        least = least_coherence(page.symbols.size)
+        if not found >= least:
+            raise CalibrationError(
+                "calibration against the recording",
+                f"a coherence of {found:.3f}",
+                f"at least {least:.3f}: the calibration of the device that was recorded, and the symbols of its pages",
+            )
 
     def known_field(self, pair: FramePair, phases: Real) -> NDArray[np.complex64]:
         """Recovered field of a known page, its image shift taken off."""

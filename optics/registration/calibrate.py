@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -195,6 +196,11 @@ def refine(
     return work.result(start)
 
 
+def least_coherence(symbols: int) -> float:
+    """Coherence of a page of so many symbols above which a geometry is that of the device."""
+    return _LEAST_OVER_CHANCE / math.sqrt(symbols)
+
+
 def check_found(coherence: float, significant: float, symbols: int) -> None:
     """Check that a registration ended at the device and not at a guess.
 
@@ -206,7 +212,7 @@ def check_found(coherence: float, significant: float, symbols: int) -> None:
     Raises:
         CalibrationError: unrelated light would do nearly as well.
     """
-    least = _LEAST_OVER_CHANCE / symbols**0.5
+    least = least_coherence(symbols)
     if not (coherence >= least and significant >= _LEAST_SIGNIFICANT):
         raise CalibrationError(
             "calibration, outcome",

@@ -7,9 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 
 from optics.errors import RecordingError
+from optics.frames import check_light
 from optics.page import symbol_phases
 from optics.profile import Profile
-from optics.recording import Recording
+from optics.recording import FramePair, Recording
 from optics.registration.calibrate import KnownPage
 
 
@@ -22,9 +23,11 @@ def known_pages(recording: Recording, profile: Profile, indices: Iterable[int]) 
         indices: which pages.
 
     Raises:
+        FrameError: a frame or reference that is black or saturated; it names recording, page and frame.
         RecordingError: no symbols, another shape than the profile's, no such page, or unreadable data.
     """
     recording.check_against(profile)
+    _check_light(recording, "reference", recording.references())
     pages = []
     for index in indices:
         symbols = recording.symbols(index)
@@ -34,5 +37,12 @@ def known_pages(recording: Recording, profile: Profile, indices: Iterable[int]) 
                 "none",
                 "the symbols that were written, to calibrate by",
             )
-        pages.append(KnownPage(recording.frames(index), np.exp(1j * symbol_phases(symbols, recording.levels))))
+        pair = recording.frames(index)
+        _check_light(recording, f"page {index}", pair)
+        pages.append(KnownPage(pair, np.exp(1j * symbol_phases(symbols, recording.levels))))
     return pages
+
+
+def _check_light(recording: Recording, what: str, pair: FramePair) -> None:
+    for name, frame in (("in-phase frame", pair.in_phase), ("quadrature frame", pair.quadrature)):
+        check_light(f"recording {recording.path}, {what}, {name}", frame, recording.bit_depth)

@@ -125,3 +125,17 @@ def test_drawn_devices_fill_the_capture_range_and_stay_inside() -> None:
 def test_the_same_seed_draws_the_same_device() -> None:
     assert draw_device(np.random.default_rng(7)) == draw_device(np.random.default_rng(7))
     assert draw_device(np.random.default_rng(7)) != draw_device(np.random.default_rng(8))
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "geometry.pipe_angle_deg=60",
+        "geometry.page_shift_x_px=1e6",
+        "sensor.full_well_e=1e300",
+        "drift.piston_rad=1e308",
+    ],
+)
+def test_states_that_no_device_can_be_in_are_named(setting: str) -> None:
+    with pytest.raises(ProfileError, match=setting.partition("=")[0].replace(".", r"\.")):
+        Device().with_settings([setting])

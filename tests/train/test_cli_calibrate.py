@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 import train.cli_calibrate
 from optics.device import Device
-from optics.errors import CalibrationError, InvalidInputError, LightpageError, RecordingError
+from optics.errors import CalibrationError, FrameError, InvalidInputError, LightpageError, RecordingError
 from optics.profile import Profile, load_profile
 from optics.recording import FramePair, Recording, RecordingWriter
 from optics.registration.calibrate import Registered
@@ -86,9 +86,9 @@ def test_symbols_that_were_not_written_find_nothing(bench_recording: Path, tmp_p
     assert not (tmp_path / "calibration.toml").exists()
 
 
-@pytest.mark.parametrize("level", [0, 255])
-def test_black_and_saturated_frames_find_nothing(tmp_path: Path, level: int) -> None:
-    with pytest.raises(CalibrationError, match="0 of 12 patches of known symbols found"):
+@pytest.mark.parametrize(("level", "words"), [(0, "black"), (255, "saturated")])
+def test_black_and_saturated_frames_are_named(tmp_path: Path, level: int, words: str) -> None:
+    with pytest.raises(FrameError, match=f"in-phase frame: got {words}"):
         run(flat_recording(tmp_path / "R.h5", level), tmp_path / "calibration.toml")
     assert not (tmp_path / "calibration.toml").exists()
 

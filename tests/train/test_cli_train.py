@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import click
 import h5py
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from click.testing import CliRunner
 
 from optics.cli import simulate
 from optics.device import Device
-from optics.errors import InvalidInputError
+from optics.errors import CalibrationError, InvalidInputError
 from optics.page import pilot_mask
 from optics.recording import Recording
 from optics.registration.calibrate import Registered
@@ -128,6 +129,26 @@ def test_pilots_of_the_devices_own_are_found(
     with Recording.open(path) as recording:
         assert _own_pilots(recording, profile, mask, [0, 1, 2]) is None
     assert "no piston" in capsys.readouterr().err
+
+
+def test_a_calibration_of_another_device_is_refused(device: list[str], tmp_path: Path) -> None:
+    text = Path(device[5]).read_text()
+    start = text.index("turn_rad = ")
+    inverted = text[:start] + "turn_rad = -1.6" + text[text.index("\n", start) :]
+    (tmp_path / "C.toml").write_text(inverted)
+    other = [*device[:5], str(tmp_path / "C.toml"), *device[6:]]
+    with pytest.raises(CalibrationError, match="calibration against the recording"):
+        run([*other, "--steps", "60", "--out", str(tmp_path / "run")])
+
+
+def test_options_that_cannot_be_are_named(device: list[str], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InvalidInputError, match=r"--out .*file"):
+        run([*device, "--out", str(tmp_path / "file")])
+    with pytest.raises(InvalidInputError, match=r"--learning-rate.*nan"):
+        run([*device, "--learning-rate", "nan", "--out", str(tmp_path / "run")])
+    with pytest.raises(click.BadParameter, match="bf16-mixed"):
+        run([*device, "--precision", "foo", "--out", str(tmp_path / "run")])
 
 
 def test_shares_that_leave_nothing_to_train_on_are_named(device: list[str], tmp_path: Path) -> None:
