@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from typing import Any
 
@@ -60,6 +61,8 @@ def _export(
     outputs: tuple[str, ...],
     shapes: tuple[dict[int, Any], ...] | None,
 ) -> onnx.ModelProto:
+    # it tells of every optional package that the graphs have no use for
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(

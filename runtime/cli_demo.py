@@ -34,7 +34,7 @@ def demo(bundle: str, out: Path, pages: int, seed: int, json_path: str | None) -
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
-    with tqdm(total=100, unit="%", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}") as bar:
+    with tqdm(total=100, unit="%", bar_format="{desc}{percentage:3.0f}%|{bar}| {elapsed}") as bar:
 
         def progress(what: str, share: float) -> None:
             bar.set_description(what)

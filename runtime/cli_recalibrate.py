@@ -83,7 +83,7 @@ def summary(result: RecalibrationOutcome | Recalibrated, seconds: float) -> dict
 @contextmanager
 def _bar() -> Iterator[Callable[[str, float], None]]:
     """A progress bar as the callback that a recalibration calls."""
-    with tqdm(total=100, unit="%", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}") as bar:
+    with tqdm(total=100, unit="%", bar_format="{desc}{percentage:3.0f}%|{bar}| {elapsed}") as bar:
 
         def progress(step: str, fraction: float) -> None:
             bar.set_description(step)

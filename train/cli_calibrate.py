@@ -114,7 +114,7 @@ def table(calibration: Calibration, profile: Profile) -> str:
 @contextmanager
 def calibration_bar() -> Iterator[Callable[[str, float], None]]:
     """A progress bar as the callback that registration calls at the start of each stage."""
-    with tqdm(total=100, unit="%", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}") as bar:
+    with tqdm(total=100, unit="%", bar_format="{desc}{percentage:3.0f}%|{bar}| {elapsed}") as bar:
 
         def progress(stage: str, share: float) -> None:
             bar.set_description(stage, refresh=False)
