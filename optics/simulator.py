@@ -186,7 +186,8 @@ class Simulator:
         profile: nominal device.
         device: true state.
         levels: levels M of the symbols it will be given.
-        seed: everything random comes from it; the same seed and calls give the same frames.
+        seed: of noise and drift from page to page; the same seed and calls give the same frames. The ripple of the
+            reference belongs to the device (`reference.ripple_seed`).
         steps: splitting steps of a sheared pipe.
 
     Raises:

@@ -42,7 +42,7 @@ class WaveGeometry:
         return 2 * np.pi / self.wavelength_m
 
 
-def modes_for(half_extent_m: float, geometry: WaveGeometry, margin: float = 1.03) -> int:
+def modes_for(half_extent_m: float, geometry: WaveGeometry, margin: float) -> int:
     """Cells per pipe axis such that the sine modes reach the plane wave of an SLM point at `half_extent_m`."""
     cells = 2 * half_extent_m * geometry.pipe_width_m / (geometry.wavelength_m * geometry.focal_length_m)
     return int(np.ceil(cells * margin))

@@ -1,7 +1,7 @@
 """Synthetic pages of a calibrated device: its fitted wave model, where it stands and where it may drift to.
 
 A network that has seen a single geometry carries part of its skill to no other. The fitted wave model shows it the same
-device after a thousand drifts, with the illumination and the noise that recorded pages have over the model.
+device as it may drift, with the illumination and the noise that recorded pages have over the model.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from optics.grid import field_grid
-from optics.page import random_symbols, symbol_phases
+from optics.page import MAX_LEVELS, random_symbols, symbol_phases
 from optics.profile import Profile
 from optics.registration.fitted_waves import FittedWaves
 from optics.registration.parameters import NAMES
@@ -29,8 +29,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 PAGES_PER_STATE = 4
-"""Pages of each drifted state: setting up a state costs as much as a few pages."""
-LEVELS = 256
+"""Pages of each drifted state: the waves and the sampling table are set up once a state."""
 MOST_NOISE = 0.3
 """Unexplained power over the light's above which synthetic light teaches nothing of the device."""
 _DRIFT = {
@@ -52,8 +51,9 @@ _DRIFT = {
     "camera_tilt_y_rad": 0.5,
     "camera_curvature_rad": 0.3,
 }
-"""Most that a device is expected to drift between two trainings, either way: twice what costs an untrained decoder most
-of its rate. The cameras' poses are left out: registration takes them off before the network sees anything."""
+"""Most that a device is expected to drift between two trainings, either way: of pipe angle and focal length twice what
+the demonstration lets it drift. The cameras' poses are left out: registration takes them off before the network sees
+anything."""
 _TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Powers of (x, y) in the illumination."""
 
@@ -132,8 +132,8 @@ class SyntheticPages:
         light_on = sum(
             factor * term for factor, term in zip(self._like.illumination, _illumination_terms(waves), strict=True)
         )
-        for symbols in random_symbols(profile, LEVELS, PAGES_PER_STATE, rng):
-            phases = symbol_phases(symbols, LEVELS)
+        for symbols in random_symbols(profile, MAX_LEVELS, PAGES_PER_STATE, rng):
+            phases = symbol_phases(symbols, MAX_LEVELS)
             field = waves.to_camera(_on_modulator(phases) * light_on)
             field = (self._like.seen * (field + self._noise(field, rng))).astype(np.complex64)
             light = demodulate(self._coherent, field, table) if wave_localizer is None else wave_localizer(field)

@@ -176,7 +176,7 @@ class TestLens:
         x, y = axis(2, 2 * edge), axis(20, 9.2e-6)
         point = np.zeros((20, 2))
         point[10, 1] = 1
-        cells = modes_for(edge, DEVICE)
+        cells = modes_for(edge, DEVICE, 1.03)
         light = FourierLens(DEVICE, x, y, (60, cells)).to_facet(point)
         by_mode = np.abs(sine_matrix(cells) @ light.T).sum(axis=1)
         strongest = 1 + int(np.argmax(by_mode))

@@ -27,8 +27,7 @@ if _version_not_supported:
 
 
 class LightpageStub:
-    """
-    INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
+    """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
     the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it.
     """
 
@@ -71,8 +70,7 @@ class LightpageStub:
 
 
 class LightpageServicer:
-    """
-    INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
+    """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
     the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it.
     """
 
@@ -163,8 +161,7 @@ def add_LightpageServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class Lightpage:
-    """
-    INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
+    """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
     the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it.
     """
 
