@@ -32,7 +32,7 @@ from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
 from train.field import FieldRecovery, TorchFieldSolver
 from train.fitting import Hyperparameters, decode_pages, fit_network, held_out_air
-from train.run import begin
+from train.run import begin, sole_writer
 from train.twin import RayTwin, TorchTwin
 
 LEVELS = 256
@@ -152,6 +152,7 @@ def main(
     device = Device(sensor=Sensor(full_well_e=full_well)).with_settings([f"geometry.pipe_angle_deg={angle_deg}"])
     choices = Hyperparameters(steps=steps, seed=seed, channels=channels)
     options = {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, **asdict(choices)}
+    click.get_current_context().with_resource(sole_writer(out))
     begin(out, options)
     written = list(random_symbols(profile, LEVELS, pages + CALIBRATED, np.random.default_rng([seed, 7])))
 

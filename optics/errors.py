@@ -8,13 +8,13 @@ class LightpageError(Exception):
 
     Args:
         thing: what the error is about, e.g. ``"recording R.h5: dataset 'in_phase'"``.
-        got: what came.
+        got: what came; of an error of the operating system, what it says without number and path.
         wanted: what would have been right.
     """
 
     def __init__(self, thing: str, got: object, wanted: object) -> None:
         self.thing = thing
-        self.got = str(got)
+        self.got = (isinstance(got, OSError) and got.strerror) or str(got)
         self.wanted = str(wanted)
         super().__init__(f"{thing}: got {self.got}, wanted {self.wanted}")
 

@@ -28,7 +28,7 @@ from train.features import FeatureExtractor
 from train.fitting import Hyperparameters, Page, best_kappa_scale, fit_network
 from train.localizers.coherent import SAMPLES, CoherentLocalizer
 from train.network import SymbolUNet
-from train.run import GOLDEN, REFERENCES, Run, begin, load_network, load_run, save_network
+from train.run import GOLDEN, REFERENCES, Run, begin, load_network, load_run, save_network, sole_writer
 from train.synthetic import MOST_NOISE, SyntheticPages, likeness
 
 PUBLISHED = ("none", "mode", "ray")
@@ -114,6 +114,7 @@ def train(
         recording.check_against(profile)
         if not recording.has_symbols:
             raise RecordingError(f"recording {recording_path}", "no dataset 'symbols'", "known symbols to train on")
+        context.with_resource(sole_writer(out))
         calibration = _calibration(recording, profile_name, calibration_path, out)
         calibration.check_profile(profile)
         first = None if start is None else _first_network(start, profile, localizer, choices)
@@ -183,10 +184,6 @@ def train(
 
 def _calibration(recording: Recording, profile_name: str, path: Path | None, out: Path) -> Calibration:
     """The calibration that was named, or was made for this run before, or is made now from the first pages."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
     kept = out / "calibration.toml"
     if path is not None:
         return load_calibration(path)

@@ -10,7 +10,7 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from scipy import optimize
@@ -27,6 +27,8 @@ CHECKPOINTS = "checkpoints"
 """Folder of a run's checkpoints."""
 LOOKS = 60
 """How often a run looks at its validation pages."""
+AVERAGED_SHARE = 0.05
+"""Share of a run's steps over which its weights are averaged, exponentially: what is validated, kept and exported."""
 
 
 @dataclass(frozen=True)
@@ -182,13 +184,14 @@ def fit_network(
     module = DecoderTraining(network, hyperparameters, pilot_mask, levels)
     best = ModelCheckpoint(folder, "best", monitor="val_air", mode="max")
     newest = ModelCheckpoint(folder, "last", save_on_train_epoch_end=True, enable_version_counter=False)
+    averaged = EMAWeightAveraging(use_buffers=False, decay=1 - 1 / max(1.0, AVERAGED_SHARE * hyperparameters.steps))
     draws = hyperparameters.batch * max(1, hyperparameters.steps // LOOKS)
     sampler = RandomSampler(training, replacement=True, num_samples=draws)  # type: ignore[arg-type]  # it has a length
     trainer = L.Trainer(
         max_steps=hyperparameters.steps,
         precision=hyperparameters.precision,  # type: ignore[arg-type]
         logger=TensorBoardLogger(str(run), name="", version="tensorboard"),
-        callbacks=[best, newest, *(callbacks or [])],
+        callbacks=[averaged, best, newest, *(callbacks or [])],
         enable_progress_bar=progress,
         enable_model_summary=False,
         gradient_clip_val=1.0,

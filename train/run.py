@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -68,11 +72,34 @@ class Run:
         replace_text(folder / DESCRIPTION, json.dumps(asdict(self), indent=2), "description of the run")
 
 
+@contextmanager
+def sole_writer(folder: Path) -> Iterator[None]:
+    """Keep the folder of a run to this process, as long as the `with` statement lasts; it is made if missing.
+
+    Raises:
+        InvalidInputError: another process works in it, or it cannot be made or read.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise InvalidInputError(f"--out {folder}", error, "a folder that can be written") from None
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            wanted = "another --out, or to wait for its end"
+            raise InvalidInputError(f"--out {folder}", "a run that another process is working on", wanted) from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def begin(folder: Path, options: dict[str, Any]) -> None:
     """Note what a run is begun with, or check that it goes on with just that.
 
     Args:
-        folder: of the run.
+        folder: of the run, which is there.
         options: by name, as JSON can keep them.
 
     Raises:
@@ -85,7 +112,6 @@ def begin(folder: Path, options: dict[str, Any]) -> None:
         if (folder / CHECKPOINTS).exists():
             wanted = f"a run that says in {BEGUN} what it was begun with, or another --out"
             raise InvalidInputError(f"run {folder}", "checkpoints of unknown origin", wanted) from None
-        folder.mkdir(parents=True, exist_ok=True)
         replace_text(path, json.dumps(options, indent=2), "options of the run")
         return
     for name, value in options.items():

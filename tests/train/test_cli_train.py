@@ -28,7 +28,7 @@ from optics.registration.parameters import NAMES
 from optics.simulator import true_parameters
 from tests.optics.small import small_profile
 from train.cli_train import _commit, _own_pilots, train
-from train.run import begin
+from train.run import begin, sole_writer
 
 PAGES = 8
 SECONDS = 120
@@ -165,6 +165,13 @@ def test_checkpoints_of_unknown_origin_are_not_taken_up(tmp_path: Path) -> None:
 def test_without_git_there_is_no_commit_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     assert _commit() == ""
+
+
+def test_a_second_training_in_the_same_folder_is_refused(device: list[str], tmp_path: Path) -> None:
+    with sole_writer(tmp_path), pytest.raises(InvalidInputError, match=r"another process.*another --out"):
+        run([*device, "--steps", "10", "--out", str(tmp_path)])
+    with sole_writer(tmp_path):
+        pass
 
 
 def test_a_run_does_not_go_on_with_other_options(tmp_path: Path) -> None:
