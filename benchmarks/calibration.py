@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from optics.device import Device, draw_device
 from optics.errors import CalibrationError, InvalidInputError
-from optics.files import replace_text
+from optics.files import OutputFile, replace_text
 from optics.grid import field_grid
 from optics.page import random_symbols, symbol_phases
 from optics.profile import Profile, load_profile
@@ -202,7 +202,7 @@ def load(path: Path, settings: dict[str, object]) -> dict[int, Outcome]:
 @click.option("--first-seed", default=1000, show_default=True, type=click.IntRange(0))
 @click.option("--pages", default=2, show_default=True, type=click.IntRange(1, 4), help="Known pages a device.")
 @click.option("--foreign", is_flag=True, help="Devices of the other simulator.")
-@click.option("--json", "json_path", required=True, type=click.Path(path_type=Path))
+@click.option("--json", "json_path", required=True, type=OutputFile())
 def main(profile_name: str, devices: int, first_seed: int, pages: int, foreign: bool, json_path: Path) -> None:
     """Calibrate drawn devices and compare with the truth."""
     settings: dict[str, object] = {"profile": profile_name, "pages": pages, "foreign": foreign}

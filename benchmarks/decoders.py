@@ -127,11 +127,11 @@ def gained_at_the_end(run: Path, steps: int) -> float:
 @click.command()
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
 @click.option("--angle", "angle_deg", type=float, default=-0.6, show_default=True, help="Pipe angle, degrees.")
-@click.option("--full-well", type=float, default=4000.0, show_default=True, help="Electrons; sets the noise.")
+@click.option("--full-well", type=float, default=1200.0, show_default=True, help="Electrons; sets the noise.")
 @click.option(
-    "--pages", type=click.IntRange(12), default=160, show_default=True, help="With 8% validation, 8% held out."
+    "--pages", type=click.IntRange(12), default=240, show_default=True, help="With 8% validation, 8% held out."
 )
-@click.option("--steps", type=click.IntRange(10), default=3200, show_default=True)
+@click.option("--steps", type=click.IntRange(10), default=6000, show_default=True)
 @click.option("--channels", type=click.IntRange(4), default=Hyperparameters.channels, show_default=True)
 @click.option("--arm", "names", type=click.Choice(ARMS), multiple=True, default=ARMS, show_default=True)
 @click.option("--seed", type=int, default=5000, show_default=True)

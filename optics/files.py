@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
+
+import click
 
 from optics.errors import InvalidInputError
 
@@ -33,3 +36,25 @@ def replace_text(path: str | Path, text: str, thing: str = "file") -> None:
             raise
     except OSError as error:
         raise InvalidInputError(f"{thing} {path}", error, "a path that can be written") from None
+
+
+class OutputFile(click.ParamType[Path]):
+    """An option that names a file to write: known before the work begins to be one that `replace_text` can write."""
+
+    name = "file"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path.
+
+        Raises:
+            InvalidInputError: it is a folder, or its folder is missing or cannot be written.
+        """
+        path = Path(value)
+        thing = f"{param.opts[0]} {path}" if param is not None else str(path)
+        if path.is_dir():
+            raise InvalidInputError(thing, "a folder", "a file")
+        try:
+            tempfile.TemporaryFile(dir=path.absolute().parent).close()
+        except OSError as error:
+            raise InvalidInputError(thing, error, "a path that can be written") from None
+        return path

@@ -10,6 +10,7 @@ import click
 import numpy as np
 from tqdm import tqdm
 
+from optics.files import OutputFile
 from runtime.client import LightpageClient
 from runtime.cpus import available_cpus
 from runtime.dataplane import DataPlane
@@ -29,7 +30,7 @@ WARM_UP = 2
 @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
 @click.option("--rounds", default=20, show_default=True, type=click.IntRange(3, 1000), help="Timed rounds.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the figures to this file.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def bench(bundle: str, rounds: int, threads: int | None, json_path: Path | None) -> None:
     """Time one page three ways in turn, so that a machine whose speed drifts does not tilt the comparison."""
     decoder = Decoder.load(bundle_path(bundle), threads)

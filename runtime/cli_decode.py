@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import click
@@ -12,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from optics.errors import InvalidInputError
+from optics.files import OutputFile
 from optics.measures import PageMeasures, measure
 from optics.page import pilot_symbols
 from optics.profile import parse_profile
@@ -33,7 +35,7 @@ from runtime.report import write_json
 @click.option("--pages", type=click.IntRange(1), help="How many pages; all of a recording, or one of the source.")
 @click.option("--levels", type=click.IntRange(2, 256), help="Level count; that of the recording or source by default.")
 @click.option("--out", type=click.Path(), help="Write symbols and confidences to this HDF5 file.")
-@click.option("--json", "json_path", type=click.Path(), help="Write the figures to this file.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def decode(
     target: str,
     recording: str | None,
@@ -41,7 +43,7 @@ def decode(
     pages: int | None,
     levels: int | None,
     out: str | None,
-    json_path: str | None,
+    json_path: Path | None,
 ) -> None:
     """Decode a recording, or pages of the service's source.
 

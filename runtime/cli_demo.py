@@ -9,6 +9,7 @@ import click
 from tqdm import tqdm
 
 from optics.errors import InvalidInputError
+from optics.files import OutputFile
 from runtime.demo import DemoResult, run_demo
 from runtime.report import write_json
 from runtime.shipped import DEFAULT, bundle_path
@@ -21,8 +22,8 @@ from runtime.shipped import DEFAULT, bundle_path
 )
 @click.option("--pages", default=3, show_default=True, type=click.IntRange(1, 100), help="Pages in each state.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of what is written.")
-@click.option("--json", "json_path", type=click.Path(), help="Also write the figures to this file.")
-def demo(bundle: str, out: Path, pages: int, seed: int, json_path: str | None) -> None:
+@click.option("--json", "json_path", type=OutputFile(), help="Also write the figures to this file.")
+def demo(bundle: str, out: Path, pages: int, seed: int, json_path: Path | None) -> None:
     """Decode pages of the simulated device through a service, let the device drift, recalibrate, decode again.
 
     Writes demo.json and demo.png (frames, confidence, AIR in each state) to the folder --out.

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import click
 from tqdm import tqdm
 
+from optics.files import OutputFile
 from optics.recording import Recording
 from runtime.decoder import Decoder
 from runtime.evaluation import Evaluation
@@ -18,10 +21,10 @@ from runtime.tracking import NoTracker, tracker_for
 @click.command()
 @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
 @click.option("--recording", required=True, type=click.Path(), help="HDF5 recording with known symbols.")
-@click.option("--json", "json_path", type=click.Path(), help="Write the figures to this file.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow slow shift page by page.")
-def evaluate(bundle: str, recording: str, json_path: str | None, threads: int | None, tracking: bool) -> None:
+def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int | None, tracking: bool) -> None:
     """Measure a bundle on the pages of a recording that it has not seen.
 
     Pages that cannot be decoded are left out of the figures, named, and make the exit status 2.

@@ -11,6 +11,7 @@ import click
 from tqdm import tqdm
 
 from optics.errors import InvalidInputError, RecordingError
+from optics.files import OutputFile
 from optics.recording import Recording
 from runtime.client import LightpageClient, Recalibrated
 from runtime.decoder import Decoder
@@ -33,7 +34,7 @@ DEFAULT_PAGES = 2
 @click.option("--target", metavar="HOST:PORT", help="Recalibrate this running service instead of a bundle.")
 @click.option("--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(2), help="Known pages to use.")
 @click.option("--version", help="Offline: version of the new bundle; by default the next one.")
-@click.option("--json", "json_path", type=click.Path(), help="Write the result to this file.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the result to this file.")
 def recalibrate(
     bundle: str | None,
     recording: str | None,
@@ -41,7 +42,7 @@ def recalibrate(
     target: str | None,
     pages: int,
     version: str | None,
-    json_path: str | None,
+    json_path: Path | None,
 ) -> None:
     """Re-fit the geometry of a drifted device from known pages, keep it only if it decodes better.
 

@@ -12,8 +12,8 @@ import click
 import numpy as np
 from tqdm import tqdm
 
-from optics.errors import InvalidInputError, RecordingError
-from optics.files import replace_text
+from optics.errors import RecordingError
+from optics.files import OutputFile, replace_text
 from optics.profile import Profile, load_profile
 from optics.recording import Recording
 from optics.registration.calibrate import calibrate as register
@@ -30,17 +30,14 @@ MAX_PAGES = 4
 @click.command()
 @click.option("--profile", "profile_name", required=True, metavar="P", help="Nominal device: a shipped name or a file.")
 @click.option("--recording", required=True, type=click.Path(path_type=Path), help="Pages with known symbols, R.h5.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Where the calibration goes, TOML.")
+@click.option("--out", required=True, type=OutputFile(), help="Where the calibration goes, TOML.")
 @click.option(
     "--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(1, MAX_PAGES), help="Pages used."
 )
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the figures to this file.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_path: Path | None) -> None:
     """Find this device's geometry, from nominal, with the first pages of a recording."""
     profile = load_profile(profile_name)
-    for path in (out, *([json_path] if json_path else [])):
-        if not path.absolute().parent.is_dir():
-            raise InvalidInputError(f"path {path}", "a folder that does not exist", "a folder that does")
     start = time.perf_counter()
     with Recording.open(recording) as file, calibration_bar() as progress:
         calibration = calibrate_recording(file, profile, pages, progress)
