@@ -127,7 +127,7 @@ def gained_at_the_end(run: Path, steps: int) -> float:
 @click.command()
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
 @click.option("--angle", "angle_deg", type=float, default=-0.6, show_default=True, help="Pipe angle, degrees.")
-@click.option("--full-well", type=float, default=1200.0, show_default=True, help="Electrons; sets the noise.")
+@click.option("--full-well", type=float, default=32.0, show_default=True, help="Electrons; sets the noise.")
 @click.option(
     "--pages", type=click.IntRange(12), default=240, show_default=True, help="With 8% validation, 8% held out."
 )

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from optics.profile import Profile
 from train.field import FieldRecovery, unexplained
-from train.localizers.coherent import CoherentLocalizer, network_features
+from train.localizers.coherent import CoherentLocalizer
 from train.network import SymbolUNet
 
 FRAME_INPUTS = ("in_phase", "quadrature")
@@ -66,8 +66,7 @@ class DecoderGraph(nn.Module):
             homodyne,
         )
         light = self.localizer(field, places, place_gradients, phases)
-        features = network_features(light.flatten(0, 2)[None], positions[None])
-        p = self.network(features)[0] * self.kappa_scale
+        p = self.network(light.flatten(0, 2)[None], positions[None])[0] * self.kappa_scale
         phase = torch.atan2(p[1], p[0])
         concentration = torch.sqrt((p * p).sum(0))
         return p, phase, concentration, unexplained(field, left), field, left

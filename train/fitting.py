@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +23,6 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 
 from optics.measures import achievable_rate
 from optics.pilots import Pilots, estimate_piston, remove_piston
-from train.localizers.coherent import POSITION_CHANNELS, network_features
 from train.loss import von_mises_nll
 from train.network import SymbolUNet
 
@@ -50,7 +53,7 @@ class Hyperparameters:
     levels: int = 0
     steps: int = 6000
     batch: int = 4
-    learning_rate: float = 2e-3
+    learning_rate: float = 4e-3
     weight_decay: float = 1e-3
     seed: int = 0
     precision: str = "bf16-mixed"
@@ -83,7 +86,7 @@ class DecoderTraining(L.LightningModule):
 
     def forward(self, light: Tensor, positions: Tensor) -> Tensor:
         """Light [N, 2 C, ny, nx] and exit centroids [N, 2, ny, nx] to p [N, 2, ny, nx]."""
-        return torch.as_tensor(self.network(network_features(light.float(), positions)))
+        return torch.as_tensor(self.network(light.float(), positions))
 
     def training_step(self, batch: Page, index: int) -> Tensor:
         """Loss of pages whose field and symbols were turned by one random angle each: piston is no information."""
@@ -177,8 +180,8 @@ def fit_network(
     reached = int(_checkpoint(last)["global_step"]) if last.exists() else 0
     # another stretch of the run draws other pages and turns
     L.seed_everything(hyperparameters.seed + reached, verbose=False)
-    channels = training[0][0].shape[0] + POSITION_CHANNELS
-    network = SymbolUNet(channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.levels)
+    light_channels = training[0][0].shape[0]
+    network = SymbolUNet(light_channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.levels)
     if start is not None:
         network.load_state_dict(start.state_dict())
     module = DecoderTraining(network, hyperparameters, pilot_mask, levels)
@@ -187,26 +190,28 @@ def fit_network(
     averaged = EMAWeightAveraging(use_buffers=False, decay=1 - 1 / max(1.0, AVERAGED_SHARE * hyperparameters.steps))
     draws = hyperparameters.batch * max(1, hyperparameters.steps // LOOKS)
     sampler = RandomSampler(training, replacement=True, num_samples=draws)  # type: ignore[arg-type]  # it has a length
-    trainer = L.Trainer(
-        max_steps=hyperparameters.steps,
-        precision=hyperparameters.precision,  # type: ignore[arg-type]
-        logger=TensorBoardLogger(str(run), name="", version="tensorboard"),
-        callbacks=[averaged, best, newest, *(callbacks or [])],
-        enable_progress_bar=progress,
-        enable_model_summary=False,
-        gradient_clip_val=1.0,
-        num_sanity_val_steps=0,
-        log_every_n_steps=10,
-        default_root_dir=run,
-    )
-    try:
-        trainer.fit(
-            module,
-            DataLoader(training, batch_size=hyperparameters.batch, sampler=sampler),
-            DataLoader(validation, batch_size=1),
-            ckpt_path=last if last.exists() else None,
-            weights_only=False,
+    with _without_hints():
+        trainer = L.Trainer(
+            max_steps=hyperparameters.steps,
+            precision=hyperparameters.precision,  # type: ignore[arg-type]
+            logger=TensorBoardLogger(str(run), name="", version="tensorboard"),
+            callbacks=[averaged, best, newest, *(callbacks or [])],
+            enable_progress_bar=progress,
+            enable_model_summary=False,
+            gradient_clip_val=1.0,
+            num_sanity_val_steps=0,
+            log_every_n_steps=10,
+            default_root_dir=run,
         )
+    try:
+        with _without_hints():
+            trainer.fit(
+                module,
+                DataLoader(training, batch_size=hyperparameters.batch, sampler=sampler),
+                DataLoader(validation, batch_size=1),
+                ckpt_path=last if last.exists() else None,
+                weights_only=False,
+            )
     except SystemExit:  # Lightning's answer to Ctrl-C, once it has closed its files
         raise KeyboardInterrupt from None
     # the last steps are the quietest, and no look need have followed them
@@ -217,6 +222,20 @@ def fit_network(
     chosen = max(rates, key=lambda path: rates[path])
     module.load_state_dict(_checkpoint(chosen)["state_dict"])
     return module, rates[chosen]
+
+
+@contextmanager
+def _without_hints() -> Iterator[None]:
+    """Keep to itself what Lightning would tell a programmer; its errors come through."""
+    log = logging.getLogger("lightning.pytorch")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module=r"lightning\.")
+            yield
+    finally:
+        log.setLevel(level)
 
 
 def _checkpoint(path: Path) -> dict[str, Any]:

@@ -2,9 +2,50 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+_HARMONICS = (0.5, 1.0, 2.0)
+"""Turns a pipe width of the exit centroid: zones of even and odd reflections alternate, each has two edges."""
+_CONDITIONS = 6 + 4 * len(_HARMONICS)
+_CONDITION_WIDTH = 64
+
+
+class PositionModulation(nn.Module):
+    """Scales and shifts each channel by where a symbol lies: feature-wise linear modulation (FiLM).
+
+    The filter that brings a symbol's light together depends on how the walls cut its beam. Behind one convolution, this
+    makes a filter for each place; without it, a single one has to serve all.
+
+    Args:
+        channels: of the features.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.inner = nn.Conv2d(_CONDITIONS, _CONDITION_WIDTH, 1)
+        self.outer = nn.Conv2d(_CONDITION_WIDTH, 2 * channels, 1)
+        for value in self.outer.parameters():
+            nn.init.zeros_(value)
+
+    def forward(self, x: Tensor, positions: Tensor) -> Tensor:
+        """Features [N, C, ny, nx] and exit centroids q, [N, 2, ny, nx] over the pipe's width, to features."""
+        scale, shift = self.outer(functional.gelu(self.inner(self._conditions(positions)))).chunk(2, dim=1)
+        return torch.as_tensor(x * (1 + scale) + shift)
+
+    @staticmethod
+    def _conditions(positions: Tensor) -> Tensor:
+        """Column and row on the page from -1 to 1, q, q - round(q) and harmonics of q."""
+        ny, nx = positions.shape[-2:]
+        rows = torch.linspace(-1, 1, ny, device=positions.device)[:, None].expand(ny, nx)
+        columns = torch.linspace(-1, 1, nx, device=positions.device)[None, :].expand(ny, nx)
+        page = torch.stack([columns, rows]).expand(positions.shape[0], 2, ny, nx)
+        angles = [2 * math.pi * harmonic * positions for harmonic in _HARMONICS]
+        waves = [wave(angle) for angle in angles for wave in (torch.cos, torch.sin)]
+        return torch.cat([page, positions, positions - torch.round(positions), *waves], dim=1)
 
 
 class Residual(nn.Module):
@@ -23,20 +64,21 @@ class Residual(nn.Module):
 
 
 class SymbolUNet(nn.Module):
-    """Features at symbol pitch to the vector p of each symbol.
+    """Light at symbol pitch to the vector p of each symbol.
 
     All samples of a symbol are its channels (pixel-unshuffled), so a 3x3 kernel sees the neighbouring symbols whole.
 
     Args:
-        features: input channels.
+        light_channels: real and imaginary parts of a symbol's samples.
         channels: channels at symbol pitch, doubled with each level.
         blocks: residual blocks before and after each level's descent.
         levels: levels below symbol pitch; 0 is the flat network.
     """
 
-    def __init__(self, features: int, channels: int = 96, blocks: int = 2, levels: int = 0) -> None:
+    def __init__(self, light_channels: int, channels: int = 96, blocks: int = 2, levels: int = 0) -> None:
         super().__init__()
-        self.stem = nn.Conv2d(features, channels, 3, padding=1)
+        self.stem = nn.Conv2d(light_channels, channels, 3, padding=1)
+        self.where = PositionModulation(channels)
         self.down = nn.ModuleList()
         self.up = nn.ModuleList()
         self.inward = nn.ModuleList()
@@ -51,9 +93,17 @@ class SymbolUNet(nn.Module):
         self.bottom = nn.Sequential(*(Residual(width) for _ in range(blocks)))
         self.head = nn.Conv2d(channels, 2, 1)
 
-    def forward(self, features: Tensor) -> Tensor:
-        """[N, features, ny, nx] to p = (px, py), [N, 2, ny, nx]: its angle is the phase, its length kappa."""
-        x = self.stem(features)
+    def forward(self, light: Tensor, positions: Tensor) -> Tensor:
+        """Light and exit centroids to p: its angle is the phase, its length kappa.
+
+        Args:
+            light: [N, light_channels, ny, nx].
+            positions: exit centroids over the pipe's width, [N, 2, ny, nx].
+
+        Returns:
+            p = (px, py), [N, 2, ny, nx].
+        """
+        x = self.where(self.stem(light), positions)
         kept = []
         for inward, down in zip(self.inward, self.down, strict=True):
             x = inward(x)

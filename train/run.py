@@ -18,7 +18,6 @@ from optics.files import replace_text
 from optics.profile import Profile, parse_profile
 from optics.registration.calibration import Calibration, parse_calibration
 from train.fitting import CHECKPOINTS, DecoderTraining, Hyperparameters
-from train.localizers.coherent import POSITION_CHANNELS
 from train.network import SymbolUNet
 
 BEGUN = "begun.json"
@@ -154,7 +153,7 @@ def load_network(folder: Path, run: Run, light_channels: int) -> SymbolUNet:
         InvalidInputError: no weights, or weights of another network.
     """
     choices = run.hyperparameters
-    network = SymbolUNet(light_channels + POSITION_CHANNELS, choices.channels, choices.blocks, choices.levels)
+    network = SymbolUNet(light_channels, choices.channels, choices.blocks, choices.levels)
     try:
         network.load_state_dict(torch.load(folder / WEIGHTS, map_location="cpu", weights_only=True))
     except (OSError, RuntimeError) as error:

@@ -25,7 +25,7 @@ from runtime.decoder import Decoder
 from runtime.ort import open_session
 from tests.optics.small import small_profile
 from train.fitting import Hyperparameters
-from train.localizers.coherent import POSITION_CHANNELS, CoherentLocalizer
+from train.localizers.coherent import CoherentLocalizer
 from train.network import SymbolUNet
 from train.run import GOLDEN, REFERENCES, WEIGHTS, Run, load_run
 from train.twin import RayTwin, TorchTwin
@@ -46,7 +46,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     turn = np.pi / 2 + np.deg2rad(device.homodyne.quadrature_error_deg)
     fitted = Registered(true_parameters(profile, device), np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
     torch.manual_seed(0)
-    features = CoherentLocalizer(profile).light_channels + POSITION_CHANNELS
+    features = CoherentLocalizer(profile).light_channels
     network = SymbolUNet(features, CHOICES.channels, CHOICES.blocks, CHOICES.levels)
     torch.save(network.state_dict(), folder / WEIGHTS)
     np.savez(folder / GOLDEN, in_phase=pair.in_phase, quadrature=pair.quadrature)

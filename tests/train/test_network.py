@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from train.network import SymbolUNet
+from train.network import PositionModulation, SymbolUNet
 
 
 @pytest.mark.parametrize("levels", [0, 1, 2])
 def test_it_keeps_the_page_whatever_its_size(levels: int) -> None:
     network = SymbolUNet(7, channels=8, blocks=1, levels=levels)
-    assert network(torch.zeros(2, 7, 11, 13)).shape == (2, 2, 11, 13)
+    assert network(torch.zeros(2, 7, 11, 13), torch.zeros(2, 2, 11, 13)).shape == (2, 2, 11, 13)
 
 
 def test_a_flat_network_sees_the_neighbours_and_no_further() -> None:
@@ -20,9 +20,19 @@ def test_a_flat_network_sees_the_neighbours_and_no_further() -> None:
     for block in network.bottom:
         torch.nn.init.normal_(block.second.weight, std=0.1)
     x = torch.randn(1, 3, 31, 31, requires_grad=True)
-    network(x)[0, 0, 15, 15].backward()
+    network(x, torch.zeros(1, 2, 31, 31))[0, 0, 15, 15].backward()
     assert x.grad is not None
     seen = x.grad.abs().sum((0, 1)) > 0
     rows = torch.nonzero(seen.any(1)).ravel()
     # stem 3x3 and two blocks of two 3x3: five rings of neighbours
     assert (int(rows.min()), int(rows.max())) == (10, 20)
+
+
+def test_the_filter_depends_on_where_a_beam_leaves_the_pipe() -> None:
+    torch.manual_seed(0)
+    modulation = PositionModulation(4)
+    x = torch.randn(1, 4, 1, 3)
+    positions = torch.tensor([0.2, 0.4, 1.2]).expand(1, 2, 1, 3)
+    assert torch.equal(modulation(x, positions), x)  # at the start, everywhere the same
+    torch.nn.init.normal_(modulation.outer.weight)
+    assert not torch.allclose(modulation(x, positions), x)

@@ -63,24 +63,3 @@ class CoherentLocalizer(nn.Module):
         real = (sampled[0] * cos + sampled[1] * sin) * scale
         imaginary = (sampled[1] * cos - sampled[0] * sin) * scale
         return torch.stack([real, imaginary])
-
-
-POSITION_CHANNELS = 6
-"""Features that `network_features` adds to the light."""
-
-
-def network_features(light: Tensor, positions: Tensor) -> Tensor:
-    """What a network sees: light, where in its zone a symbol's beam leaves the pipe, where on the page it lies.
-
-    Args:
-        light: [N, 2 C, ny, nx].
-        positions: exit centroids q, [N, 2, ny, nx].
-
-    Returns:
-        [N, 2 C + 6, ny, nx]: the light, q, q - round(q), column and row from -1 to 1.
-    """
-    ny, nx = light.shape[-2:]
-    rows = torch.linspace(-1, 1, ny, device=light.device)[:, None].expand(ny, nx)
-    columns = torch.linspace(-1, 1, nx, device=light.device)[None, :].expand(ny, nx)
-    page = torch.stack([columns, rows]).expand(light.shape[0], 2, ny, nx)
-    return torch.cat([light, positions, positions - torch.round(positions), page], dim=1)
