@@ -4,9 +4,11 @@
     python -m benchmarks.calibration --devices 3 --foreign --json F
 
 The coherence of the calibrated geometry is put in ratio to that of the true one (the oracle), fields recovered with
-the true cameras and turn, the image's drift included. A foreign device comes from a simulator that shares nothing
-with this project; its true geometry has other parameters, so it has no such ratio. An interrupted run goes on where
-it stopped: seeds that are in the JSON file are not computed again, failed ones are.
+the true cameras and turn, the image's drift included. The cameras' relation is how far the quadrature camera is placed
+wrong against the in-phase one, root mean square over the page: the field that is recovered from both depends on it. A
+foreign device comes from a simulator that shares nothing with this project; its true geometry has other parameters, so
+it has neither. An interrupted run goes on where it stopped: seeds that are in the JSON file are not computed again,
+failed ones are.
 """
 
 from __future__ import annotations
@@ -54,6 +56,7 @@ class Outcome:
     angle_deg: float
     angle_error_deg: float | None = None
     turn_error_deg: float | None = None
+    relation_error_px: float | None = None
     coherence: float | None = None
     oracle_coherence: float | None = None
     ratio: float | None = None
@@ -67,13 +70,17 @@ class Outcome:
 
         text = (
             f"{self.seed:>6} {self.angle_deg:>+9.4f} {show(self.angle_error_deg, '>9.4f')} "
+            f"{show(self.turn_error_deg, '>9.2f')} {show(self.relation_error_px, '>8.2f')} "
             f"{show(self.coherence, '>9.4f')} {show(self.oracle_coherence, '>9.4f')} "
             f"{show(self.ratio, '>7.3f')} {show(self.seconds, '>7.1f')}"
         )
         return f"{text}  {self.failure}" if self.failure else text
 
 
-HEADER = f"{'seed':>6} {'angle':>9} {'error':>9} {'coherence':>9} {'oracle':>9} {'ratio':>7} {'seconds':>7}"
+HEADER = (
+    f"{'seed':>6} {'angle':>9} {'error':>9} {'turn err.':>9} {'relation':>8} "
+    f"{'coherence':>9} {'oracle':>9} {'ratio':>7} {'seconds':>7}"
+)
 
 
 class Bench:
@@ -96,7 +103,7 @@ class Bench:
         truth = self._truth(device, np.mean([page.shift_px for page in seen], axis=0))
         turn = np.deg2rad(90 * device.homodyne.quadrature_sign + device.homodyne.quadrature_error_deg)
         oracle = float(np.mean([self._coherence(page, references, truth, turn) for page in known]))
-        return self._outcome(seed, device.geometry.pipe_angle_deg, turn, references, known, oracle)
+        return self._outcome(seed, device.geometry.pipe_angle_deg, turn, references, known, oracle, truth)
 
     def foreign(self, seed: int) -> Outcome:
         """Draw a device of the other simulator, and calibrate through a recording."""
@@ -119,6 +126,7 @@ class Bench:
         references: FramePair,
         known: list[KnownPage],
         oracle: float | None,
+        truth: NDArray[np.float64] | None = None,
     ) -> Outcome:
         start = time.perf_counter()
         try:
@@ -132,6 +140,7 @@ class Bench:
             angle_deg=angle,
             angle_error_deg=abs(self._angle(found) - angle),
             turn_error_deg=abs(float(np.rad2deg(np.angle(np.exp(1j * (found.turn - turn)))))),
+            relation_error_px=self._relation_error_px(found.parameters, truth) if truth is not None else None,
             coherence=found.coherence_after,
             oracle_coherence=oracle,
             ratio=found.coherence_after / oracle if oracle else None,
@@ -141,6 +150,13 @@ class Bench:
 
     def _angle(self, found: Registered) -> float:
         return self.profile.pipe.angle_deg + float(np.rad2deg(found.parameters[NAMES.index("pipe_angle_rad")]))
+
+    def _relation_error_px(self, found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+        """What of the cameras' displacements from the truth is not common to both, root mean square over the page."""
+        grid = field_grid(self.profile)
+        places = np.stack(np.meshgrid(grid.x_m[::16], grid.y_m[::16]), axis=-1).reshape(-1, 2)
+        in_phase, quadrature = self.twin.pixels(found, places) - self.twin.pixels(truth, places)
+        return float(np.sqrt(np.mean(np.sum((quadrature - in_phase) ** 2, axis=-1))))
 
     def _truth(self, device: Device, shift_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """True parameters [P], with the image's mean drift over the pages in both cameras' shifts."""
@@ -164,6 +180,7 @@ def summary(outcomes: list[Outcome]) -> dict[str, float | int | None]:
     seconds = [o.seconds for o in outcomes if o.seconds is not None]
     with_oracle = [o for o in outcomes if o.oracle_coherence is not None]
     near = sum(1 for o in with_oracle if o.ratio is not None and o.ratio >= WANTED_SHARE)
+    relations = [o.relation_error_px for o in outcomes if o.relation_error_px is not None]
     ratios = [o.ratio for o in with_oracle if o.ratio is not None]
     return {
         "devices": len(outcomes),
@@ -173,6 +190,8 @@ def summary(outcomes: list[Outcome]) -> dict[str, float | int | None]:
         "near_oracle": near if with_oracle else None,
         "near_oracle_share": near / len(with_oracle) if with_oracle else None,
         "ratio_worst": min(ratios, default=None),
+        "relation_error_px_worst": max(relations, default=None),
+        "relation_error_px_median": statistics.median(relations) if relations else None,
         "seconds_median": statistics.median(seconds) if seconds else None,
         "seconds_worst": max(seconds, default=None),
     }
