@@ -17,7 +17,7 @@ from scipy import signal
 from optics.grid import field_grid
 from optics.page import MAX_LEVELS, random_symbols, symbol_phases
 from optics.profile import Profile
-from optics.registration.fitted_waves import FittedWaves
+from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
 from optics.registration.parameters import NAMES
 from optics.registration.table import sampling_table
 from train.features import PageFeatures, demodulate
@@ -54,8 +54,6 @@ _DRIFT = {
 """Most that a device is expected to drift between two trainings, either way: of pipe angle and focal length twice what
 the demonstration lets it drift. The cameras' poses are left out: registration takes them off before the network sees
 anything."""
-_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-"""Powers of (x, y) in the illumination."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +84,8 @@ def likeness(profile: Profile, parameters: Real, fields: Sequence[Complex], phas
     seen = _seen(profile, parameters)
     found, left = [], []
     for field, written in zip(fields, phases, strict=True):
-        page = _on_modulator(written)
-        shown = np.stack([waves.to_camera(page * term)[seen] for term in _illumination_terms(waves)], axis=1)
+        page = on_modulator(written, SAMPLES)
+        shown = np.stack([waves.to_camera(page * term)[seen] for term in illumination_terms(waves)], axis=1)
         light = field[seen]
         factors = np.linalg.lstsq(shown, light, rcond=None)[0]
         found.append(factors / factors[0])
@@ -130,11 +128,11 @@ class SyntheticPages:
         wave_localizer = WaveLocalizer(profile, parameters) if self._by_waves else None
         table = sampling_table(self._twin, parameters, np.pi / 2, profile)
         light_on = sum(
-            factor * term for factor, term in zip(self._like.illumination, _illumination_terms(waves), strict=True)
+            factor * term for factor, term in zip(self._like.illumination, illumination_terms(waves), strict=True)
         )
         for symbols in random_symbols(profile, MAX_LEVELS, PAGES_PER_STATE, rng):
             phases = symbol_phases(symbols, MAX_LEVELS)
-            field = waves.to_camera(_on_modulator(phases) * light_on)
+            field = waves.to_camera(on_modulator(phases, SAMPLES) * light_on)
             field = (self._like.seen * (field + self._noise(field, rng))).astype(np.complex64)
             light = demodulate(self._coherent, field, table) if wave_localizer is None else wave_localizer(field)
             yield PageFeatures(light.astype(np.float16), table["positions"], phases.astype(np.float32), (0.0, 0.0))
@@ -158,11 +156,3 @@ def _seen(profile: Profile, parameters: Real) -> NDArray[np.bool_]:
     pixels = TorchTwin(RayTwin(profile)).pixels(parameters, places)
     last = np.array([profile.camera.columns_px - 1, profile.camera.rows_px - 1])
     return np.asarray(np.all((pixels >= 0) & (pixels <= last), axis=(0, 2)).reshape(grid.shape))
-
-
-def _on_modulator(phases: Real) -> Complex:
-    return np.asarray(np.exp(1j * np.kron(phases, np.ones((SAMPLES, SAMPLES)))))
-
-
-def _illumination_terms(waves: FittedWaves) -> list[Real]:
-    return [waves.x[None, :] ** i * waves.y[:, None] ** j for i, j in _TERMS]

@@ -17,6 +17,7 @@ from optics.registration.coherence import COHERENT_BRANCHES, page_coherence
 from optics.registration.fit import Fit, fit_parameters
 from optics.registration.parameters import PARAMETERS, indices, nominal
 from optics.registration.patches import Measurement, Patch, measure, middle_patches, patches, search_window
+from optics.registration.relation import CameraRelation
 from optics.registration.samplers import FieldSampler, FrameSampler
 from optics.registration.table import registration_coefficients
 from optics.registration.twin import FieldSolver, Twin
@@ -32,14 +33,6 @@ _FEWEST = 5
 _CAMERA_GROUPS = ("in_phase", "quadrature", "centre", "camera_phase")
 _SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "launch")
 _ALL_GROUPS = tuple(dict.fromkeys(p.group for p in PARAMETERS))
-_POSE_ERRORS = np.array([0.1, 0.1, 2e-4, 2e-4, 2e-4, 2e-4])
-"""How well known symbols place one camera against the other: shift (pixels), scales and turns."""
-_POSE_DRIFT = np.array([0.5, 0.5, 1e-3, 1e-3, 1e-3, 1e-3])
-"""How far one camera may have drifted against the other since an earlier calibration, same units."""
-_TURN_ERROR = np.deg2rad(0.6)
-"""How well they give the angle between the arms."""
-_SAMPLES_PER_DEGREE = 6.0
-"""Grid samples per independent number of the residual: the grid's rate over the pipe's band, squared."""
 _LEAST_OVER_CHANCE = 8.0
 """Coherence that a calibration must reach, in units of 1/sqrt(symbols of a page), what chance gives. Measured on the
 bench device: 34 or more where it was found, 18 with half of the symbols wrong; at most 2.3 for the right symbols at
@@ -49,10 +42,6 @@ _LEAST_SIGNIFICANT = 0.1
 of the symbols wrong (no branch carries light from all of the page)."""
 _WANTED = "right symbols and profile, a device in the capture range"
 _WANTED_REFLECTIONS = f"{_WANTED}, a page wide enough for its light to meet the pipe's walls"
-_HOMODYNE_ROUNDS = 2
-_HOMODYNE_LIMIT = 2.0
-"""Most that the equations may move what symbols said, in its standard deviations: under a reference of 2.8 times the
-signal the residual alone falls all the way to a turn that is 10 degrees wrong."""
 _LEAST_QUADRATURE = 0.5
 """Sine of the angle between the arms below which the two frames hardly differ."""
 
@@ -152,18 +141,17 @@ def calibrate(
         CalibrationError: nothing within the capture range explains the frames, or the page is too small to tell.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
-    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASE) + 5
+    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASE) + 4
     for stage in _SINGLE_CAMERA:
         work.single_camera(stage)
     work.estimate_turn()
     for stage in _COMPLEX:
         work.complex_field(stage)
     work.estimate_turn()
-    work.refine_homodyne()
+    work.place_cameras()
     for stage in _PHASE:
         work.complex_field(stage)
-    work.estimate_turn()
-    work.refine_homodyne()
+    work.place_cameras()
     return work.result(nominal())
 
 
@@ -190,9 +178,9 @@ def refine(
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.turn = start.copy(), turn
     work.total = len(_DRIFTED) + 2
-    work.refine_homodyne(_POSE_DRIFT, rounds=1)
     for stage in _DRIFTED:
         work.complex_field(stage, start, _DRIFT_SCALE)
+    work.place_cameras()
     return work.result(start)
 
 
@@ -298,33 +286,12 @@ class _Registration:
                 "angle between the homodyne arms", f"{np.rad2deg(self.turn):.0f} degrees", "about +90 or -90 degrees"
             )
 
-    def refine_homodyne(self, pose_errors: Real = _POSE_ERRORS, rounds: int = _HOMODYNE_ROUNDS) -> None:
-        """Relation of the two cameras from the homodyne equations, which need no symbol.
-
-        Angle between the arms and pose of the quadrature camera against the in-phase one: what is left of the
-        equations is least where they are right. Gauss-Newton on the residual images by finite differences; what was
-        known before has its weight, since under a strong reference the equations say little.
-        """
+    def place_cameras(self) -> None:
+        """Poses of both cameras and the angle between the arms, from the waves of the first page."""
         self._tell("relation of the cameras")
-        page, chosen = self.pages[0], indices("quadrature")
-        known = np.append(pose_errors, _TURN_ERROR)
-        moved = np.zeros(len(known))
-
-        def residual(offset: Real) -> NDArray[np.float32]:
-            parameters = self.parameters.copy()
-            parameters[chosen] += offset[:-1]
-            return self._field(page, parameters, self.turn + float(offset[-1]))[1].ravel()
-
-        for _ in range(rounds):
-            here = residual(moved)
-            slopes = np.stack([residual(moved + step) - here for step in np.diag(known)], axis=1)
-            noise = float(here @ here) / len(here) * _SAMPLES_PER_DEGREE
-            normal = slopes.T @ slopes / noise + np.eye(len(known))
-            moved = moved - known * np.linalg.solve(normal, slopes.T @ here / noise + moved / known)
-            moved = np.clip(moved, -_HOMODYNE_LIMIT * known, _HOMODYNE_LIMIT * known)
-        self.parameters = self.parameters.copy()
-        self.parameters[chosen] += moved[:-1]
-        self.turn += float(moved[-1])
+        page = self.pages[0]
+        relation = CameraRelation(self.twin, self.profile, self.parameters, page.pair, self.references, page.symbols)
+        self.parameters, self.turn = relation.fit(self.turn)
 
     def result(self, before: Real) -> Registered:
         """Judge the outcome; `before` is the geometry that it is compared with."""

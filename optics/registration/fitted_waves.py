@@ -16,6 +16,8 @@ Complex = NDArray[np.complexfloating]
 
 _STEPS = 24
 """Splitting steps; more change the result by less than the fit's own error."""
+_ILLUMINATION = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+"""Powers of (x, y) in an illumination."""
 
 
 class FittedWaves:
@@ -80,3 +82,13 @@ class FittedWaves:
     def to_page(self, field: Complex) -> Complex:
         """Field on the common grid [Gy, Gx] back to the modulator, by the adjoint."""
         return np.asarray(self._channel.adjoint(field * self._camera.conj()) * self._launch.conj())
+
+
+def on_modulator(phases: Real, samples: int) -> Complex:
+    """A page's phases [ny, nx] as a field on the modulator, [ny samples, nx samples]."""
+    return np.asarray(np.exp(1j * np.kron(phases, np.ones((samples, samples)))))
+
+
+def illumination_terms(waves: FittedWaves) -> list[Real]:
+    """Terms of an illumination that is a quadratic in the page's coordinates, over the modulator."""
+    return [waves.x[None, :] ** i * waves.y[:, None] ** j for i, j in _ILLUMINATION]

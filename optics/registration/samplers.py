@@ -15,6 +15,12 @@ _REFERENCE_SMOOTHING_PX = 3.0
 _FRAME_SMOOTHING_PX = 1.2
 
 
+def smooth_reference(reference: NDArray[np.integer]) -> NDArray[np.float32]:
+    """Counts of a reference-only frame [H, W] without its noise, nowhere zero."""
+    level = ndimage.gaussian_filter(reference.astype(np.float32), _REFERENCE_SMOOTHING_PX)
+    return np.asarray(np.maximum(level, max(1e-3 * float(level.mean()), 1e-6)), dtype=np.float32)
+
+
 class FrameSampler:
     """One camera's frame as a linear estimate of the field's projection on its reference, |E|^2 left in.
 
@@ -27,8 +33,7 @@ class FrameSampler:
     def __init__(
         self, frame: NDArray[np.integer], reference: NDArray[np.integer], camera: int, twin: Twin, parameters: Real
     ) -> None:
-        level = ndimage.gaussian_filter(reference.astype(np.float32), _REFERENCE_SMOOTHING_PX)
-        level = np.maximum(level, max(1e-3 * float(level.mean()), 1e-6))
+        level = smooth_reference(reference)
         linear = (frame.astype(np.float32) - level) / np.sqrt(level)
         self._image = ndimage.gaussian_filter(linear, _FRAME_SMOOTHING_PX)
         self._camera, self._twin, self._parameters = camera, twin, parameters
