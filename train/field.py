@@ -19,6 +19,7 @@ from torch.nn import functional
 from optics.grid import FieldGrid, field_grid
 from optics.profile import Profile
 from optics.recording import FramePair
+from optics.registration.relation import READ_NOISE
 from optics.registration.table import monomial_powers
 from train.filters import SeparableFilter
 
@@ -26,8 +27,6 @@ _ROUNDS = 6
 _STEP = 0.9
 """Along the weighted gradient: the weights bound the curvature by 2, and step times curvature must stay below 2."""
 _MOMENTUM = 0.5
-_READ_NOISE = 0.3
-"""Variance that does not grow with the light, over the shot noise of the reference alone."""
 _FLOOR = 0.1
 """Least reference, as a share of its mean, that frames are divided by: outside the beam there is nothing to learn."""
 
@@ -124,8 +123,8 @@ class FieldRecovery(nn.Module):
             real, imaginary = ahead[0], ahead[1]
             half_power = (real * real + imaginary * imaginary) / 2
             a_re, a_im, b_re, b_im = 1 + real, imaginary, cos + real, sin + imaginary
-            pull_a = (a - real - half_power) / (a_re * a_re + a_im * a_im + _READ_NOISE)
-            pull_b = (b - cos * real - sin * imaginary - half_power) / (b_re * b_re + b_im * b_im + _READ_NOISE)
+            pull_a = (a - real - half_power) / (a_re * a_re + a_im * a_im + READ_NOISE)
+            pull_b = (b - cos * real - sin * imaginary - half_power) / (b_re * b_re + b_im * b_im + READ_NOISE)
             step = torch.stack([a_re * pull_a + b_re * pull_b, a_im * pull_a + b_im * pull_b])
             before, estimate = estimate, self.band((ahead + _STEP * step) * amplitude) / amplitude
         return estimate[0], estimate[1]

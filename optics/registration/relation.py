@@ -27,12 +27,12 @@ _ROUNDS = 5
 _CONVERGED_PX = 0.003
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
-_READ_NOISE = 0.3
+READ_NOISE = 0.3
 """Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
 _STRIDE = 2
 """Grid samples from one equation to the next: the grid has twice the rate that the light needs."""
 _INSIDE = 0.98
-"""Share of the page's image that is compared, to either side: at the rim light of the neighbouring zone comes in."""
+"""Share of the page's image that is compared, to either side."""
 _SAMPLES = 4
 """Samples per symbol and axis on the modulator."""
 _POSE_PLACES = 37
@@ -116,7 +116,7 @@ class CameraRelation:
         columns, left = [], []
         for camera, arm in enumerate((0.0, turn)):
             phasor = np.exp(-1j * arm)
-            weight = 1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + _READ_NOISE)
+            weight = 1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + READ_NOISE)
             along = (phasor + here.conj()) * weight  # derivative of Re(e exp(-i arm)) + |e|^2 / 2 by e
             left.append((data[camera] - (here * phasor).real - np.abs(here) ** 2 / 2) * weight)
             mine = [(along * term).real for term in shown] + [(along * 1j * term).real for term in shown]
