@@ -314,9 +314,11 @@ class Recording:
         return data
 
     def _without_black(self, frame: NDArray[Any]) -> NDArray[Any]:
-        """Counts above the black level, of the same type; noise below it becomes 0."""
-        black = frame.dtype.type(self._black_level)
-        return np.asarray(np.maximum(frame, black) - black)
+        """Counts above the black level, of the same type; noise below it becomes 0, full scale stays: it is clipped."""
+        if self._black_level == 0:
+            return frame
+        black, full_scale = frame.dtype.type(self._black_level), 2**self._bit_depth - 1
+        return np.where(frame == full_scale, frame, np.maximum(frame, black) - black)
 
     def _check_counts(self, name: str, frame: NDArray[Any], where: str) -> None:
         full_scale = 2**self._bit_depth - 1

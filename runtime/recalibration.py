@@ -26,6 +26,8 @@ from runtime.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
 Progress = Callable[[str, float], None]
 """Called with what is being done and how far it is, 0..1. It may raise to stop the work."""
 
+_RECALIBRATED = re.compile(r"(.*)\+r(\d+)")
+
 FIT_PAGES = 1
 """Pages that are fitted on: one has thousands of symbols, and another adds less than what drifts between pages."""
 
@@ -197,12 +199,11 @@ def recalibrate(
 
 
 def next_version(version: str, taken: Sequence[str] = ()) -> str:
-    """The next version not in `taken`: ``bench-1`` gives ``bench-1+r1``, and that gives ``bench-1+r2``."""
-    match = re.fullmatch(r"(.*)\+r(\d+)", version)
-    base, number = (match[1], int(match[2])) if match else (version, 0)
-    while (candidate := f"{base}+r{(number := number + 1)}") in taken:
-        pass
-    return candidate
+    """The version after this one and all `taken`: ``bench-1`` gives ``bench-1+r1``, and that gives ``bench-1+r2``."""
+    parts = [_RECALIBRATED.fullmatch(name) for name in (version, *taken)]
+    base = parts[0][1] if parts[0] else version
+    last = max((int(part[2]) for part in parts if part and part[1] == base), default=0)
+    return f"{base}+r{last + 1}"
 
 
 def _air(decoder: Decoder, pages: KnownPages, table: Table | None) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import tempfile
 import threading
@@ -28,6 +29,9 @@ from runtime.evaluation import check_recording
 from runtime.frames import narrow
 from runtime.recalibration import Fit, KnownPages, Progress, RecalibrationOutcome, next_version, recalibrate
 from runtime.sources import FrameSource, own_fault
+from runtime.store import ModelStore
+
+_log = logging.getLogger(__name__)
 
 _POLL_S = 0.25
 """How often a silent recalibration looks whether its caller is still there."""
@@ -148,7 +152,18 @@ class Recalibrator:
         except BaseException:
             path.unlink(missing_ok=True)
             raise
+        if plane.store is not None:
+            self._prune(plane.store)
         return outcome
+
+    def _prune(self, store: ModelStore) -> None:
+        try:
+            dropped = store.prune([model.decoder.bundle.path for model in self._plane.registry.models])
+        except OSError as error:  # the new model serves all the same
+            _log.warning("model store %s: old bundles stay: %s", store.folder, error)
+        else:
+            for path in dropped:
+                _log.info("model store %s: dropped %s", store.folder, path.name)
 
     def _folder(self) -> Path:
         if self._temporary is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from runtime.bundle import Bundle
 from runtime.manifest import MANIFEST, sha256
 
 CURRENT = "current.json"
+
+KEPT_BUNDLES = 32
+"""Bundles kept: a device that recalibrates itself for years shall not fill its disk, yet leave a trail to follow."""
 
 
 class ModelStore:
@@ -40,6 +44,14 @@ class ModelStore:
     def versions(self) -> list[str]:
         """Versions that exist here."""
         return sorted(path.name.removesuffix(".zip") for path in self.folder.glob("*.zip"))
+
+    def prune(self, held: Collection[Path]) -> list[Path]:
+        """Delete the oldest bundles beyond `KEPT_BUNDLES`, none of those `held`; returns what was deleted."""
+        newest_first = sorted(self.folder.glob("*+r*.zip"), key=lambda path: path.stat().st_mtime_ns, reverse=True)
+        dropped = [path for path in newest_first[KEPT_BUNDLES:] if path not in held]
+        for path in dropped:
+            path.unlink(missing_ok=True)
+        return dropped
 
     def remember(self, path: Path | None) -> None:
         """Note which bundle is in service, None standing for the base; survives a crash in the middle.

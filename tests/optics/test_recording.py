@@ -11,7 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
-from optics.errors import PageError, RecordingError
+from optics.errors import FrameError, PageError, RecordingError
+from optics.frames import check_light
 from optics.page import pilot_mask, random_symbols
 from optics.profile import Profile, load_profile, parse_profile
 from optics.recording import FramePair, Recording, RecordingWriter, hash_frames
@@ -159,6 +160,18 @@ class TestReading:
                     counts = file[prefix + name][where].astype(int)
                     assert getattr(got, name).dtype == np.uint16
                     assert np.array_equal(getattr(got, name), np.clip(counts - black, 0, None))
+
+    def test_a_clipped_count_stays_at_full_scale_where_the_black_level_is_taken_off(self, foreign: Path) -> None:
+        with h5py.File(foreign, "r+") as file:
+            file.attrs["black_level"] = 200
+            clipped = np.zeros(file["in_phase"].shape, bool)
+            clipped[1, 3:9] = True
+            file["in_phase"][...] = np.where(clipped, 4095, file["in_phase"][...])
+        with Recording.open(foreign) as recording:
+            frame = recording.frames(1).in_phase
+            assert np.all(frame[3:9] == 4095)
+            with pytest.raises(FrameError, match="saturated"):
+                check_light("in-phase frame", frame, recording.bit_depth)
 
     def test_a_recording_without_a_black_level_keeps_its_counts_and_its_hashes(self, foreign: Path) -> None:
         with Recording.open(foreign) as recording, h5py.File(foreign) as file:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from runtime.bundle import Bundle
 from runtime.decoder import Decoder
 from runtime.recalibration import FitReport, FitResult, KnownPages, next_version, recalibrate
 from runtime.registry import ModelRegistry
-from runtime.store import CURRENT, ModelStore
+from runtime.store import CURRENT, KEPT_BUNDLES, ModelStore
 from tests.runtime import toy
 
 DRIFTED = (150.0, 62.0)
@@ -137,10 +138,12 @@ def test_unusable_pages_are_named(decoder: Decoder, tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def test_versions_count_up_and_skip_what_exists() -> None:
+def test_versions_count_up_from_the_latest_that_exists() -> None:
     assert next_version("bench-1") == "bench-1+r1"
     assert next_version("bench-1+r9") == "bench-1+r10"
-    assert next_version("bench-1", ["bench-1+r1", "bench-1+r2"]) == "bench-1+r3"
+    # r1 has been dropped from a full store, or rolled back to: its number is not given twice
+    assert next_version("bench-1", ["bench-1+r2", "bench-1+r10", "other+r70", "bench-1"]) == "bench-1+r11"
+    assert next_version("bench-1+r1", ["bench-1+r2"]) == "bench-1+r3"
 
 
 def test_the_registry_keeps_a_bounded_number_and_refuses_other_devices(decoder: Decoder, tmp_path: Path) -> None:
@@ -152,6 +155,20 @@ def test_the_registry_keeps_a_bounded_number_and_refuses_other_devices(decoder: 
     with pytest.raises(BundleError, match="toy-4"):
         registry.swap(registry.models[1].decoder)
     assert registry.rollback()[0].version == "toy-4"
+
+
+def test_a_full_store_drops_its_oldest_bundles_but_none_that_is_held(decoder: Decoder, tmp_path: Path) -> None:
+    store = ModelStore(tmp_path / "store", decoder.bundle)
+    paths = [store.path_of(f"toy-1+r{number}") for number in range(1, KEPT_BUNDLES + 4)]
+    for age, path in enumerate(paths):
+        path.write_bytes(b"")
+        os.utime(path, (age, age))
+    (given := store.folder / "bench.zip").write_bytes(b"")  # put there by someone else
+    os.utime(given, (0, 0))
+    assert set(store.prune([paths[1]])) == {paths[0], paths[2]}
+    assert [path for path in paths if path.exists()] == [paths[1], *paths[3:]]
+    assert given.exists()
+    assert store.prune([paths[1]]) == []
 
 
 def test_the_store_remembers_what_was_in_service_for_its_own_base_only(decoder: Decoder, tmp_path: Path) -> None:
