@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from optics.errors import CalibrationError
 from optics.grid import field_grid
 from optics.profile import Profile
+from optics.progress import Progress
 from optics.recording import FramePair
 from optics.registration.coherence import COHERENT_BRANCHES, page_coherence
 from optics.registration.fit import Fit, fit_parameters
@@ -23,9 +24,6 @@ from optics.registration.table import registration_coefficients
 from optics.registration.twin import FieldSolver, Twin
 
 Real = NDArray[np.float64]
-Progress = Callable[[str, float], None]
-"""Called with what is being done and the share of the work that is behind, 0 to 1."""
-
 SIGNIFICANT = 16.0
 """A patch counts from here: unrelated light reaches it in fewer than one search in a hundred, the widest included."""
 _FEWEST = 5
@@ -40,6 +38,11 @@ nominal geometry and 1.2 for unrelated symbols at the right one."""
 _LEAST_SIGNIFICANT = 0.1
 """Share of the searched patches that must be found in the end: half are where the device was found, a quarter with half
 of the symbols wrong (no branch carries light from all of the page)."""
+_REFLECTED = ("x", "y")
+"""Branches without which a device is not known: the direct image says nothing of the pipe's angle, x hardly more."""
+_LEAST_REFLECTED = 0.05
+"""Share of the patches of either reflected branch that must be found in the end: a third of y's are where the device
+was found, unrelated light makes less than one in a hundred."""
 _WANTED = "right symbols and profile, a device in the capture range"
 _WANTED_REFLECTIONS = f"{_WANTED}, a page wide enough for its light to meet the pipe's walls"
 _LEAST_QUADRATURE = 0.5
@@ -98,7 +101,7 @@ _SINGLE_CAMERA = (
     _Stage("settle the cameras", 6, 2, _SHAPE_GROUPS),
 )
 _COMPLEX = (
-    _Stage("find the reflections", 32, 4, _ALL_GROUPS, ("x", "y"), samples=2, wanted=_WANTED_REFLECTIONS),
+    _Stage("find the reflections", 32, 4, _ALL_GROUPS, _REFLECTED, samples=2, wanted=_WANTED_REFLECTIONS),
     _Stage("all branches, coarse", 8, 2, _ALL_GROUPS, COHERENT_BRANCHES),
     _Stage("all branches, fine", 3, 1, _ALL_GROUPS, COHERENT_BRANCHES),
 )
@@ -189,13 +192,14 @@ def least_coherence(symbols: int) -> float:
     return _LEAST_OVER_CHANCE / math.sqrt(symbols)
 
 
-def check_found(coherence: float, significant: float, symbols: int) -> None:
+def check_found(coherence: float, significant: float, symbols: int, reflected: Mapping[str, float]) -> None:
     """Check that a registration ended at the device and not at a guess.
 
     Args:
         coherence: of the known pages with the fitted geometry.
         significant: share of the patches that were found in the last stage.
         symbols: number of symbols on a page.
+        reflected: the same share for each reflected branch.
 
     Raises:
         CalibrationError: unrelated light would do nearly as well.
@@ -207,6 +211,13 @@ def check_found(coherence: float, significant: float, symbols: int) -> None:
             f"a coherence of {coherence:.3f} and {significant:.0%} of the patches found",
             f"at least {least:.3f} and {_LEAST_SIGNIFICANT:.0%}: {_WANTED}",
         )
+    for branch, share in reflected.items():
+        if not share >= _LEAST_REFLECTED:
+            raise CalibrationError(
+                f"calibration, light that the pipe reflects along {branch}",
+                f"{share:.0%} of the patches found",
+                f"at least {_LEAST_REFLECTED:.0%}: {_WANTED_REFLECTIONS}",
+            )
 
 
 class _Registration:
@@ -240,8 +251,8 @@ class _Registration:
         self.total = 1
         self._done = 0
         self._pixel = profile.camera.pitch_m
-        self._last: list[Measurement] = []
-        self._looked = 1
+        self._looked: list[Measurement] = []
+        self._found: list[Measurement] = []
 
     def _tell(self, what: str) -> None:
         self.progress(what, self._done / self.total)
@@ -298,8 +309,9 @@ class _Registration:
         if self.fit is None:
             raise CalibrationError("calibration", "no fit", "at least one stage")
         after = float(np.mean([self._coherence(page, self.parameters) for page in self.pages]))
-        significant = len(self._last) / self._looked
-        check_found(after, significant, self.pages[0].symbols.size)
+        significant = len(self._found) / len(self._looked)
+        reflected = {branch: self._share(branch) for branch in _REFLECTED}
+        check_found(after, significant, self.pages[0].symbols.size, reflected)
         return Registered(
             parameters=self.parameters,
             deviations=self.fit.deviations,
@@ -309,6 +321,11 @@ class _Registration:
             cost=self.fit.cost,
             significant=significant,
         )
+
+    def _share(self, branch: str) -> float:
+        """Share of the patches of a branch that the last stage found."""
+        looked, found = (sum(m.branch == branch for m in part) for part in (self._looked, self._found))
+        return found / looked if looked else 0.0
 
     def _coherence(self, page: KnownPage, parameters: Real) -> float:
         sampler = FieldSampler(self._field(page, parameters)[0], self.grid)
@@ -365,7 +382,7 @@ class _Registration:
         self, stage: _Stage, found: list[Measurement], centre: Real | None, prior_scale: float | Real = 1.0
     ) -> None:
         good = [m for m in found if m.significance > SIGNIFICANT]
-        self._last, self._looked = good, len(found)
+        self._looked, self._found = found, good
         if len(good) < _FEWEST:
             best = max((m.significance for m in found), default=0.0)
             raise CalibrationError(

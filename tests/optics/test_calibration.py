@@ -124,7 +124,7 @@ BENCH_SYMBOLS = 56 * 87
 
 @pytest.mark.parametrize(("coherence", "significant"), [(0.49, 0.51), (0.26, 0.25)])
 def test_a_device_that_was_found_is_accepted(coherence: float, significant: float) -> None:
-    check_found(coherence, significant, BENCH_SYMBOLS)
+    check_found(coherence, significant, BENCH_SYMBOLS, {"x": 0.6, "y": 0.15})
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,14 @@ def test_a_device_that_was_found_is_accepted(coherence: float, significant: floa
 )
 def test_an_outcome_near_chance_is_no_calibration(coherence: float, significant: float) -> None:
     with pytest.raises(CalibrationError, match="calibration, outcome"):
-        check_found(coherence, significant, BENCH_SYMBOLS)
+        check_found(coherence, significant, BENCH_SYMBOLS, {"x": 0.6, "y": 0.3})
+
+
+@pytest.mark.parametrize("branch", ["x", "y"])
+def test_a_reflection_that_is_not_found_leaves_the_device_unknown(branch: str) -> None:
+    reflected = {"x": 0.6, "y": 0.3} | {branch: 0.02}
+    with pytest.raises(CalibrationError, match=f"light that the pipe reflects along {branch}: got 2%"):
+        check_found(0.43, 0.37, BENCH_SYMBOLS, reflected)
 
 
 def test_a_page_too_small_to_be_found_is_refused_before_anything_is_searched() -> None:

@@ -15,12 +15,13 @@ from click.testing import CliRunner
 import train.cli_calibrate
 from optics.device import Device
 from optics.errors import CalibrationError, FrameError, InvalidInputError, LightpageError, RecordingError
+from optics.page import random_symbols
 from optics.profile import Profile, load_profile
 from optics.recording import FramePair, Recording, RecordingWriter
 from optics.registration.calibrate import Registered
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.parameters import NAMES, PRIORS
-from optics.simulator import true_parameters
+from optics.simulator import Simulator, true_parameters
 from train.cli_calibrate import calibrate
 
 
@@ -129,6 +130,20 @@ def test_a_recording_that_cannot_serve_is_refused_by_name(
 def test_a_folder_that_is_not_there_is_named_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="nowhere"):
         run(tmp_path / "R.h5", tmp_path / "nowhere" / "calibration.toml")
+
+
+def test_a_device_outside_the_capture_range_is_not_guessed_at(tmp_path: Path) -> None:
+    """Takes its seconds: a whole search. At 4.5 degrees all light but that of the y walls lies where it would at 0."""
+    profile, rng = load_profile("bench"), np.random.default_rng(0)
+    device = Device().with_settings(["geometry.pipe_angle_deg=4.5"])
+    simulator = Simulator(profile, device, 256, 0)
+    with RecordingWriter(tmp_path / "R.h5", profile, 256, device.sensor.bit_depth, simulator.references()) as writer:
+        symbols = random_symbols(profile, 256, 1, rng)[0]
+        writer.append(symbols, simulator.page(symbols))
+    out = tmp_path / "calibration.toml"
+    with pytest.raises(CalibrationError, match=r"reflects along y.*wanted .*a device in the capture range"):
+        run(tmp_path / "R.h5", out, "--pages", "1")
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt(), CalibrationError("calibration", "nothing", "something")])
