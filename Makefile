@@ -47,7 +47,7 @@ format: $(STAMP)  ## let ruff put the code in order
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(STAMP)  ## measure the figures that the README reports
+bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 	$(BIN)/lightpage bench
 
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/

@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from optics.device import Device, draw_device
 from optics.errors import CalibrationError, InvalidInputError
-from optics.files import OutputFile, replace_text
+from optics.files import OutputFile, write_json
 from optics.grid import field_grid
 from optics.page import random_symbols, symbol_phases
 from optics.profile import Profile, load_profile
@@ -101,7 +101,7 @@ class Bench:
         phasors = [np.exp(1j * symbol_phases(page, LEVELS)) for page in symbols]
         known = [KnownPage(page.pair, page_phasors) for page, page_phasors in zip(seen, phasors, strict=True)]
         truth = self._truth(device, np.mean([page.shift_px for page in seen], axis=0))
-        turn = np.deg2rad(90 * device.homodyne.quadrature_sign + device.homodyne.quadrature_error_deg)
+        turn = device.homodyne.turn_rad
         oracle = float(np.mean([self._coherence(page, references, truth, turn) for page in known]))
         return self._outcome(seed, device.geometry.pipe_angle_deg, turn, references, known, oracle, truth)
 
@@ -233,11 +233,11 @@ def main(profile_name: str, devices: int, first_seed: int, pages: int, foreign: 
         if seed not in done:
             done[seed] = bench.foreign(seed) if foreign else bench.own(seed)
             document = {"settings": settings, "outcomes": [asdict(done[s]) for s in sorted(done)]}
-            replace_text(json_path, json.dumps(document, indent=1) + "\n", "JSON file")
+            write_json(json_path, document)
         tqdm.write(done[seed].line())
     figures = summary([done[seed] for seed in seeds])
     document = {"settings": settings, "summary": figures, "outcomes": [asdict(done[s]) for s in sorted(done)]}
-    replace_text(json_path, json.dumps(document, indent=1) + "\n", "JSON file")
+    write_json(json_path, document)
     for name, value in figures.items():
         click.echo(f"{name:<24} {value if not isinstance(value, float) else format(value, '.4g')}")
 

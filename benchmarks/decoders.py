@@ -8,7 +8,6 @@ the wave adjoint and the same network. Interrupted, it goes on where it was: fea
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,14 +19,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from optics.cameras import resample
 from optics.device import Device, Sensor
-from optics.files import replace_text
+from optics.files import write_json
 from optics.page import pilot_mask, random_symbols, symbol_phases
 from optics.profile import Profile, load_profile
+from optics.progress import percent_bar
 from optics.recording import FramePair, hash_frames
 from optics.registration.calibrate import KnownPage, calibrate
 from optics.registration.calibration import Calibration, load_calibration
 from optics.simulator import SimulatedPage, Simulator, TrueOptics, true_parameters
-from train.cli_calibrate import calibration_bar
 from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
 from train.field import FieldRecovery, TorchFieldSolver
@@ -90,7 +89,7 @@ def calibrated(profile: Profile, simulator: Simulator, known: list[NDArray[np.ui
     if not path.exists():
         pages = [KnownPage(simulator.page(page), np.exp(1j * symbol_phases(page, LEVELS))) for page in known]
         twin, solver = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
-        with calibration_bar() as progress:
+        with percent_bar() as progress:
             fitted = calibrate(twin, solver, profile, simulator.references(), pages, progress)
         hashes = [hash_frames(page.pair) for page in pages]
         Calibration.from_registered(fitted, profile, hashes).save(path)
@@ -101,13 +100,12 @@ def arms(
     profile: Profile, device: Device, fitted: Calibration, references: FramePair, names: Sequence[str]
 ) -> list[Arm]:
     """The decoders of these names, each with what it may know."""
-    homodyne = device.homodyne
-    true_turn = homodyne.quadrature_sign * np.pi / 2 + np.deg2rad(homodyne.quadrature_error_deg)
     truth = true_parameters(profile, device)
     made = []
     for name in names:
         if name == "oracle":
-            extractor = FeatureExtractor(profile, truth, true_turn, references, "wave", with_signal_power=False)
+            turn = device.homodyne.turn_rad
+            extractor = FeatureExtractor(profile, truth, turn, references, "wave", with_signal_power=False)
         else:
             extractor = FeatureExtractor(profile, fitted.vector, fitted.turn_rad, references, name)
         made.append(Arm(name, extractor, without_power=name == "oracle"))
@@ -134,7 +132,7 @@ def gained_at_the_end(run: Path, steps: int) -> float:
 @click.option("--steps", type=click.IntRange(10), default=6000, show_default=True)
 @click.option("--channels", type=click.IntRange(4), default=Hyperparameters.channels, show_default=True)
 @click.option("--arm", "names", type=click.Choice(ARMS), multiple=True, default=ARMS, show_default=True)
-@click.option("--seed", type=int, default=5000, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=5000, show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for features, runs, figures.json.")
 def main(
     profile_name: str,
@@ -176,7 +174,7 @@ def main(
     for arm in arms(profile, device, fitted, simulator().references(), names):
         folder = out / arm.name
         key = f"{angle_deg} {full_well} {seed} {fitted.to_toml() if arm.name != 'oracle' else ''}"
-        fill(
+        preparing = fill(
             folder / "features",
             key,
             pages,
@@ -187,22 +185,25 @@ def main(
             FeatureStore(folder / "features", part)
             for part in (range(first), range(first, first + held), range(first + held, pages))
         )
-        module, best = fit_network(folder, choices, mask, LEVELS, training, validation)
-        p, phases = decode_pages(module, unseen)
+        trained = fit_network(folder, choices, mask, LEVELS, training, validation, devices=1)
+        p, phases = decode_pages(trained.module, unseen)
         rates[arm.name] = held_out_air(p, phases, mask, LEVELS)
         figures |= {
             f"{arm.name}_air": rates[arm.name],
-            f"{arm.name}_validation_air": best,
+            f"{arm.name}_validation_air": trained.validation_air,
+            f"{arm.name}_preparing_seconds": preparing,
+            f"{arm.name}_training_seconds": trained.seconds,
             f"{arm.name}_gained_in_last_fifth": gained_at_the_end(folder, steps),
         }
         click.echo(
             f"{arm.name:<10} held-out AIR {rates[arm.name]:.3f} bits/symbol; validation AIR gained "
-            f"{figures[f'{arm.name}_gained_in_last_fifth']:.3f} in the last fifth of {steps} steps"
+            f"{figures[f'{arm.name}_gained_in_last_fifth']:.3f} in the last fifth of {steps} steps; "
+            f"{trained.seconds / 60:.1f} min after {preparing / 60:.1f} min for simulation and features"
         )
         for name in rates:
             if "oracle" in rates and name != "oracle":
                 figures[f"{name}_over_oracle"] = rates[name] / rates["oracle"]
-        replace_text(out / "figures.json", json.dumps(figures, indent=2) + "\n", "JSON file")
+        write_json(out / "figures.json", figures)
     for name in rates:
         if f"{name}_over_oracle" in figures:
             click.echo(f"{name:<10} over the oracle {figures[f'{name}_over_oracle']:.3f}")

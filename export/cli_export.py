@@ -5,25 +5,27 @@ from __future__ import annotations
 import shutil
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import click
 import numpy as np
 from numpy.typing import NDArray
 
-from export.graph import TABLE_INPUTS, DecoderGraph, table_tensors
+from export.graph import FRAME_INPUTS, TABLE_INPUTS, DecoderGraph, table_tensors
 from export.onnx_files import decoder_onnx, twin_onnx
 from export.parity import check_parity, torch_answer
 from optics.errors import BundleError, InvalidInputError
+from optics.files import NewPath, OutputFile, write_json
+from optics.progress import Progress, percent_bar
 from optics.recording import FramePair
 from optics.registration.table import sampling_table
 from runtime.bundle import Bundle, npz, write_bundle
 from runtime.decoder import Decoder
 from runtime.frames import narrow
-from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest, Provenance
+from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version
+from runtime.ort import open_session
 from train.localizers.coherent import CoherentLocalizer
 from train.run import GOLDEN as RUN_GOLDEN
-from train.run import REFERENCES, load_network, load_run
+from train.run import REFERENCES, load_arrays, load_network, load_run
 from train.twin import RayTwin, TorchTwin
 
 PILOT_ARRAYS = {"mask": "pilots", "phases": "pilot_phases"}
@@ -34,17 +36,28 @@ _LEAST_CONTRAST = 2.0
 
 @click.command()
 @click.argument("run", type=click.Path(path_type=Path, exists=True, file_okay=False))
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="New bundle: a folder, or a .zip.")
+@click.option("--out", required=True, type=NewPath(), help="New bundle: a folder, or a .zip.")
 @click.option("--name", default=None, help="Name of the bundle; the profile's if left out.")
 @click.option("--version", "version", default="1", show_default=True)
-def export(run: Path, out: Path, name: str | None, version: str) -> None:
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def export(run: Path, out: Path, name: str | None, version: str, json_path: Path | None) -> None:
     """Export a training run, proving the bundle against torch with the runtime's own decoder."""
-    bundle, error = export_run(run, out, name, version)
+    with percent_bar() as progress:
+        bundle, error = export_run(run, out, name, version, progress)
     size = sum(len(data) for data in bundle.files.values())
+    if json_path is not None:
+        figures = {"bundle": str(out), "version": version, "parity_error": error, "unpacked_bytes": size}
+        write_json(json_path, figures)
     click.echo(f"{out}: version {version}, p within {error:.1e} of torch, {size / 1e6:.1f} MB unpacked")
 
 
-def export_run(folder: Path, out: Path, name: str | None = None, version: str = "1") -> tuple[Bundle, float]:
+def export_run(
+    folder: Path,
+    out: Path,
+    name: str | None = None,
+    version: str = "1",
+    progress: Progress = lambda step, share: None,
+) -> tuple[Bundle, float]:
     """Write the bundle of a run.
 
     Returns:
@@ -52,8 +65,9 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
 
     Raises:
         InvalidInputError: the run is unfinished or of a localizer that has no exported graph.
-        BundleError: the exported decoder does not say what torch says; nothing stays at `out`.
+        BundleError: `version` is none, or the exported decoder does not say what torch says; nothing stays at `out`.
     """
+    check_version(version, "--version")
     if out.exists():
         raise BundleError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     run = load_run(folder)
@@ -64,13 +78,20 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
     graph = DecoderGraph(profile, network, run.kappa_scale).eval()
     twin = RayTwin(profile)
     table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
-    kept, golden = _arrays(folder / REFERENCES), _arrays(folder / RUN_GOLDEN)
+    kept, golden = load_arrays(folder / REFERENCES), load_arrays(folder / RUN_GOLDEN)
     references, pair = (
         narrow(FramePair(arrays["in_phase"], arrays["quadrature"]), run.camera_bit_depth) for arrays in (kept, golden)
     )
     frame_dtype = pair.in_phase.dtype.name
     defaults = table_tensors(table, references.in_phase, references.quadrature)
+    progress("ask torch", 0.0)
     expected = torch_answer(graph, pair, defaults)
+    progress("decoder to ONNX", 0.2)
+    decoder = decoder_onnx(graph, frame_dtype, profile.frame_shape, defaults)
+    progress("ask ONNX Runtime", 0.6)
+    session = open_session(decoder, f"{out}: {DECODER}")
+    (answer,) = session.run(["p"], dict(zip(FRAME_INPUTS, (pair.in_phase, pair.quadrature), strict=True)))
+    error = check_parity(expected["p"], np.asarray(answer), str(out))
     manifest = Manifest(
         name=name or profile.name,
         version=version,
@@ -88,17 +109,17 @@ def export_run(folder: Path, out: Path, name: str | None = None, version: str = 
         provenance=Provenance(**run.provenance),
     )
     files = {
-        DECODER: decoder_onnx(graph, frame_dtype, profile.frame_shape, defaults),
+        DECODER: decoder,
         TWIN: twin_onnx(twin),
         GOLDEN: npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected["p"]),
         PILOTS: npz(**{name: kept[key] for name, key in PILOT_ARRAYS.items() if key in kept}),
     }
+    progress("load the bundle as the service does", 0.8)
     partial = out.with_name(f".{out.stem}-unproven{out.suffix}")
     _remove(partial)
     try:
         write_bundle(partial, manifest, files)
-        decoder = Decoder.load(partial)
-        error = check_parity(expected["p"], decoder.infer(pair).p, str(out))
+        Decoder.load(partial)
     finally:
         _remove(partial)
     write_bundle(out, manifest, files)
@@ -110,15 +131,6 @@ def _residual_limit(graph: DecoderGraph, pair: FramePair, defaults: dict[str, ND
     right = float(torch_answer(graph, pair, defaults)["residual"])
     swapped = float(torch_answer(graph, FramePair(pair.quadrature, pair.in_phase), defaults)["residual"])
     return float(np.sqrt(right * swapped)) if swapped > _LEAST_CONTRAST * right else None
-
-
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Arrays of a file of the run."""
-    try:
-        with np.load(path) as kept:
-            return dict(kept)
-    except (OSError, ValueError) as error:
-        raise InvalidInputError(f"run file {path}", error, "a file of a finished run") from None
 
 
 def _remove(path: Path) -> None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from optics.profile import Profile
-from train.field import FieldRecovery, unexplained
+from train.field import FieldRecovery, relative_power
 from train.localizers.coherent import CoherentLocalizer
 from train.network import SymbolUNet
 
@@ -25,6 +25,7 @@ TABLE_INPUTS = (
 )
 """Inputs that carry the calibrated table as their default and may be fed instead."""
 OUTPUTS = ("p", "phase", "concentration", "residual", "field", "unexplained")
+"""`unexplained` is what is left of the homodyne equations, [2, Gy, Gx]; `residual` its power over the field's."""
 
 
 class DecoderGraph(nn.Module):
@@ -69,7 +70,7 @@ class DecoderGraph(nn.Module):
         p = self.network(light.flatten(0, 2)[None], positions[None])[0] * self.kappa_scale
         phase = torch.atan2(p[1], p[0])
         concentration = torch.sqrt((p * p).sum(0))
-        return p, phase, concentration, unexplained(field, left), field, left
+        return p, phase, concentration, relative_power(left, field), field, left
 
 
 def table_tensors(

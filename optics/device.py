@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -72,6 +73,11 @@ class Homodyne(Table):
     quadrature_error_deg: Annotated[float, Field(ge=-89, le=89, allow_inf_nan=False)] = 3.0
     quadrature_gain: Annotated[float, Field(ge=0.01, le=100, allow_inf_nan=False)] = 0.95
     quadrature_sign: Literal[-1, 1] = 1
+
+    @property
+    def turn_rad(self) -> float:
+        """Angle between the arms, sign of Q included."""
+        return self.quadrature_sign * math.pi / 2 + math.radians(self.quadrature_error_deg)
 
 
 class SlmDefects(Table):

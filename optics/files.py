@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import click
 
 from optics.errors import InvalidInputError
 
 
-def replace_text(path: str | Path, text: str, thing: str = "file") -> None:
-    """Write `text` to `path` as UTF-8, replacing what is there in one step.
+def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], thing: str = "file") -> None:
+    """Have `write` fill a file, and replace what is at `path` by it in one step.
 
     Args:
         path: final name, in a folder that exists.
-        text: the content.
+        write: writes the content.
         thing: what the file is, for the error message.
 
     Raises:
@@ -27,8 +30,8 @@ def replace_text(path: str | Path, text: str, thing: str = "file") -> None:
     try:
         descriptor, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
         try:
-            with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-                file.write(text)
+            with os.fdopen(descriptor, "wb") as file:
+                write(file)
             os.chmod(name, 0o644)
             os.replace(name, path)
         except BaseException:
@@ -36,6 +39,49 @@ def replace_text(path: str | Path, text: str, thing: str = "file") -> None:
             raise
     except OSError as error:
         raise InvalidInputError(f"{thing} {path}", error, "a path that can be written") from None
+
+
+def replace_text(path: str | Path, text: str, thing: str = "file") -> None:
+    """Write `text` to `path` as UTF-8, replacing what is there in one step; see `replace_file`."""
+    replace_file(path, lambda file: file.write(text.encode()), thing)
+
+
+def write_json(path: str | Path, data: Any) -> None:
+    """Write `data` to `path` as JSON, null for what is not a number, replacing what is there in one step.
+
+    Raises:
+        InvalidInputError: the path cannot be written.
+    """
+    replace_text(path, json.dumps(_plain(data), indent=2, allow_nan=False) + "\n", "JSON file")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+class NewPath(click.ParamType[Path]):
+    """An option that names a new file or folder: known before the work begins to be one that can be made."""
+
+    name = "path"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path.
+
+        Raises:
+            InvalidInputError: its folder cannot be written.
+        """
+        path = Path(value)
+        folder = path.absolute().parent
+        while not folder.exists():
+            folder = folder.parent
+        _check_writable(folder, path, param)
+        return path
 
 
 class OutputFile(click.ParamType[Path]):
@@ -50,11 +96,18 @@ class OutputFile(click.ParamType[Path]):
             InvalidInputError: it is a folder, or its folder is missing or cannot be written.
         """
         path = Path(value)
-        thing = f"{param.opts[0]} {path}" if param is not None else str(path)
         if path.is_dir():
-            raise InvalidInputError(thing, "a folder", "a file")
-        try:
-            tempfile.TemporaryFile(dir=path.absolute().parent).close()
-        except OSError as error:
-            raise InvalidInputError(thing, error, "a path that can be written") from None
+            raise InvalidInputError(_option(path, param), "a folder", "a file")
+        _check_writable(path.absolute().parent, path, param)
         return path
+
+
+def _option(path: Path, param: click.Parameter | None) -> str:
+    return f"{param.opts[0]} {path}" if param is not None else str(path)
+
+
+def _check_writable(folder: Path, path: Path, param: click.Parameter | None) -> None:
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise InvalidInputError(_option(path, param), error, "a path that can be written") from None

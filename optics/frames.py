@@ -8,12 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.errors import FrameError
+from optics.recording_layout import FramePair
 
 BLACK_FRACTION = 0.02
 """A frame whose brightest pixel is below this share of full scale is dark: its laser or its shutter is off."""
 
 SATURATED_FRACTION = 0.05
 """Share of pixels at full scale from which on a frame is overexposed; speckle peaks clip about one in a hundred."""
+
+
+def check_pair_light(thing: str, pair: FramePair, bit_depth: int) -> None:
+    """Check the counts of both frames of a pair; `thing` goes before the frame's name in the error.
+
+    Raises:
+        FrameError: see `check_light`.
+    """
+    check_light(f"{thing}in-phase frame", pair.in_phase, bit_depth)
+    check_light(f"{thing}quadrature frame", pair.quadrature, bit_depth)
 
 
 def check_light(name: str, frame: NDArray[np.integer[Any]], bit_depth: int) -> None:

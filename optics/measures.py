@@ -27,11 +27,6 @@ _ALIASING = 60.0
 _CHUNK = 8192
 
 
-def log_i0(kappa: Floats) -> Floats:
-    """Natural logarithm of the modified Bessel function I0, safe for any kappa."""
-    return np.asarray(np.log(i0e(kappa)) + kappa, np.float64)
-
-
 def mean_resultant(kappa: Floats) -> Floats:
     """I1(kappa) / I0(kappa): the mean cosine of the error that a concentration promises."""
     return np.asarray(i1e(kappa) / i0e(kappa), np.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from importlib import resources
 from pathlib import Path
@@ -98,6 +99,11 @@ class Profile(Table):
     def page_width_m(self) -> float:
         """Width of the page on the SLM, metres."""
         return self.page.columns * self.page.symbol_size_px * self.slm.pitch_m
+
+    @property
+    def corner_m(self) -> float:
+        """Distance of the page's corner from its centre, metres: aberrations and distortions are stated there."""
+        return math.hypot(self.page_width_m, self.page_height_m) / 2
 
     @property
     def page_height_m(self) -> float:

@@ -18,9 +18,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from optics.errors import RecordingError
+from optics.errors import ProfileError, RecordingError
 from optics.page import MAX_LEVELS, MIN_LEVELS
-from optics.profile import Profile
+from optics.profile import Profile, parse_profile
 from optics.recording_layout import (
     FORMAT,
     FRAMES,
@@ -190,6 +190,26 @@ class Recording:
                 f"{_size(profile.page_shape)} (profile {profile.name})",
             )
 
+    def differences(self, profile: Profile) -> list[str]:
+        """What the recording's own nominal profile says otherwise than `profile`, a line each.
+
+        Empty where it has none that can be read: another program's notes are no reason to stop.
+        """
+        try:
+            own = None if self._profile_text is None else parse_profile(self._profile_text, "profile of the recording")
+        except ProfileError:
+            own = None
+        if own is None:
+            return []
+        told, wanted = own.model_dump(), profile.model_dump()
+        return [
+            f"{table}.{key} = {value} (profile {profile.name}: {wanted[table][key]})"
+            for table, values in told.items()
+            if isinstance(values, dict)
+            for key, value in values.items()
+            if wanted[table][key] != value
+        ]
+
     def _thing(self, name: str) -> str:
         return f"recording {self.path}: {name}"
 
@@ -264,14 +284,19 @@ class Recording:
                 raise RecordingError(thing, f"type {dataset.dtype}", f"{wanted_type} for {self._bit_depth} bits")
             if dataset.shape != shape:
                 raise RecordingError(thing, f"shape {dataset.shape}", f"shape {shape}, as 'in_phase' has")
-            if 0 in dataset.shape[-2:]:
-                raise RecordingError(thing, f"shape {dataset.shape}", "at least one pixel")
+            if 0 in dataset.shape:
+                raise RecordingError(thing, f"shape {dataset.shape}", "at least one page and one pixel")
 
     def _check_page(self) -> None:
         if "pilots" in self._file:
             pilots = self._dataset("pilots", 2)
             if pilots.dtype.kind not in "bui":
                 raise RecordingError(self._thing("dataset 'pilots'"), f"type {pilots.dtype}", "booleans")
+            known = np.count_nonzero(self._read("pilots", ()))
+            if not 0 < known < pilots.size:
+                raise RecordingError(
+                    self._thing("dataset 'pilots'"), f"{known} pilots of {pilots.size} symbols", "some of them, not all"
+                )
         if not self.has_symbols:
             return
         symbols = self._dataset("symbols", 3)

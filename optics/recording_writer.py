@@ -129,7 +129,7 @@ class RecordingWriter:
             truth: what only a simulator knows, one array a name, of the same shape and type on every page.
 
         Raises:
-            RecordingError: wrong frames, or symbols or truth on some pages only.
+            RecordingError: wrong frames, symbols or truth on some pages only, or a page that cannot be written.
             PageError: symbols of the wrong shape or range.
         """
         data = {name: self._checked(name, getattr(frames, name)) for name in FRAMES}
@@ -139,12 +139,15 @@ class RecordingWriter:
                 raise PageError(f"{self._thing}: symbols", f"shape {data['symbols'].shape}", "one page [ny, nx]")
         data |= {f"truth/{name}": np.asarray(value) for name, value in (truth or {}).items()}
         self._check_same_datasets(data)
-        for name, value in data.items():
-            self._write_page(name, value)
-        # The count comes last: pages beyond it were cut off in the middle, and resuming drops them.
+        try:
+            for name, value in data.items():
+                self._write_page(name, value)
+            # The count comes last: pages beyond it were cut off in the middle, and resuming drops them.
+            self._file.attrs["pages_complete"] = self._pages + 1
+            self._file.flush()
+        except OSError as error:
+            raise RecordingError(f"{self._thing}: page {self._pages}", error, "room for it on the disk") from None
         self._pages += 1
-        self._file.attrs["pages_complete"] = self._pages
-        self._file.flush()
 
     def set_truth(self, device_toml: str) -> None:
         """Keep the true state of a simulated device as TOML text, where no decoder looks."""

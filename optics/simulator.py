@@ -79,11 +79,6 @@ class TrueOptics:
         return x, y
 
     @cached_property
-    def corner_m(self) -> float:
-        """Distance of the page's corner from its centre."""
-        return float(np.hypot(self.profile.page_width_m, self.profile.page_height_m) / 2)
-
-    @cached_property
     def camera_axes_m(self) -> tuple[Real, Real]:
         """Uniform axes (x, y) of the computed camera plane, at the cameras' pitch."""
         camera = self.profile.camera
@@ -115,8 +110,8 @@ class TrueOptics:
     def slm_factor(self) -> Complex:
         """Illumination and the launch side's aberrations on the SLM's pixels [ny, nx], complex."""
         page_x, page_y = self.page_axes_m
-        x = (page_x - page_x.mean())[None, :] / self.corner_m
-        y = (page_y - page_y.mean())[:, None] / self.corner_m
+        x = (page_x - page_x.mean())[None, :] / self.profile.corner_m
+        y = (page_y - page_y.mean())[:, None] / self.profile.corner_m
         radius2 = x**2 + y**2
         aberration = self.device.aberration
         phase = (
@@ -154,7 +149,7 @@ class TrueOptics:
         phase = (
             knobs.tilt_x_rad * x / half_width
             + knobs.tilt_y_rad * y / half_height
-            + knobs.curvature_rad * (x**2 + y**2) / self.corner_m**2
+            + knobs.curvature_rad * (x**2 + y**2) / self.profile.corner_m**2
         )
         rng = np.random.default_rng([knobs.ripple_seed, _RIPPLE])
         ripple = np.zeros((len(axis_y), len(axis_x)))
@@ -170,7 +165,7 @@ class TrueOptics:
             update={"shift_x_px": pose.shift_x_px + shift_px[0], "shift_y_px": pose.shift_y_px + shift_px[1]}
         )
         distortion = self.device.aberration.distortion_relative
-        return CameraView(self.profile.camera, moved, distortion, self.corner_m).positions_m()
+        return CameraView(self.profile.camera, moved, distortion, self.profile.corner_m).positions_m()
 
     @property
     def electrons_per_unit(self) -> float:

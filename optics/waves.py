@@ -6,7 +6,7 @@ y' = +-w/2 with y' = x sin t + y cos t, and the field vanishes on them. The comm
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -306,11 +306,3 @@ class WaveChannel:
         """Field on the camera plane back to the SLM: undoes the pipe exactly, the chain inside the pipe's band."""
         at_entrance = self.pipe.adjoint(self.delaunch_lens.to_facet(field))
         return self.launch_lens.to_plane(at_entrance * self.entrance_window)
-
-    def with_steps(self, steps: int) -> WaveChannel:
-        """The same channel at another number of splitting steps."""
-        return replace(self, steps=steps)
-
-    def with_camera_grid(self, x_m: Real, y_m: Real) -> WaveChannel:
-        """The same channel seen on another camera-plane grid."""
-        return replace(self, camera_x_m=x_m, camera_y_m=y_m)

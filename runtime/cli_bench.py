@@ -10,7 +10,7 @@ import click
 import numpy as np
 from tqdm import tqdm
 
-from optics.files import OutputFile
+from optics.files import OutputFile, write_json
 from runtime.client import LightpageClient
 from runtime.cpus import available_cpus
 from runtime.dataplane import DataPlane
@@ -18,7 +18,6 @@ from runtime.decoder import Decoder
 from runtime.recalibrator import Recalibrator
 from runtime.refit import refit
 from runtime.registry import ModelRegistry
-from runtime.report import write_json
 from runtime.server import LightpageServer
 from runtime.shipped import DEFAULT, bundle_path
 

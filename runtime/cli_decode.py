@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from optics.errors import InvalidInputError
-from optics.files import OutputFile
+from optics.files import OutputFile, write_json
 from optics.measures import PageMeasures, measure
 from optics.page import pilot_symbols
 from optics.profile import parse_profile
@@ -25,7 +25,6 @@ from runtime.errors import SourceError
 from runtime.frames import narrow
 from runtime.phase_shift import LEAST_COHERENCE
 from runtime.refused import RefusedPage, refusal
-from runtime.report import write_json
 
 
 @click.command()

@@ -6,12 +6,11 @@ import time
 from pathlib import Path
 
 import click
-from tqdm import tqdm
 
 from optics.errors import InvalidInputError
-from optics.files import OutputFile
-from runtime.demo import DemoResult, run_demo
-from runtime.report import write_json
+from optics.files import OutputFile, write_json
+from optics.progress import percent_bar
+from runtime.demo import AIR_LEVELS, LEVELS, DemoResult, run_demo
 from runtime.shipped import DEFAULT, bundle_path
 
 
@@ -35,12 +34,7 @@ def demo(bundle: str, out: Path, pages: int, seed: int, json_path: Path | None) 
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
-    with tqdm(total=100, unit="%", bar_format="{desc}{percentage:3.0f}%|{bar}| {elapsed}") as bar:
-
-        def progress(what: str, share: float) -> None:
-            bar.set_description(what)
-            bar.update(max(0.0, 100 * share - bar.n))
-
+    with percent_bar() as progress:
         result = run_demo(bundle_path(bundle), pages, seed, progress)
     figures = result.to_json() | {"seconds": time.perf_counter() - start}
     write_json(out / "demo.json", figures)
@@ -54,14 +48,15 @@ def demo(bundle: str, out: Path, pages: int, seed: int, json_path: Path | None) 
 def describe(result: DemoResult) -> str:
     """The figures as a table for people."""
     lines = [
-        f"{'device':<16}{'model':<16}{'AIR, bit/symbol':>16}{'confidence':>12}{'error rate':>12}{'decode, ms':>12}"
+        f"{'device':<16}{'model':<16}{'AIR, bit/symbol*':>17}{'confidence':>12}{'error rate':>12}{'decode, ms':>12}"
     ]
     lines += [
-        f"{phase.name:<16}{phase.model_version:<16}{phase.air_bits_per_symbol:>16.3f}{phase.confidence.mean():>12.3f}"
+        f"{phase.name:<16}{phase.model_version:<16}{phase.air_bits_per_symbol:>17.3f}{phase.confidence.mean():>12.3f}"
         f"{phase.symbol_error_rate:>12.4f}{1e3 * phase.seconds:>12.0f}"
         for phase in result.phases
     ]
     found = result.recalibrated
     angle = "" if found.angle_deg is None else f", pipe angle {found.angle_deg:.3f} degree"
     lines.append(f"\nrecalibrated with {found.pages_used} known pages in {found.seconds:.0f} s{angle}")
+    lines.append(f"* what a phase carries, counted in {AIR_LEVELS} levels; the pages hold {LEVELS}, as confidence does")
     return "\n".join(lines)

@@ -7,13 +7,12 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
-from optics.files import OutputFile
+from optics.files import OutputFile, write_json
 from optics.recording import Recording
 from runtime.decoder import Decoder
 from runtime.evaluation import Evaluation
 from runtime.evaluation import evaluate as evaluate_recording
 from runtime.refused import refusal
-from runtime.report import write_json
 from runtime.shipped import DEFAULT, bundle_path
 from runtime.tracking import NoTracker, tracker_for
 

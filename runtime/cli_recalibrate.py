@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import click
-from tqdm import tqdm
 
 from optics.errors import InvalidInputError, RecordingError
-from optics.files import OutputFile
+from optics.files import NewPath, OutputFile, write_json
+from optics.progress import percent_bar
 from optics.recording import Recording
 from runtime.client import LightpageClient, Recalibrated
 from runtime.decoder import Decoder
@@ -21,7 +19,6 @@ from runtime.recalibration import KnownPages, RecalibrationOutcome, next_version
 from runtime.recalibration import recalibrate as recalibrate_bundle
 from runtime.recalibrator import known_pages
 from runtime.refit import refit
-from runtime.report import write_json
 from runtime.shipped import bundle_path
 
 DEFAULT_PAGES = 2
@@ -30,7 +27,7 @@ DEFAULT_PAGES = 2
 @click.command()
 @click.option("--bundle", help="Offline: the bundle to start from, a path or a shipped name.")
 @click.option("--recording", help="Pages with known symbols: a file, or with --target a name in the service's folder.")
-@click.option("--out", type=click.Path(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
+@click.option("--out", type=NewPath(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
 @click.option("--target", metavar="HOST:PORT", help="Recalibrate this running service instead of a bundle.")
 @click.option("--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(2), help="Known pages to use.")
 @click.option("--version", help="Offline: version of the new bundle; by default the next one.")
@@ -38,7 +35,7 @@ DEFAULT_PAGES = 2
 def recalibrate(
     bundle: str | None,
     recording: str | None,
-    out: str | None,
+    out: Path | None,
     target: str | None,
     pages: int,
     version: str | None,
@@ -57,7 +54,7 @@ def recalibrate(
     else:
         if not (bundle and recording and out):
             raise InvalidInputError("options", "not all of them", "--bundle, --recording and --out, or --target")
-        result = _offline(bundle, recording, Path(out), pages, version)
+        result = _offline(bundle, recording, out, pages, version)
     data = summary(result, time.perf_counter() - start)
     if json_path is not None:
         write_json(json_path, data)
@@ -81,20 +78,8 @@ def summary(result: RecalibrationOutcome | Recalibrated, seconds: float) -> dict
     }
 
 
-@contextmanager
-def _bar() -> Iterator[Callable[[str, float], None]]:
-    """A progress bar as the callback that a recalibration calls."""
-    with tqdm(total=100, unit="%", bar_format="{desc}{percentage:3.0f}%|{bar}| {elapsed}") as bar:
-
-        def progress(step: str, fraction: float) -> None:
-            bar.set_description(step)
-            bar.update(max(0.0, 100 * fraction - bar.n))
-
-        yield progress
-
-
 def _remote(target: str, recording: str | None, pages: int) -> Recalibrated:
-    with LightpageClient(target) as client, _bar() as progress:
+    with LightpageClient(target) as client, percent_bar() as progress:
         return client.recalibrate(count=pages, recording=recording, progress=progress)
 
 
@@ -104,7 +89,7 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
     if version is not None:
         check_version(version, "--version")
     decoder = Decoder.load(bundle_path(bundle))
-    with _bar() as progress:
+    with percent_bar() as progress:
         known = _read(decoder, recording, pages)
         new = next_version(decoder.version) if version is None else version
         return recalibrate_bundle(decoder, known, out, new, refit, progress)

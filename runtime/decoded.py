@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -42,11 +44,16 @@ class DecodedWriter:
         self._pages: list[int] = []
 
     def append(self, page: RemotePage) -> None:
-        """Add one page."""
-        for name, values in (("symbols", page.symbols), ("confidence", page.confidence)):
-            dataset = self._dataset(name, values.shape, values.dtype)
-            dataset.resize(len(self._versions) + 1, axis=0)
-            dataset[-1] = values
+        """Add one page.
+
+        Raises:
+            InvalidInputError: it cannot be written.
+        """
+        with self._writing():
+            for name, values in (("symbols", page.symbols), ("confidence", page.confidence)):
+                dataset = self._dataset(name, values.shape, values.dtype)
+                dataset.resize(len(self._versions) + 1, axis=0)
+                dataset[-1] = values
         self._pages.append(len(self._pages) if page.page is None else page.page)
         self._versions.append(page.model_version)
 
@@ -56,14 +63,24 @@ class DecodedWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self._file["model_versions"] = np.array(self._versions, dtype=h5py.string_dtype())
-            self._file["pages"] = np.array(self._pages, np.int64)
-        self._file.close()
-        if kind is None:
-            os.replace(self._partial, self.path)
-        else:
+        try:
+            if kind is None:
+                with self._writing():
+                    self._file["model_versions"] = np.array(self._versions, dtype=h5py.string_dtype())
+                    self._file["pages"] = np.array(self._pages, np.int64)
+                    self._file.close()
+                    os.replace(self._partial, self.path)
+        finally:
+            with suppress(OSError):
+                self._file.close()
             self._partial.unlink(missing_ok=True)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InvalidInputError(f"output {self.path}", error, "a path with room for it") from None
 
     def _dataset(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> h5py.Dataset:
         if name not in self._file:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from optics.device import CameraPose, Device
 from optics.errors import InvalidInputError
 from optics.measures import achievable_rate
+from optics.progress import Progress
 from runtime.client import LightpageClient, Recalibrated
 from runtime.convert import RemotePage
 from runtime.dataplane import DataPlane
@@ -25,7 +26,6 @@ from runtime.sources import SimulatorSource
 from runtime.tracking import tracker_for
 
 Floats = NDArray[np.float64]
-Progress = Callable[[str, float], None]
 
 LEVELS = 16
 AIR_LEVELS = 256
@@ -91,6 +91,7 @@ class DemoResult:
             "seed": self.seed,
             "pages": self.pages,
             "levels": LEVELS,
+            "air_levels": AIR_LEVELS,
             "phases": [phase.to_json() for phase in self.phases],
             "recalibration": {
                 "model_version": recalibrated.model_version,

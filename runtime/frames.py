@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,15 @@ def check_pair(pair: FramePair, shape: tuple[int, int], dtype: str, bit_depth: i
     """
     for name, frame in (("in-phase frame", pair.in_phase), ("quadrature frame", pair.quadrature)):
         _check_frame(name, frame, shape, dtype, bit_depth)
+
+
+@contextmanager
+def named(thing: str) -> Iterator[None]:
+    """Put `thing` before what a `FrameError` names."""
+    try:
+        yield
+    except FrameError as error:
+        raise FrameError(thing + error.thing, error.got, error.wanted) from error
 
 
 def _check_frame(name: str, frame: NDArray[Any], shape: tuple[int, int], dtype: str, bit_depth: int) -> None:

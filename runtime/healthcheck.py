@@ -16,15 +16,18 @@ def is_serving(target: str, *, service: str = "", timeout_s: float = 3.0) -> tup
     """Ask `target` (HOST:PORT) for the health of `service`, "" being the server as a whole.
 
     Returns whether it serves, and one line that says what was heard. An unreachable, silent or unknowing server is not
-    healthy; it raises nothing, since to find that out is the question.
+    healthy; it raises nothing, since to find that out is the question. One that turns calls away since it is full
+    serves: to restart it would lose what it works on. `Watch` is asked for its first answer, as the service keeps
+    threads for it that no decode takes.
     Source: the gRPC health checking protocol, grpc.health.v1.
     """
     with grpc.insecure_channel(target, options=[("grpc.enable_http_proxy", 0)]) as channel:
         stub = health_pb2_grpc.HealthStub(channel)
         try:
-            response = stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=timeout_s)
+            response = next(iter(stub.Watch(health_pb2.HealthCheckRequest(service=service), timeout=timeout_s)))
         except grpc.RpcError as error:
-            return False, f"{target}: {error.code().name}: {error.details()}"
+            full = error.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+            return full, f"{target}: {error.code().name}: {error.details()}"
     status = health_pb2.HealthCheckResponse.ServingStatus.Name(response.status)
     return response.status == health_pb2.HealthCheckResponse.SERVING, f"{target}: {status}"
 

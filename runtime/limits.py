@@ -14,7 +14,7 @@ PAIR_BYTES = 256 << 20
 """Both frames of a pair: three times a full-scale 20-megapixel pair of 16 bits."""
 
 REPLY_BYTES = 64 << 20
-"""One reply: symbols, float32 confidence, concentration and phase of a full-scale page are 4 MB."""
+"""One reply: symbols, float32 confidence, concentration and phase of 700 x 450 symbols are 4 MB."""
 
 CONCURRENT_RECEIVES = 8
 """Frame pairs being received, each with its buffer: bounds memory, leaves room for slow senders."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,13 +18,12 @@ from optics.errors import CalibrationError, FrameError, InvalidInputError, Recal
 from optics.measures import measure
 from optics.page import check_symbols
 from optics.pilots import Pilots
+from optics.progress import Progress
 from optics.recording import FramePair, hash_frames
 from runtime.bundle import Bundle, Table, npz, write_bundle
 from runtime.decoder import Decoder
+from runtime.frames import named
 from runtime.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
-
-Progress = Callable[[str, float], None]
-"""Called with what is being done and how far it is, 0..1. It may raise to stop the work."""
 
 _RECALIBRATED = re.compile(r"(.*)\+r(\d+)")
 
@@ -49,7 +48,7 @@ class KnownPages:
         pairs: frame pairs, one a page.
         symbols: what was written, uint8 [ny, nx], one a page.
         levels: M of those symbols.
-        references: reference-only frames taken with them, or None: then the bundle's hold.
+        references: reference-only frames taken with them, or None: then those of the last recalibration hold.
         pilot_mask: where the pilots are, bool [ny, nx], or None for the device's usual positions.
     """
 
@@ -70,11 +69,13 @@ class KnownPages:
         if len(self.pairs) < MIN_PAGES or len(self.pairs) != len(self.symbols):
             got = f"{len(self.pairs)} frame pairs and {len(self.symbols)} pages of symbols"
             raise InvalidInputError("pages to recalibrate with", got, f"at least {MIN_PAGES} of both")
-        for pair, symbols in zip(self.pairs, self.symbols, strict=True):
-            decoder.check(pair)
-            check_symbols(symbols, decoder.bundle.profile.page_shape, self.levels, "known symbols")
+        for number, (pair, symbols) in enumerate(zip(self.pairs, self.symbols, strict=True)):
+            with named(f"known page {number}: "):
+                decoder.check(pair)
+            check_symbols(symbols, decoder.bundle.profile.page_shape, self.levels, f"known page {number}: symbols")
         if self.references is not None:
-            decoder.check(self.references)
+            with named("reference: "):
+                decoder.check(self.references)
 
     def part(self, pages: slice) -> KnownPages:
         """Some of the pages, the rest as it is."""
@@ -184,7 +185,6 @@ def recalibrate(
     progress("write the new bundle", 0.95)
     files, manifest = _new_contents(decoder, held_back.pairs[0], pages, result, version, before, after)
     write_bundle(out, manifest, files)
-    progress("done", 1.0)
     return RecalibrationOutcome(
         path=out,
         version=version,

@@ -18,16 +18,17 @@ from optics.errors import (
     RecalibrationRefusedError,
     RecordingError,
 )
+from optics.progress import Progress
 from optics.recording import Recording
 from runtime.archive import check_name
 from runtime.bundle import Bundle
 from runtime.caller import Caller, CallerLeft
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
-from runtime.errors import SourceError
+from runtime.errors import SourceError, StoppingError
 from runtime.evaluation import check_recording
 from runtime.frames import narrow
-from runtime.recalibration import Fit, KnownPages, Progress, RecalibrationOutcome, next_version, recalibrate
+from runtime.recalibration import Fit, KnownPages, RecalibrationOutcome, next_version, recalibrate
 from runtime.sources import FrameSource, own_fault
 from runtime.store import ModelStore
 
@@ -79,18 +80,22 @@ class Recalibrator:
     def from_recording(self, name: str, count: int, caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
         """Recalibrate with the first `count` pages (0: all) of a recording in the recordings folder.
 
-        Yields and raises as `from_source`, and `RecordingError` for another device's recording or too short a one.
+        Yields and raises as `from_source`, and `RecordingError` for another device's recording or too short a one; one
+        that is damaged or dark is the service's fault, as a source is.
         """
         path = self._path(name)
         self._check_count(count)
 
         def read() -> KnownPages:
-            with Recording.open(path) as recording:
+            with own_fault():
+                opened = Recording.open(path)
+            with opened as recording:
                 check_recording(self._plane.registry.current.decoder, recording)
                 if recording.pages < count:
                     raise RecordingError(f"recording {name}", f"{recording.pages} pages", f"at least {count}")
                 self._check_count(count or recording.pages)
-                return known_pages(recording, range(count or recording.pages))
+                with own_fault():
+                    return known_pages(recording, range(count or recording.pages))
 
         return self._run(read, caller)
 
@@ -110,7 +115,9 @@ class Recalibrator:
         left = threading.Event()
 
         def progress(name: str, fraction: float) -> None:
-            if left.is_set() or self._stop.is_set():
+            if self._stop.is_set():
+                raise StoppingError("recalibration", "a service that stops", "one that serves; nothing was changed")
+            if left.is_set():
                 raise CallerLeft
             steps.put(Step(name, fraction))
 
@@ -140,6 +147,8 @@ class Recalibrator:
     def _work(self, pages: KnownPages, progress: Progress) -> RecalibrationOutcome:
         plane = self._plane
         model = plane.registry.current
+        with own_fault():  # the pages are the service's own
+            pages.check(model.decoder)
         held = [m.version for m in plane.registry.models]
         taken = [*held, *(plane.store.versions() if plane.store is not None else [])]
         version = next_version(model.version, taken)
@@ -176,7 +185,7 @@ class Recalibrator:
         elif isinstance(result, RecalibrationRefusedError):
             name = "refused"
         else:
-            name = "dropped" if isinstance(result, CallerLeft) else "failed"
+            name = "dropped" if isinstance(result, CallerLeft | StoppingError) else "failed"
         self._plane.metrics.recalibrations.labels(name).inc()
 
     def _check_count(self, count: int) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from optics.errors import CalibrationError
 from optics.page import symbol_phases
+from optics.progress import Progress
 from optics.recording import FramePair, hash_frames
 from optics.registration.calibrate import KnownPage, refine
 from optics.registration.calibration import Calibration
@@ -13,7 +14,7 @@ from optics.registration.table import sampling_table
 from runtime.bundle import Bundle
 from runtime.calibrated import calibration_of
 from runtime.decoder import Decoder
-from runtime.recalibration import FitReport, FitResult, KnownPages, Progress
+from runtime.recalibration import FitReport, FitResult, KnownPages
 from runtime.twin import OnnxTwin
 
 _TWIN_THREADS = 1

@@ -74,6 +74,8 @@ class LightpageServer:
     @property
     def target(self) -> str:
         """Where a client on this machine finds it."""
+        if self._address.startswith("unix:"):
+            return self._address
         host = self._address.rpartition(":")[0]
         return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
 

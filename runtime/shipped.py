@@ -9,9 +9,7 @@ DEFAULT = "bench"
 
 
 def bundle_path(name_or_path: str) -> Path:
-    """A path as it is; a shipped bundle's name, e.g. ``bench``, as the path where it was installed."""
+    """A shipped bundle's name, e.g. ``bench``, as the path where it was installed; any other path, e.g. ``./bench``."""
     path = Path(name_or_path)
-    if path.exists() or path.name != name_or_path or path.suffix:
-        return path
     shipped = Path(str(resources.files("runtime"))) / "bundles" / f"{name_or_path}.zip"
-    return shipped if shipped.is_file() else path
+    return shipped if name_or_path == path.name and shipped.is_file() else path

@@ -19,7 +19,7 @@ from optics.errors import (
 )
 from runtime import errors as service_errors
 from runtime.caller import CallerLeft
-from runtime.errors import SlotsTakenError, SourceError
+from runtime.errors import SlotsTakenError, SourceError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 DETAIL_KEY = "lightpage-error-bin"
@@ -30,6 +30,7 @@ _CODES: tuple[tuple[type[BaseException], grpc.StatusCode], ...] = (
     (SlotsTakenError, grpc.StatusCode.RESOURCE_EXHAUSTED),
     (BusyError, grpc.StatusCode.ABORTED),
     (SourceError, grpc.StatusCode.FAILED_PRECONDITION),
+    (StoppingError, grpc.StatusCode.UNAVAILABLE),
     (BundleError, grpc.StatusCode.FAILED_PRECONDITION),
     (RecalibrationRefusedError, grpc.StatusCode.FAILED_PRECONDITION),
     (CalibrationError, grpc.StatusCode.FAILED_PRECONDITION),

@@ -105,15 +105,17 @@ class ShiftTracker:
     def update(self, pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> bool:
         """Take in the shift that `page`, decoded with `table`, still shows; whether it was a jump.
 
-        A jump is believed at once. A page decoded with a table that has been replaced since is left out: its remainder
-        is already accounted for.
+        A jump is believed at once. From a page decoded with a table that has been replaced since nothing is learnt: its
+        remainder is already accounted for, and decoding it again with the new table pays if it was a jump.
         """
         rest = self._measure(pair, page, table, pilots)
-        with self._lock:
-            if rest is None or table is not self._table:
-                return False
-            before = self._shift
+        if rest is None:
+            return False
         jumped = max(abs(rest.x_px), abs(rest.y_px)) > JUMP_PX
+        with self._lock:
+            if table is not self._table:
+                return jumped
+            before = self._shift
         gain = 1.0 if jumped else self._gain
         after = Shift(self._step(before.x_px, gain * rest.x_px), self._step(before.y_px, gain * rest.y_px))
         moved = self._move(after)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import click
 import numpy as np
-from tqdm import tqdm
 
 from optics.errors import RecordingError
-from optics.files import OutputFile, replace_text
+from optics.files import OutputFile, write_json
 from optics.profile import Profile, load_profile
+from optics.progress import Progress, percent_bar
 from optics.recording import Recording
 from optics.registration.calibrate import calibrate as register
 from optics.registration.calibration import Calibration
@@ -39,12 +36,12 @@ def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_pa
     """Find this device's geometry, from nominal, with the first pages of a recording."""
     profile = load_profile(profile_name)
     start = time.perf_counter()
-    with Recording.open(recording) as file, calibration_bar() as progress:
+    with Recording.open(recording) as file, percent_bar() as progress:
         calibration = calibrate_recording(file, profile, pages, progress)
     seconds = time.perf_counter() - start
     calibration.save(out)
     if json_path is not None:
-        replace_text(json_path, json.dumps(figures(calibration, profile, seconds), indent=2) + "\n", "JSON file")
+        write_json(json_path, figures(calibration, profile, seconds))
     click.echo(table(calibration, profile))
     click.echo(
         f"\ncoherence {calibration.coherence_before:.3f} -> {calibration.coherence_after:.3f}, "
@@ -52,9 +49,7 @@ def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_pa
     )
 
 
-def calibrate_recording(
-    recording: Recording, profile: Profile, pages: int, progress: Callable[[str, float], None]
-) -> Calibration:
+def calibrate_recording(recording: Recording, profile: Profile, pages: int, progress: Progress) -> Calibration:
     """Calibrate from nominal with the first `pages` pages of a recording.
 
     Raises:
@@ -62,6 +57,8 @@ def calibrate_recording(
         CalibrationError: nothing within the capture range explains the frames.
     """
     recording.check_against(profile)
+    if others := recording.differences(profile):
+        click.echo(f"lightpage: warning: recording {recording.path} says of its device: {'; '.join(others)}", err=True)
     if recording.pages < pages:
         raise RecordingError(f"recording {recording.path}", f"{recording.pages} pages", f"at least {pages} (--pages)")
     known = known_pages(recording, profile, range(pages))
@@ -106,17 +103,3 @@ def table(calibration: Calibration, profile: Profile) -> str:
     turn = np.rad2deg(calibration.turn_rad)
     lines.append(f"{'between the arms, degree':<32}{turn:>12.6g}   {'':<10}{'+90 or -90':>10}")
     return "\n".join(lines)
-
-
-@contextmanager
-def calibration_bar() -> Iterator[Callable[[str, float], None]]:
-    """A progress bar as the callback that registration calls at the start of each stage."""
-    with tqdm(total=100, unit="%", bar_format="{desc}{percentage:3.0f}%|{bar}| {elapsed}") as bar:
-
-        def progress(stage: str, share: float) -> None:
-            bar.set_description(stage, refresh=False)
-            bar.update(100 * share - bar.n)
-            bar.refresh()
-
-        yield progress
-        progress("done", 1.0)

@@ -7,7 +7,6 @@ import math
 import shlex
 import subprocess
 import sys
-import time
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,19 +15,34 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import ConcatDataset
 
-from optics.errors import InvalidInputError, RecordingError
+from optics.errors import FrameError, InvalidInputError, RecordingError
+from optics.files import OutputFile, write_json
+from optics.frames import check_pair_light
 from optics.page import pilot_mask, pilot_symbols, symbol_phases
 from optics.profile import Profile, load_profile
+from optics.progress import percent_bar
 from optics.recording import Recording, hash_frames
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.known import known_pages
-from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording, calibration_bar
+from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording
 from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor
 from train.fitting import Hyperparameters, Page, best_kappa_scale, fit_network
 from train.localizers.coherent import SAMPLES, CoherentLocalizer
 from train.network import SymbolUNet
-from train.run import GOLDEN, REFERENCES, Run, begin, load_network, load_run, save_network, sole_writer
+from train.run import (
+    DESCRIPTION,
+    GOLDEN,
+    REFERENCES,
+    Run,
+    begin,
+    is_first_process,
+    load_network,
+    load_run,
+    save_arrays,
+    save_network,
+    sole_writer,
+)
 from train.synthetic import MOST_NOISE, SyntheticPages, likeness
 
 PUBLISHED = ("none", "mode", "ray")
@@ -70,7 +84,13 @@ _LIKENESS_PAGES = 2
     help="Pages that the fitted device would show after drifts, trained on beside the recorded ones.",
 )
 @click.option("--start", type=click.Path(path_type=Path), help="Finished run whose weights this one begins with.")
-@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option(
+    "--devices",
+    type=click.IntRange(min=1),
+    help="GPUs, or processes without one; all GPUs, or one process, by default.",
+)
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def train(
     profile_name: str,
     recording_path: Path,
@@ -89,6 +109,8 @@ def train(
     synthetic_pages: int,
     start: Path | None,
     seed: int,
+    devices: int | None,
+    json_path: Path | None,
 ) -> None:
     """Train a decoder on known pages; the last pages of the recording stay unseen for `lightpage evaluate`."""
     if localizer in PUBLISHED:
@@ -118,12 +140,12 @@ def train(
         calibration = _calibration(recording, profile_name, calibration_path, out)
         calibration.check_profile(profile)
         first = None if start is None else _first_network(start, profile, localizer, choices)
-        groups = _split(recording, validation_share, test_share)
-        hashes = [recording.page_hash(page) for page in range(recording.pages)]
+        hashes = _usable(recording)
+        groups = _split(recording, list(hashes), validation_share, test_share)
         references = recording.references()
         options = {
             "--profile": profile.to_toml(),
-            "--recording (SHA-256 of its frames)": _digest([*hashes, hash_frames(references)]),
+            "--recording (SHA-256 of its frames)": _digest([*hashes.values(), hash_frames(references)]),
             "--localizer": localizer,
             "calibration": calibration.to_toml(),
             "--validation-share": validation_share,
@@ -133,18 +155,23 @@ def train(
             **{f"--{name.replace('_', '-')}": value for name, value in asdict(choices).items()},
         }
         extractor = FeatureExtractor(profile, calibration.vector, calibration.turn_rad, references, localizer)
-        extractor.check(known_pages(recording, profile, [0])[0])
+        extractor.check(known_pages(recording, profile, groups[0][:1])[0])
         begin(out, options)
+        if (out / DESCRIPTION).exists():
+            _tell(load_run(out), out, json_path)
+            return
         key = _digest([options[name] for name in ("--profile", "--recording (SHA-256 of its frames)", "calibration")])
         known = [*groups[0], *groups[1]]
-        fill(
+        preparing = fill(
             out / "features",
             f"{key} {localizer}",
             len(known),
             lambda first, shift: extractor.pages(recording, known[first:], shift),
             "recorded pages",
         )
-        synthetic = _synthetic(recording, extractor, synthetic_pages, out, calibration, profile, localizer, seed)
+        synthetic = _synthetic(
+            recording, extractor, synthetic_pages, groups[0], out, calibration, profile, localizer, seed
+        )
         mask = recording.pilots()
         mask = pilot_mask(profile) if mask is None else mask
         count = len(groups[0])
@@ -152,34 +179,70 @@ def train(
             [FeatureStore(out / "features", range(count)), *map(FeatureStore, synthetic)]
         )
         validation = FeatureStore(out / "features", range(count, len(known)))
-        started = time.monotonic()
-        module, air = fit_network(out, choices, mask, recording.levels, training, validation, start=first)
-        seconds = time.monotonic() - started
-        scale = best_kappa_scale(module, validation, mask)
-        save_network(module, out)
+        fitted = fit_network(
+            out, choices, mask, recording.levels, training, validation, start=first, devices=devices or "auto"
+        )
+        if not is_first_process():
+            return
+        scale = best_kappa_scale(fitted.module, validation, mask)
+        save_network(fitted.module, out)
         own = _own_pilots(recording, profile, mask, known)
         kept = {"in_phase": references.in_phase, "quadrature": references.quadrature, "pilots": mask}
-        np.savez_compressed(out / REFERENCES, **kept, **({} if own is None else {"pilot_phases": own}))  # type: ignore[arg-type]
+        save_arrays(out / REFERENCES, kept if own is None else kept | {"pilot_phases": own})
         golden = recording.frames(groups[1][0])
-        np.savez_compressed(out / GOLDEN, in_phase=golden.in_phase, quadrature=golden.quadrature)
-        Run(
+        save_arrays(out / GOLDEN, {"in_phase": golden.in_phase, "quadrature": golden.quadrature})
+        run = Run(
             localizer=localizer,
             profile_toml=profile.to_toml(),
             calibration_toml=calibration.to_toml(),
             hyperparameters=choices,
             camera_bit_depth=recording.bit_depth,
             trained_pages=tuple(hashes[page] for page in known),
-            validation_air=air,
+            validation_air=fitted.validation_air,
             kappa_scale=scale,
-            seconds=seconds,
-            synthetic_pages=sum(len(FeatureStore(folder)) for folder in synthetic),
+            seconds=preparing + fitted.seconds,
+            pages=(len(groups[0]), len(groups[1]), len(groups[2])),
+            synthetic_pages=len(training) - count,
             provenance={"command": shlex.join(["lightpage", *sys.argv[1:]]), "seed": seed, "commit": _commit()},
-        ).save(out)
+        )
+        run.save(out)
+    _tell(run, out, json_path)
+
+
+def _tell(run: Run, folder: Path, json_path: Path | None) -> None:
+    """The figures of a finished run, for people and, if wanted, for machines."""
+    trained, validated, left = run.pages
+    if json_path is not None:
+        write_json(
+            json_path,
+            {
+                "validation_air_bits_per_symbol": run.validation_air,
+                "kappa_scale": run.kappa_scale,
+                "training_seconds": run.seconds,
+                "pages": {"training": trained, "validation": validated, "left_for_evaluate": left},
+                "synthetic_pages": run.synthetic_pages,
+                "run": str(folder),
+            },
+        )
     click.echo(
-        f"validation AIR {air:.3f} bits/symbol, {len(groups[0])} recorded and {len(training) - count} synthetic "
-        f"pages trained on, {len(groups[1])} validation pages, "
-        f"{len(groups[2])} left for evaluate, kappa scaled by {scale:.3f}; run in {out}"
+        f"validation AIR {run.validation_air:.3f} bits/symbol, {trained} recorded and {run.synthetic_pages} synthetic "
+        f"pages trained on, {validated} validation pages, {left} left for evaluate, kappa scaled by "
+        f"{run.kappa_scale:.3f}, {run.seconds / 60:.1f} min; run in {folder}"
     )
+
+
+def _usable(recording: Recording) -> dict[int, str]:
+    """Hashes of the pages that show light, by page; the others are named and left out."""
+    hashes = {}
+    for page in range(recording.pages):
+        pair = recording.frames(page)
+        try:
+            check_pair_light(f"recording {recording.path}, page {page}, ", pair, recording.bit_depth)
+        except FrameError as error:
+            click.echo(f"lightpage: warning: left out: {error}", err=True)
+        else:
+            hashes[page] = hash_frames(pair)
+    return hashes
 
 
 def _calibration(recording: Recording, profile_name: str, path: Path | None, out: Path) -> Calibration:
@@ -189,7 +252,7 @@ def _calibration(recording: Recording, profile_name: str, path: Path | None, out
         return load_calibration(path)
     if kept.exists():
         return load_calibration(kept)
-    with calibration_bar() as progress:
+    with percent_bar() as progress:
         calibration = calibrate_recording(recording, load_profile(profile_name), DEFAULT_PAGES, progress)
     calibration.save(kept)
     return calibration
@@ -210,12 +273,16 @@ def _size(choices: Hyperparameters) -> tuple[int, int, int]:
     return choices.channels, choices.blocks, choices.levels
 
 
-def _split(recording: Recording, validation_share: float, test_share: float) -> tuple[list[int], list[int], list[int]]:
-    """Pages for training, validation and, last, for nobody here."""
-    pages = recording.pages
+def _split(
+    recording: Recording, usable: list[int], validation_share: float, test_share: float
+) -> tuple[list[int], list[int], list[int]]:
+    """Usable pages for training, validation and, last, for nobody here."""
+    pages = len(usable)
     if pages < _FEWEST_PAGES:
         raise RecordingError(
-            f"recording {recording.path}", f"{pages} pages", f"at least {_FEWEST_PAGES} to train, validate and evaluate"
+            f"recording {recording.path}",
+            f"{pages} usable pages",
+            f"at least {_FEWEST_PAGES} to train, validate and evaluate",
         )
     test = round(pages * test_share) if test_share == 0 else max(1, round(pages * test_share))
     validation = max(1, round(pages * validation_share))
@@ -223,7 +290,7 @@ def _split(recording: Recording, validation_share: float, test_share: float) -> 
     if first < _LIKENESS_PAGES:
         got = f"{validation} validation and {test} test pages of {pages}"
         raise InvalidInputError("--validation-share and --test-share", got, f"{_LIKENESS_PAGES} pages left to train on")
-    return list(range(first)), list(range(first, first + validation)), list(range(first + validation, pages))
+    return usable[:first], usable[first : first + validation], usable[first + validation :]
 
 
 def _own_pilots(
@@ -248,6 +315,7 @@ def _synthetic(
     recording: Recording,
     extractor: FeatureExtractor,
     count: int,
+    training: list[int],
     out: Path,
     calibration: Calibration,
     profile: Profile,
@@ -257,7 +325,7 @@ def _synthetic(
     """Folder with the features of synthetic pages; none where the wave model is not like the device."""
     if count == 0:
         return []
-    known = known_pages(recording, profile, range(_LIKENESS_PAGES))
+    known = known_pages(recording, profile, training[:_LIKENESS_PAGES])
     phases = [np.angle(page.symbols) for page in known]
     fields = [extractor.known_field(page.pair, written) for page, written in zip(known, phases, strict=True)]
     like = likeness(profile, calibration.vector, fields, phases)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -54,8 +55,11 @@ class FeatureStore(Dataset[tuple[Tensor, Tensor, Tensor]]):
         )
 
 
-def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> None:
+def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
     """Make the features of `count` pages and keep them in `folder`, or go on with those that are there.
+
+    Returns:
+        Seconds that it took, all stretches together.
 
     Args:
         folder: made if missing; what it holds under another key is made anew.
@@ -66,9 +70,10 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     key = f"{count} pages {key}"
-    done, shift = _kept(folder, key)
+    done, shift, before = _kept(folder, key)
     if done >= count:
-        return
+        return before
+    start, seconds = time.monotonic() - before, before
     if done == 0:
         (folder / _STATE).unlink(missing_ok=True)  # before its arrays are
     arrays: dict[str, np.memmap[Any, Any]] = {}
@@ -86,16 +91,19 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> None:
                     )
                 arrays[name][number] = value
                 arrays[name].flush()
-            state = {"key": key, "done": number + 1, "shift_px": page.shift_px}
+            seconds = time.monotonic() - start
+            state = {"key": key, "done": number + 1, "shift_px": page.shift_px, "seconds": seconds}
             replace_text(folder / _STATE, json.dumps(state), "state of the features")
+    return seconds
 
 
-def _kept(folder: Path, key: str) -> tuple[int, tuple[float, float]]:
-    """Pages that an earlier call completed under the same key, and the last one's shift."""
+def _kept(folder: Path, key: str) -> tuple[int, tuple[float, float], float]:
+    """Pages that an earlier call completed under the same key, the last one's shift, and the seconds that they took."""
     try:
         state = json.loads((folder / _STATE).read_text())
         if state["key"] == key:
-            return int(state["done"]), (float(state["shift_px"][0]), float(state["shift_px"][1]))
+            shift = float(state["shift_px"][0]), float(state["shift_px"][1])
+            return int(state["done"]), shift, float(state["seconds"])
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    return 0, (0.0, 0.0)
+    return 0, (0.0, 0.0), 0.0

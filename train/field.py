@@ -46,7 +46,7 @@ class FieldRecovery(nn.Module):
         grid = field_grid(profile)
         self.grid: FieldGrid = grid
         self.rows_px, self.columns_px = profile.frame_shape
-        corner = float((profile.page_width_m**2 + profile.page_height_m**2) ** 0.5 / 2)
+        corner = profile.corner_m
         self.prefilter = SeparableFilter(grid.prefilter)
         self.band = SeparableFilter(grid.band)
         self.u: Tensor
@@ -138,7 +138,7 @@ class FieldRecovery(nn.Module):
         return (2 * pixels / size[None, :, None, None] - 1).permute(0, 2, 3, 1)
 
 
-def unexplained(field: Tensor, residual: Tensor) -> Tensor:
+def relative_power(residual: Tensor, field: Tensor) -> Tensor:
     """Power of the residual over that of the field, scalar."""
     return (residual * residual).mean() / (field * field).mean()
 

@@ -14,7 +14,7 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from scipy import optimize
@@ -109,7 +109,9 @@ class DecoderTraining(L.LightningModule):
         p = torch.cat([seen[0] for seen in self._seen]).numpy()
         phases = torch.cat([seen[1] for seen in self._seen]).numpy()
         self._seen.clear()
-        self.log("val_air", held_out_air(p, phases, self._pilot_mask, self._levels), prog_bar=True)
+        # each of several processes has seen as many pages as the others
+        air = held_out_air(p, phases, self._pilot_mask, self._levels)
+        self.log("val_air", air, prog_bar=True, sync_dist=True)
 
     def configure_optimizers(self) -> Any:
         """AdamW under a one-cycle schedule."""
@@ -148,6 +150,21 @@ def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDAr
     return float(np.mean(rates))
 
 
+@dataclass(frozen=True)
+class Fitted:
+    """A trained module.
+
+    Attributes:
+        module: the best one, in float32.
+        validation_air: its AIR on the validation pages, bits per data symbol.
+        seconds: of training, all stretches of an interrupted run together.
+    """
+
+    module: DecoderTraining
+    validation_air: float
+    seconds: float
+
+
 def fit_network(
     run: Path,
     hyperparameters: Hyperparameters,
@@ -158,9 +175,12 @@ def fit_network(
     callbacks: list[Callback] | None = None,
     *,
     start: SymbolUNet | None = None,
+    devices: int | str = "auto",
     progress: bool = True,
-) -> tuple[DecoderTraining, float]:
-    """Train, or go on with, the network of a run; returns the best module, in float32, and its validation AIR.
+) -> Fitted:
+    """Train, or go on with, the network of a run.
+
+    On several devices Lightning runs the program once for each; all of them return the same.
 
     Raises KeyboardInterrupt after Ctrl-C, with the last checkpoint in place.
 
@@ -173,6 +193,7 @@ def fit_network(
         training, validation: pages.
         callbacks: further Lightning callbacks.
         start: network of the same size whose weights a new run begins with; random ones if left out.
+        devices: how many GPUs, or processes where there is none; "auto" takes all GPUs, or one process.
         progress: whether to show a bar.
     """
     folder = run / CHECKPOINTS
@@ -187,6 +208,7 @@ def fit_network(
     module = DecoderTraining(network, hyperparameters, pilot_mask, levels)
     best = ModelCheckpoint(folder, "best", monitor="val_air", mode="max")
     newest = ModelCheckpoint(folder, "last", save_on_train_epoch_end=True, enable_version_counter=False)
+    timer = Timer()
     averaged = EMAWeightAveraging(use_buffers=False, decay=1 - 1 / max(1.0, AVERAGED_SHARE * hyperparameters.steps))
     draws = hyperparameters.batch * max(1, hyperparameters.steps // LOOKS)
     sampler = RandomSampler(training, replacement=True, num_samples=draws)  # type: ignore[arg-type]  # it has a length
@@ -195,7 +217,8 @@ def fit_network(
             max_steps=hyperparameters.steps,
             precision=hyperparameters.precision,  # type: ignore[arg-type]
             logger=TensorBoardLogger(str(run), name="", version="tensorboard"),
-            callbacks=[averaged, best, newest, *(callbacks or [])],
+            callbacks=[averaged, best, timer, newest, *(callbacks or [])],
+            devices=devices,
             enable_progress_bar=progress,
             enable_model_summary=False,
             gradient_clip_val=1.0,
@@ -221,7 +244,7 @@ def fit_network(
         rates[path] = held_out_air(*decode_pages(module.float().eval(), validation), pilot_mask, levels)
     chosen = max(rates, key=lambda path: rates[path])
     module.load_state_dict(_checkpoint(chosen)["state_dict"])
-    return module, rates[chosen]
+    return Fitted(module, rates[chosen], timer.time_elapsed())
 
 
 @contextmanager

@@ -5,16 +5,21 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
+from zipfile import BadZipFile
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from optics.errors import InvalidInputError
-from optics.files import replace_text
+from optics.files import replace_file, replace_text
 from optics.profile import Profile, parse_profile
 from optics.registration.calibration import Calibration, parse_calibration
 from train.fitting import CHECKPOINTS, DecoderTraining, Hyperparameters
@@ -25,6 +30,9 @@ DESCRIPTION = "run.json"
 WEIGHTS = "decoder.pt"
 REFERENCES = "references.npz"
 GOLDEN = "golden.npz"
+FORMAT = 2
+"""Of what a run keeps while it is made: raised when features, network or checkpoints of an earlier version would not go
+together with those of this one."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +46,10 @@ class Run:
         camera_bit_depth: of the recording.
         trained_pages: hashes of the pages that were trained on or used to stop.
         validation_air: bits per data symbol.
+        pages: recorded pages for training, for validation, and left for evaluation.
         synthetic_pages: synthetic pages trained on beside the recorded ones.
         kappa_scale: factor on p that makes the claimed concentration honest on the validation pages.
-        seconds: training time.
+        seconds: training time, that of the recorded pages' features included, simulation not.
         provenance: command, seed, commit.
     """
 
@@ -53,6 +62,7 @@ class Run:
     validation_air: float
     kappa_scale: float
     seconds: float
+    pages: tuple[int, int, int] = (0, 0, 0)
     synthetic_pages: int = 0
     provenance: dict[str, Any] = field(default_factory=dict)
 
@@ -71,9 +81,16 @@ class Run:
         replace_text(folder / DESCRIPTION, json.dumps(asdict(self), indent=2), "description of the run")
 
 
+def is_first_process() -> bool:
+    """Whether this is the process that a user started, and not one that Lightning started for a further device."""
+    return os.environ.get("LOCAL_RANK", "0") == "0"
+
+
 @contextmanager
 def sole_writer(folder: Path) -> Iterator[None]:
-    """Keep the folder of a run to this process, as long as the `with` statement lasts; it is made if missing.
+    """Keep the folder of a run to this command, as long as the `with` statement lasts; it is made if missing.
+
+    The processes that Lightning starts for further devices work in it too.
 
     Raises:
         InvalidInputError: another process works in it, or it cannot be made or read.
@@ -85,7 +102,8 @@ def sole_writer(folder: Path) -> Iterator[None]:
         raise InvalidInputError(f"--out {folder}", error, "a folder that can be written") from None
     try:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if is_first_process():
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             wanted = "another --out, or to wait for its end"
             raise InvalidInputError(f"--out {folder}", "a run that another process is working on", wanted) from None
@@ -105,6 +123,7 @@ def begin(folder: Path, options: dict[str, Any]) -> None:
         InvalidInputError: the folder holds a run that was begun with other options.
     """
     path = folder / BEGUN
+    options = {"format": FORMAT, **options}
     try:
         kept = json.loads(path.read_text())
     except (OSError, ValueError):
@@ -130,7 +149,8 @@ def load_run(folder: Path) -> Run:
     try:
         data = json.loads(path.read_text())
         data["hyperparameters"] = Hyperparameters(**data["hyperparameters"])
-        data["trained_pages"] = tuple(data["trained_pages"])
+        for name in ("trained_pages", "pages"):
+            data[name] = tuple(data[name])
         return Run(**data)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise InvalidInputError(f"run {folder}", error, f"a finished training run with {DESCRIPTION}") from None
@@ -138,7 +158,25 @@ def load_run(folder: Path) -> Run:
 
 def save_network(module: DecoderTraining, folder: Path) -> None:
     """Write the network's weights."""
-    torch.save(module.network.state_dict(), folder / WEIGHTS)
+    replace_file(folder / WEIGHTS, partial(torch.save, module.network.state_dict()), "weights")
+
+
+def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write named arrays, compressed."""
+    replace_file(path, lambda file: np.savez_compressed(file, **arrays), "arrays")  # type: ignore[arg-type]
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Arrays that `save_arrays` wrote.
+
+    Raises:
+        InvalidInputError: they are missing or damaged.
+    """
+    try:
+        with np.load(path) as kept:
+            return dict(kept)
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise InvalidInputError(f"arrays {path}", error, "the arrays of a finished run") from None
 
 
 def load_network(folder: Path, run: Run, light_channels: int) -> SymbolUNet:
@@ -156,6 +194,6 @@ def load_network(folder: Path, run: Run, light_channels: int) -> SymbolUNet:
     network = SymbolUNet(light_channels, choices.channels, choices.blocks, choices.levels)
     try:
         network.load_state_dict(torch.load(folder / WEIGHTS, map_location="cpu", weights_only=True))
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, EOFError, UnpicklingError) as error:
         raise InvalidInputError(f"weights {folder / WEIGHTS}", error, "the weights of this run") from None
     return network.eval()

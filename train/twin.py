@@ -44,7 +44,7 @@ class RayTwin(nn.Module):
         self.pipe_angle = math.radians(profile.pipe.angle_deg)
         self.half_width = profile.page_width_m / 2
         self.half_height = profile.page_height_m / 2
-        self.corner = math.hypot(self.half_width, self.half_height)
+        self.corner = profile.corner_m
         self.camera_pitch = profile.camera.pitch_m
         self.camera_centre = ((profile.camera.columns_px - 1) / 2, (profile.camera.rows_px - 1) / 2)
         spread = self.pipe_length / self.focal_length / self.index / self.pipe_width * _WIDEST_SPREAD

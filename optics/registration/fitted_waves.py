@@ -61,7 +61,7 @@ class FittedWaves:
             steps=_STEPS,
             envelope_m=pitch if filled else 0.0,
         )
-        corner = np.hypot(half_width, half_height)
+        corner = profile.corner_m
         edges = half_width / corner, half_height / corner
         at_camera = camera_phase(value, grid.x_m[None, :] / corner, grid.y_m[:, None] / corner, *edges)
         at_launch = launch_phase(value, x[None, :] / corner, y[:, None] / corner)

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 
 from optics.errors import RecordingError
-from optics.frames import check_light
+from optics.frames import check_pair_light
 from optics.page import symbol_phases
 from optics.profile import Profile
-from optics.recording import FramePair, Recording
+from optics.recording import Recording
 from optics.registration.calibrate import KnownPage
 
 
@@ -27,7 +27,7 @@ def known_pages(recording: Recording, profile: Profile, indices: Iterable[int]) 
         RecordingError: no symbols, another shape than the profile's, no such page, or unreadable data.
     """
     recording.check_against(profile)
-    _check_light(recording, "reference", recording.references())
+    check_pair_light(f"recording {recording.path}, reference, ", recording.references(), recording.bit_depth)
     pages = []
     for index in indices:
         symbols = recording.symbols(index)
@@ -38,11 +38,6 @@ def known_pages(recording: Recording, profile: Profile, indices: Iterable[int]) 
                 "the symbols that were written, to calibrate by",
             )
         pair = recording.frames(index)
-        _check_light(recording, f"page {index}", pair)
+        check_pair_light(f"recording {recording.path}, page {index}, ", pair, recording.bit_depth)
         pages.append(KnownPage(pair, np.exp(1j * symbol_phases(symbols, recording.levels))))
     return pages
-
-
-def _check_light(recording: Recording, what: str, pair: FramePair) -> None:
-    for name, frame in (("in-phase frame", pair.in_phase), ("quadrature frame", pair.quadrature)):
-        check_light(f"recording {recording.path}, {what}, {name}", frame, recording.bit_depth)

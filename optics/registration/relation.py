@@ -76,7 +76,7 @@ class CameraRelation:
         self._places = np.stack([x, y], axis=-1)[::_STRIDE, ::_STRIDE]
         half = _INSIDE * np.array([profile.page_width_m, profile.page_height_m]) / 2
         self._inside = np.all(np.abs(self._places) < half, axis=-1)
-        corner = np.hypot(profile.page_width_m, profile.page_height_m) / 2
+        corner = profile.corner_m
         self._affine = np.stack([np.ones_like(x), x / corner, y / corner])[:, ::_STRIDE, ::_STRIDE]
         self._levels = [smooth_reference(frame) for frame in (references.in_phase, references.quadrature)]
         self._images = [

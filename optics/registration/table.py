@@ -16,7 +16,7 @@ from optics.registration.twin import Twin
 Real = NDArray[np.float64]
 Table = dict[str, NDArray[np.float32]]
 
-TABLE_INPUTS = ("registration", "homodyne", "places", "place_gradients", "phases", "positions")
+SAMPLING_TABLE = ("registration", "homodyne", "places", "place_gradients", "phases", "positions")
 """Names of the table's tensors, as inputs of an exported decoder."""
 
 _FIT_POINTS = 9
@@ -38,10 +38,9 @@ def symbol_centres(profile: Profile) -> Real:
 def registration_coefficients(twin: Twin, parameters: Real, profile: Profile) -> NDArray[np.float32]:
     """Pixels of both cameras as cubics in the grid's coordinates over the page's corner radius, [2, 2, 10]."""
     grid = field_grid(profile)
-    corner = np.hypot(profile.page_width_m, profile.page_height_m) / 2
     x, y = np.linspace(grid.x_m[0], grid.x_m[-1], _FIT_POINTS), np.linspace(grid.y_m[0], grid.y_m[-1], _FIT_POINTS)
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    u, v = places.T / corner
+    u, v = places.T / profile.corner_m
     terms = np.stack([u**i * v**j for i, j in monomial_powers()], axis=-1)
     pixels = twin.pixels(parameters, places)
     coefficients = [np.linalg.lstsq(terms, camera, rcond=None)[0].T for camera in pixels]

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 
 from export import cli_export
-from export.cli_export import export_run
+from export.cli_export import export, export_run
 from export.graph import TABLE_INPUTS
 from export.parity import check_parity
 from optics.device import Device
@@ -43,7 +45,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         simulator.page(random_symbols(profile, 256, 1, np.random.default_rng(1))[0]),
         simulator.references(),
     )
-    turn = np.pi / 2 + np.deg2rad(device.homodyne.quadrature_error_deg)
+    turn = device.homodyne.turn_rad
     fitted = Registered(true_parameters(profile, device), np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
     torch.manual_seed(0)
     features = CoherentLocalizer(profile).light_channels
@@ -145,9 +147,49 @@ def test_a_graph_that_differs_from_torch_leaves_no_bundle(
         return {**outputs, "p": outputs["p"] * 1.01}
 
     monkeypatch.setattr(cli_export, "torch_answer", off)
-    with pytest.raises(BundleError):
+    with pytest.raises(BundleError, match=r"parity of .*bad\.zip with torch: got p off by 0\.0099 of"):
         export_run(run_folder, tmp_path / "bad.zip")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_export_leaves_nothing_and_works_again(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(path: Path) -> None:
+        assert path.exists()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Decoder, "load", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            export_run(run_folder, tmp_path / "small.zip")
+    assert list(tmp_path.iterdir()) == []
+    assert (
+        CliRunner()
+        .invoke(export, [str(run_folder), "--out", str(tmp_path / "small.zip"), "--json", str(tmp_path / "F")])
+        .exit_code
+        == 0
+    )
+    figures = json.loads((tmp_path / "F").read_text())
+    assert 0 < figures["parity_error"] <= 1e-3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["F", "small.zip"]
+
+
+def test_a_version_that_is_none_is_refused_before_the_work(run_folder: Path, tmp_path: Path) -> None:
+    steps: list[str] = []
+    with pytest.raises(BundleError, match=r"--version.*'v 2'"):
+        export_run(run_folder, tmp_path / "n.zip", version="v 2", progress=lambda step, share: steps.append(step))
+    assert steps == []
+
+
+@pytest.mark.parametrize("name", [GOLDEN, REFERENCES, WEIGHTS])
+def test_a_run_file_that_was_cut_off_is_named(run_folder: Path, tmp_path: Path, name: str) -> None:
+    cut = tmp_path / "run"
+    shutil.copytree(run_folder, cut)
+    for size in (0, 100):
+        (cut / name).write_bytes((run_folder / name).read_bytes()[:size])
+        with pytest.raises(InvalidInputError, match=name):
+            export_run(cut, tmp_path / "n.zip")
 
 
 def test_parity_is_judged_against_the_norm_and_never_passes_nan() -> None:

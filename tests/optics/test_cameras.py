@@ -154,7 +154,7 @@ class TestPose:
             aberration=Aberration(distortion_relative=distortion, defocus_rad=0, astigmatism_rad=0, coma_rad=0),
         )
         twin, parameters = TorchTwin(RayTwin(profile)), true_parameters(profile, device)
-        corner = np.hypot(profile.page_width_m, profile.page_height_m) / 2
+        corner = profile.corner_m
         columns, rows = np.meshgrid(np.arange(profile.camera.columns_px), np.arange(profile.camera.rows_px))
         for camera, pose in enumerate(poses):
             x, y = CameraView(profile.camera, pose, distortion, corner).positions_m()

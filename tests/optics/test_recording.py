@@ -199,6 +199,19 @@ class TestReading:
                 assert recording.page_hash(page) == plain.page_hash(page)
             assert np.array_equal(recording.references().quadrature, plain.references().quadrature)
 
+    def test_it_tells_where_its_own_profile_says_otherwise(self, foreign: Path) -> None:
+        profile = load_profile("bench")
+        other = profile.model_copy(update={"pipe": profile.pipe.model_copy(update={"length_m": 0.2})})
+        for text, wanted in (
+            (other.to_toml(), [f"pipe.length_m = 0.2 (profile bench: {profile.pipe.length_m})"]),
+            (profile.to_toml(), []),
+            ("somebody else's notes", []),
+        ):
+            with h5py.File(foreign, "r+") as file:
+                file.attrs["profile"] = text
+            with Recording.open(foreign) as recording:
+                assert recording.differences(profile) == wanted
+
     def test_a_page_that_is_not_there_is_refused(self, foreign: Path) -> None:
         with Recording.open(foreign) as recording:
             for page in (-1, PAGES):
@@ -307,6 +320,9 @@ BAD = {
     "fewer symbol pages": (replace("symbols", lambda d: d[:2]), "dataset 'symbols'", r"shape \(2, 6, 9\)"),
     "flat symbols": (replace("symbols", lambda d: d[0]), "dataset 'symbols'", r"shape \(6, 9\)"),
     "pilots of another page": (replace("pilots", lambda d: d.T), "dataset 'pilots'", r"shape \(9, 6\)"),
+    "no pilots": (replace("pilots", np.zeros_like), "dataset 'pilots'", "0 pilots of 54"),
+    "nothing but pilots": (replace("pilots", np.ones_like), "dataset 'pilots'", "54 pilots of 54"),
+    "no pages": (replace("in_phase", lambda d: d[:0]), "dataset 'in_phase'", r"shape \(0, 14, 20\)"),
     "float pilots": (replace("pilots", lambda d: d.astype(np.float64)), "dataset 'pilots'", "type float64"),
 }
 
@@ -372,7 +388,7 @@ class TestBadFiles:
 
         monkeypatch.setattr(h5py.Dataset, "__getitem__", spy)
         with Recording.open(foreign):
-            assert read == ["/symbols"]
+            assert read == ["/pilots", "/symbols"]
 
 
 class TestWriting:

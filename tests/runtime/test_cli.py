@@ -421,6 +421,31 @@ def test_an_interrupted_decode_leaves_nothing_half_written(
     assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
 
 
+def test_an_interrupted_evaluation_leaves_nothing(
+    recording: tuple[Path, np.ndarray], toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupting(self: Recording, page: int) -> FramePair:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Recording, "frames", interrupting)
+    arguments = ["evaluate", "--bundle", toy_zip, "--recording", recording[0], "--json", tmp_path / "e.json"]
+    assert run(arguments) == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
+
+
+@pytest.mark.parametrize("command", ["demo", "bench"])
+def test_an_interrupted_measurement_leaves_no_figures(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupting(self: LightpageServer) -> LightpageServer:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(LightpageServer, "start", interrupting)
+    assert run([command, "--json", tmp_path / "figures.json"]) == 130
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
 def test_a_command_without_a_service_or_a_choice_says_so(
     recording: tuple[Path, np.ndarray], toy_zip: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -101,8 +101,10 @@ def test_the_tracker_ignores_silent_pages_and_late_answers(seen: tuple[FramePair
     old = tracker.table()
     tracker.update(*seen, old)
     assert tracker.shift == Shift(1.0, 0.0)
-    tracker.update(*seen, old)  # decoded before the step above: its remainder is already taken in
+    # decoded before the step above: its remainder is already taken in, but the page itself is worth another decode
+    assert tracker.update(*seen, old)
     assert tracker.shift == Shift(1.0, 0.0)
+    assert not tracker.update(*seen, tracker.table())
     image.silent = True
     tracker.update(*seen, tracker.table())
     assert tracker.shift == Shift(1.0, 0.0)

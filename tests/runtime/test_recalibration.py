@@ -119,13 +119,26 @@ def test_an_interrupted_recalibration_leaves_nothing(decoder: Decoder, tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_no_step_is_told_once_the_bundle_is_written(decoder: Decoder, tmp_path: Path) -> None:
+    """Whoever stops the work at a step finds nothing left behind."""
+    out, steps = tmp_path / "n.zip", []
+
+    def step(name: str, share: float) -> None:
+        steps.append(name)
+        assert not out.exists()
+
+    recalibrate(decoder, known(), out, "toy-1+r1", toy.fit_references, step)
+    assert out.exists()
+    assert steps[-1] == "write the new bundle"
+
+
 def test_unusable_pages_are_named(decoder: Decoder, tmp_path: Path) -> None:
     good, out = known(), tmp_path / "n.zip"
     cases: list[tuple[KnownPages, type[Exception], str]] = [
         (known(count=1), InvalidInputError, "at least 2"),
         (KnownPages(good.pairs, good.symbols[:2], 16), InvalidInputError, "2 pages of symbols"),
-        (KnownPages(good.pairs, good.symbols, 8), PageError, "known symbols"),
-        (KnownPages(good.pairs, tuple(s[:4] for s in good.symbols), 16), PageError, "known symbols"),
+        (KnownPages(good.pairs, good.symbols, 8), PageError, "known page 0: symbols"),
+        (KnownPages(good.pairs, tuple(s[:4] for s in good.symbols), 16), PageError, "known page 0: symbols"),
         (
             KnownPages((good.pairs[0], FramePair(*2 * (np.zeros((2, 2), np.uint8),))), good.symbols[:2], 16),
             FrameError,

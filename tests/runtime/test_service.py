@@ -33,7 +33,7 @@ from runtime.client import LightpageClient
 from runtime.convert import KnownPilots
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
-from runtime.errors import SourceError
+from runtime.errors import SourceError, StoppingError
 from runtime.limits import Limits
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
@@ -376,7 +376,21 @@ def test_a_damaged_page_of_the_source_is_the_services_own_fault(toy_zip: Path, t
         recalibrate = pb.RecalibrateRequest(source=pb.SourcePages(pages=[0, 2]))
         code, text = status(lambda: list(stub.Recalibrate(recalibrate, timeout=20)))
         assert code == grpc.StatusCode.FAILED_PRECONDITION
+        # what the service itself reads is never the caller's fault
+        dark = pb.RecalibrateRequest(source=pb.SourcePages(pages=[0, 1]))
+        code, text = status(lambda: list(stub.Recalibrate(dark, timeout=20)))
+        assert code == grpc.StatusCode.FAILED_PRECONDITION
+        assert text.startswith("known page 1: quadrature frame: got black")
         assert client.describe().source == "recording:source.h5"
+
+
+def test_a_damaged_recording_on_the_server_is_the_services_own_fault(start: Start, tmp_path: Path) -> None:
+    service = start()
+    path = tmp_path / "R.h5"
+    toy.write_toy_recording(path, toy.ToyDevice(), 16, 2)
+    path.write_bytes(path.read_bytes()[:-2000])
+    with pytest.raises(SourceError, match=r"recording R\.h5"):
+        service.client.recalibrate(recording="R.h5")
 
 
 @pytest.mark.parametrize(
@@ -545,6 +559,26 @@ class SlowFit:
 
 def slow_fit() -> SlowFit:
     return SlowFit(threading.Event(), threading.Event(), threading.Event())
+
+
+def test_a_recalibration_that_the_end_of_the_service_cuts_off_says_so(start: Start) -> None:
+    fit = slow_fit()
+    service = start(fit=fit)  # type: ignore[arg-type]
+    errors: list[BaseException] = []
+
+    def call() -> None:
+        try:
+            service.client.recalibrate(count=2)
+        except LightpageError as error:
+            errors.append(error)
+
+    caller = threading.Thread(target=call)
+    caller.start()
+    assert fit.entered.wait(10)
+    service.server.stop(5.0)
+    caller.join(10)
+    assert [type(error) for error in errors] == [StoppingError]
+    assert service.plane.metrics.recalibrations.labels("dropped")._value.get() == 1
 
 
 def test_a_second_recalibration_is_turned_away_and_the_first_ends_well(start: Start) -> None:
@@ -719,6 +753,15 @@ def test_a_port_that_is_taken_is_named(start: Start, toy_zip: Path) -> None:
     address = service.server.target
     with pytest.raises(InvalidInputError, match=address):
         LightpageServer(plane, Recalibrator(plane, toy.fit_references), address).start()
+
+
+def test_a_service_on_a_unix_socket_is_found_there(toy_zip: Path, tmp_path: Path) -> None:
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)))
+    address = f"unix:{tmp_path}/s"
+    with LightpageServer(plane, Recalibrator(plane, toy.fit_references), address) as server:
+        assert server.target == address
+        with LightpageClient(server.target) as client:
+            assert client.describe().model.version == "toy-1"
 
 
 def test_a_service_without_a_source_says_so(toy_zip: Path) -> None:

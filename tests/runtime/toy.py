@@ -16,11 +16,12 @@ from onnx import TensorProto, helper, numpy_helper
 from optics.errors import CalibrationError
 from optics.page import random_symbols, symbol_phases
 from optics.profile import Profile, parse_profile
+from optics.progress import Progress
 from optics.recording import FramePair, RecordingWriter
 from runtime.bundle import Bundle, npz, write_bundle
 from runtime.decoder import Decoder
 from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
-from runtime.recalibration import FitReport, FitResult, KnownPages, Progress
+from runtime.recalibration import FitReport, FitResult, KnownPages
 from runtime.sources import SourcePage
 
 PROFILE_TOML = """

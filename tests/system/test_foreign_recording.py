@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,8 @@ PAGES = 16
 STEPS = 300
 SYNTHETIC = 48
 MINUTES = 12
+SEED = "LIGHTPAGE_FOREIGN_SEED"
+"""Environment variable that repeats the device of an earlier test; another is drawn each time without it."""
 
 
 def lightpage(*arguments: str) -> None:
@@ -29,7 +32,7 @@ def lightpage(*arguments: str) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(60 * MINUTES)
 def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decoded(tmp_path: Path) -> None:
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
+    seed = int(os.environ.get(SEED) or np.random.SeedSequence().generate_state(1)[0])
     print(f"foreign device, seed {seed}")
     recording = tmp_path / "foreign.h5"
     device = ForeignDevice.draw(seed)
@@ -54,5 +57,5 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
         f"angle {angle:.4f}, true {device.parameters.pipe_angle_deg:.4f}; AIR {evaluation['air_bits_per_symbol']:.2f}"
     )
     assert evaluation["pages"] >= 1
-    # 300 steps on 14 pages are a start, not a decoder; unrelated light gives zero or less
-    assert evaluation["air_bits_per_symbol"] > 1.0, f"seed {seed}: {evaluation}"
+    # 300 steps on 14 pages are a start, not a decoder: 3.6 to 4.5 on devices seen so far; unrelated light gives none
+    assert evaluation["air_bits_per_symbol"] > 2.5, f"seed {seed}: {evaluation}"

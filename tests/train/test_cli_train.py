@@ -43,7 +43,7 @@ def device(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     arguments = ["--profile", str(folder / "small.toml"), "--recording", str(folder / "R.h5")]
     made = f"--profile {folder}/small.toml --pages {PAGES} --seed 4 --out {folder}/R.h5"
     CliRunner().invoke(simulate, made.split(), standalone_mode=False, catch_exceptions=False)
-    turn = np.pi / 2 + np.deg2rad(state.homodyne.quadrature_error_deg)
+    turn = state.homodyne.turn_rad
     perfect = Registered(true_parameters(profile, state), np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
     Calibration.from_registered(perfect, profile, ["0" * 64]).save(folder / "C.toml")
     return [*arguments, "--calibration", str(folder / "C.toml"), "--channels", "8", "--blocks", "1"]
@@ -104,6 +104,44 @@ def test_ctrl_c_in_training_loses_nothing_and_the_same_command_goes_on(device: l
     run(arguments)
     assert torch.load(last, map_location="cpu", weights_only=False)["global_step"] == steps
     assert (out / "run.json").exists()
+
+
+def test_a_finished_run_is_told_again_and_not_touched(device: list[str], tmp_path: Path) -> None:
+    arguments = [*device, "--steps", "10", "--synthetic-pages", "0", "--out", str(tmp_path / "run")]
+    told = run(arguments).splitlines()[-1]
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*")}
+    assert run([*arguments, "--json", str(tmp_path / "F")]).splitlines()[-1] == told
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*")} == before
+    figures = json.loads((tmp_path / "F").read_text())
+    assert figures["pages"] == {"training": 6, "validation": 1, "left_for_evaluate": 1}
+    assert figures["training_seconds"] > 0
+
+
+def test_dark_pages_are_named_and_left_out(device: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "R.h5"
+    shutil.copy(device[3], path)
+    with h5py.File(path, "r+") as file:
+        file["quadrature"][0] = 0
+        file["in_phase"][6] = 255
+    output = run(
+        [*device[:3], str(path), *device[4:], "--steps", "10", "--synthetic-pages", "2", "--out", str(tmp_path / "run")]
+    )
+    assert "4 recorded and 2 synthetic pages trained on, 1 validation pages, 1 left" in output
+    assert "page 0, quadrature frame: got black" in output
+    assert "page 6, in-phase frame: got saturated" in output
+    with Recording.open(path) as recording:
+        wanted = [recording.page_hash(page) for page in (1, 2, 3, 4, 5)]
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["trained_pages"] == wanted
+
+
+def test_two_processes_train_one_run(device: list[str], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    arguments = [*device, "--steps", "60", "--synthetic-pages", "0", "--devices", "2", "--out", str(out)]
+    command = [sys.executable, "-m", "runtime.cli", "train", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=2 * SECONDS)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("validation AIR") == 1
+    assert json.loads((out / "run.json").read_text())["validation_air"] > 0.5
 
 
 def test_pilots_of_the_devices_own_are_found(

@@ -16,7 +16,7 @@ from optics.recording import FramePair
 from optics.registration.table import monomial_powers
 from optics.simulator import Simulator
 from tests.optics.small import small_profile
-from train.field import FieldRecovery, TorchFieldSolver, unexplained
+from train.field import FieldRecovery, TorchFieldSolver, relative_power
 
 PROFILE = small_profile()
 SHIFTS_PX = (0.5, 4.3)
@@ -56,7 +56,7 @@ def record(sign: int = 1, ratio: float = 1.6, full_well_e: float = 15_000.0) -> 
 
 def registration(shifts_px: tuple[float, float] = SHIFTS_PX) -> np.ndarray:
     """Cameras at their nominal scale, shifted in x."""
-    corner = np.hypot(PROFILE.page_width_m, PROFILE.page_height_m) / 2
+    corner = PROFILE.corner_m
     powers = monomial_powers()
     cubics = np.zeros((2, 2, len(powers)), np.float32)
     cubics[:, 0, powers.index((1, 0))] = cubics[:, 1, powers.index((0, 1))] = corner / PROFILE.camera.pitch_m
@@ -201,9 +201,9 @@ class TestResidual:
         np.testing.assert_allclose(same, residual, atol=1e-5)
         assert error_db(mirrored, recorded.truth) > -0.5
 
-    def test_unexplained_is_the_ratio_of_the_powers(self) -> None:
+    def test_relative_power_is_the_ratio_of_the_powers(self) -> None:
         field, residual = torch.full((2, 4, 5), 2.0), torch.full((2, 4, 5), 0.5)
-        assert float(unexplained(field, residual)) == pytest.approx(1 / 16)
+        assert float(relative_power(residual, field)) == pytest.approx(1 / 16)
 
 
 class TestDarkness:

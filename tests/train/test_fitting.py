@@ -37,19 +37,22 @@ def mask() -> np.ndarray:
 def test_it_learns_and_a_finished_run_is_taken_up_at_its_last_step(tmp_path: Path, mask: np.ndarray) -> None:
     training, validation = pages(12, 0), pages(3, 1)
     run = tmp_path / "run"
-    first, early = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
-    assert early > 1.0
-    again, same = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
-    assert same == pytest.approx(early, abs=1e-6)
-    for one, other in zip(first.parameters(), again.parameters(), strict=True):
+    first = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    assert first.validation_air > 1.0
+    again = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    assert again.validation_air == pytest.approx(first.validation_air, abs=1e-6)
+    for one, other in zip(first.module.parameters(), again.module.parameters(), strict=True):
         torch.testing.assert_close(one, other)
+    # the time of the earlier stretch, up to its last checkpoint, and not that of looking at it again
+    assert 0.5 * first.seconds < again.seconds <= first.seconds
     checkpoint = torch.load(run / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=False)
     assert checkpoint["global_step"] == CHOICES.steps
 
 
 def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarray) -> None:
     training, validation = pages(12, 0), pages(3, 1)
-    module, _ = fit_network(tmp_path, replace(CHOICES, steps=60), mask, LEVELS, training, validation, progress=False)
+    choices = replace(CHOICES, steps=60)
+    module = fit_network(tmp_path, choices, mask, LEVELS, training, validation, progress=False).module
     honest = best_kappa_scale(module, validation, mask)
     with torch.no_grad():
         module.network.head.weight *= 3

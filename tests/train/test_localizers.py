@@ -23,7 +23,7 @@ def page() -> tuple[np.ndarray, dict[str, np.ndarray], FeatureExtractor]:
     symbols = random_symbols(profile, 256, 1, np.random.default_rng(SEED))[0]
     recorded = simulator.simulate(symbols)
     phases = symbol_phases(symbols, 256)
-    turn = np.pi / 2 + np.deg2rad(device.homodyne.quadrature_error_deg)
+    turn = device.homodyne.turn_rad
     features = {}
     for localizer in ("coherent", "wave"):
         extractor = FeatureExtractor(profile, true_parameters(profile, device), turn, simulator.references(), localizer)

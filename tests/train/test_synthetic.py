@@ -28,7 +28,7 @@ def recorded() -> tuple[PageFeatures, np.ndarray, np.ndarray]:
     simulator = Simulator(PROFILE, DEVICE, seed=SEED)
     phases = symbol_phases(random_symbols(PROFILE, 256, 1, np.random.default_rng(SEED))[0], 256)
     pair = simulator.page(np.rint(phases / (2 * np.pi) * 256).astype(np.uint8))
-    turn = np.pi / 2 + np.deg2rad(DEVICE.homodyne.quadrature_error_deg)
+    turn = DEVICE.homodyne.turn_rad
     extractor = FeatureExtractor(PROFILE, TRUTH, turn, simulator.references())
     features, _ = extractor.page(extractor.field(pair), phases, np.zeros(2))
     return features, extractor.known_field(pair, phases), phases

@@ -9,7 +9,7 @@ from optics.grid import field_grid
 from optics.profile import Profile, load_profile
 from optics.registration.parameters import NAMES, PRIORS
 from optics.registration.table import (
-    TABLE_INPUTS,
+    SAMPLING_TABLE,
     monomial_powers,
     registration_coefficients,
     sampling_table,
@@ -64,7 +64,7 @@ def test_its_maps_have_the_names_and_shapes_that_a_decoder_takes() -> None:
     profile = small_profile()
     table = sampling_table(TorchTwin(RayTwin(profile)), some_device(), TURN, profile)
     branches, page = len(BRANCHES), profile.page_shape
-    assert tuple(table) == TABLE_INPUTS
+    assert tuple(table) == SAMPLING_TABLE
     assert {name: array.shape for name, array in table.items()} == {
         "registration": (2, 2, 10),
         "homodyne": (2,),
