@@ -1,15 +1,18 @@
 """Decoders against the oracle on the same light: same pages, same network, same steps and seeds.
 
     python -m benchmarks.decoders --angle -0.6 --out runs/decoders
+    python -m benchmarks.decoders --arm coherent --size 64x2x0 --size 96x2x1 --steps 1500 --out runs/decoders
 
 The oracle knows the simulated truth: geometry, cameras, reference; the signal's own power is taken off its frames; then
-the wave adjoint and the same network. Interrupted, it goes on where it was: features and checkpoints lie in --out.
+the wave adjoint and the same network. Image shift and piston of every page, held-out ones too, are found from all of
+its symbols, for each arm alike. Interrupted, it goes on where it was: features and checkpoints lie in --out.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import click
@@ -122,6 +125,45 @@ def gained_at_the_end(run: Path, steps: int) -> float:
     return max(late) - max(early) if late and early else float("nan")
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What one arm reached with a network of one size. AIR in bits per data symbol, `size` as `--size` has it."""
+
+    arm: str
+    size: str
+    air: float
+    validation_air: float
+    gained_in_last_fifth: float
+    preparing_seconds: float
+    training_seconds: float
+    over_oracle: float | None = None
+
+    def line(self) -> str:
+        over = "" if self.over_oracle is None else f"{self.over_oracle:.3f}"
+        return (
+            f"{self.arm:<10} {self.size:<9} {self.air:>8.3f} {over:>10} {self.gained_in_last_fifth:>8.3f} "
+            f"{self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f}"
+        )
+
+
+HEADER = f"{'arm':<10} {'size':<9} {'held out':>8} {'of oracle':>10} {'gained':>8} {'features':>9} {'training':>8}"
+"""AIR on held-out pages; what validation AIR gained in the last fifth of the steps; minutes (simulation: features)."""
+
+
+class Size(click.ParamType[str]):
+    """Channels, blocks and levels of a network, e.g. ``96x2x0``."""
+
+    name = "channels x blocks x levels"
+
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        if not re.fullmatch(r"[1-9]\d*x[1-9]\d*x\d", value):
+            self.fail(f"{value!r}: wanted CHANNELSxBLOCKSxLEVELS, as {DEFAULT_SIZE}", param, ctx)
+        return value
+
+
+DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparameters.levels}"
+
+
 @click.command()
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
 @click.option("--angle", "angle_deg", type=float, default=-0.6, show_default=True, help="Pipe angle, degrees.")
@@ -130,7 +172,9 @@ def gained_at_the_end(run: Path, steps: int) -> float:
     "--pages", type=click.IntRange(12), default=240, show_default=True, help="With 8% validation, 8% held out."
 )
 @click.option("--steps", type=click.IntRange(10), default=6000, show_default=True)
-@click.option("--channels", type=click.IntRange(4), default=Hyperparameters.channels, show_default=True)
+@click.option(
+    "--size", "sizes", type=Size(), multiple=True, default=(DEFAULT_SIZE,), show_default=True, help="Network."
+)
 @click.option("--arm", "names", type=click.Choice(ARMS), multiple=True, default=ARMS, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=5000, show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for features, runs, figures.json.")
@@ -140,7 +184,7 @@ def main(
     full_well: float,
     pages: int,
     steps: int,
-    channels: int,
+    sizes: tuple[str, ...],
     names: tuple[str, ...],
     seed: int,
     out: Path,
@@ -148,8 +192,7 @@ def main(
     """Train every arm on the same pages and print held-out AIR."""
     profile = load_profile(profile_name)
     device = Device(sensor=Sensor(full_well_e=full_well)).with_settings([f"geometry.pipe_angle_deg={angle_deg}"])
-    choices = Hyperparameters(steps=steps, seed=seed, channels=channels)
-    options = {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, **asdict(choices)}
+    options = {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed}
     click.get_current_context().with_resource(sole_writer(out))
     begin(out, options)
     written = list(random_symbols(profile, LEVELS, pages + CALIBRATED, np.random.default_rng([seed, 7])))
@@ -158,55 +201,64 @@ def main(
         return Simulator(profile, device, LEVELS, seed)
 
     fitted = calibrated(profile, simulator(), written[:CALIBRATED], out / "calibration.toml")
-    figures: dict[str, object] = {
-        "angle_deg": angle_deg,
-        "angle_error_deg": fitted.angle_deg(profile) - angle_deg,
-        "full_well_e": full_well,
-        "pages": pages,
-        "steps": steps,
-        "channels": channels,
-        "seed": seed,
-    }
     mask = pilot_mask(profile)
     held = max(2, round(HELD_OUT_SHARE * pages))
     first = pages - 2 * held
-    rates: dict[str, float] = {}
+    outcomes: list[Outcome] = []
     for arm in arms(profile, device, fitted, simulator().references(), names):
-        folder = out / arm.name
+        features = out / arm.name / "features"
         key = f"{angle_deg} {full_well} {seed} {fitted.to_toml() if arm.name != 'oracle' else ''}"
         preparing = fill(
-            folder / "features",
+            features,
             key,
             pages,
             lambda start, shift, arm=arm: arm.features(simulator(), written[CALIBRATED:], start, shift),  # type: ignore[misc]
             f"features of {arm.name}",
         )
         training, validation, unseen = (
-            FeatureStore(folder / "features", part)
+            FeatureStore(features, part)
             for part in (range(first), range(first, first + held), range(first + held, pages))
         )
-        trained = fit_network(folder, choices, mask, LEVELS, training, validation, devices=1)
-        p, phases = decode_pages(trained.module, unseen)
-        rates[arm.name] = held_out_air(p, phases, mask, LEVELS)
-        figures |= {
-            f"{arm.name}_air": rates[arm.name],
-            f"{arm.name}_validation_air": trained.validation_air,
-            f"{arm.name}_preparing_seconds": preparing,
-            f"{arm.name}_training_seconds": trained.seconds,
-            f"{arm.name}_gained_in_last_fifth": gained_at_the_end(folder, steps),
-        }
-        click.echo(
-            f"{arm.name:<10} held-out AIR {rates[arm.name]:.3f} bits/symbol; validation AIR gained "
-            f"{figures[f'{arm.name}_gained_in_last_fifth']:.3f} in the last fifth of {steps} steps; "
-            f"{trained.seconds / 60:.1f} min after {preparing / 60:.1f} min for simulation and features"
-        )
-        for name in rates:
-            if "oracle" in rates and name != "oracle":
-                figures[f"{name}_over_oracle"] = rates[name] / rates["oracle"]
-        write_json(out / "figures.json", figures)
-    for name in rates:
-        if f"{name}_over_oracle" in figures:
-            click.echo(f"{name:<10} over the oracle {figures[f'{name}_over_oracle']:.3f}")
+        for size in sizes:
+            channels, blocks, levels = map(int, size.split("x"))
+            choices = Hyperparameters(steps=steps, seed=seed, channels=channels, blocks=blocks, levels=levels)
+            folder = out / arm.name / f"{size}-{steps}"
+            folder.mkdir(exist_ok=True)
+            begin(folder, asdict(choices))
+            trained = fit_network(folder, choices, mask, LEVELS, training, validation, devices=1)
+            p, phases = decode_pages(trained.module, unseen)
+            outcomes.append(
+                Outcome(
+                    arm.name,
+                    size,
+                    held_out_air(p, phases, mask, LEVELS),
+                    trained.validation_air,
+                    gained_at_the_end(folder, steps),
+                    preparing,
+                    trained.seconds,
+                )
+            )
+            outcomes = against_oracle(outcomes)
+            figures = {
+                "angle_deg": angle_deg,
+                "angle_error_deg": fitted.angle_deg(profile) - angle_deg,
+                "full_well_e": full_well,
+                "pages": pages,
+                "steps": steps,
+                "seed": seed,
+                "outcomes": [asdict(outcome) for outcome in outcomes],
+            }
+            write_json(out / "figures.json", figures)
+    click.echo("\n".join([HEADER, *(outcome.line() for outcome in outcomes)]))
+
+
+def against_oracle(outcomes: list[Outcome]) -> list[Outcome]:
+    """The outcomes with their share of what the oracle reached with a network of the same size, where it was run."""
+    oracle = {outcome.size: outcome.air for outcome in outcomes if outcome.arm == "oracle"}
+    return [
+        replace(outcome, over_oracle=outcome.air / oracle[outcome.size]) if outcome.size in oracle else outcome
+        for outcome in outcomes
+    ]
 
 
 if __name__ == "__main__":

@@ -56,7 +56,8 @@ class Golden:
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle whose files match their hashes. `Decoder` checks the models in it and runs its golden page."""
+    """A bundle whose files match their hashes. `Decoder` checks its decoder and runs its golden page;
+    `runtime.twin.OnnxTwin` checks the twin, where it is needed."""
 
     path: Path
     manifest: Manifest

@@ -92,6 +92,7 @@ def page_report(page: RemotePage) -> dict[str, Any]:
         "mean_confidence": float(page.confidence.mean()),
         "piston_rad": page.piston_rad,
         "pilot_coherence": page.pilot_coherence,
+        "pilot_trust": page.pilot_trust,
         "air_bits_per_symbol": figures.air_bits_per_symbol if figures is not None else None,
         "symbol_error_rate": figures.symbol_error_rate if figures is not None else None,
         **asdict(page.timings),

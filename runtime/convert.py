@@ -91,6 +91,7 @@ def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
         phase=page.phase.astype(_FLOAT).tobytes() if options.want_phase else b"",
         piston_rad=page.piston_rad,
         pilot_coherence=page.pilot_coherence,
+        pilot_trust=page.pilot_trust,
         model_version=answer.model_version,
         timings=pb.Timings(
             receive_s=answer.receive_s,
@@ -167,6 +168,7 @@ class RemotePage:
         levels: M.
         piston_rad: what was removed.
         pilot_coherence: agreement of the pilots, 0..1.
+        pilot_trust: share of the claimed concentration that they bear out, 0..1; in the fields above already.
         model_version: which model decoded it.
         timings: seconds in the service.
         page: number of the page in the source, or None where the caller sent the frames.
@@ -186,6 +188,7 @@ class RemotePage:
     page: int | None = None
     written: NDArray[np.uint8] | None = None
     pilot_mask: NDArray[np.bool_] | None = None
+    pilot_trust: float = 1.0
 
 
 def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> RemotePage:
@@ -208,6 +211,7 @@ def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> 
         levels=reply.levels,
         piston_rad=reply.piston_rad,
         pilot_coherence=reply.pilot_coherence,
+        pilot_trust=reply.pilot_trust,
         model_version=reply.model_version,
         timings=RemoteTimings(
             reply.timings.receive_s, reply.timings.decode_s, reply.timings.inference_s, reply.timings.total_s

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from optics.errors import BundleError, FrameError, InvalidInputError
 from optics.measures import decide_with_confidence
 from optics.page import MAX_LEVELS, check_levels
-from optics.pilots import Pilots, estimate_piston, remove_piston
+from optics.pilots import Pilots, estimate_piston, estimate_trust, remove_piston
 from optics.recording import FramePair
 from runtime.bundle import Bundle, Table
 from runtime.frames import check_pair
@@ -65,11 +65,12 @@ class DecodedPage:
     Attributes:
         symbols: uint8 [ny, nx], 0..levels-1.
         confidence: float32 [ny, nx], posterior probability of each symbol among the levels.
-        concentration: float32 [ny, nx], von Mises kappa.
+        concentration: float32 [ny, nx], von Mises kappa as far as the pilots bear it out.
         phase: float32 [ny, nx], radians, piston removed.
         levels: M.
         piston_rad: what was removed.
         pilot_coherence: how far the pilots agree on it, 0..1.
+        pilot_trust: share of the network's claimed concentration that they bear out, 0..1; low after a drift.
         timings: seconds.
     """
 
@@ -80,6 +81,7 @@ class DecodedPage:
     levels: int
     piston_rad: float
     pilot_coherence: float
+    pilot_trust: float
     timings: Timings
 
 
@@ -258,23 +260,42 @@ class Decoder:
         inference = self.infer(pair, table)
         inferred = time.perf_counter()
         page = self.settle(inference, levels, pilots)
-        return _timed(page, Timings(checked - start, inferred - checked, time.perf_counter() - inferred))
+        return replace(page, timings=Timings(checked - start, inferred - checked, time.perf_counter() - inferred))
 
     def settle(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
-        """Take the piston out and decide: everything behind the graph, timings left at zero."""
-        piston = estimate_piston(inference.p, pilots or self.pilots(levels))
+        """Piston, belief and decision: everything behind the graph, timings left at zero."""
+        pilots = pilots or self.pilots(levels)
+        piston = estimate_piston(inference.p, pilots)
+        trust = estimate_trust(inference.p, pilots, piston.angle_rad)
         phase = remove_piston(inference.phase, piston.angle_rad)
-        symbols, confidence = decide_with_confidence(phase, inference.concentration, levels)
+        concentration = inference.concentration * np.float32(trust)
+        symbols, confidence = decide_with_confidence(phase, concentration, levels)
         return DecodedPage(
             symbols=symbols,
             confidence=confidence,
-            concentration=inference.concentration,
+            concentration=concentration,
             phase=phase,
             levels=levels,
             piston_rad=piston.angle_rad,
             pilot_coherence=piston.coherence,
+            pilot_trust=trust,
             timings=Timings(0.0, 0.0, 0.0),
         )
+
+    def settle_again(self, page: DecodedPage, bend: NDArray[np.floating], pilots: Pilots | None = None) -> DecodedPage:
+        """The page with `bend` (radians [ny, nx]) added to its phases, settled by the same pilots; timings stay.
+
+        Args:
+            page: what `decode` or `settle` made of it.
+            bend: what is known by now of how its phases are off.
+            pilots: as for `decode`.
+        """
+        concentration = page.concentration / np.float32(page.pilot_trust)
+        phase = (page.phase + bend).astype(np.float32)
+        p = concentration * np.stack([np.cos(phase), np.sin(phase)])
+        again = self.settle(Inference(p, phase, concentration), page.levels, pilots)
+        piston = float(remove_piston(np.asarray(page.piston_rad), -again.piston_rad))
+        return replace(again, piston_rad=piston, timings=page.timings)
 
     def _check_graph(self, session: Session) -> dict[str, _Port]:
         """The overridable inputs by name, after checking names, types and shapes of everything."""
@@ -322,7 +343,3 @@ class Decoder:
             raise BundleError(
                 thing, f"an answer off by {error_norm:.3g} of its norm", f"the expected p within {GOLDEN_TOLERANCE:g}"
             )
-
-
-def _timed(page: DecodedPage, timings: Timings) -> DecodedPage:
-    return DecodedPage(**{**page.__dict__, "timings": timings})

@@ -14,6 +14,7 @@ from optics.device import CameraPose, Device
 from optics.errors import InvalidInputError
 from optics.measures import achievable_rate
 from optics.progress import Progress
+from optics.recording import FramePair
 from runtime.client import LightpageClient, Recalibrated
 from runtime.convert import RemotePage
 from runtime.dataplane import DataPlane
@@ -76,11 +77,12 @@ class Phase:
 
 @dataclass(frozen=True)
 class DemoResult:
-    """All of the demo: three phases, the recalibration between the last two, and one frame pair to look at."""
+    """All of the demo: three phases, the recalibration between the last two, and one frame pair with what it says."""
 
     phases: tuple[Phase, ...]
     recalibrated: Recalibrated
-    frames: tuple[NDArray[np.integer], NDArray[np.integer]]
+    frames: FramePair
+    symbols: NDArray[np.uint8]
     pages: int
     seed: int
 
@@ -168,6 +170,7 @@ def run_demo(bundle: Path, pages: int, seed: int, progress: Progress = lambda wh
                 found.append(client.read_page(page, want_concentration=True, want_phase=True, want_written=True))
             return summarise(name, found)
 
+        symbols = client.decode(frames, LEVELS).symbols
         fresh = decode("as calibrated", 0, 0.1, 0.3)
         source.set_device(drifted(device))
         lost = decode("after drift", 1, 0.3, 0.5)
@@ -177,7 +180,7 @@ def run_demo(bundle: Path, pages: int, seed: int, progress: Progress = lambda wh
         )
         again = decode("recalibrated", 2, 0.8, 1.0)
     progress("done", 1.0)
-    return DemoResult((fresh, lost, again), recalibrated, (frames.in_phase, frames.quadrature), pages, seed)
+    return DemoResult((fresh, lost, again), recalibrated, frames, symbols, pages, seed)
 
 
 def summarise(name: str, pages: Sequence[RemotePage]) -> Phase:

@@ -29,6 +29,7 @@ class ServiceMetrics:
         self.concentration = Gauge("lightpage_concentration_mean", "Mean kappa of the last page.", registry=own)
         self.piston = Gauge("lightpage_piston_radians", "Piston of the last page.", registry=own)
         self.pilots = Gauge("lightpage_pilot_coherence", "Agreement of the last pilots, 0..1.", registry=own)
+        self.trust = Gauge("lightpage_pilot_trust", "Claim that the last pilots bear out, 0..1.", registry=own)
         self.recalibrations = Counter("lightpage_recalibrations", "By their end.", ["result"], registry=own)
         self.model = Gauge("lightpage_model_info", "1 for the model in service.", ["version"], registry=own)
 
@@ -40,6 +41,7 @@ class ServiceMetrics:
         self.concentration.set(float(page.concentration.mean()))
         self.piston.set(page.piston_rad)
         self.pilots.set(page.pilot_coherence)
+        self.trust.set(page.pilot_trust)
 
     def in_service(self, version: str) -> None:
         """Say which model decodes now."""

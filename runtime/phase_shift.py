@@ -95,12 +95,14 @@ class PhaseShift:
         """The table of an image that lies `shift_px` (x, y) from where calibration saw it."""
         return _moved(self._places, shift_px) if np.any(shift_px) else {}
 
-    def measure(self, page: DecodedPage, pilots: Pilots | None = None) -> Real | None:
-        """Remaining shift (x, y) of a page, camera pixels, or None where it does not show it reliably."""
+    def measure(self, page: DecodedPage, pilots: Pilots | None = None) -> Estimate | None:
+        """Remaining shift of a page, or None where it does not show it reliably."""
         estimate = self.estimate(page, pilots)
-        if estimate is None or np.any(estimate.error_px > LARGEST_ERROR_PX):
-            return None
-        return estimate.shift_px
+        return None if estimate is None or np.any(estimate.error_px > LARGEST_ERROR_PX) else estimate
+
+    def bend(self, shift_px: Real) -> Real:
+        """What to add to the phases [ny, nx] of a page that was decoded `shift_px` (x, y) off, radians, first order."""
+        return np.asarray(np.tensordot(shift_px, self._sensitivity, 1))
 
     def estimate(self, page: DecodedPage, pilots: Pilots | None = None) -> Estimate | None:
         """Shift from the pilots, then, freed from it, from safe decisions too; None where the pilots disagree.
@@ -131,7 +133,7 @@ class PhaseShift:
 
     def _model(self, estimate: Estimate) -> Real:
         """Phase error of every symbol under an estimate, radians [ny, nx]."""
-        return np.asarray(estimate.constant_rad - np.tensordot(estimate.shift_px, self._sensitivity, 1))
+        return estimate.constant_rad - self.bend(estimate.shift_px)
 
 
 def default_places(decoder: Decoder) -> NDArray[np.float32]:

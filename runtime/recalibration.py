@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from statistics import fmean
 from typing import Protocol
 
 import numpy as np
@@ -34,7 +35,7 @@ MIN_PAGES = 2
 """One to fit on, one to judge by."""
 
 MIN_AIR_SHARE = 0.02
-"""Share of log2 M below which the held-back pages do not match their symbols at all: wrong pilots, wrong device."""
+"""Share of log2 M below which a held-back page does not match its symbols at all: wrong pilots, wrong device."""
 
 TOLERATED_LOSS_BITS = 0.01
 """AIR that a re-fit may lose to the noise of a few held-back pages and still replace an equally good model."""
@@ -172,16 +173,17 @@ def recalibrate(
     fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))
     progress("measure the model in service", 0.0)
     try:
-        before = _air(decoder, held_back, table)
+        before = fmean(_air(decoder, held_back, table))
     except FrameError:
         before = -math.inf  # any model that takes the frames is better
     try:
         result = fit(decoder.bundle, fitted, lambda step, share: progress(step, 0.05 + 0.85 * share), decoder)
         progress("judge by the held-back pages", 0.9)
-        after = _air(decoder, held_back, result.table)
+        rates = _air(decoder, held_back, result.table)
     except (CalibrationError, FrameError) as error:
         raise RecalibrationRefusedError(error.thing, error.got, error.wanted) from error
-    _judge(before, after, pages.levels)
+    after = fmean(rates)
+    _judge(before, rates, pages.levels)
     progress("write the new bundle", 0.95)
     files, manifest = _new_contents(decoder, held_back.pairs[0], pages, result, version, before, after)
     write_bundle(out, manifest, files)
@@ -206,27 +208,25 @@ def next_version(version: str, taken: Sequence[str] = ()) -> str:
     return f"{base}+r{last + 1}"
 
 
-def _air(decoder: Decoder, pages: KnownPages, table: Table | None) -> float:
-    """AIR over the data symbols of all `pages`, bits per symbol; `FrameError` where the model refuses the frames."""
+def _air(decoder: Decoder, pages: KnownPages, table: Table | None) -> list[float]:
+    """AIR over the data symbols of each page, bits per symbol; `FrameError` where the model refuses the frames."""
     mask = decoder.bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
-    data = ~mask
-    phases, concentrations, truths = [], [], []
+    data, rates = ~mask, []
     for pair, symbols in zip(pages.pairs, pages.symbols, strict=True):
         page = decoder.decode(pair, pages.levels, table, Pilots.of_symbols(mask, symbols, pages.levels))
-        phases.append(page.phase[data])
-        concentrations.append(page.concentration[data])
-        truths.append(symbols[data])
-    figures = measure(np.concatenate(phases), np.concatenate(concentrations), np.concatenate(truths), pages.levels)
-    return figures.air_bits_per_symbol
+        figures = measure(page.phase[data], page.concentration[data], symbols[data], pages.levels)
+        rates.append(figures.air_bits_per_symbol)
+    return rates
 
 
-def _judge(before: float, after: float, levels: int) -> None:
-    least = MIN_AIR_SHARE * math.log2(levels)
-    if not after >= least:
+def _judge(before: float, rates: list[float], levels: int) -> None:
+    """Each page must show its symbols, whatever the others do, and all together more of them than before."""
+    least, worst, after = MIN_AIR_SHARE * math.log2(levels), min(rates), fmean(rates)
+    if not worst >= least:
         raise RecalibrationRefusedError(
             "re-fitted geometry",
-            f"an AIR of {after:.3f} bit/symbol on held-back pages",
-            f"at least {least:.3f}: the pages do not match their symbols",
+            f"an AIR of {worst:.3f} bit/symbol on one of the held-back pages",
+            f"at least {least:.3f}: the page does not match its symbols",
         )
     if after < before - TOLERATED_LOSS_BITS:
         raise RecalibrationRefusedError(

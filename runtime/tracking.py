@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optics.pilots import Pilots
 from optics.recording import FramePair
@@ -20,10 +21,8 @@ JUMP_PX = 0.1
 ATTEMPTS = 3
 """Most decodes of one page: a jump is read to a tenth of itself, so two corrections settle any."""
 
-GAIN = 0.5
-"""Share of a measured shift that is believed at once. The image walks 0.02 px a page and a page shows it to 0.03 px by
-its pilots, to 0.005 px with safe decisions; the page after then lies 0.029 or 0.023 px (root mean square) off the
-estimate, against 0.029 and 0.021 at the best gain of either, 0.5 and 1."""
+WALK_PX = 0.02
+"""Standard deviation of the image's movement from one page to the next, per axis."""
 
 
 @dataclass(frozen=True)
@@ -34,18 +33,38 @@ class Shift:
     y_px: float = 0.0
 
 
-class MeasureShift(Protocol):
-    """Measures from one decoded page how far the image lies from where the table in use looks for it."""
+@dataclass(frozen=True)
+class Measured:
+    """A remaining shift with its standard deviation per axis, camera pixels."""
 
-    def __call__(self, pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None) -> Shift | None:
-        """The remaining shift, or None where the page does not show it reliably."""
+    shift: Shift
+    error_px: tuple[float, float]
 
 
-class MoveTable(Protocol):
-    """Turns a total shift into the tensors that are fed instead of the bundle's."""
+@dataclass(frozen=True)
+class Lesson:
+    """What a page taught.
 
-    def __call__(self, shift: Shift) -> Table:
-        """Tensors by input name; empty for no change."""
+    Attributes:
+        rest: what is believed of how far the image lay from where the page's table looked for it.
+        again: whether that is a jump, so that decoding the page again with the new table pays.
+    """
+
+    rest: Shift = field(default_factory=Shift)
+    again: bool = False
+
+
+class ShiftReader(Protocol):
+    """Reads shift from decoded pages, and says what it does to tables and to phases."""
+
+    def measure(self, page: DecodedPage, pilots: Pilots | None) -> Measured | None:
+        """How far the image still lies from where the page's table looked for it; None where it does not show."""
+
+    def move(self, shift: Shift) -> Table:
+        """The tensors that are fed instead of the bundle's under a total shift; empty for no change."""
+
+    def bend(self, shift: Shift) -> NDArray[np.float64]:
+        """What to add to the phases [ny, nx] of a page whose table was `shift` off, radians."""
 
 
 class Tracker(Protocol):
@@ -54,11 +73,14 @@ class Tracker(Protocol):
     def table(self) -> Table:
         """Tensors for the next page, empty for the bundle's own."""
 
-    def update(self, pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> bool:
-        """Learn from a decoded page and the table that it was decoded with; whether decoding it again would pay.
+    def update(self, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> Lesson:
+        """Learn from a decoded page and the table that it was decoded with.
 
         `pilots` are the page's known symbols where they differ from the device's.
         """
+
+    def bend(self, rest: Shift) -> NDArray[np.float64] | None:
+        """What to add to the phases of a page whose table was `rest` off, None for nothing."""
 
 
 class NoTracker:
@@ -68,27 +90,30 @@ class NoTracker:
         """Always empty."""
         return {}
 
-    def update(self, pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> bool:
+    def update(self, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> Lesson:
         """Learns nothing."""
-        return False
+        return Lesson()
+
+    def bend(self, rest: Shift) -> None:
+        """Nothing."""
 
 
 class ShiftTracker:
-    """Exponential average of the measured shift, applied to the table of the next page.
+    """Kalman filter of the image's shift, one an axis, which walks from page to page.
 
     Args:
-        measure: how one page shows the remaining shift.
-        move: how a shift changes the table.
-        gain: share of a measured remainder that is believed at once, 0..1.
-        limit_px: the average is held within this distance per axis; drift beyond it needs a recalibration.
+        reader: reads and applies shift.
+        walk_px: standard deviation of the walk from page to page.
+        limit_px: the estimate is held within this distance per axis; drift beyond it needs a recalibration.
     """
 
-    def __init__(self, measure: MeasureShift, move: MoveTable, gain: float = 0.3, limit_px: float = 3.0) -> None:
-        self._measure, self._move = measure, move
-        self._gain, self._limit = gain, limit_px
+    def __init__(self, reader: ShiftReader, walk_px: float = WALK_PX, limit_px: float = 3.0) -> None:
+        self._reader, self._walk, self._limit = reader, walk_px, limit_px
         self._lock = threading.Lock()
-        """Guards the two below; taken by table() and update(), never held while measuring or moving."""
+        """Guards the three below; never held while measuring or moving."""
         self._shift = Shift()
+        self._variance = (walk_px**2, walk_px**2)
+        """Of the shift before the next page is measured, per axis."""
         self._table: Table = {}
 
     @property
@@ -102,47 +127,62 @@ class ShiftTracker:
         with self._lock:
             return self._table
 
-    def update(self, pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> bool:
-        """Take in the shift that `page`, decoded with `table`, still shows; whether it was a jump.
+    def bend(self, rest: Shift) -> NDArray[np.float64] | None:
+        """What to add to the phases of a page whose table was `rest` off, None for nothing."""
+        return self._reader.bend(rest) if rest != Shift() else None
 
-        A jump is believed at once. From a page decoded with a table that has been replaced since nothing is learnt: its
-        remainder is already accounted for, and decoding it again with the new table pays if it was a jump.
+    def update(self, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> Lesson:
+        """Take in the shift that `page`, decoded with `table`, still shows.
+
+        A jump is believed at once. A page decoded with a table that has been replaced since teaches the filter nothing:
+        its remainder is already accounted for.
         """
-        rest = self._measure(pair, page, table, pilots)
-        if rest is None:
-            return False
+        measured = self._reader.measure(page, pilots)
+        if measured is None:
+            with self._lock:  # it walks on unseen
+                self._variance = (self._variance[0] + self._walk**2, self._variance[1] + self._walk**2)
+            return Lesson()
+        rest = measured.shift
         jumped = max(abs(rest.x_px), abs(rest.y_px)) > JUMP_PX
         with self._lock:
-            if table is not self._table:
-                return jumped
-            before = self._shift
-        gain = 1.0 if jumped else self._gain
-        after = Shift(self._step(before.x_px, gain * rest.x_px), self._step(before.y_px, gain * rest.y_px))
-        moved = self._move(after)
+            before, variance = self._shift, self._variance
+            late = table is not self._table
+        gains = [1.0 if jumped else v / (v + e**2) for v, e in zip(variance, measured.error_px, strict=True)]
+        believed = Shift(gains[0] * rest.x_px, gains[1] * rest.y_px)
+        if late:
+            return Lesson(believed, jumped)
+        after = Shift(self._held(before.x_px + believed.x_px), self._held(before.y_px + believed.y_px))
+        moved = self._reader.move(after)
+        left = [g * e**2 + self._walk**2 for g, e in zip(gains, measured.error_px, strict=True)]
         with self._lock:
-            if self._shift == before:
-                self._shift, self._table = after, moved
-        return jumped and after != before
+            if self._table is table:
+                self._shift, self._variance, self._table = after, (left[0], left[1]), moved
+        return Lesson(believed, jumped and after != before)
 
-    def _step(self, old: float, by: float) -> float:
-        return min(self._limit, max(-self._limit, old + by))
+    def _held(self, value: float) -> float:
+        return min(self._limit, max(-self._limit, value))
 
 
 def decode_tracked(
     decoder: Decoder, tracker: Tracker, pair: FramePair, levels: int, pilots: Pilots | None = None
 ) -> DecodedPage:
-    """Decode a pair with the tracker's table, again where it shows that the image has jumped; the last answer counts.
+    """Decode a pair with the tracker's table, its phases freed from what the page itself shows of further shift.
+
+    Where it shows that the image has jumped, it is decoded again. The last answer counts, its timings too: they say
+    nothing of the attempts before it.
 
     Args:
         decoder, tracker: of one model.
         pair, levels, pilots: as for `Decoder.decode`.
     """
-    for _ in range(ATTEMPTS - 1):
+    for attempt in range(1, ATTEMPTS + 1):
         table = tracker.table()
         page = decoder.decode(pair, levels, table, pilots)
-        if not tracker.update(pair, page, table, pilots):
-            return page
-    return decoder.decode(pair, levels, tracker.table(), pilots)
+        lesson = tracker.update(page, table, pilots)
+        if not lesson.again or attempt == ATTEMPTS:
+            break
+    bend = tracker.bend(lesson.rest)
+    return page if bend is None else decoder.settle_again(page, bend, pilots)
 
 
 def tracker_for(decoder: Decoder) -> Tracker:
@@ -151,15 +191,28 @@ def tracker_for(decoder: Decoder) -> Tracker:
     Raises:
         BundleError, CalibrationError: see `PhaseShift.of_decoder`.
     """
-    if "places" not in decoder.table_shapes:
-        return NoTracker()
-    reader = PhaseShift.of_decoder(decoder)
+    return ShiftTracker(_PhaseReader(decoder)) if "places" in decoder.table_shapes else NoTracker()
 
-    def measure(pair: FramePair, page: DecodedPage, table: Table, pilots: Pilots | None) -> Shift | None:
-        found = reader.measure(page, pilots)
-        return None if found is None else Shift(float(found[0]), float(found[1]))
 
-    def move(shift: Shift) -> Table:
-        return reader.move(np.array([shift.x_px, shift.y_px]))
+class _PhaseReader:
+    """`PhaseShift` as the tracker asks for it."""
 
-    return ShiftTracker(measure, move, GAIN)
+    def __init__(self, decoder: Decoder) -> None:
+        self._reader = PhaseShift.of_decoder(decoder)
+
+    def measure(self, page: DecodedPage, pilots: Pilots | None) -> Measured | None:
+        found = self._reader.measure(page, pilots)
+        if found is None:
+            return None
+        x, y = map(float, found.shift_px)
+        return Measured(Shift(x, y), (float(found.error_px[0]), float(found.error_px[1])))
+
+    def move(self, shift: Shift) -> Table:
+        return self._reader.move(_array(shift))
+
+    def bend(self, shift: Shift) -> NDArray[np.float64]:
+        return self._reader.bend(_array(shift))
+
+
+def _array(shift: Shift) -> NDArray[np.float64]:
+    return np.array([shift.x_px, shift.y_px])

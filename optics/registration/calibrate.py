@@ -63,7 +63,7 @@ class Registered:
 
     Attributes:
         parameters: [P] fitted vector.
-        deviations: [P] standard deviations.
+        deviations: [P] standard deviations in the fit of patches; the cameras, placed by waves after it, are better.
         turn: angle between the homodyne arms, radians.
         coherence_before, coherence_after: mean over the pages, at the start's geometry and at the fitted one.
         cost: mean squared normalised residual.

@@ -283,7 +283,7 @@ def test_offline_recalibration_with_wrong_pilots_is_refused(
         file["symbols"][...] = np.random.default_rng(0).integers(16, size=file["symbols"].shape)
     arguments = ["recalibrate", "--bundle", toy_zip, "--recording", tmp_path / "d.h5", "--out", tmp_path / "new.zip"]
     assert run(arguments) == 2
-    assert "do not match" in capsys.readouterr().err
+    assert "does not match" in capsys.readouterr().err
     assert not (tmp_path / "new.zip").exists()
 
 

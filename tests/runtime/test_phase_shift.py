@@ -33,7 +33,7 @@ def page(
     phase[wrong] = rng.uniform(-np.pi, np.pi, np.count_nonzero(wrong))
     flat = np.full(phase.shape, kappa, np.float32)
     wrapped = np.angle(np.exp(1j * phase)).astype(np.float32)
-    return DecodedPage(symbols, flat, flat, wrapped, levels, 0.0, 1.0, Timings(0, 0, 0))
+    return DecodedPage(symbols, flat, flat, wrapped, levels, 0.0, 1.0, 1.0, Timings(0, 0, 0))
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.1, -0.05), (-0.8, 0.6)])
@@ -78,7 +78,7 @@ def test_a_pages_own_pilots_take_the_place_of_the_devices() -> None:
     assert reader().measure(foreign) is None
     found = reader().measure(foreign, Pilots.of_symbols(mask, symbols, 16))
     assert found is not None
-    assert np.all(np.abs(found - (0.1, -0.05)) < 0.03)
+    assert np.all(np.abs(found.shift_px - (0.1, -0.05)) < 0.03)
 
 
 def test_a_page_too_noisy_to_tell_is_left_out() -> None:

@@ -28,6 +28,6 @@ def test_wrong_symbols_are_refused(wrong: tuple[int, ...], tmp_path: Path) -> No
     pairs = tuple(simulator.page(page) for page in written[:2])
     told = tuple(written[2 + page] if page in wrong else written[page] for page in (0, 1))
     known = KnownPages(pairs, told, LEVELS, simulator.references())
-    with pytest.raises(RecalibrationRefusedError, match="right symbols" if 0 in wrong else "do not match"):
+    with pytest.raises(RecalibrationRefusedError, match="right symbols" if 0 in wrong else "does not match"):
         recalibrate(decoder, known, tmp_path / "n.zip", "bench+r1", refit, lambda *_: None)
     assert list(tmp_path.iterdir()) == []

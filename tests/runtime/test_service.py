@@ -484,7 +484,7 @@ def test_recalibration_with_wrong_pilots_is_refused_and_the_old_model_stays(star
         return type(found)(found.pair, found.page_index, wrong)
 
     service.source.read = lying  # type: ignore[method-assign,assignment]
-    with pytest.raises(RecalibrationRefusedError, match="do not match"):
+    with pytest.raises(RecalibrationRefusedError, match="does not match"):
         service.client.recalibrate(count=3)
     service.source.read = honest  # type: ignore[method-assign]
     assert service.client.describe().model.version == "toy-1"

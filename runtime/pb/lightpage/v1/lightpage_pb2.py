@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1clightpage/v1/lightpage.proto\x12\x0clightpage.v1\"\x11\n\x0f\x44\x65scribeRequest\"\xc0\x02\n\rDescribeReply\x12\x17\n\x0fservice_version\x18\x01 \x01(\t\x12\"\n\x05model\x18\x02 \x01(\x0b\x32\x13.lightpage.v1.Model\x12$\n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x14.lightpage.v1.Camera\x12%\n\x04page\x18\x04 \x01(\x0b\x32\x17.lightpage.v1.PageShape\x12$\n\x06limits\x18\x05 \x01(\x0b\x32\x14.lightpage.v1.Limits\x12\x0e\n\x06source\x18\x06 \x01(\t\x12\x15\n\rsource_levels\x18\x07 \x01(\r\x12\x14\n\x0cprofile_toml\x18\x08 \x01(\t\x12\x18\n\x10\x63\x61libration_toml\x18\t \x01(\t\x12\x12\n\npilot_mask\x18\n \x01(\x0c\x12\x14\n\x0cpilot_phases\x18\x0b \x03(\x02\"\xab\x01\n\x05Model\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\x12\x0f\n\x07\x63reated\x18\x03 \x01(\t\x12\x0f\n\x07\x63urrent\x18\x04 \x01(\x08\x12\x31\n\x07metrics\x18\x05 \x03(\x0b\x32 .lightpage.v1.Model.MetricsEntry\x1a.\n\x0cMetricsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"m\n\x06\x43\x61mera\x12\x0f\n\x07rows_px\x18\x01 \x01(\r\x12\x12\n\ncolumns_px\x18\x02 \x01(\r\x12\x11\n\tbit_depth\x18\x03 \x01(\r\x12+\n\npixel_type\x18\x04 \x01(\x0e\x32\x17.lightpage.v1.PixelType\"*\n\tPageShape\x12\x0c\n\x04rows\x18\x01 \x01(\r\x12\x0f\n\x07\x63olumns\x18\x02 \x01(\r\"d\n\x06Limits\x12\x15\n\rmessage_bytes\x18\x01 \x01(\x04\x12\x13\n\x0b\x63hunk_bytes\x18\x02 \x01(\x04\x12\x12\n\npair_bytes\x18\x03 \x01(\x04\x12\x1a\n\x12\x63oncurrent_decodes\x18\x04 \x01(\r\"\x8a\x01\n\rDecodeOptions\x12\x0e\n\x06levels\x18\x01 \x01(\r\x12\x39\n\x11\x63onfidence_format\x18\x02 \x01(\x0e\x32\x1e.lightpage.v1.ConfidenceFormat\x12\x1a\n\x12want_concentration\x18\x03 \x01(\x08\x12\x12\n\nwant_phase\x18\x04 \x01(\x08\"6\n\x06Pilots\x12\x0c\n\x04mask\x18\x01 \x01(\x0c\x12\x0e\n\x06values\x18\x02 \x01(\x0c\x12\x0e\n\x06levels\x18\x03 \x01(\r\"\xc7\x01\n\x0c\x44\x65\x63odeHeader\x12\x0f\n\x07rows_px\x18\x01 \x01(\r\x12\x12\n\ncolumns_px\x18\x02 \x01(\r\x12+\n\npixel_type\x18\x03 \x01(\x0e\x32\x17.lightpage.v1.PixelType\x12\x11\n\tbit_depth\x18\x04 \x01(\r\x12,\n\x07options\x18\x05 \x01(\x0b\x32\x1b.lightpage.v1.DecodeOptions\x12$\n\x06pilots\x18\x06 \x01(\x0b\x32\x14.lightpage.v1.Pilots\"\\\n\x13\x44\x65\x63odeFramesRequest\x12,\n\x06header\x18\x01 \x01(\x0b\x32\x1a.lightpage.v1.DecodeHeaderH\x00\x12\x0f\n\x05\x63hunk\x18\x02 \x01(\x0cH\x00\x42\x06\n\x04part\"\xae\x02\n\x0b\x44\x65\x63odeReply\x12\x0c\n\x04rows\x18\x01 \x01(\r\x12\x0f\n\x07\x63olumns\x18\x02 \x01(\r\x12\x0e\n\x06levels\x18\x03 \x01(\r\x12\x0f\n\x07symbols\x18\x04 \x01(\x0c\x12\x12\n\nconfidence\x18\x05 \x01(\x0c\x12\x39\n\x11\x63onfidence_format\x18\x06 \x01(\x0e\x32\x1e.lightpage.v1.ConfidenceFormat\x12\x15\n\rconcentration\x18\x07 \x01(\x0c\x12\r\n\x05phase\x18\x08 \x01(\x0c\x12\x12\n\npiston_rad\x18\t \x01(\x01\x12\x17\n\x0fpilot_coherence\x18\n \x01(\x01\x12\x15\n\rmodel_version\x18\x0b \x01(\t\x12&\n\x07timings\x18\x0c \x01(\x0b\x32\x15.lightpage.v1.Timings\"T\n\x07Timings\x12\x11\n\treceive_s\x18\x01 \x01(\x01\x12\x10\n\x08\x64\x65\x63ode_s\x18\x02 \x01(\x01\x12\x13\n\x0binference_s\x18\x03 \x01(\x01\x12\x0f\n\x07total_s\x18\x04 \x01(\x01\"q\n\x0fReadPageRequest\x12\x11\n\x04page\x18\x01 \x01(\rH\x00\x88\x01\x01\x12,\n\x07options\x18\x02 \x01(\x0b\x32\x1b.lightpage.v1.DecodeOptions\x12\x14\n\x0cwant_written\x18\x03 \x01(\x08\x42\x07\n\x05_page\"n\n\rReadPageReply\x12*\n\x07\x64\x65\x63oded\x18\x01 \x01(\x0b\x32\x19.lightpage.v1.DecodeReply\x12\x0c\n\x04page\x18\x02 \x01(\r\x12\x0f\n\x07written\x18\x03 \x01(\x0c\x12\x12\n\npilot_mask\x18\x04 \x01(\x0c\"x\n\x12RecalibrateRequest\x12+\n\x06source\x18\x01 \x01(\x0b\x32\x19.lightpage.v1.SourcePagesH\x00\x12\x13\n\trecording\x18\x02 \x01(\tH\x00\x12\x17\n\x0frecording_count\x18\x03 \x01(\rB\x07\n\x05pages\"+\n\x0bSourcePages\x12\r\n\x05\x63ount\x18\x01 \x01(\r\x12\r\n\x05pages\x18\x02 \x03(\r\"{\n\x10RecalibrateReply\x12*\n\x08progress\x18\x01 \x01(\x0b\x32\x16.lightpage.v1.ProgressH\x00\x12\x33\n\x06result\x18\x02 \x01(\x0b\x32!.lightpage.v1.RecalibrationResultH\x00\x42\x06\n\x04step\"*\n\x08Progress\x12\x0c\n\x04step\x18\x01 \x01(\t\x12\x10\n\x08\x66raction\x18\x02 \x01(\x01\"\xb7\x02\n\x13RecalibrationResult\x12\x15\n\rmodel_version\x18\x01 \x01(\t\x12\x18\n\x10previous_version\x18\x02 \x01(\t\x12\x12\n\npages_used\x18\x03 \x01(\r\x12\x17\n\x0fpages_held_back\x18\x04 \x01(\r\x12\x12\n\nair_before\x18\x05 \x01(\x01\x12\x11\n\tair_after\x18\x06 \x01(\x01\x12\x16\n\tangle_deg\x18\x07 \x01(\x01H\x00\x88\x01\x01\x12\x1d\n\x10\x63oherence_before\x18\x08 \x01(\x01H\x01\x88\x01\x01\x12\x1c\n\x0f\x63oherence_after\x18\t \x01(\x01H\x02\x88\x01\x01\x12\x0f\n\x07seconds\x18\n \x01(\x01\x42\x0c\n\n_angle_degB\x13\n\x11_coherence_beforeB\x12\n\x10_coherence_after\"\x11\n\x0fRollbackRequest\"@\n\rRollbackReply\x12\x15\n\rmodel_version\x18\x01 \x01(\t\x12\x18\n\x10previous_version\x18\x02 \x01(\t\"\x13\n\x11ListModelsRequest\"6\n\x0fListModelsReply\x12#\n\x06models\x18\x01 \x03(\x0b\x32\x13.lightpage.v1.Model\"G\n\x0b\x45rrorDetail\x12\x0c\n\x04kind\x18\x01 \x01(\t\x12\r\n\x05thing\x18\x02 \x01(\t\x12\x0b\n\x03got\x18\x03 \x01(\t\x12\x0e\n\x06wanted\x18\x04 \x01(\t*T\n\tPixelType\x12\x1a\n\x16PIXEL_TYPE_UNSPECIFIED\x10\x00\x12\x14\n\x10PIXEL_TYPE_UINT8\x10\x01\x12\x15\n\x11PIXEL_TYPE_UINT16\x10\x02*q\n\x10\x43onfidenceFormat\x12!\n\x1d\x43ONFIDENCE_FORMAT_UNSPECIFIED\x10\x00\x12\x1d\n\x19\x43ONFIDENCE_FORMAT_FLOAT32\x10\x01\x12\x1b\n\x17\x43ONFIDENCE_FORMAT_UINT8\x10\x02\x32\xd4\x03\n\tLightpage\x12\x46\n\x08\x44\x65scribe\x12\x1d.lightpage.v1.DescribeRequest\x1a\x1b.lightpage.v1.DescribeReply\x12N\n\x0c\x44\x65\x63odeFrames\x12!.lightpage.v1.DecodeFramesRequest\x1a\x19.lightpage.v1.DecodeReply(\x01\x12\x46\n\x08ReadPage\x12\x1d.lightpage.v1.ReadPageRequest\x1a\x1b.lightpage.v1.ReadPageReply\x12Q\n\x0bRecalibrate\x12 .lightpage.v1.RecalibrateRequest\x1a\x1e.lightpage.v1.RecalibrateReply0\x01\x12\x46\n\x08Rollback\x12\x1d.lightpage.v1.RollbackRequest\x1a\x1b.lightpage.v1.RollbackReply\x12L\n\nListModels\x12\x1f.lightpage.v1.ListModelsRequest\x1a\x1d.lightpage.v1.ListModelsReplyb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1clightpage/v1/lightpage.proto\x12\x0clightpage.v1\"\x11\n\x0f\x44\x65scribeRequest\"\xc0\x02\n\rDescribeReply\x12\x17\n\x0fservice_version\x18\x01 \x01(\t\x12\"\n\x05model\x18\x02 \x01(\x0b\x32\x13.lightpage.v1.Model\x12$\n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x14.lightpage.v1.Camera\x12%\n\x04page\x18\x04 \x01(\x0b\x32\x17.lightpage.v1.PageShape\x12$\n\x06limits\x18\x05 \x01(\x0b\x32\x14.lightpage.v1.Limits\x12\x0e\n\x06source\x18\x06 \x01(\t\x12\x15\n\rsource_levels\x18\x07 \x01(\r\x12\x14\n\x0cprofile_toml\x18\x08 \x01(\t\x12\x18\n\x10\x63\x61libration_toml\x18\t \x01(\t\x12\x12\n\npilot_mask\x18\n \x01(\x0c\x12\x14\n\x0cpilot_phases\x18\x0b \x03(\x02\"\xab\x01\n\x05Model\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\x12\x0f\n\x07\x63reated\x18\x03 \x01(\t\x12\x0f\n\x07\x63urrent\x18\x04 \x01(\x08\x12\x31\n\x07metrics\x18\x05 \x03(\x0b\x32 .lightpage.v1.Model.MetricsEntry\x1a.\n\x0cMetricsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"m\n\x06\x43\x61mera\x12\x0f\n\x07rows_px\x18\x01 \x01(\r\x12\x12\n\ncolumns_px\x18\x02 \x01(\r\x12\x11\n\tbit_depth\x18\x03 \x01(\r\x12+\n\npixel_type\x18\x04 \x01(\x0e\x32\x17.lightpage.v1.PixelType\"*\n\tPageShape\x12\x0c\n\x04rows\x18\x01 \x01(\r\x12\x0f\n\x07\x63olumns\x18\x02 \x01(\r\"d\n\x06Limits\x12\x15\n\rmessage_bytes\x18\x01 \x01(\x04\x12\x13\n\x0b\x63hunk_bytes\x18\x02 \x01(\x04\x12\x12\n\npair_bytes\x18\x03 \x01(\x04\x12\x1a\n\x12\x63oncurrent_decodes\x18\x04 \x01(\r\"\x8a\x01\n\rDecodeOptions\x12\x0e\n\x06levels\x18\x01 \x01(\r\x12\x39\n\x11\x63onfidence_format\x18\x02 \x01(\x0e\x32\x1e.lightpage.v1.ConfidenceFormat\x12\x1a\n\x12want_concentration\x18\x03 \x01(\x08\x12\x12\n\nwant_phase\x18\x04 \x01(\x08\"6\n\x06Pilots\x12\x0c\n\x04mask\x18\x01 \x01(\x0c\x12\x0e\n\x06values\x18\x02 \x01(\x0c\x12\x0e\n\x06levels\x18\x03 \x01(\r\"\xc7\x01\n\x0c\x44\x65\x63odeHeader\x12\x0f\n\x07rows_px\x18\x01 \x01(\r\x12\x12\n\ncolumns_px\x18\x02 \x01(\r\x12+\n\npixel_type\x18\x03 \x01(\x0e\x32\x17.lightpage.v1.PixelType\x12\x11\n\tbit_depth\x18\x04 \x01(\r\x12,\n\x07options\x18\x05 \x01(\x0b\x32\x1b.lightpage.v1.DecodeOptions\x12$\n\x06pilots\x18\x06 \x01(\x0b\x32\x14.lightpage.v1.Pilots\"\\\n\x13\x44\x65\x63odeFramesRequest\x12,\n\x06header\x18\x01 \x01(\x0b\x32\x1a.lightpage.v1.DecodeHeaderH\x00\x12\x0f\n\x05\x63hunk\x18\x02 \x01(\x0cH\x00\x42\x06\n\x04part\"\xc3\x02\n\x0b\x44\x65\x63odeReply\x12\x0c\n\x04rows\x18\x01 \x01(\r\x12\x0f\n\x07\x63olumns\x18\x02 \x01(\r\x12\x0e\n\x06levels\x18\x03 \x01(\r\x12\x0f\n\x07symbols\x18\x04 \x01(\x0c\x12\x12\n\nconfidence\x18\x05 \x01(\x0c\x12\x39\n\x11\x63onfidence_format\x18\x06 \x01(\x0e\x32\x1e.lightpage.v1.ConfidenceFormat\x12\x15\n\rconcentration\x18\x07 \x01(\x0c\x12\r\n\x05phase\x18\x08 \x01(\x0c\x12\x12\n\npiston_rad\x18\t \x01(\x01\x12\x17\n\x0fpilot_coherence\x18\n \x01(\x01\x12\x15\n\rmodel_version\x18\x0b \x01(\t\x12&\n\x07timings\x18\x0c \x01(\x0b\x32\x15.lightpage.v1.Timings\x12\x13\n\x0bpilot_trust\x18\r \x01(\x01\"T\n\x07Timings\x12\x11\n\treceive_s\x18\x01 \x01(\x01\x12\x10\n\x08\x64\x65\x63ode_s\x18\x02 \x01(\x01\x12\x13\n\x0binference_s\x18\x03 \x01(\x01\x12\x0f\n\x07total_s\x18\x04 \x01(\x01\"q\n\x0fReadPageRequest\x12\x11\n\x04page\x18\x01 \x01(\rH\x00\x88\x01\x01\x12,\n\x07options\x18\x02 \x01(\x0b\x32\x1b.lightpage.v1.DecodeOptions\x12\x14\n\x0cwant_written\x18\x03 \x01(\x08\x42\x07\n\x05_page\"n\n\rReadPageReply\x12*\n\x07\x64\x65\x63oded\x18\x01 \x01(\x0b\x32\x19.lightpage.v1.DecodeReply\x12\x0c\n\x04page\x18\x02 \x01(\r\x12\x0f\n\x07written\x18\x03 \x01(\x0c\x12\x12\n\npilot_mask\x18\x04 \x01(\x0c\"x\n\x12RecalibrateRequest\x12+\n\x06source\x18\x01 \x01(\x0b\x32\x19.lightpage.v1.SourcePagesH\x00\x12\x13\n\trecording\x18\x02 \x01(\tH\x00\x12\x17\n\x0frecording_count\x18\x03 \x01(\rB\x07\n\x05pages\"+\n\x0bSourcePages\x12\r\n\x05\x63ount\x18\x01 \x01(\r\x12\r\n\x05pages\x18\x02 \x03(\r\"{\n\x10RecalibrateReply\x12*\n\x08progress\x18\x01 \x01(\x0b\x32\x16.lightpage.v1.ProgressH\x00\x12\x33\n\x06result\x18\x02 \x01(\x0b\x32!.lightpage.v1.RecalibrationResultH\x00\x42\x06\n\x04step\"*\n\x08Progress\x12\x0c\n\x04step\x18\x01 \x01(\t\x12\x10\n\x08\x66raction\x18\x02 \x01(\x01\"\xb7\x02\n\x13RecalibrationResult\x12\x15\n\rmodel_version\x18\x01 \x01(\t\x12\x18\n\x10previous_version\x18\x02 \x01(\t\x12\x12\n\npages_used\x18\x03 \x01(\r\x12\x17\n\x0fpages_held_back\x18\x04 \x01(\r\x12\x12\n\nair_before\x18\x05 \x01(\x01\x12\x11\n\tair_after\x18\x06 \x01(\x01\x12\x16\n\tangle_deg\x18\x07 \x01(\x01H\x00\x88\x01\x01\x12\x1d\n\x10\x63oherence_before\x18\x08 \x01(\x01H\x01\x88\x01\x01\x12\x1c\n\x0f\x63oherence_after\x18\t \x01(\x01H\x02\x88\x01\x01\x12\x0f\n\x07seconds\x18\n \x01(\x01\x42\x0c\n\n_angle_degB\x13\n\x11_coherence_beforeB\x12\n\x10_coherence_after\"\x11\n\x0fRollbackRequest\"@\n\rRollbackReply\x12\x15\n\rmodel_version\x18\x01 \x01(\t\x12\x18\n\x10previous_version\x18\x02 \x01(\t\"\x13\n\x11ListModelsRequest\"6\n\x0fListModelsReply\x12#\n\x06models\x18\x01 \x03(\x0b\x32\x13.lightpage.v1.Model\"G\n\x0b\x45rrorDetail\x12\x0c\n\x04kind\x18\x01 \x01(\t\x12\r\n\x05thing\x18\x02 \x01(\t\x12\x0b\n\x03got\x18\x03 \x01(\t\x12\x0e\n\x06wanted\x18\x04 \x01(\t*T\n\tPixelType\x12\x1a\n\x16PIXEL_TYPE_UNSPECIFIED\x10\x00\x12\x14\n\x10PIXEL_TYPE_UINT8\x10\x01\x12\x15\n\x11PIXEL_TYPE_UINT16\x10\x02*q\n\x10\x43onfidenceFormat\x12!\n\x1d\x43ONFIDENCE_FORMAT_UNSPECIFIED\x10\x00\x12\x1d\n\x19\x43ONFIDENCE_FORMAT_FLOAT32\x10\x01\x12\x1b\n\x17\x43ONFIDENCE_FORMAT_UINT8\x10\x02\x32\xd4\x03\n\tLightpage\x12\x46\n\x08\x44\x65scribe\x12\x1d.lightpage.v1.DescribeRequest\x1a\x1b.lightpage.v1.DescribeReply\x12N\n\x0c\x44\x65\x63odeFrames\x12!.lightpage.v1.DecodeFramesRequest\x1a\x19.lightpage.v1.DecodeReply(\x01\x12\x46\n\x08ReadPage\x12\x1d.lightpage.v1.ReadPageRequest\x1a\x1b.lightpage.v1.ReadPageReply\x12Q\n\x0bRecalibrate\x12 .lightpage.v1.RecalibrateRequest\x1a\x1e.lightpage.v1.RecalibrateReply0\x01\x12\x46\n\x08Rollback\x12\x1d.lightpage.v1.RollbackRequest\x1a\x1b.lightpage.v1.RollbackReply\x12L\n\nListModels\x12\x1f.lightpage.v1.ListModelsRequest\x1a\x1d.lightpage.v1.ListModelsReplyb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -34,10 +34,10 @@ if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_MODEL_METRICSENTRY']._loaded_options = None
   _globals['_MODEL_METRICSENTRY']._serialized_options = b'8\001'
-  _globals['_PIXELTYPE']._serialized_start=2815
-  _globals['_PIXELTYPE']._serialized_end=2899
-  _globals['_CONFIDENCEFORMAT']._serialized_start=2901
-  _globals['_CONFIDENCEFORMAT']._serialized_end=3014
+  _globals['_PIXELTYPE']._serialized_start=2836
+  _globals['_PIXELTYPE']._serialized_end=2920
+  _globals['_CONFIDENCEFORMAT']._serialized_start=2922
+  _globals['_CONFIDENCEFORMAT']._serialized_end=3035
   _globals['_DESCRIBEREQUEST']._serialized_start=46
   _globals['_DESCRIBEREQUEST']._serialized_end=63
   _globals['_DESCRIBEREPLY']._serialized_start=66
@@ -61,33 +61,33 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_DECODEFRAMESREQUEST']._serialized_start=1218
   _globals['_DECODEFRAMESREQUEST']._serialized_end=1310
   _globals['_DECODEREPLY']._serialized_start=1313
-  _globals['_DECODEREPLY']._serialized_end=1615
-  _globals['_TIMINGS']._serialized_start=1617
-  _globals['_TIMINGS']._serialized_end=1701
-  _globals['_READPAGEREQUEST']._serialized_start=1703
-  _globals['_READPAGEREQUEST']._serialized_end=1816
-  _globals['_READPAGEREPLY']._serialized_start=1818
-  _globals['_READPAGEREPLY']._serialized_end=1928
-  _globals['_RECALIBRATEREQUEST']._serialized_start=1930
-  _globals['_RECALIBRATEREQUEST']._serialized_end=2050
-  _globals['_SOURCEPAGES']._serialized_start=2052
-  _globals['_SOURCEPAGES']._serialized_end=2095
-  _globals['_RECALIBRATEREPLY']._serialized_start=2097
-  _globals['_RECALIBRATEREPLY']._serialized_end=2220
-  _globals['_PROGRESS']._serialized_start=2222
-  _globals['_PROGRESS']._serialized_end=2264
-  _globals['_RECALIBRATIONRESULT']._serialized_start=2267
-  _globals['_RECALIBRATIONRESULT']._serialized_end=2578
-  _globals['_ROLLBACKREQUEST']._serialized_start=2580
-  _globals['_ROLLBACKREQUEST']._serialized_end=2597
-  _globals['_ROLLBACKREPLY']._serialized_start=2599
-  _globals['_ROLLBACKREPLY']._serialized_end=2663
-  _globals['_LISTMODELSREQUEST']._serialized_start=2665
-  _globals['_LISTMODELSREQUEST']._serialized_end=2684
-  _globals['_LISTMODELSREPLY']._serialized_start=2686
-  _globals['_LISTMODELSREPLY']._serialized_end=2740
-  _globals['_ERRORDETAIL']._serialized_start=2742
-  _globals['_ERRORDETAIL']._serialized_end=2813
-  _globals['_LIGHTPAGE']._serialized_start=3017
-  _globals['_LIGHTPAGE']._serialized_end=3485
+  _globals['_DECODEREPLY']._serialized_end=1636
+  _globals['_TIMINGS']._serialized_start=1638
+  _globals['_TIMINGS']._serialized_end=1722
+  _globals['_READPAGEREQUEST']._serialized_start=1724
+  _globals['_READPAGEREQUEST']._serialized_end=1837
+  _globals['_READPAGEREPLY']._serialized_start=1839
+  _globals['_READPAGEREPLY']._serialized_end=1949
+  _globals['_RECALIBRATEREQUEST']._serialized_start=1951
+  _globals['_RECALIBRATEREQUEST']._serialized_end=2071
+  _globals['_SOURCEPAGES']._serialized_start=2073
+  _globals['_SOURCEPAGES']._serialized_end=2116
+  _globals['_RECALIBRATEREPLY']._serialized_start=2118
+  _globals['_RECALIBRATEREPLY']._serialized_end=2241
+  _globals['_PROGRESS']._serialized_start=2243
+  _globals['_PROGRESS']._serialized_end=2285
+  _globals['_RECALIBRATIONRESULT']._serialized_start=2288
+  _globals['_RECALIBRATIONRESULT']._serialized_end=2599
+  _globals['_ROLLBACKREQUEST']._serialized_start=2601
+  _globals['_ROLLBACKREQUEST']._serialized_end=2618
+  _globals['_ROLLBACKREPLY']._serialized_start=2620
+  _globals['_ROLLBACKREPLY']._serialized_end=2684
+  _globals['_LISTMODELSREQUEST']._serialized_start=2686
+  _globals['_LISTMODELSREQUEST']._serialized_end=2705
+  _globals['_LISTMODELSREPLY']._serialized_start=2707
+  _globals['_LISTMODELSREPLY']._serialized_end=2761
+  _globals['_ERRORDETAIL']._serialized_start=2763
+  _globals['_ERRORDETAIL']._serialized_end=2834
+  _globals['_LIGHTPAGE']._serialized_start=3038
+  _globals['_LIGHTPAGE']._serialized_end=3506
 # @@protoc_insertion_point(module_scope)

@@ -156,7 +156,7 @@ class DecodeFramesRequest(_message.Message):
     def __init__(self, header: _Optional[_Union[DecodeHeader, _Mapping]] = ..., chunk: _Optional[bytes] = ...) -> None: ...
 
 class DecodeReply(_message.Message):
-    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings")
+    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings", "pilot_trust")
     ROWS_FIELD_NUMBER: _ClassVar[int]
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
     LEVELS_FIELD_NUMBER: _ClassVar[int]
@@ -169,6 +169,7 @@ class DecodeReply(_message.Message):
     PILOT_COHERENCE_FIELD_NUMBER: _ClassVar[int]
     MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
     TIMINGS_FIELD_NUMBER: _ClassVar[int]
+    PILOT_TRUST_FIELD_NUMBER: _ClassVar[int]
     rows: int
     columns: int
     levels: int
@@ -181,7 +182,8 @@ class DecodeReply(_message.Message):
     pilot_coherence: float
     model_version: str
     timings: Timings
-    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ...) -> None: ...
+    pilot_trust: float
+    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ...) -> None: ...
 
 class Timings(_message.Message):
     __slots__ = ("receive_s", "decode_s", "inference_s", "total_s")
