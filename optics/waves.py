@@ -7,7 +7,7 @@ y' = +-w/2 with y' = x sin t + y cos t, and the field vanishes on them. The comm
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,7 +153,7 @@ class PipePropagator:
         self._cells = cells
         self._sheared = abs(geometry.pipe_angle) > 0
         self._steps = steps if self._sheared else 1
-        self._bases = [_ParityBasis(n) for n in cells]
+        self._bases = [_parity_basis(n) for n in cells]
         w, k = geometry.pipe_width_m, geometry.wave_number
         nk = geometry.refractive_index * k
         k_y = np.pi * self._bases[0].mode_numbers / w
@@ -215,6 +215,12 @@ class _ParityBasis:
         self.sine_by_parity = np.zeros((2, size, count), dtype=np.float32)
         self.sine_by_parity[0, : len(odd)] = sine[odd - 1]
         self.sine_by_parity[1, : len(even)] = sine[even - 1]
+
+
+@lru_cache(maxsize=8)
+def _parity_basis(cells: int) -> _ParityBasis:
+    """It depends on nothing else, and takes as long as the rest of a small propagator."""
+    return _ParityBasis(cells)
 
 
 def _real_products(left: Real, stack: Complex, right: Real) -> Complex:

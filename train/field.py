@@ -19,8 +19,8 @@ from torch.nn import functional
 from optics.grid import FieldGrid, field_grid
 from optics.profile import Profile
 from optics.recording import FramePair
-from optics.registration.relation import READ_NOISE
 from optics.registration.table import monomial_powers
+from optics.registration.wave_fit import READ_NOISE
 from train.filters import SeparableFilter
 
 _ROUNDS = 6

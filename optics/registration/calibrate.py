@@ -1,4 +1,4 @@
-"""From nominal geometry to this device: coarse-to-fine registration of known pages, then a fit of everything."""
+"""From nominal geometry to this device: coarse-to-fine registration of a known page by rays, then a fit by waves."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from optics.registration.coherence import COHERENT_BRANCHES, page_coherence
 from optics.registration.fit import Fit, fit_parameters
 from optics.registration.parameters import PARAMETERS, indices, nominal
 from optics.registration.patches import Measurement, Patch, measure, middle_patches, patches, search_window
-from optics.registration.relation import CameraRelation
 from optics.registration.samplers import FieldSampler, FrameSampler
 from optics.registration.table import registration_coefficients
 from optics.registration.twin import FieldSolver, Twin
+from optics.registration.wave_fit import WaveFit
 
 Real = NDArray[np.float64]
 SIGNIFICANT = 16.0
@@ -63,10 +63,10 @@ class Registered:
 
     Attributes:
         parameters: [P] fitted vector.
-        deviations: [P] standard deviations in the fit of patches; the cameras, placed by waves after it, are better.
+        deviations: [P] standard deviations.
         turn: angle between the homodyne arms, radians.
         coherence_before, coherence_after: mean over the pages, at the start's geometry and at the fitted one.
-        cost: mean squared normalised residual.
+        cost: mean squared normalised residual of the last fit of patches.
         significant: share of the measured patches that were found, in the last stage.
     """
 
@@ -89,7 +89,6 @@ class _Stage:
     groups: tuple[str, ...]
     branches: tuple[str, ...] = ("direct",)
     middle_only: bool = False
-    all_pages: bool = False
     use_phase: bool = False
     samples: int = 4
     wanted: str = _WANTED
@@ -105,16 +104,10 @@ _COMPLEX = (
     _Stage("all branches, coarse", 8, 2, _ALL_GROUPS, COHERENT_BRANCHES),
     _Stage("all branches, fine", 3, 1, _ALL_GROUPS, COHERENT_BRANCHES),
 )
-_PHASE = (
-    *(_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True) for _ in range(4)),
-    *(_Stage("phases, all pages", 1.5, 0.75, _ALL_GROUPS, COHERENT_BRANCHES, all_pages=True, use_phase=True),) * 2,
-)
-"""Each round halves what is left of the error, since patches are measured about the current geometry."""
-_DRIFTED = (
-    _Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, samples=2),
-    _Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True, samples=2),
-    *(_Stage("phases, fine", 1, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True, samples=4),) * 2,
-)
+_PHASES = (_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True),) * 2
+"""Each round halves what is left of the error, since patches are measured about the current geometry; two bring it
+within reach of the waves."""
+_DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, samples=2),)
 """From an earlier calibration: the complex field is right from the start, so nothing is searched camera by camera."""
 _DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3}
 _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for parameter in PARAMETERS])
@@ -137,24 +130,24 @@ def calibrate(
         solve_field: recovers the complex field from registered frames.
         profile: the nominal device.
         references: reference-only frames.
-        pages: one to a few known pages; the first finds the geometry, all refine it.
+        pages: one to a few known pages; the first is fitted, all are judged by.
         progress: told of every stage.
 
     Raises:
         CalibrationError: nothing within the capture range explains the frames, or the page is too small to tell.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
-    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASE) + 4
+    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASES) + 4
     for stage in _SINGLE_CAMERA:
         work.single_camera(stage)
     work.estimate_turn()
     for stage in _COMPLEX:
         work.complex_field(stage)
     work.estimate_turn()
-    work.place_cameras()
-    for stage in _PHASE:
+    work.waves("relation of the cameras", ("in_phase", "quadrature"))
+    for stage in _PHASES:
         work.complex_field(stage)
-    work.place_cameras()
+    work.waves("waves", _ALL_GROUPS)
     return work.result(nominal())
 
 
@@ -180,10 +173,10 @@ def refine(
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.turn = start.copy(), turn
-    work.total = len(_DRIFTED) + 2
+    work.total = len(_DRIFTED) + 1
     for stage in _DRIFTED:
         work.complex_field(stage, start, _DRIFT_SCALE)
-    work.place_cameras()
+    work.waves("waves", _ALL_GROUPS, start, _DRIFT_SCALE)
     return work.result(start)
 
 
@@ -246,6 +239,7 @@ class _Registration:
             )
         self.grid = field_grid(profile)
         self.parameters = nominal()
+        self.deviations = np.zeros_like(self.parameters)
         self.turn = np.pi / 2
         self.fit: Fit | None = None
         self.total = 1
@@ -261,21 +255,19 @@ class _Registration:
     def single_camera(self, stage: _Stage, centre: Real | None = None) -> None:
         """Measure the direct branch on each camera by itself and fit places and slopes."""
         self._tell(stage.name)
-        page = self.pages[0]
-        found: list[Measurement] = []
+        page, found = self.pages[0], list[Measurement]()
         for camera, sampler in enumerate(self._frame_samplers(page)):
             for patch in self._where(stage):
-                found += self._measure(sampler, stage, patch, page, (camera,), 0)
+                found += self._measure(sampler, stage, patch, page, (camera,))
         self._fit(stage, found, centre)
 
     def complex_field(self, stage: _Stage, centre: Real | None = None, prior_scale: float | Real = 1.0) -> None:
         """Measure branches on the recovered field and fit."""
         self._tell(stage.name)
-        found: list[Measurement] = []
-        for index, page in enumerate(self.pages if stage.all_pages else self.pages[:1]):
-            sampler = FieldSampler(self._field(page)[0], self.grid)
-            for patch in self._where(stage):
-                found += self._measure(sampler, stage, patch, page, (0, 1), index)
+        page, found = self.pages[0], list[Measurement]()
+        sampler = FieldSampler(self._field(page)[0], self.grid)
+        for patch in self._where(stage):
+            found += self._measure(sampler, stage, patch, page, (0, 1))
         self._fit(stage, found, centre, prior_scale)
 
     def estimate_turn(self) -> None:
@@ -283,7 +275,7 @@ class _Registration:
         self._tell("angle between the arms")
         page, where = self.pages[0], _Stage("", 0, 1, (), COHERENT_BRANCHES)
         seen = [
-            [m for patch in self.patches for m in self._measure(sampler, where, patch, page, (camera,), 0)]
+            [m for patch in self.patches for m in self._measure(sampler, where, patch, page, (camera,))]
             for camera, sampler in enumerate(self._frame_samplers(page))
         ]
         total = 0j
@@ -297,12 +289,15 @@ class _Registration:
                 "angle between the homodyne arms", f"{np.rad2deg(self.turn):.0f} degrees", "about +90 or -90 degrees"
             )
 
-    def place_cameras(self) -> None:
-        """Poses of both cameras and the angle between the arms, from the waves of the first page."""
-        self._tell("relation of the cameras")
+    def waves(
+        self, what: str, groups: tuple[str, ...], centre: Real | None = None, prior_scale: float | Real = 1.0
+    ) -> None:
+        """Fit `groups` and the angle between the arms to the waves of the first page."""
+        self._tell(what)
         page = self.pages[0]
-        relation = CameraRelation(self.twin, self.profile, self.parameters, page.pair, self.references, page.symbols)
-        self.parameters, self.turn = relation.fit(self.turn)
+        fit = WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
+        found = fit.fit(self.parameters, self.turn, groups, centre, prior_scale)
+        self.parameters, self.deviations, self.turn = found.parameters, found.deviations, found.turn
 
     def result(self, before: Real) -> Registered:
         """Judge the outcome; `before` is the geometry that it is compared with."""
@@ -314,7 +309,7 @@ class _Registration:
         check_found(after, significant, self.pages[0].symbols.size, reflected)
         return Registered(
             parameters=self.parameters,
-            deviations=self.fit.deviations,
+            deviations=self.deviations,
             turn=self.turn,
             coherence_before=float(np.mean([self._coherence(page, before) for page in self.pages])),
             coherence_after=after,
@@ -361,7 +356,6 @@ class _Registration:
         patch: Patch,
         page: KnownPage,
         cameras: tuple[int, ...],
-        index: int,
     ) -> list[Measurement]:
         window = search_window(stage.reach_px * self._pixel, stage.step_px * self._pixel)
         return measure(
@@ -375,7 +369,6 @@ class _Registration:
             window,
             samples=stage.samples,
             cameras=cameras,
-            page=index,
         )
 
     def _fit(

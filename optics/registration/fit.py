@@ -27,8 +27,6 @@ _STENCIL = 0.5
 """Reach of the finite difference that gives the model's slope, symbols."""
 _DIFFERENCE = 1e-3
 """Finite difference of the Jacobian, in standard deviations of the priors."""
-_SHIFT_PRIOR_PX = 1.0
-"""How far the image may have moved between the pages of one calibration."""
 
 
 @dataclass(frozen=True)
@@ -38,15 +36,13 @@ class Fit:
     Attributes:
         parameters: [P] fitted vector; held parameters keep their value.
         deviations: [P] standard deviations, the prior's where held.
-        pistons: phase of each page, radians.
-        shifts_px: image shift (x, y) of each page against the first, [pages, 2].
+        piston: phase of the page, radians.
         cost: mean squared normalised residual of the data (about 1 when the twin explains them).
     """
 
     parameters: Real
     deviations: Real
-    pistons: Real
-    shifts_px: Real
+    piston: float
     cost: float
 
 
@@ -67,7 +63,7 @@ def fit_parameters(
     Args:
         twin: the ray tracer.
         profile: the nominal device.
-        measurements: from any branches, cameras and pages.
+        measurements: of one page, from any branches and cameras.
         start: [P] start vector.
         free: indices of the parameters to fit.
         use_phase: whether the patches' phases count, beside places and slopes; needs a start whose phases are right
@@ -76,45 +72,37 @@ def fit_parameters(
         prior_scale: factor on the priors' standard deviations, one for all or [P].
         evaluations: bound on the solver's steps.
     """
-    pages = 1 + max(m.page for m in measurements)
     centre = np.zeros_like(start) if centre is None else centre
     design = _Design(twin, profile, measurements)
     scale = PRIORS * prior_scale
 
-    def unpack(vector: Real) -> tuple[Real, Real, Real]:
+    def unpack(vector: Real) -> tuple[Real, float]:
         parameters = start.copy()
-        parameters[free] = centre[free] + vector[: len(free)] * scale[free]
-        pistons = vector[len(free) : len(free) + pages]
-        shifts = np.vstack([np.zeros(2), vector[len(free) + pages :].reshape(pages - 1, 2) * _SHIFT_PRIOR_PX])
-        return parameters, pistons, shifts
+        parameters[free] = centre[free] + vector[:-1] * scale[free]
+        return parameters, float(vector[-1])
 
     def residuals(vector: Real) -> Real:
-        parameters, pistons, shifts = unpack(vector)
-        data = design.residuals(parameters, pistons, shifts, use_phase=use_phase)
-        # pistons are free; everything else has a prior
-        return np.concatenate([data, vector[: len(free)], vector[len(free) + pages :]])
+        # the piston is free; everything else has a prior
+        return np.concatenate([design.residuals(*unpack(vector), use_phase=use_phase), vector[:-1]])
 
     def jacobian(vector: Real) -> Real:
-        parameters, pistons, shifts = unpack(vector)
-        return design.jacobian(parameters, pistons, shifts, free, scale, use_phase=use_phase)
+        return design.jacobian(unpack(vector)[0], free, scale, use_phase=use_phase)
 
-    parameter_start = (start[free] - centre[free]) / scale[free]
-    pistons = design.pistons(start, pages)
     solved = optimize.least_squares(
         residuals,
-        np.concatenate([parameter_start, pistons, np.zeros(2 * (pages - 1))]),
+        np.append((start[free] - centre[free]) / scale[free], design.piston(start)),
         loss="soft_l1",
         f_scale=2.0,
         jac=jacobian,
         max_nfev=evaluations,
     )
-    parameters, pistons, shifts = unpack(solved.x)
-    data = design.residuals(parameters, pistons, shifts, use_phase=use_phase)
+    parameters, piston = unpack(solved.x)
+    data = design.residuals(parameters, piston, use_phase=use_phase)
     deviations = scale.copy()
     slopes = np.asarray(solved.jac, dtype=np.float64)
     covariance = np.linalg.pinv(slopes.T @ slopes)
-    deviations[free] = np.sqrt(np.clip(np.diag(covariance)[: len(free)], 0, None)) * scale[free]
-    return Fit(parameters, deviations, pistons, shifts, float(np.mean(np.minimum(data**2, 25.0))))
+    deviations[free] = np.sqrt(np.clip(np.diag(covariance)[:-1], 0, None)) * scale[free]
+    return Fit(parameters, deviations, piston, float(np.mean(np.minimum(data**2, 25.0))))
 
 
 class _Design:
@@ -123,7 +111,6 @@ class _Design:
     def __init__(self, twin: Twin, profile: Profile, measurements: list[Measurement]) -> None:
         self._twin = twin
         self._branch = np.array([BRANCHES.index(m.branch) for m in measurements])
-        self._page = np.array([m.page for m in measurements])
         self._phase = np.array([m.phase for m in measurements])
         self._slope = np.stack([m.slope for m in measurements])
         self._read_at = np.stack([m.read_at for m in measurements])
@@ -173,29 +160,25 @@ class _Design:
     def _slope_weight(self, use_phase: bool) -> Real:
         return np.asarray(1 / self._slope_error[:, None] / (_SLOPE_DISTRUST if use_phase else 1.0))
 
-    def pistons(self, parameters: Real, pages: int) -> Real:
-        """Weighted mean phase of each page against the twin's, radians."""
+    def piston(self, parameters: Real) -> float:
+        """Weighted mean phase of the page against the twin's, radians."""
         _, phases, _ = self._predict(parameters)
-        turn = np.exp(1j * (self._phase - phases)) * self._has_phase / self._phase_error**2
-        return np.array([np.angle(np.sum(turn[self._page == page])) for page in range(pages)])
+        return float(np.angle(np.sum(np.exp(1j * (self._phase - phases)) * self._has_phase / self._phase_error**2)))
 
-    def residuals(self, parameters: Real, pistons: Real, shifts: Real, *, use_phase: bool) -> Real:
+    def residuals(self, parameters: Real, piston: float, *, use_phase: bool) -> Real:
         """All residuals over their errors, flat."""
         pixels, phases, slopes = self._predict(parameters)
-        off = pixels + shifts[self._page][:, None, :] - self._pixels
         parts = [
-            (off * self._place_weight).ravel(),
+            ((pixels - self._pixels) * self._place_weight).ravel(),
             ((slopes - self._slope) * self._slope_weight(use_phase)).ravel(),
         ]
         if use_phase:
-            turned = np.angle(np.exp(1j * (phases + pistons[self._page] - self._phase)))
+            turned = np.angle(np.exp(1j * (phases + piston - self._phase)))
             parts.append(turned * self._phase_weight)
         return np.concatenate(parts)
 
-    def jacobian(
-        self, parameters: Real, pistons: Real, shifts: Real, free: list[int], scale: Real, *, use_phase: bool
-    ) -> Real:
-        """Derivative of `residuals` and of the priors' terms by (free parameters / scale, pistons, shifts)."""
+    def jacobian(self, parameters: Real, free: list[int], scale: Real, *, use_phase: bool) -> Real:
+        """Derivative of `residuals` and of the priors' terms by (free parameters / scale, piston)."""
         steps = np.zeros((len(free), len(parameters)))
         steps[np.arange(len(free)), free] = _DIFFERENCE * scale[free]
         here = self._predict(parameters)
@@ -205,18 +188,12 @@ class _Design:
             (pixels * self._place_weight).reshape(len(free), -1),
             (slopes * self._slope_weight(use_phase)).reshape(len(free), -1),
         ]
-        pages, count = len(pistons), len(self._page)
-        on_page = (self._page == np.arange(pages)[:, None]).astype(float)
-        by_shift = on_page[1:, None, :, None, None] * np.eye(2)[None, :, None, None, :] * self._place_weight
         if use_phase:
             by_parameter.append(phases * self._phase_weight)
         data = np.concatenate(by_parameter, axis=1).T
-        columns = len(free) + pages + 2 * (pages - 1)
-        full = np.zeros((len(data) + len(free) + 2 * (pages - 1), columns))
-        full[: len(data), : len(free)] = data
+        full = np.zeros((len(data) + len(free), len(free) + 1))
+        full[: len(data), :-1] = data
         if use_phase:
-            full[len(data) - count : len(data), len(free) : len(free) + pages] = (on_page * self._phase_weight).T
-        full[: 4 * count, len(free) + pages :] = by_shift.reshape(2 * (pages - 1), 4 * count).T * _SHIFT_PRIOR_PX
-        full[len(data) : len(data) + len(free), : len(free)] = np.eye(len(free))
-        full[len(data) + len(free) :, len(free) + pages :] = np.eye(2 * (pages - 1))
+            full[len(data) - len(self._phase) : len(data), -1] = self._phase_weight
+        full[len(data) :, :-1] = np.eye(len(free))
         return full

@@ -14,8 +14,8 @@ from optics.waves import WaveChannel, WaveGeometry, cells_for
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-_STEPS = 24
-"""Splitting steps; more change the result by less than the fit's own error."""
+_STEPS = 64
+"""Splitting steps: a field error of 0.006. With 24 it is 0.04, and a fit to it errs in the angle."""
 _ILLUMINATION = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Powers of (x, y) in an illumination."""
 
@@ -28,12 +28,25 @@ class FittedWaves:
         parameters: [P] fitted (or, for an oracle, true) parameters of the ray twin.
         samples: samples per symbol and axis on the modulator's side.
         filled: whether each sample stands for a pixel of that size; else for a point.
+        stride: samples of the common grid from one to the next that is computed.
+        steps: splitting steps.
+        like: waves whose work is shared where geometry and sampling are the same.
 
     Attributes:
         x, y: places of the modulator's samples over the page's half width and half height, [nx samples], [ny samples].
     """
 
-    def __init__(self, profile: Profile, parameters: Real, samples: int, *, filled: bool = False) -> None:
+    def __init__(
+        self,
+        profile: Profile,
+        parameters: Real,
+        samples: int,
+        *,
+        filled: bool = False,
+        stride: int = 1,
+        steps: int = _STEPS,
+        like: FittedWaves | None = None,
+    ) -> None:
         value = as_dict(parameters)
         geometry = WaveGeometry(
             wavelength_m=profile.light.wavelength_m,
@@ -45,6 +58,7 @@ class FittedWaves:
             pipe_roll=value["pipe_roll_rad"],
         )
         grid = field_grid(profile)
+        grid_x, grid_y = grid.x_m[::stride], grid.y_m[::stride]
         rows, columns = profile.page_shape
         pitch = profile.symbol_pitch_m / samples
         x = (np.arange(columns * samples) - (columns * samples - 1) / 2) * pitch
@@ -52,18 +66,23 @@ class FittedWaves:
         half_width, half_height = profile.page_width_m / 2, profile.page_height_m / 2
         self.x, self.y = x / half_width, y / half_height
         page = x + value["page_centre_x_m"], y + value["page_centre_y_m"]
-        self._channel = WaveChannel(
-            geometry,
-            *page,
-            grid.x_m,
-            grid.y_m,
-            cells=cells_for(geometry, *page, float(grid.x_m[-1]), float(grid.y_m[-1])),
-            steps=_STEPS,
-            envelope_m=pitch if filled else 0.0,
-        )
+        self._sampling = geometry, value["page_centre_x_m"], value["page_centre_y_m"], samples, filled, stride, steps
+        self._channel: WaveChannel
+        if like is not None and like._sampling == self._sampling:
+            self._channel = like._channel
+        else:
+            self._channel = WaveChannel(
+                geometry,
+                *page,
+                grid_x,
+                grid_y,
+                cells=cells_for(geometry, *page, float(grid.x_m[-1]), float(grid.y_m[-1])),
+                steps=steps,
+                envelope_m=pitch if filled else 0.0,
+            )
         corner = profile.corner_m
         edges = half_width / corner, half_height / corner
-        at_camera = camera_phase(value, grid.x_m[None, :] / corner, grid.y_m[:, None] / corner, *edges)
+        at_camera = camera_phase(value, grid_x[None, :] / corner, grid_y[:, None] / corner, *edges)
         at_launch = launch_phase(value, x[None, :] / corner, y[:, None] / corner)
         ramp = (
             geometry.wave_number
@@ -71,9 +90,9 @@ class FittedWaves:
             * np.array([value["pipe_centre_x_m"], value["pipe_centre_y_m"]])
         )
         at_launch = at_launch - ramp[0] * x[None, :] - ramp[1] * y[:, None]
-        at_camera = at_camera + ramp[0] * grid.x_m[None, :] + ramp[1] * grid.y_m[:, None]
+        at_camera = at_camera + ramp[0] * grid_x[None, :] + ramp[1] * grid_y[:, None]
         self._launch: Complex = np.exp(1j * at_launch)
-        self._camera: Complex = np.exp(1j * at_camera)
+        self._camera: Complex = np.exp(1j * at_camera) / stride  # samples that stand for more area are larger
 
     def to_camera(self, field: Complex) -> Complex:
         """Field on the modulator [ny samples, nx samples] to the common grid [Gy, Gx], against the reference."""

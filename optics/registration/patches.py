@@ -56,7 +56,6 @@ class Measurement:
         significance: power of the coherent sum over that of the symbols' incoherent sum; the number of symbols when
             all agree, about 1 when they are unrelated.
         symbols: number of symbols in the patch.
-        page: which page it was measured on.
     """
 
     branch: str
@@ -69,7 +68,6 @@ class Measurement:
     slope: Real
     significance: float
     symbols: int
-    page: int
 
 
 def patches(profile: Profile, edge: int = 10) -> list[Patch]:
@@ -119,7 +117,6 @@ def measure(
     window: Real,
     samples: int = 4,
     cameras: tuple[int, ...] = (0, 1),
-    page: int = 0,
 ) -> list[Measurement]:
     """Find each branch of a patch within a window around where the twin puts it.
 
@@ -134,7 +131,6 @@ def measure(
         window: trial shifts [K, 2], metres on the camera plane, a square lattice (see `search_window`).
         samples: samples per symbol along each axis; four is the field's own rate, two serves a wide search.
         cameras: which cameras the sampler looks through, a label of the result.
-        page: a label of the result.
     """
     known = symbols[patch.rows, patch.columns]
     rows, columns = known.shape
@@ -198,7 +194,6 @@ def measure(
                 slope=expected_slope + np.array([slope_x, slope_y]) / pitch,
                 significance=float(power / floor),
                 symbols=rows * columns,
-                page=page,
             )
         )
     return found

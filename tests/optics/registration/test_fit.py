@@ -1,4 +1,4 @@
-"""Claims about the fit: its derivative, its priors, what it recovers, and what outliers and several pages do to it."""
+"""Claims about the fit: its derivative, its priors, what it recovers, and what outliers do to it."""
 
 from __future__ import annotations
 
@@ -23,9 +23,7 @@ EVERY = list(range(len(NAMES)))
 def measured(
     truth: np.ndarray,
     branches: tuple[str, ...] = ("direct", "x", "y"),
-    page: int = 0,
     piston: float = 0.0,
-    shift_px: tuple[float, float] = (0.0, 0.0),
 ) -> list[Measurement]:
     """What patches would say, without error, of a device with parameters `truth`, looked at with the nominal twin."""
     found, step = [], 0.5 * PROFILE.symbol_pitch_m
@@ -37,11 +35,11 @@ def measured(
         for branch in branches:
             b = BRANCHES.index(branch)
             phases = rays.phases[b]
-            pixels = TWIN.pixels(truth, rays.places[b, :1])[:, 0] + np.array(shift_px)
+            pixels = TWIN.pixels(truth, rays.places[b, :1])[:, 0]
             read_at = TWIN.pixels(nominal(), expected.places[b, :1])[:, 0]
             carrier = np.array([0.02, -0.03])
             # read at another place than the true one, the phase is off by the carrier times the way
-            phase = phases[0] + piston + (read_at - pixels + np.array(shift_px)).mean(0) @ carrier
+            phase = phases[0] + piston + (read_at - pixels).mean(0) @ carrier
             found.append(
                 Measurement(
                     branch=branch,
@@ -54,7 +52,6 @@ def measured(
                     slope=np.array([phases[1] - phases[2], phases[3] - phases[4]]) / (2 * step),
                     significance=80.0,
                     symbols=100,
-                    page=page,
                 )
             )
     return found
@@ -65,7 +62,7 @@ def some_device(seed: int, scale: float) -> np.ndarray:
 
 
 def scattered(count: int = 12) -> list[Measurement]:
-    """Measurements of nothing in particular: any branch, one or both cameras, two pages."""
+    """Measurements of nothing in particular: any branch, one or both cameras."""
     rng = np.random.default_rng(0)
     return [
         Measurement(
@@ -79,7 +76,6 @@ def scattered(count: int = 12) -> list[Measurement]:
             slope=rng.normal(size=2) * 1e3,
             significance=float(rng.uniform(20, 90)),
             symbols=100,
-            page=i % 2,
         )
         for i in range(count)
     ]
@@ -92,28 +88,27 @@ class TestJacobian:
         design = module._Design(TWIN, PROFILE, scattered())
 
         def residuals(vector: np.ndarray) -> np.ndarray:
-            shifts = np.vstack([np.zeros(2), vector[-2:] * module._SHIFT_PRIOR_PX])
             parameters = base + vector[:count] * PRIORS
-            data = design.residuals(parameters, vector[count : count + 2], shifts, use_phase=use_phase)
-            return np.concatenate([data, vector[:count], vector[-2:]])
+            data = design.residuals(parameters, vector[count], use_phase=use_phase)
+            return np.concatenate([data, vector[:count]])
 
-        zero = np.zeros(count + 4)
+        zero = np.zeros(count + 1)
         by_hand = np.stack(
             [(residuals(zero + step) - residuals(zero - step)) / 2e-4 for step in 1e-4 * np.eye(len(zero))], axis=1
         )
-        got = design.jacobian(base, np.zeros(2), np.zeros((2, 2)), EVERY, PRIORS, use_phase=use_phase)
+        got = design.jacobian(base, EVERY, PRIORS, use_phase=use_phase)
         assert got.shape == by_hand.shape
-        for column, name in enumerate([*NAMES, "piston 0", "piston 1", "shift x", "shift y"]):
+        for column, name in enumerate([*NAMES, "piston"]):
             scale = max(1.0, np.abs(by_hand[:, column]).max())
             assert np.abs(got[:, column] - by_hand[:, column]).max() < 2e-3 * scale, name
 
     def test_only_the_free_parameters_have_columns(self) -> None:
         design, free = module._Design(TWIN, PROFILE, scattered()), indices("angle", "roll")
-        every = design.jacobian(nominal(), np.zeros(2), np.zeros((2, 2)), EVERY, PRIORS, use_phase=True)
-        some = design.jacobian(nominal(), np.zeros(2), np.zeros((2, 2)), free, PRIORS, use_phase=True)
-        data = len(every) - len(EVERY) - 2
+        every = design.jacobian(nominal(), EVERY, PRIORS, use_phase=True)
+        some = design.jacobian(nominal(), free, PRIORS, use_phase=True)
+        data = len(every) - len(EVERY)
         np.testing.assert_allclose(some[:data, :2], every[:data, free])
-        assert some.shape == (data + 2 + 2, 2 + 2 + 2)
+        assert some.shape == (data + 2, 2 + 1)
 
 
 class TestRecovery:
@@ -133,7 +128,7 @@ class TestRecovery:
         data = measured(truth, piston=2.5)
         found = fit_parameters(TWIN, PROFILE, data, start, EVERY, use_phase=True)
         predicted, wanted = (TWIN.trace(p, patch_centres()).phases[:3] for p in (found.parameters, truth))
-        off = np.angle(np.exp(1j * (predicted + found.pistons[0] - wanted - 2.5)))
+        off = np.angle(np.exp(1j * (predicted + found.piston - wanted - 2.5)))
         before = np.angle(np.exp(1j * (TWIN.trace(start, patch_centres()).phases[:3] - wanted)))
         assert np.abs(off).max() < 5e-3 < 0.05 < np.abs(before).max()
 
@@ -142,7 +137,7 @@ class TestRecovery:
         data = measured(truth, piston=0.7)
         right = fit_parameters(TWIN, PROFILE, data, truth, EVERY, use_phase=True)
         assert right.cost < 1e-3
-        assert right.pistons[0] == pytest.approx(0.7, abs=0.01)
+        assert right.piston == pytest.approx(0.7, abs=0.01)
         ignored = [replace(m, carrier=np.zeros(2)) for m in data]
         wrong = fit_parameters(TWIN, PROFILE, ignored, truth, EVERY, use_phase=True)
         assert wrong.cost > 100 * right.cost
@@ -155,18 +150,10 @@ class TestRecovery:
         places, wanted = (TWIN.pixels(p, TWIN.trace(p, patch_centres()).places[0]) for p in (robust.parameters, truth))
         assert np.sqrt(np.mean((places - wanted) ** 2)) < 0.5
 
-    def test_each_page_has_a_piston_and_a_shift_of_its_own(self) -> None:
-        truth = some_device(7, 0.2)
-        data = measured(truth, piston=0.4) + measured(truth, page=1, piston=-2.0, shift_px=(0.6, -0.3))
-        found = fit_parameters(TWIN, PROFILE, data, truth, EVERY, use_phase=True)
-        assert found.pistons[1] - found.pistons[0] == pytest.approx(-2.4, abs=0.01)
-        assert found.shifts_px[0] == pytest.approx([0, 0])
-        assert found.shifts_px[1] == pytest.approx([0.6, -0.3], abs=0.02)
-
     def test_a_patch_on_one_camera_says_nothing_of_the_other_and_no_phase(self) -> None:
         one_camera = [replace(m, cameras=(0,)) for m in measured(some_device(8, 0.3), ("direct",))]
         design = module._Design(TWIN, PROFILE, one_camera)
-        jacobian = design.jacobian(nominal(), np.zeros(1), np.zeros((1, 2)), EVERY, PRIORS, use_phase=True)
+        jacobian = design.jacobian(nominal(), EVERY, PRIORS, use_phase=True)
         data = jacobian[: -len(EVERY)]
         assert np.abs(data[:, indices("quadrature")]).max() == 0
         assert np.abs(data[:, indices("in_phase")]).max() > 1

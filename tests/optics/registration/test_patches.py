@@ -142,9 +142,8 @@ class TestFinding:
             ("y", "direct"),
             window,
             cameras=(1,),
-            page=3,
         )
-        assert [(m.branch, m.cameras, m.page) for m in found] == [("y", (1,), 3), ("direct", (1,), 3)]
+        assert [(m.branch, m.cameras) for m in found] == [("y", (1,)), ("direct", (1,))]
 
 
 class TestSignificance:

@@ -1,0 +1,95 @@
+"""Claims about the fit to waves: a known page places both cameras and tells the device, with honest deviations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from optics.device import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor, draw_device
+from optics.grid import field_grid
+from optics.page import symbol_phases
+from optics.registration.parameters import NAMES, PARAMETERS, PRIORS, indices
+from optics.registration.wave_fit import WaveFit
+from optics.simulator import Simulator, true_parameters
+from tests.optics.small import small_profile
+from train.twin import RayTwin, TorchTwin
+
+PROFILE = small_profile()
+TWIN = TorchTwin(RayTwin(PROFILE))
+TURN = np.deg2rad(-90 + 3)
+EVERY = tuple(dict.fromkeys(parameter.group for parameter in PARAMETERS))
+
+
+def seen_by(device: Device, seed: int) -> WaveFit:
+    """The fit of one random page of a device."""
+    simulator = Simulator(PROFILE, device, seed=seed)
+    symbols = np.random.default_rng(seed).integers(256, size=PROFILE.page_shape).astype(np.uint8)
+    pair, references = simulator.page(symbols), simulator.references()
+    return WaveFit(TWIN, PROFILE, pair, references, np.exp(1j * symbol_phases(symbols, 256)))
+
+
+@pytest.mark.parametrize(("ratio", "full_well_e"), [(1.3, 15_000.0), (3.0, 15_000.0), (1.6, 100.0)])
+def test_both_cameras_and_the_angle_between_the_arms_come_back(ratio: float, full_well_e: float) -> None:
+    device = Device(
+        in_phase_camera=CameraPose(scale_relative_error=2e-3, rotation_deg=0.1, shift_x_px=1.0),
+        quadrature_camera=CameraPose(scale_relative_error=-1e-3, rotation_deg=-0.1, shift_y_px=-2.0),
+        aberration=Aberration(distortion_relative=0),
+        reference=Reference(amplitude_ratio=ratio),
+        homodyne=Homodyne(quadrature_error_deg=3, quadrature_sign=-1, quadrature_gain=0.9),
+        sensor=Sensor(full_well_e=full_well_e),
+        drift=Drift(shift_px=0),
+    )
+    truth = true_parameters(PROFILE, device)
+    start = truth.copy()
+    start[indices("in_phase")] += [0.3, 0.1, 1e-3, 0, 1e-3, 0]
+    start[indices("quadrature")] += [-0.4, 0.2, -1e-3, 1e-3, 0, 2e-3]
+    result = seen_by(device, 1).fit(start, TURN + np.deg2rad(8), ("in_phase", "quadrature"))
+    found, turn = result.parameters, result.turn
+
+    grid = field_grid(PROFILE)
+    half = np.array([PROFILE.page_width_m, PROFILE.page_height_m]) / 2
+    places = np.stack(np.meshgrid(grid.x_m, grid.y_m), axis=-1).reshape(-1, 2)
+    places = places[np.all(np.abs(places) < half, axis=1)]
+
+    def off(parameters: np.ndarray) -> np.ndarray:
+        """Largest error of either camera's place, pixels."""
+        errors = TWIN.pixels(parameters, places) - TWIN.pixels(truth, places)
+        return np.asarray(np.linalg.norm(errors, axis=-1).max(axis=1))
+
+    assert np.all(off(start) > 0.4)
+    assert np.all(off(found) < 0.1)
+    assert abs(np.rad2deg(turn - TURN)) < 0.3
+    poses = np.r_[indices("in_phase"), indices("quadrature")]
+    assert np.array_equal(np.delete(found, poses), np.delete(truth, poses))
+    assert np.array_equal(np.flatnonzero(result.deviations), np.sort(poses))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_realistic_device_is_told_from_near_it_with_honest_deviations(seed: int) -> None:
+    device = draw_device(np.random.default_rng(seed))
+    truth = true_parameters(PROFILE, device)
+    rng, angle = np.random.default_rng([seed, 1]), NAMES.index("pipe_angle_rad")
+    start = truth + 0.02 * PRIORS * rng.standard_normal(len(PRIORS))
+    start[angle] = truth[angle] + 4e-4
+    found = seen_by(device, seed).fit(start, device.homodyne.turn_rad, EVERY)
+    assert abs(found.parameters[angle] - truth[angle]) < 5e-5
+    assert found.deviations[angle] < 2e-4
+    assert np.rad2deg(abs(found.turn - device.homodyne.turn_rad)) < 0.3
+    moving = indices("in_phase", "quadrature")[::6], indices("in_phase", "quadrature")[1::6]
+    known = [i for i in range(len(PRIORS)) if i not in np.ravel(moving)]  # the image has moved since
+    off = (found.parameters - truth)[known] / found.deviations[known]
+    assert np.sqrt(np.mean(off**2)) < 2
+
+
+def test_held_parameters_keep_their_values_and_priors_hold_the_others() -> None:
+    device = draw_device(np.random.default_rng(3))
+    truth = true_parameters(PROFILE, device)
+    fit, start = seen_by(device, 3), truth.copy()
+    angle = NAMES.index("pipe_angle_rad")
+    start[angle] += 4e-4
+    free = fit.fit(start, device.homodyne.turn_rad, ("angle",))
+    held = fit.fit(start, device.homodyne.turn_rad, ("angle",), centre=start, prior_scale=1e-4)
+    assert np.array_equal(np.flatnonzero(free.parameters - start), [angle])
+    assert abs(free.parameters[angle] - truth[angle]) < 1e-4
+    assert abs(held.parameters[angle] - start[angle]) < 1e-5
+    assert free.residual < held.residual
