@@ -102,6 +102,22 @@ class OutputFile(click.ParamType[Path]):
         return path
 
 
+def check_outputs(context: click.Context) -> None:
+    """Check that no option of a command names for writing what another one names.
+
+    Raises:
+        InvalidInputError: the same file is to be read and written, or written twice.
+    """
+    given = [(param, context.params.get(param.name or "")) for param in context.command.params]
+    paths = [(param, Path(value)) for param, value in given if isinstance(value, str | Path) and str(value)]
+    for param, path in paths:
+        for other, there in paths:
+            if param is other or not isinstance(param.type, NewPath | OutputFile):
+                continue
+            if path.resolve() == there.resolve():
+                raise InvalidInputError(_option(path, param), f"what {other.opts[0]} names", "a file of its own")
+
+
 def _option(path: Path, param: click.Parameter | None) -> str:
     return f"{param.opts[0]} {path}" if param is not None else str(path)
 

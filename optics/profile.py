@@ -15,6 +15,8 @@ from optics.errors import ProfileError
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(gt=0)]
+Side = Annotated[int, Field(gt=0, le=30_000)]
+"""Pixels along one side of a sensor: the largest that are made have some twenty thousand."""
 
 SHIPPED = ("bench", "paper")
 
@@ -68,8 +70,8 @@ class PageLayout(Table):
 class Camera(Table):
     """The sensor of both cameras."""
 
-    columns_px: Count
-    rows_px: Count
+    columns_px: Side
+    rows_px: Side
     pitch_m: Positive
 
 

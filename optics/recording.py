@@ -64,6 +64,8 @@ class Recording:
                 file, the dataset or attribute, what came and what was wanted.
         """
         path = Path(path)
+        if not path.exists():
+            raise RecordingError(f"recording {path}", "no such file", "a readable, complete HDF5 file")
         try:
             file = h5py.File(str(path), "r")
         except OSError as error:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
+from functools import wraps
 from importlib.metadata import EntryPoint, entry_points
 from typing import NoReturn
 
 import click
 
 from optics.errors import LightpageError
+from optics.files import check_outputs
 
 GROUP = "lightpage.commands"
 
@@ -69,7 +72,7 @@ class LazyGroup(click.Group):
             raise missing(f"lightpage {cmd_name}", error) from error
         if not isinstance(command, click.Command):
             raise LightpageError(f"command {cmd_name}", type(command).__name__, "a click command")
-        return command
+        return _checked(command)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the overview without importing a command."""
@@ -77,6 +80,22 @@ class LazyGroup(click.Group):
         if rows:
             with formatter.section("Commands"):
                 formatter.write_dl(rows)
+
+
+def _checked(command: click.Command) -> click.Command:
+    """The command, which first sees to it that it overwrites nothing that it reads."""
+    run_it = command.callback
+    if run_it is None:
+        return command
+
+    @wraps(run_it)
+    def run_checked(*args: object, **options: object) -> object:
+        check_outputs(click.get_current_context())
+        return run_it(*args, **options)
+
+    checked = copy(command)
+    checked.callback = run_checked
+    return checked
 
 
 def missing(thing: str, error: ModuleNotFoundError) -> LightpageError:
@@ -116,6 +135,8 @@ def run(group: click.Group, arguments: Sequence[str] | None = None) -> int:
         if not any((error.name or "").partition(".")[0] in modules for modules in EXTRAS.values()):
             raise
         return _fail(missing("lightpage", error))
+    except MemoryError as error:
+        return _fail(LightpageError("memory", str(error) or "too little", "a machine or a device that fits the other"))
     except (KeyboardInterrupt, click.Abort):
         click.echo(f"\nlightpage: interrupted; {meta.get(RESUME_KEY, RESUME)}", err=True)
         return EXIT_INTERRUPTED

@@ -12,7 +12,7 @@ import click
 import numpy as np
 from tqdm import tqdm
 
-from optics.errors import InvalidInputError
+from optics.errors import InvalidInputError, RecordingError
 from optics.files import OutputFile, write_json
 from optics.measures import PageMeasures, measure
 from optics.page import pilot_symbols
@@ -33,7 +33,7 @@ from runtime.refused import RefusedPage, refusal
 @click.option("--source", is_flag=True, help="Have the service read pages from its own source.")
 @click.option("--pages", type=click.IntRange(1), help="How many pages; all of a recording, or one of the source.")
 @click.option("--levels", type=click.IntRange(2, 256), help="Level count; that of the recording or source by default.")
-@click.option("--out", type=click.Path(), help="Write symbols and confidences to this HDF5 file.")
+@click.option("--out", type=OutputFile(), help="Write symbols and confidences to this HDF5 file.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def decode(
     target: str,
@@ -41,7 +41,7 @@ def decode(
     source: bool,
     pages: int | None,
     levels: int | None,
-    out: str | None,
+    out: Path | None,
     json_path: Path | None,
 ) -> None:
     """Decode a recording, or pages of the service's source.
@@ -56,7 +56,9 @@ def decode(
         client = stack.enter_context(LightpageClient(target))
         if recording is not None:
             file = stack.enter_context(Recording.open(recording))
-            count, levels = min(pages or file.pages, file.pages), levels or file.levels
+            if pages is not None and pages > file.pages:
+                raise RecordingError(f"recording {recording}", f"{file.pages} pages", f"at least {pages} (--pages)")
+            count, levels = pages or file.pages, levels or file.levels
             thing, decoded = f"recording {recording}", _sent(client, file, count, levels)
         else:
             count, levels = pages or 1, levels or client.describe().source_levels

@@ -216,15 +216,19 @@ class LightpageClient:
             request.source.CopyFrom(pb.SourcePages(count=count, pages=pages))
         call = self._stub.Recalibrate(request, timeout=timeout_s)
         try:
-            for reply in call:
+            result = None
+            for reply in call:  # to its end: a call that is left early counts as cancelled
                 if reply.WhichOneof("step") == "result":
-                    return _recalibrated(reply.result)
-                progress(reply.progress.step, reply.progress.fraction)
+                    result = _recalibrated(reply.result)
+                else:
+                    progress(reply.progress.step, reply.progress.fraction)
         except grpc.RpcError as error:
             raise error_of(error, self.target) from None
         finally:
             call.cancel()
-        raise LightpageError(f"service at {self.target}", "an end without a result", "a recalibration's result")
+        if result is None:
+            raise LightpageError(f"service at {self.target}", "an end without a result", "a recalibration's result")
+        return result
 
     def rollback(self) -> tuple[str, str]:
         """Go back to the model before; returns the versions (now current, dropped)."""

@@ -8,7 +8,7 @@ from optics.errors import CalibrationError
 from optics.page import symbol_phases
 from optics.progress import Progress
 from optics.recording import FramePair, hash_frames
-from optics.registration.calibrate import KnownPage, refine
+from optics.registration.calibrate import LEAST_KEPT, KnownPage, refine
 from optics.registration.calibration import Calibration
 from optics.registration.table import sampling_table
 from runtime.bundle import Bundle
@@ -56,6 +56,13 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         turn=earlier.turn_rad,
         progress=progress,
     )
+    if registered.coherence_after < LEAST_KEPT * earlier.coherence_after:
+        raise CalibrationError(
+            "re-fit, outcome",
+            f"a coherence of {registered.coherence_after:.3f}",
+            f"at least {LEAST_KEPT:.0%} of the {earlier.coherence_after:.3f} when it was calibrated: this device, "
+            "drifted a little; else calibrate anew",
+        )
     fitted = Calibration.from_registered(registered, profile, [hash_frames(pair) for pair in pages.pairs])
     # Figures of later pages must not count any page that an earlier fit has seen.
     fitted = fitted.model_copy(update={"calibrated_pages": (*earlier.calibrated_pages, *fitted.calibrated_pages)})

@@ -36,6 +36,7 @@ from train.run import (
     REFERENCES,
     Run,
     begin,
+    check_begun,
     is_first_process,
     load_network,
     load_run,
@@ -61,12 +62,44 @@ _LIKENESS_PAGES = 2
     "--out", required=True, type=click.Path(path_type=Path), help="Folder of the run; resumed if it is there."
 )
 @click.option("--calibration", "calibration_path", type=click.Path(path_type=Path), help="Made here if left out.")
-@click.option("--steps", type=click.IntRange(min=10), default=Hyperparameters.steps, show_default=True)
-@click.option("--batch", type=click.IntRange(min=1), default=Hyperparameters.batch, show_default=True)
-@click.option("--channels", type=click.IntRange(min=4), default=Hyperparameters.channels, show_default=True)
-@click.option("--blocks", type=click.IntRange(min=1), default=Hyperparameters.blocks, show_default=True)
-@click.option("--levels", type=click.IntRange(min=0, max=4), default=Hyperparameters.levels, show_default=True)
-@click.option("--learning-rate", type=float, default=Hyperparameters.learning_rate, show_default=True)
+@click.option(
+    "--steps",
+    type=click.IntRange(min=10),
+    default=Hyperparameters.steps,
+    show_default=True,
+    help="Optimiser steps: 300 for a first try, thousands for all that a device gives.",
+)
+@click.option(
+    "--batch", type=click.IntRange(min=1), default=Hyperparameters.batch, show_default=True, help="Pages a step."
+)
+@click.option(
+    "--channels",
+    type=click.IntRange(min=4),
+    default=Hyperparameters.channels,
+    show_default=True,
+    help="Of the network.",
+)
+@click.option(
+    "--blocks",
+    type=click.IntRange(min=1),
+    default=Hyperparameters.blocks,
+    show_default=True,
+    help="Residual blocks of the network, at each of its levels.",
+)
+@click.option(
+    "--levels",
+    type=click.IntRange(min=0, max=4),
+    default=Hyperparameters.levels,
+    show_default=True,
+    help="Levels of the network below symbol pitch; 0 is the flat one.",
+)
+@click.option(
+    "--learning-rate",
+    type=float,
+    default=Hyperparameters.learning_rate,
+    show_default=True,
+    help="Peak of the one-cycle schedule.",
+)
 @click.option(
     "--precision",
     type=click.Choice(["bf16-mixed", "16-mixed", "32-true"]),
@@ -74,7 +107,13 @@ _LIKENESS_PAGES = 2
     show_default=True,
     help="Of the network's arithmetic; bf16-mixed is fastest where the processor has it.",
 )
-@click.option("--validation-share", type=click.FloatRange(0.01, 0.5), default=0.08, show_default=True)
+@click.option(
+    "--validation-share",
+    type=click.FloatRange(0.01, 0.5),
+    default=0.08,
+    show_default=True,
+    help="Share of the pages that training is judged by.",
+)
 @click.option("--test-share", type=click.FloatRange(0, 0.5), default=0.08, show_default=True, help="Left for evaluate.")
 @click.option(
     "--synthetic-pages",
@@ -84,7 +123,13 @@ _LIKENESS_PAGES = 2
     help="Pages that the fitted device would show after drifts, trained on beside the recorded ones.",
 )
 @click.option("--start", type=click.Path(path_type=Path), help="Finished run whose weights this one begins with.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Of initial weights, batches and rotations.",
+)
 @click.option(
     "--devices",
     type=click.IntRange(min=1),
@@ -120,7 +165,7 @@ def train(
     if not (math.isfinite(learning_rate) and learning_rate > 0):
         raise InvalidInputError("--learning-rate", learning_rate, "a positive number")
     context = click.get_current_context()
-    context.meta["lightpage.resume"] = "run the same command again; it goes on from the last checkpoint"
+    context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
     choices = Hyperparameters(
         channels=channels,
         blocks=blocks,
@@ -137,8 +182,6 @@ def train(
         if not recording.has_symbols:
             raise RecordingError(f"recording {recording_path}", "no dataset 'symbols'", "known symbols to train on")
         context.with_resource(sole_writer(out))
-        calibration = _calibration(recording, profile_name, calibration_path, out)
-        calibration.check_profile(profile)
         first = None if start is None else _first_network(start, profile, localizer, choices)
         hashes = _usable(recording)
         groups = _split(recording, list(hashes), validation_share, test_share)
@@ -147,15 +190,18 @@ def train(
             "--profile": profile.to_toml(),
             "--recording (SHA-256 of its frames)": _digest([*hashes.values(), hash_frames(references)]),
             "--localizer": localizer,
-            "calibration": calibration.to_toml(),
             "--validation-share": validation_share,
             "--test-share": test_share,
             "--synthetic-pages": synthetic_pages,
             "--start": None if start is None else str(start.resolve()),
             **{f"--{name.replace('_', '-')}": value for name, value in asdict(choices).items()},
         }
+        check_begun(out, options)
+        calibration = _calibration(recording, profile_name, calibration_path, out)
+        calibration.check_profile(profile)
+        options["calibration"] = calibration.to_toml()
         extractor = FeatureExtractor(profile, calibration.vector, calibration.turn_rad, references, localizer)
-        extractor.check(known_pages(recording, profile, groups[0][:1])[0])
+        extractor.check(known_pages(recording, profile, groups[0][:1])[0], calibration.coherence_after)
         begin(out, options)
         if (out / DESCRIPTION).exists():
             _tell(load_run(out), out, json_path)

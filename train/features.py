@@ -15,7 +15,7 @@ from optics.grid import GRID_STEP_PX, field_grid
 from optics.page import symbol_phases
 from optics.profile import Profile
 from optics.recording import FramePair, Recording
-from optics.registration.calibrate import KnownPage, least_coherence
+from optics.registration.calibrate import LEAST_KEPT, KnownPage, least_coherence
 from optics.registration.coherence import COHERENT_BRANCHES, branch_shares, page_coherence
 from optics.registration.samplers import FieldSampler
 from optics.registration.table import Table, sampling_table
@@ -84,16 +84,20 @@ class FeatureExtractor:
         """Recovered field on the common grid."""
         return self._solve(pair, self._references, self.table["registration"], self.table["homodyne"])[0]
 
-    def check(self, page: KnownPage) -> None:
+    def check(self, page: KnownPage, calibrated: float) -> None:
         """Check that a known page shows its symbols where this calibration says.
 
+        Args:
+            page: of the recording.
+            calibrated: coherence of the pages that were calibrated on.
+
         Raises:
-            CalibrationError: it shows hardly more of them than chance does.
+            CalibrationError: it shows hardly more of them than chance does, or clearly less than those pages.
         """
         field = self.known_field(page.pair, np.angle(page.symbols))
         sampler = FieldSampler(field, field_grid(self._profile))
         found = page_coherence(sampler, self._twin, self._parameters, self._profile, page.symbols)
-        least = least_coherence(page.symbols.size)
+        least = max(least_coherence(page.symbols.size), LEAST_KEPT * calibrated)
         if not found >= least:
             raise CalibrationError(
                 "calibration against the recording",

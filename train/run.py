@@ -95,6 +95,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
     Raises:
         InvalidInputError: another process works in it, or it cannot be made or read.
     """
+    made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY)
@@ -110,6 +111,8 @@ def sole_writer(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+        if made and not any(folder.iterdir()):
+            folder.rmdir()  # refused before anything was written
 
 
 def begin(folder: Path, options: dict[str, Any]) -> None:
@@ -122,21 +125,29 @@ def begin(folder: Path, options: dict[str, Any]) -> None:
     Raises:
         InvalidInputError: the folder holds a run that was begun with other options.
     """
-    path = folder / BEGUN
-    options = {"format": FORMAT, **options}
+    if not check_begun(folder, options):
+        replace_text(folder / BEGUN, json.dumps({"format": FORMAT, **options}, indent=2), "options of the run")
+
+
+def check_begun(folder: Path, options: dict[str, Any]) -> bool:
+    """Check that a run goes on with what it was begun with, so far as `options` say; returns whether it was begun.
+
+    Raises:
+        InvalidInputError: see `begin`.
+    """
     try:
-        kept = json.loads(path.read_text())
+        kept = json.loads((folder / BEGUN).read_text())
     except (OSError, ValueError):
         if (folder / CHECKPOINTS).exists():
             wanted = f"a run that says in {BEGUN} what it was begun with, or another --out"
             raise InvalidInputError(f"run {folder}", "checkpoints of unknown origin", wanted) from None
-        replace_text(path, json.dumps(options, indent=2), "options of the run")
-        return
-    for name, value in options.items():
+        return False
+    for name, value in {"format": FORMAT, **options}.items():
         if kept.get(name) != value:
             raise InvalidInputError(
                 f"run {folder}: {name}", value, f"{kept.get(name)!r}, with which it was begun, or another --out"
             )
+    return True
 
 
 def load_run(folder: Path) -> Run:

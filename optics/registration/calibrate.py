@@ -35,6 +35,9 @@ _LEAST_OVER_CHANCE = 8.0
 """Coherence that a calibration must reach, in units of 1/sqrt(symbols of a page), what chance gives. Measured on the
 bench device: 34 or more where it was found, 18 with half of the symbols wrong; at most 2.3 for the right symbols at
 nominal geometry and 1.2 for unrelated symbols at the right one."""
+LEAST_KEPT = 0.9
+"""Share of a calibration's coherence that other pages of its device show, drifted a little or not: its own pages are
+alike to 0.01; on the bench device a pipe angle that is a degree off leaves 0.87."""
 _LEAST_SIGNIFICANT = 0.1
 """Share of the searched patches that must be found in the end: half are where the device was found, a quarter with half
 of the symbols wrong (no branch carries light from all of the page)."""

@@ -67,6 +67,7 @@ def test_the_image_of_the_page_fits_on_the_camera(name: str) -> None:
         ("pilot_fraction = 0.01", "pilot_fraction = 0.0", "page.pilot_fraction"),
         ("pilot_seed = 0", "pilot_seed = -1", "page.pilot_seed"),
         ("columns_px = 1368", "columns_px = -1368", "camera.columns_px"),
+        ("columns_px = 1368", "columns_px = 1000000", "camera.columns_px"),
         ("schema_version = 1", "schema_version = 2", "schema_version"),
         ('name = "bench"', 'name = ""', "name"),
         ("pitch_m = 9.2e-06\n", "", "slm.pitch_m"),

@@ -55,6 +55,11 @@ def needs_torch() -> None:
 
 
 @click.command()
+def hungry() -> None:
+    raise MemoryError("Unable to allocate 7 TiB")
+
+
+@click.command()
 def broken() -> None:
     raise ZeroDivisionError
 
@@ -64,6 +69,7 @@ def group_of(**points: str) -> LazyGroup:
 
 
 HERE = "tests.runtime.test_cli"
+CODES = ("OK", "CANCELLED")
 
 
 def test_the_overview_imports_no_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,6 +97,30 @@ def test_ctrl_c_ends_with_130_and_says_how_to_go_on(capsys: pytest.CaptureFixtur
     assert "interrupted; call it with --resume" in capsys.readouterr().err
     assert run(["x"], group_of(x=f"{HERE}:plainly_interrupted")) == 130
     assert "run the same command again" in capsys.readouterr().err
+
+
+def test_too_little_memory_is_an_error_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["hungry"], group_of(hungry=f"{HERE}:hungry")) == 2
+    assert "memory: got Unable to allocate 7 TiB" in capsys.readouterr().err
+
+
+def test_nothing_that_is_read_is_written_and_nothing_is_written_twice(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, other = recording[0].read_bytes(), tmp_path / "folder" / ".." / recording[0].name
+    (tmp_path / "folder").mkdir()
+    both = tmp_path / "both"
+    for arguments, named in (
+        (["evaluate", "--bundle", toy_zip, "--recording", recording[0], "--json", other], "--json"),
+        (["decode", "--target", "127.0.0.1:1", "--recording", recording[0], "--out", recording[0]], "--out"),
+        (["recalibrate", "--bundle", toy_zip, "--recording", recording[0], "--out", both, "--json", both], "--out"),
+        (["recalibrate", "--bundle", toy_zip, "--recording", recording[0], "--json", toy_zip], "--json"),
+    ):
+        assert run(arguments) == 2
+        assert f"error: {named}" in (said := capsys.readouterr().err)
+        assert "wanted a file of its own" in said
+    assert recording[0].read_bytes() == before
+    assert not both.exists()
 
 
 def test_an_unforeseen_error_keeps_its_traceback() -> None:
@@ -348,6 +378,13 @@ def test_decode_of_bad_pages_alone_writes_nothing(
     assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
 
 
+def test_decode_names_pages_that_a_recording_does_not_have(
+    service: LightpageServer, recording: tuple[Path, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["decode", "--target", service.target, "--recording", recording[0], "--pages", "9"]) == 2
+    assert "got 4 pages, wanted at least 9" in capsys.readouterr().err
+
+
 def test_decode_reads_the_services_source(service: LightpageServer, tmp_path: Path) -> None:
     report = tmp_path / "d.json"
     assert run(["decode", "--target", service.target, "--source", "--pages", "3", "--json", report]) == 0
@@ -389,6 +426,9 @@ def test_recalibrate_and_rollback_work_on_a_running_service(service: LightpageSe
     report = tmp_path / "r.json"
     assert run(["recalibrate", "--target", service.target, "--pages", "2", "--json", report]) == 0
     assert json.loads(report.read_text())["version"] == "toy-1+r1"
+    calls = service._plane.metrics.registry.get_sample_value
+    ended = {code: calls("lightpage_calls_total", {"method": "Recalibrate", "code": code}) for code in CODES}
+    assert ended == {"OK": 1, "CANCELLED": None}  # its client heard it to its end
     assert run(["rollback", "--target", service.target]) == 0
     assert run(["rollback", "--target", service.target]) == 2
 

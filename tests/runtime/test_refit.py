@@ -1,7 +1,8 @@
-"""The real re-fit on the shipped bundle: symbols that were not written are refused, and nothing is left behind."""
+"""The real re-fit on the shipped bundle: wrong symbols and other devices are refused, and nothing is left behind."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +19,28 @@ from runtime.refit import refit
 from runtime.shipped import DEFAULT, bundle_path
 
 
-@pytest.mark.parametrize("wrong", [(0, 1), (1,)])
-def test_wrong_symbols_are_refused(wrong: tuple[int, ...], tmp_path: Path) -> None:
-    """Takes its seconds: two simulated pages of the bench device and the fit of one."""
+def refused(device: Device, told: Callable[[np.ndarray], list[np.ndarray]], match: str, folder: Path) -> None:
+    """Takes its seconds: two simulated pages of a bench device and the fit of one."""
     decoder = Decoder.load(bundle_path(DEFAULT))
     profile = decoder.bundle.profile
     written = random_symbols(profile, LEVELS, 4, np.random.default_rng(8))
-    simulator = Simulator(profile, drifted(Device()), LEVELS, 8)
+    simulator = Simulator(profile, device, LEVELS, 8)
     pairs = tuple(simulator.page(page) for page in written[:2])
-    told = tuple(written[2 + page] if page in wrong else written[page] for page in (0, 1))
-    known = KnownPages(pairs, told, LEVELS, simulator.references())
-    with pytest.raises(RecalibrationRefusedError, match="right symbols" if 0 in wrong else "does not match"):
-        recalibrate(decoder, known, tmp_path / "n.zip", "bench+r1", refit, lambda *_: None)
-    assert list(tmp_path.iterdir()) == []
+    known = KnownPages(pairs, tuple(told(written)), LEVELS, simulator.references())
+    with pytest.raises(RecalibrationRefusedError, match=match):
+        recalibrate(decoder, known, folder / "n.zip", "bench+r1", refit, lambda *_: None)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("wrong", [(0, 1), (1,)])
+def test_wrong_symbols_are_refused(wrong: tuple[int, ...], tmp_path: Path) -> None:
+    def told(written: np.ndarray) -> list[np.ndarray]:
+        return [written[2 + page] if page in wrong else written[page] for page in (0, 1)]
+
+    refused(drifted(Device()), told, "right symbols" if 0 in wrong else "does not match", tmp_path)
+
+
+def test_a_device_that_is_another_and_not_drifted_is_refused(tmp_path: Path) -> None:
+    geometry = Device().geometry
+    other = Device(geometry=geometry.model_copy(update={"pipe_angle_deg": geometry.pipe_angle_deg + 1}))
+    refused(other, lambda written: [written[0], written[1]], "else calibrate anew", tmp_path)

@@ -23,7 +23,7 @@ from optics.errors import CalibrationError, InvalidInputError
 from optics.page import pilot_mask
 from optics.recording import Recording
 from optics.registration.calibrate import Registered
-from optics.registration.calibration import Calibration
+from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.parameters import NAMES
 from optics.simulator import true_parameters
 from tests.optics.small import small_profile
@@ -177,6 +177,23 @@ def test_a_calibration_of_another_device_is_refused(device: list[str], tmp_path:
     other = [*device[:5], str(tmp_path / "C.toml"), *device[6:]]
     with pytest.raises(CalibrationError, match="calibration against the recording"):
         run([*other, "--steps", "60", "--out", str(tmp_path / "run")])
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_calibration_of_a_device_with_another_angle_is_refused(device: list[str], tmp_path: Path) -> None:
+    calibration = load_calibration(device[5])
+    angle = calibration.parameters["pipe_angle_rad"] + float(np.deg2rad(1))
+    changed = {"parameters": calibration.parameters | {"pipe_angle_rad": angle}}
+    calibration.model_copy(update=changed).save(tmp_path / "C.toml")
+    with pytest.raises(CalibrationError, match=r"calibration against the recording: got a coherence of 0\.[34]"):
+        run([*device[:5], str(tmp_path / "C.toml"), *device[6:], "--steps", "60", "--out", str(tmp_path / "run")])
+
+
+def test_other_options_are_refused_before_a_calibration_is_made(device: list[str], tmp_path: Path) -> None:
+    begin(tmp_path, {"--steps": 60})
+    with pytest.raises(InvalidInputError, match=r"with which it was begun, or another --out"):
+        run([*device[:4], *device[6:], "--steps", "70", "--out", str(tmp_path)])
+    assert [path.name for path in tmp_path.iterdir()] == ["begun.json"]
 
 
 def test_options_that_cannot_be_are_named(device: list[str], tmp_path: Path) -> None:
