@@ -34,7 +34,11 @@ SAFE_DEVIATIONS = 2.5
 """A decision serves like a pilot where the nearest wrong one lies this many standard deviations away."""
 
 LARGEST_ERROR_PX = 0.15
-"""Standard deviation of the estimate, per axis, above which a page is left out."""
+"""Standard deviation of the estimate, per axis, above which a page is left out unless its shift is plain to see."""
+
+PLAIN_DEVIATIONS = 4.0
+"""A shift of so many standard deviations is there, however large they are: the further off a page is, the less exactly
+it says by how much, until it has been decoded where it lies."""
 
 _CAP = 400.0
 """Largest concentration that counts as such: no symbol shall outvote the rest."""
@@ -98,7 +102,10 @@ class PhaseShift:
     def measure(self, page: DecodedPage, pilots: Pilots | None = None) -> Estimate | None:
         """Remaining shift of a page, or None where it does not show it reliably."""
         estimate = self.estimate(page, pilots)
-        return None if estimate is None or np.any(estimate.error_px > LARGEST_ERROR_PX) else estimate
+        if estimate is None:
+            return None
+        plain = np.linalg.norm(estimate.shift_px / estimate.error_px) > PLAIN_DEVIATIONS
+        return estimate if plain or np.all(estimate.error_px <= LARGEST_ERROR_PX) else None
 
     def bend(self, shift_px: Real) -> Real:
         """What to add to the phases [ny, nx] of a page that was decoded `shift_px` (x, y) off, radians, first order."""

@@ -8,7 +8,7 @@ import pytest
 from optics.page import symbol_phases
 from optics.pilots import Pilots
 from runtime.decoder import DecodedPage, Timings
-from runtime.phase_shift import PhaseShift
+from runtime.phase_shift import LARGEST_ERROR_PX, PhaseShift
 from tests.runtime import toy
 
 NY, NX = toy.PAGE
@@ -87,6 +87,16 @@ def test_a_page_too_noisy_to_tell_is_left_out() -> None:
     assert estimate is not None
     assert estimate.error_px.max() > 0.15
     assert reader().measure(noisy) is None
+
+
+def test_a_shift_that_is_plain_to_see_is_told_however_roughly() -> None:
+    far = page((-0.9, 0.9), levels=256, kappa=14)
+    estimate = reader().estimate(far)
+    assert estimate is not None
+    assert estimate.error_px.max() > LARGEST_ERROR_PX
+    assert reader().measure(far) is not None
+    near = page((-0.1, 0.1), levels=256, kappa=14)
+    assert reader().measure(near) is None
 
 
 def test_the_table_moves_half_a_grid_sample_a_pixel_and_not_at_all_without_shift() -> None:
