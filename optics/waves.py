@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 Complex = NDArray[np.complexfloating]
@@ -17,6 +18,9 @@ Real = NDArray[np.floating]
 
 _RANK_TOLERANCE = 1e-7
 """Singular values of the roll's coupling below this share of the largest are dropped (field error of the same size)."""
+
+_SPARE_DEGREES = 12
+"""Degrees beyond the largest phase of the roll's coupling, in radians, that its polynomials need for that tolerance."""
 
 _MODE_MARGIN = 1.04
 """Modes beyond the one that the page's edge excites: an edge of the facet spreads it."""
@@ -106,10 +110,7 @@ class FourierLens:
         self._x_to_x = (unitary * kernel(cos(roll) + tan(t) * sin(roll), x_m, facet_x)).astype(np.complex64)
         self._y_and_x = kernel(sin(roll) - tan(t) * cos(roll), y_m, facet_x).astype(np.complex64)
         self._y_to_y = kernel(cos(roll) / cos(t), facet_y, y_m).astype(np.complex64)
-        left, weights, right = np.linalg.svd(kernel(-sin(roll) / cos(t), facet_y, x_m), full_matrices=False)
-        rank = int(np.sum(weights > _RANK_TOLERANCE * weights[0]))
-        self._facet_terms = (left[:, :rank] * weights[:rank]).T.astype(np.complex64)
-        self._plane_terms = right[:rank].astype(np.complex64)
+        self._facet_terms, self._plane_terms = _separated(kernel(-sin(roll) / cos(t), facet_y, x_m), facet_y, x_m)
 
     def to_facet(self, field: Complex) -> Complex:
         """Field on the plane [ny, nx] to the facet's grid [cells_y - 1, cells_x - 1]."""
@@ -132,6 +133,24 @@ class FourierLens:
             total = term if total is None else total + term
         assert total is not None
         return total
+
+
+def _separated(kernel: Complex, rows: Real, columns: Real) -> tuple[Complex, Complex]:
+    """Fewest terms [R, rows] and [R, columns] whose products sum to a kernel exp(i c row column).
+
+    They are its leading singular vectors, found among polynomials of the degree that its largest phase needs: the full
+    decomposition would take longer than a page.
+    """
+    largest = float(np.abs(np.angle(kernel[1:, -1] / kernel[:-1, -1])).sum()) if len(rows) > 1 else 0.0
+    degree = int(np.ceil(largest)) + _SPARE_DEGREES
+    on_rows, on_columns = (
+        np.linalg.qr(legvander(places / np.abs(places).max(), min(degree, len(places) - 1)))[0]
+        for places in (rows, columns)
+    )
+    left, weights, right = np.linalg.svd(on_rows.T @ kernel @ on_columns)
+    rank = int(np.sum(weights > _RANK_TOLERANCE * weights[0]))
+    facet = (on_rows @ (left[:, :rank] * weights[:rank])).T
+    return facet.astype(np.complex64), (right[:rank] @ on_columns.T).astype(np.complex64)
 
 
 class PipePropagator:

@@ -252,7 +252,8 @@ def _write_zip(path: Path, contents: Mapping[str, bytes]) -> None:
         with zipfile.ZipFile(file, "w") as archive:
             for name, data in contents.items():
                 entry = zipfile.ZipInfo(name, _EPOCH)
-                entry.compress_type = zipfile.ZIP_DEFLATED
+                packed = name.endswith(".npz")  # compressed by itself
+                entry.compress_type = zipfile.ZIP_STORED if packed else zipfile.ZIP_DEFLATED
                 entry.external_attr = 0o100644 << 16
                 archive.writestr(entry, data, compresslevel=9)
         file.flush()

@@ -34,6 +34,7 @@ class FittedWaves:
 
     Attributes:
         x, y: places of the modulator's samples over the page's half width and half height, [nx samples], [ny samples].
+        against_reference: [Gy, Gx] phasor of the smooth phases at the camera, which multiplies all light there.
     """
 
     def __init__(
@@ -92,7 +93,8 @@ class FittedWaves:
         at_launch = at_launch - ramp[0] * x[None, :] - ramp[1] * y[:, None]
         at_camera = at_camera + ramp[0] * grid_x[None, :] + ramp[1] * grid_y[:, None]
         self._launch: Complex = np.exp(1j * at_launch)
-        self._camera: Complex = np.exp(1j * at_camera) / stride  # samples that stand for more area are larger
+        self.against_reference: Complex = np.exp(1j * at_camera)
+        self._camera = self.against_reference / stride  # samples that stand for more area are larger
 
     def to_camera(self, field: Complex) -> Complex:
         """Field on the modulator [ny samples, nx samples] to the common grid [Gy, Gx], against the reference."""

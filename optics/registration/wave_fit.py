@@ -47,6 +47,8 @@ _SAMPLES = 4
 _DIFFERENCE = 1e-3
 """Finite difference of the derivatives, in standard deviations of the priors."""
 _CAMERAS = ("in_phase", "quadrature")
+_AT_CAMERA = frozenset(indices("camera_phase"))
+"""Parameters whose change of the light needs no propagation."""
 _SEEN = frozenset(indices(*_CAMERAS, "distortion"))
 """Parameters that say where the cameras see a place; all others change the light itself."""
 
@@ -200,9 +202,13 @@ class WaveFit:
         here = waves(state.parameters)
         by_term = np.stack([here.to_camera(page) for page in self._pages])
         page, field = np.tensordot(state.light, self._pages, 1), np.tensordot(state.light, by_term, 1)
-        light, pixels = [], []
-        for there, step in map(stepped, of_light):
-            light.append((waves(there, here).to_camera(page) - field) / step)
+        light, pixels = list[Complex](), list[Real]()
+        for index in of_light:
+            there, step = stepped(index)
+            moved = waves(there, here)
+            at_camera = index in _AT_CAMERA
+            ratio = moved.against_reference / here.against_reference
+            light.append(((field * ratio if at_camera else moved.to_camera(page)) - field) / step)
         for there, step in map(stepped, of_cameras):
             pixels.append((self._pixels(there) - self._pixels(state.parameters)) / step)
         return _Slopes(by_term, light, pixels)
