@@ -1,118 +1,197 @@
-"""Decoders against the oracle on the same light: same pages, same network, same steps and seeds.
+"""Every decoder on the same light, against the oracle: same recording, same held-out pages.
 
     python -m benchmarks.decoders --angle -0.6 --out runs/decoders
     python -m benchmarks.decoders --arm coherent --size 64x2x0 --size 96x2x1 --steps 1500 --out runs/decoders
 
-The oracle knows the simulated truth: geometry, cameras, reference; the signal's own power is taken off its frames; then
-the wave adjoint and the same network. Image shift and piston of every page, held-out ones too, are found from all of
-its symbols, for each arm alike. Interrupted, it goes on where it was: features and checkpoints lie in --out.
+Coherent, wave and oracle share network, steps and seeds. The oracle knows the simulated truth: geometry, cameras,
+reference; the signal's own power is taken off its frames; then the wave adjoint and the same network. None, mode and
+ray are the published decoders, with their own network and training. Image shift and piston of every page, held-out ones
+too, are found from all of its symbols, for each arm alike. Interrupted, it goes on where it was; all lies in --out.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.utils.data import Dataset
 
-from optics.cameras import resample
+from benchmarks.oracle import Oracle
 from optics.device import Device, Sensor
 from optics.files import write_json
-from optics.page import pilot_mask, random_symbols, symbol_phases
+from optics.measures import measure
+from optics.page import pilot_mask
 from optics.profile import Profile, load_profile
 from optics.progress import percent_bar
-from optics.recording import FramePair, hash_frames
-from optics.registration.calibrate import KnownPage, calibrate
+from optics.recording import Recording, hash_frames
+from optics.recording_job import RecordingJob
+from optics.registration.calibrate import calibrate
 from optics.registration.calibration import Calibration, load_calibration
-from optics.simulator import SimulatedPage, Simulator, TrueOptics, true_parameters
+from optics.registration.known import known_pages
 from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
 from train.field import FieldRecovery, TorchFieldSolver
-from train.fitting import Hyperparameters, decode_pages, fit_network, held_out_air
+from train.fitting import (
+    DecoderTraining,
+    Fitted,
+    Hyperparameters,
+    Page,
+    best_kappa_scale,
+    decode_pages,
+    fit_network,
+    seed_stretch,
+    without_piston,
+)
+from train.published.localizers import NAMES as PUBLISHED
+from train.published.recipe import published_choices, published_decoder
+from train.published.states import page_states
+from train.published.training import FramePages, PublishedChoices, PublishedTraining, fit_published
 from train.run import begin, sole_writer
+from train.symbols import LOCALIZERS
 from train.twin import RayTwin, TorchTwin
 
 LEVELS = 256
-ARMS = ("coherent", "wave", "oracle")
+ORACLE = "oracle"
+ARMS = (*PUBLISHED, *LOCALIZERS, ORACLE)
 CALIBRATED = 2
 HELD_OUT_SHARE = 0.08
 LAST_SHARE = 0.2
 
 
-def without_signal_power(page: SimulatedPage, optics: TrueOptics) -> FramePair:
-    """The frames of a page with the counts that |E|^2 adds taken off, noise and quantisation left in, float32."""
-    device = optics.device
-    power = np.abs(optics.camera_field(page.exit_field)) ** 2
-    counts = optics.electrons_per_unit * (2**device.sensor.bit_depth - 1) / device.sensor.full_well_e
-    frames = []
-    for frame, pose, gain in (
-        (page.pair.in_phase, device.in_phase_camera, 1.0),
-        (page.pair.quadrature, device.quadrature_camera, device.homodyne.quadrature_gain),
-    ):
-        seen = resample(power, *optics.camera_axes_m, *optics.view(pose, page.shift_px))
-        frames.append((frame - gain * counts * seen).astype(np.float32))
-    return FramePair(*frames)
-
-
-@dataclass(frozen=True)
-class Arm:
-    """One decoder's way from frames to features.
-
-    Attributes:
-        name: of the decoder.
-        extractor: with the geometry that it may know.
-        without_power: whether it may know what |E|^2 added to the frames.
-    """
-
-    name: str
-    extractor: FeatureExtractor
-    without_power: bool = False
-
-    def features(
-        self, simulator: Simulator, pages: list[NDArray[np.uint8]], first: int, shift_px: tuple[float, float]
-    ) -> Iterator[PageFeatures]:
-        """Features of the pages from `first` on, by a simulator that has written none; `shift_px` was the last."""
-        simulator.skip(first)
-        shift = np.array(shift_px)
-        for symbols in pages[first:]:
-            seen = simulator.simulate(symbols)
-            pair = without_signal_power(seen, simulator.optics) if self.without_power else seen.pair
-            phases = symbol_phases(symbols, LEVELS)
-            features, shift = self.extractor.page(self.extractor.field(pair), phases, shift)
-            yield features
-
-
-def calibrated(profile: Profile, simulator: Simulator, known: list[NDArray[np.uint8]], path: Path) -> Calibration:
-    """The calibration from nominal on known pages, kept in `path`."""
+def calibrated(profile: Profile, recording: Recording, path: Path) -> Calibration:
+    """The calibration from nominal on the recording's first pages, kept in `path`."""
     if not path.exists():
-        pages = [KnownPage(simulator.page(page), np.exp(1j * symbol_phases(page, LEVELS))) for page in known]
+        pages = known_pages(recording, profile, range(CALIBRATED))
         twin, solver = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
         with percent_bar() as progress:
-            fitted = calibrate(twin, solver, profile, simulator.references(), pages, progress)
+            fitted = calibrate(twin, solver, profile, recording.references(), pages, progress)
         hashes = [hash_frames(page.pair) for page in pages]
         Calibration.from_registered(fitted, profile, hashes).save(path)
     return load_calibration(path)
 
 
-def arms(
-    profile: Profile, device: Device, fitted: Calibration, references: FramePair, names: Sequence[str]
-) -> list[Arm]:
-    """The decoders of these names, each with what it may know."""
-    truth = true_parameters(profile, device)
-    made = []
-    for name in names:
-        if name == "oracle":
-            turn = device.homodyne.turn_rad
-            extractor = FeatureExtractor(profile, truth, turn, references, "wave", with_signal_power=False)
-        else:
-            extractor = FeatureExtractor(profile, fitted.vector, fitted.turn_rad, references, name)
-        made.append(Arm(name, extractor, without_power=name == "oracle"))
-    return made
+@dataclass(frozen=True)
+class Bench:
+    """What all arms share.
+
+    Attributes:
+        recording: open.
+        profile, device: nominal and true.
+        fitted: the calibration.
+        out: folder of everything.
+        training, validation, unseen: page numbers.
+    """
+
+    recording: Recording
+    profile: Profile
+    device: Device
+    fitted: Calibration
+    out: Path
+    training: range
+    validation: range
+    unseen: range
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """Pilots, bool [ny, nx]."""
+        return pilot_mask(self.profile)
+
+    @property
+    def pages(self) -> list[int]:
+        """All that is not calibrated on, in order."""
+        return [*self.training, *self.validation, *self.unseen]
+
+    def extractor(self, localizer: str) -> FeatureExtractor:
+        """Of the calibrated device."""
+        references = self.recording.references()
+        return FeatureExtractor(self.profile, self.fitted.vector, self.fitted.turn_rad, references, localizer)
+
+    def symbol_arm(self, name: str, size: str, choices: Hyperparameters) -> Outcome:
+        """Features, then the network at symbol pitch."""
+        features = self.out / name / "features"
+        key = "" if name == ORACLE else self.fitted.to_toml()
+
+        def make(start: int, shift: tuple[float, float]) -> Iterator[PageFeatures]:
+            if name == ORACLE:
+                return Oracle(self.recording, self.profile, self.device).pages(self.pages[start:], shift)
+            return self.extractor(name).pages(self.recording, self.pages[start:], shift)
+
+        preparing = fill(features, key, len(self.pages), make, f"features of {name}")
+        first = self.training.start
+        training, validation, unseen = (
+            FeatureStore(features, range(part.start - first, part.stop - first))
+            for part in (self.training, self.validation, self.unseen)
+        )
+        channels, blocks, levels = map(int, size.split("x"))
+        choices = replace(choices, channels=channels, blocks=blocks, levels=levels)
+        folder = self.begun(self.out / name / f"{size}-{choices.steps}", asdict(choices))
+        trained = fit_network(folder, choices, self.mask, LEVELS, training, validation, devices=1)
+        return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing)
+
+    def published_arm(self, name: str, choices: PublishedChoices) -> Outcome:
+        """States of the pages, then a published decoder on raw frames."""
+        states, preparing = page_states(
+            self.out / "states.json", self.fitted.to_toml(), self.recording, self.extractor("coherent"), self.pages
+        )
+        by_page = dict(zip(self.pages, states, strict=True))
+        training, validation, unseen = (
+            FramePages(self.recording, part, [by_page[page] for page in part])
+            for part in (self.training, self.validation, self.unseen)
+        )
+        size = "/".join(map(str, choices.channels))
+        chosen = asdict(choices) | {"channels": list(choices.channels)}
+        folder = self.begun(self.out / name / f"{size.replace('/', '-')}-{choices.steps}", chosen)
+        seed_stretch(folder, choices.seed)
+        decoder = published_decoder(name, choices, self.profile, self.recording.references(), self.fitted.turn_rad)
+        module = PublishedTraining(decoder, choices, self.mask, LEVELS)
+        trained = fit_published(folder, module, training, validation, devices=1)
+        return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing)
+
+    def begun(self, folder: Path, options: dict[str, Any]) -> Path:
+        """The folder of a run that was begun with these options."""
+        folder.mkdir(parents=True, exist_ok=True)
+        begin(folder, options)
+        return folder
+
+    def outcome(
+        self,
+        name: str,
+        size: str,
+        steps: int,
+        folder: Path,
+        trained: Fitted[Any],
+        validation: Dataset[Page],
+        unseen: Dataset[Page],
+        preparing: float,
+    ) -> Outcome:
+        """Figures of the held-out pages, kappa made honest on the validation pages."""
+        module: DecoderTraining[Any] = trained.module
+        scale = best_kappa_scale(module, validation, self.mask)
+        decoded = [without_piston(p * scale, t, self.mask) for p, t in zip(*decode_pages(module, unseen), strict=True)]
+        px, py = np.concatenate([p[:, ~self.mask] for p in decoded], axis=1)
+        truth = [self.recording.symbols(page) for page in self.unseen]
+        symbols = np.concatenate([page[~self.mask] for page in truth if page is not None])
+        figures = measure(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
+        return Outcome(
+            arm=name,
+            size=size,
+            steps=steps,
+            air=figures.air_bits_per_symbol,
+            own_mi=figures.own_mi_bits_per_symbol,
+            page_kB=figures.air_bits_per_symbol * int((~self.mask).sum()) / 8000,
+            validation_air=trained.validation_air,
+            gained_in_last_fifth=gained_at_the_end(folder, steps),
+            preparing_seconds=preparing,
+            training_seconds=trained.seconds,
+        )
 
 
 def gained_at_the_end(run: Path, steps: int) -> float:
@@ -131,7 +210,10 @@ class Outcome:
 
     arm: str
     size: str
+    steps: int
     air: float
+    own_mi: float
+    page_kB: float
     validation_air: float
     gained_in_last_fifth: float
     preparing_seconds: float
@@ -141,13 +223,17 @@ class Outcome:
     def line(self) -> str:
         over = "" if self.over_oracle is None else f"{self.over_oracle:.3f}"
         return (
-            f"{self.arm:<10} {self.size:<9} {self.air:>8.3f} {over:>10} {self.gained_in_last_fifth:>8.3f} "
-            f"{self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f}"
+            f"{self.arm:<10} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} {self.page_kB:>6.2f} "
+            f"{over:>10} {self.gained_in_last_fifth:>8.3f} {self.preparing_seconds / 60:>9.1f} "
+            f"{self.training_seconds / 60:>8.1f}"
         )
 
 
-HEADER = f"{'arm':<10} {'size':<9} {'held out':>8} {'of oracle':>10} {'gained':>8} {'features':>9} {'training':>8}"
-"""AIR on held-out pages; what validation AIR gained in the last fifth of the steps; minutes (simulation: features)."""
+HEADER = (
+    f"{'arm':<10} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'kB':>6} {'of oracle':>10} {'gained':>8} "
+    f"{'features':>9} {'training':>8}"
+)
+"""Held-out pages, bits a symbol and kB a page; what validation AIR gained in the last fifth of the steps; minutes."""
 
 
 class Size(click.ParamType[str]):
@@ -175,6 +261,14 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
 @click.option(
     "--size", "sizes", type=Size(), multiple=True, default=(DEFAULT_SIZE,), show_default=True, help="Network."
 )
+@click.option(
+    "--published-steps",
+    type=click.IntRange(10),
+    help="Of the published decoders; their authors' 50 passes if left out.",
+)
+@click.option(
+    "--published-channels", type=click.IntRange(4), multiple=True, default=(32,), show_default=True, help="Network."
+)
 @click.option("--arm", "names", type=click.Choice(ARMS), multiple=True, default=ARMS, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=5000, show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for features, runs, figures.json.")
@@ -185,66 +279,53 @@ def main(
     pages: int,
     steps: int,
     sizes: tuple[str, ...],
+    published_steps: int | None,
+    published_channels: tuple[int, ...],
     names: tuple[str, ...],
     seed: int,
     out: Path,
 ) -> None:
-    """Train every arm on the same pages and print held-out AIR."""
+    """Train every arm on the same pages and print what it says of held-out ones."""
     profile = load_profile(profile_name)
     device = Device(sensor=Sensor(full_well_e=full_well)).with_settings([f"geometry.pipe_angle_deg={angle_deg}"])
-    options = {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed}
     click.get_current_context().with_resource(sole_writer(out))
-    begin(out, options)
-    written = list(random_symbols(profile, LEVELS, pages + CALIBRATED, np.random.default_rng([seed, 7])))
-
-    def simulator() -> Simulator:
-        return Simulator(profile, device, LEVELS, seed)
-
-    fitted = calibrated(profile, simulator(), written[:CALIBRATED], out / "calibration.toml")
-    mask = pilot_mask(profile)
+    begin(out, {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed})
+    path = out / "recording.h5"
+    if not path.exists():
+        job = RecordingJob(profile, device, LEVELS, seed, truth=True, out=path)
+        job.claim(force=False)
+        job.run(pages + CALIBRATED)
     held = max(2, round(HELD_OUT_SHARE * pages))
-    first = pages - 2 * held
-    outcomes: list[Outcome] = []
-    for arm in arms(profile, device, fitted, simulator().references(), names):
-        features = out / arm.name / "features"
-        key = f"{angle_deg} {full_well} {seed} {fitted.to_toml() if arm.name != 'oracle' else ''}"
-        preparing = fill(
-            features,
-            key,
-            pages,
-            lambda start, shift, arm=arm: arm.features(simulator(), written[CALIBRATED:], start, shift),  # type: ignore[misc]
-            f"features of {arm.name}",
+    last = CALIBRATED + pages
+    with Recording.open(path) as recording:
+        bench = Bench(
+            recording=recording,
+            profile=profile,
+            device=device,
+            fitted=calibrated(profile, recording, out / "calibration.toml"),
+            out=out,
+            training=range(CALIBRATED, last - 2 * held),
+            validation=range(last - 2 * held, last - held),
+            unseen=range(last - held, last),
         )
-        training, validation, unseen = (
-            FeatureStore(features, part)
-            for part in (range(first), range(first, first + held), range(first + held, pages))
-        )
-        for size in sizes:
-            channels, blocks, levels = map(int, size.split("x"))
-            choices = Hyperparameters(steps=steps, seed=seed, channels=channels, blocks=blocks, levels=levels)
-            folder = out / arm.name / f"{size}-{steps}"
-            folder.mkdir(exist_ok=True)
-            begin(folder, asdict(choices))
-            trained = fit_network(folder, choices, mask, LEVELS, training, validation, devices=1)
-            p, phases = decode_pages(trained.module, unseen)
-            outcomes.append(
-                Outcome(
-                    arm.name,
-                    size,
-                    held_out_air(p, phases, mask, LEVELS),
-                    trained.validation_air,
-                    gained_at_the_end(folder, steps),
-                    preparing,
-                    trained.seconds,
-                )
-            )
-            outcomes = against_oracle(outcomes)
+        runs: list[Callable[[], Outcome]] = []
+        for name in names:
+            if name in PUBLISHED:
+                for width in published_channels:
+                    choices = replace(published_choices(profile, len(bench.training)), channels=(width, 2 * width))
+                    choices = choices if published_steps is None else replace(choices, steps=published_steps)
+                    runs.append(partial(bench.published_arm, name, replace(choices, seed=seed)))
+            else:
+                common = Hyperparameters(steps=steps, seed=seed)
+                runs += [partial(bench.symbol_arm, name, size, common) for size in sizes]
+        outcomes: list[Outcome] = []
+        for run in runs:
+            outcomes = against_oracle([*outcomes, run()])
             figures = {
                 "angle_deg": angle_deg,
-                "angle_error_deg": fitted.angle_deg(profile) - angle_deg,
+                "angle_error_deg": bench.fitted.angle_deg(profile) - angle_deg,
                 "full_well_e": full_well,
                 "pages": pages,
-                "steps": steps,
                 "seed": seed,
                 "outcomes": [asdict(outcome) for outcome in outcomes],
             }

@@ -10,7 +10,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from export.graph import FRAME_INPUTS, TABLE_INPUTS, DecoderGraph, table_tensors
+from export.graph import FRAME_INPUTS, DecoderGraph, Graph, PublishedGraph, published_tensors, table_tensors
 from export.onnx_files import decoder_onnx, twin_onnx
 from export.parity import check_parity, torch_answer
 from optics.errors import BundleError, InvalidInputError
@@ -24,10 +24,14 @@ from runtime.frames import narrow
 from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version
 from runtime.ort import open_session
 from train.localizers.coherent import CoherentLocalizer
+from train.published.localizers import NAMES as PUBLISHED
+from train.published.recipe import published_decoder
+from train.published.training import PublishedChoices
 from train.run import GOLDEN as RUN_GOLDEN
-from train.run import REFERENCES, load_arrays, load_network, load_run
+from train.run import REFERENCES, Run, load_arrays, load_network, load_run, load_weights
 from train.twin import RayTwin, TorchTwin
 
+Tensors = dict[str, NDArray[np.generic]]
 PILOT_ARRAYS = {"mask": "pilots", "phases": "pilot_phases"}
 """Arrays of the bundle's pilots by their name in the run; phases only where the device has fixed ones of its own."""
 _LEAST_CONTRAST = 2.0
@@ -71,19 +75,14 @@ def export_run(
     if out.exists():
         raise BundleError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     run = load_run(folder)
-    if run.localizer != "coherent":
-        raise InvalidInputError(f"run {folder}: localizer", repr(run.localizer), "'coherent', which has a graph")
     profile, calibration = run.profile, run.calibration
-    network = load_network(folder, run, CoherentLocalizer(profile).light_channels)
-    graph = DecoderGraph(profile, network, run.kappa_scale).eval()
     twin = RayTwin(profile)
-    table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
     kept, golden = load_arrays(folder / REFERENCES), load_arrays(folder / RUN_GOLDEN)
     references, pair = (
         narrow(FramePair(arrays["in_phase"], arrays["quadrature"]), run.camera_bit_depth) for arrays in (kept, golden)
     )
     frame_dtype = pair.in_phase.dtype.name
-    defaults = table_tensors(table, references.in_phase, references.quadrature)
+    graph, defaults = _graph(folder, run, references, twin)
     progress("ask torch", 0.0)
     expected = torch_answer(graph, pair, defaults)
     progress("decoder to ONNX", 0.2)
@@ -103,8 +102,8 @@ def export_run(
         metrics={"validation_air_bits_per_symbol": run.validation_air, "training_seconds": run.seconds},
         calibrated_pages=calibration.calibrated_pages,
         trained_pages=run.trained_pages,
-        table_inputs=TABLE_INPUTS,
-        residual_output="residual",
+        table_inputs=tuple(defaults),
+        residual_output="residual" if "residual" in graph.outputs else None,
         residual_limit=_residual_limit(graph, pair, defaults),
         provenance=Provenance(**run.provenance),
     )
@@ -126,8 +125,30 @@ def export_run(
     return Bundle.open(out), error
 
 
-def _residual_limit(graph: DecoderGraph, pair: FramePair, defaults: dict[str, NDArray[np.generic]]) -> float | None:
+def _graph(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tuple[Graph, Tensors]:
+    """A run's decoder as a graph, and the defaults of its table.
+
+    Raises:
+        InvalidInputError: a localizer that has no graph, or no weights.
+    """
+    profile, calibration, choices = run.profile, run.calibration, run.hyperparameters
+    if isinstance(choices, PublishedChoices):
+        decoder = published_decoder(run.localizer, choices, profile, references, calibration.turn_rad)
+        published = PublishedGraph(load_weights(folder, decoder), run.kappa_scale).eval()
+        return published, published_tensors(decoder)
+    if run.localizer != "coherent":
+        wanted = f"'coherent' or one of {', '.join(PUBLISHED)}, which have a graph"
+        raise InvalidInputError(f"run {folder}: localizer", repr(run.localizer), wanted)
+    network = load_network(folder, run, CoherentLocalizer(profile).light_channels)
+    table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
+    graph = DecoderGraph(profile, network, run.kappa_scale).eval()
+    return graph, table_tensors(table, references.in_phase, references.quadrature)
+
+
+def _residual_limit(graph: Graph, pair: FramePair, defaults: Tensors) -> float | None:
     """Half way, in ratio, between the residuals of right and of swapped frames; None where both are alike."""
+    if "residual" not in graph.outputs:
+        return None
     right = float(torch_answer(graph, pair, defaults)["residual"])
     swapped = float(torch_answer(graph, FramePair(pair.quadrature, pair.in_phase), defaults)["residual"])
     return float(np.sqrt(right * swapped)) if swapped > _LEAST_CONTRAST * right else None

@@ -11,8 +11,11 @@ from optics.profile import Profile
 from train.field import FieldRecovery, relative_power
 from train.localizers.coherent import CoherentLocalizer
 from train.network import SymbolUNet
+from train.published.decoder import PublishedDecoder, sample_frames
 
 FRAME_INPUTS = ("in_phase", "quadrature")
+ANSWERS = ("p", "phase", "concentration")
+"""What every decoder says."""
 TABLE_INPUTS = (
     "reference_in_phase",
     "reference_quadrature",
@@ -24,7 +27,9 @@ TABLE_INPUTS = (
     "positions",
 )
 """Inputs that carry the calibrated table as their default and may be fed instead."""
-OUTPUTS = ("p", "phase", "concentration", "residual", "field", "unexplained")
+PUBLISHED_TABLE_INPUTS = ("grid", "levels")
+"""The same of a published decoder: where it samples the frames, and the references there."""
+OUTPUTS = (*ANSWERS, "residual", "field", "unexplained")
 """`unexplained` is what is left of the homodyne equations, [2, Gy, Gx]; `residual` its power over the field's."""
 
 
@@ -36,6 +41,8 @@ class DecoderGraph(nn.Module):
         network: trained.
         kappa_scale: factor on p that makes its length an honest concentration.
     """
+
+    outputs = OUTPUTS
 
     def __init__(self, profile: Profile, network: SymbolUNet, kappa_scale: float) -> None:
         super().__init__()
@@ -68,13 +75,50 @@ class DecoderGraph(nn.Module):
         )
         light = self.localizer(field, places, place_gradients, phases)
         p = self.network(light.flatten(0, 2)[None], positions[None])[0] * self.kappa_scale
-        phase = torch.atan2(p[1], p[0])
-        concentration = torch.sqrt((p * p).sum(0))
-        return p, phase, concentration, relative_power(left, field), field, left
+        return *_answers(p), relative_power(left, field), field, left
+
+
+class PublishedGraph(nn.Module):
+    """A published decoder with its sampling grid as a constant.
+
+    Args:
+        decoder: trained.
+        kappa_scale: factor on p that makes its length an honest concentration.
+    """
+
+    outputs = ANSWERS
+
+    def __init__(self, decoder: PublishedDecoder, kappa_scale: float) -> None:
+        super().__init__()
+        self.decoder = decoder
+        self.kappa_scale = kappa_scale
+
+    def forward(self, in_phase: Tensor, quadrature: Tensor, grid: Tensor, levels: Tensor) -> tuple[Tensor, ...]:
+        """Decode one pair: `ANSWERS`, from where `grid` [2, h, w, 2] looks; the references there are `levels`."""
+        seen = sample_frames(torch.stack([in_phase, quadrature])[None].to(torch.float32), grid[None])
+        return _answers(self.decoder.read(seen, levels[None])[0] * self.kappa_scale)
+
+
+def _answers(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """p [2, ny, nx], its angle and its length."""
+    return p, torch.atan2(p[1], p[0]), torch.sqrt((p * p).sum(0))
 
 
 def table_tensors(
     table: dict[str, NDArray[np.float32]], in_phase: NDArray[np.integer], quadrature: NDArray[np.integer]
 ) -> dict[str, NDArray[np.generic]]:
-    """The defaults of `TABLE_INPUTS`: the sampling table and the reference-only frames."""
-    return {"reference_in_phase": in_phase, "reference_quadrature": quadrature, **table}
+    """The defaults of `TABLE_INPUTS`, in order: the sampling table and the reference-only frames."""
+    tensors = {"reference_in_phase": in_phase, "reference_quadrature": quadrature, **table}
+    return {name: tensors[name] for name in TABLE_INPUTS}
+
+
+def published_tensors(decoder: PublishedDecoder) -> dict[str, NDArray[np.generic]]:
+    """The defaults of `PUBLISHED_TABLE_INPUTS`, in order."""
+    with torch.no_grad():
+        grid = decoder.localizer.grid()
+        levels = sample_frames(decoder.references[None], grid[None])[0]
+    return dict(zip(PUBLISHED_TABLE_INPUTS, (grid.numpy(), levels.numpy()), strict=True))
+
+
+Graph = DecoderGraph | PublishedGraph
+"""Frames and then, in the order of their defaults, table tensors in; `outputs` out."""

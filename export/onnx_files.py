@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 from torch import nn
 
-from export.graph import FRAME_INPUTS, OUTPUTS, TABLE_INPUTS, DecoderGraph
+from export.graph import FRAME_INPUTS, Graph
 from optics.registration.parameters import nominal
 from train.twin import RayTwin
 
@@ -23,7 +23,7 @@ TWIN_OUTPUTS = ("places", "phases", "positions", "pixels")
 
 
 def decoder_onnx(
-    graph: DecoderGraph, frame_dtype: str, frame_shape: tuple[int, int], defaults: dict[str, NDArray[np.generic]]
+    graph: Graph, frame_dtype: str, frame_shape: tuple[int, int], defaults: dict[str, NDArray[np.generic]]
 ) -> bytes:
     """The decoder as ONNX, the calibrated table as the default of its inputs.
 
@@ -31,14 +31,14 @@ def decoder_onnx(
         graph: the decoder, in evaluation mode.
         frame_dtype: "uint8" or "uint16".
         frame_shape: (rows, columns).
-        defaults: tensor of every input of `TABLE_INPUTS`.
+        defaults: tensor of every input behind the frames, in order.
     """
     frame = torch.from_numpy(np.zeros(frame_shape, dtype=frame_dtype))
     # torch.export takes one tensor given twice for one input, hence the clone below
-    tensors = [torch.from_numpy(np.ascontiguousarray(defaults[name])) for name in TABLE_INPUTS]
-    model = _export(graph, (frame, frame.clone(), *tensors), (*FRAME_INPUTS, *TABLE_INPUTS), OUTPUTS, None)
-    for name in TABLE_INPUTS:
-        model.graph.initializer.append(numpy_helper.from_array(np.ascontiguousarray(defaults[name]), name))
+    tensors = [torch.from_numpy(np.ascontiguousarray(value)) for value in defaults.values()]
+    model = _export(graph, (frame, frame.clone(), *tensors), (*FRAME_INPUTS, *defaults), graph.outputs, None)
+    for name, value in defaults.items():
+        model.graph.initializer.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
     onnx.checker.check_model(model)
     return bytes(model.SerializeToString())
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from export.graph import OUTPUTS, TABLE_INPUTS, DecoderGraph
+from export.graph import Graph
 from optics.errors import BundleError
 from optics.recording import FramePair
 
@@ -15,16 +15,16 @@ TOLERANCE = 1e-3
 
 
 def torch_answer(
-    graph: DecoderGraph, pair: FramePair, defaults: dict[str, NDArray[np.generic]]
+    graph: Graph, pair: FramePair, defaults: dict[str, NDArray[np.generic]]
 ) -> dict[str, NDArray[np.float32]]:
-    """Every output of the decoder (`OUTPUTS`) for a frame pair, by torch."""
+    """Every output of the decoder for a frame pair, by torch; `defaults` in the order of its inputs."""
     with torch.no_grad():
         answers = graph(
             torch.from_numpy(pair.in_phase),
             torch.from_numpy(pair.quadrature),
-            *(torch.from_numpy(np.ascontiguousarray(defaults[name])) for name in TABLE_INPUTS),
+            *(torch.from_numpy(np.ascontiguousarray(value)) for value in defaults.values()),
         )
-    return {name: answer.numpy() for name, answer in zip(OUTPUTS, answers, strict=True)}
+    return {name: answer.numpy() for name, answer in zip(graph.outputs, answers, strict=True)}
 
 
 def check_parity(expected: NDArray[np.float32], got: NDArray[np.float32], thing: str) -> float:

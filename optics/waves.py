@@ -81,6 +81,48 @@ def sine_matrix(cells: int) -> Real:
     return np.asarray(np.sqrt(2 / cells) * np.sin(np.pi * np.outer(index, index) / cells))
 
 
+def _facet(cells: int, width: float) -> Real:
+    """Sample positions on one axis of a facet, metres, [cells - 1]."""
+    return np.asarray((np.arange(1, cells) / cells - 0.5) * width)
+
+
+def _lens_kernel(geometry: WaveGeometry, rows: Real, columns: Real) -> Complex:
+    """exp(-i k/f row column): what a 2f lens does along one axis."""
+    return np.asarray(np.exp(-1j * geometry.wave_number / geometry.focal_length_m * np.outer(rows, columns)))
+
+
+def mode_detuning(geometry: WaveGeometry, rows: Real, columns: Real) -> Real:
+    """kz - nk of the square pipe's sine modes, rad/m.
+
+    Args:
+        geometry: the device; its shear does not count.
+        rows, columns: mode numbers along y' and x, arrays that broadcast.
+
+    Raises:
+        ValueError: a mode that does not propagate.
+    """
+    nk = geometry.refractive_index * geometry.wave_number
+    transverse = (np.pi / geometry.pipe_width_m) ** 2 * (rows**2 + columns**2)
+    if transverse.max() >= nk**2:
+        raise ValueError(f"modes: got transverse wave number {np.sqrt(transverse.max()):.3g}, wanted below {nk:.3g}")
+    return np.asarray(-transverse / (np.sqrt(nk**2 - transverse) + nk))  # without cancellation
+
+
+def modes_of_plane(geometry: WaveGeometry, plane_m: Real, cells: int) -> Complex:
+    """One axis of a field on a lens's outer plane to the square pipe's sine modes, by a matrix [cells - 1, samples].
+
+    Mode m = row + 1. The pipe neither sheared nor rolled; the matrix's adjoint takes modes back to the plane.
+
+    Args:
+        geometry: the device.
+        plane_m: sample positions, uniform, metres, [samples].
+        cells: sample intervals of the pipe on this axis.
+    """
+    width = geometry.pipe_width_m
+    unitary = np.sqrt((plane_m[1] - plane_m[0]) * width / cells / (geometry.wavelength_m * geometry.focal_length_m))
+    return np.asarray(unitary * sine_matrix(cells) @ _lens_kernel(geometry, _facet(cells, width), plane_m))
+
+
 class FourierLens:
     """A 2f lens between a Cartesian plane (SLM or camera) and the oblique sample grid on a pipe facet.
 
@@ -97,13 +139,11 @@ class FourierLens:
     def __init__(self, geometry: WaveGeometry, x_m: Real, y_m: Real, cells: tuple[int, int]) -> None:
         w = geometry.pipe_width_m
         t, roll = geometry.pipe_angle, geometry.pipe_roll
-        facet_y = (np.arange(1, cells[0]) / cells[0] - 0.5) * w
-        facet_x = (np.arange(1, cells[1]) / cells[1] - 0.5) * w
-        scale = geometry.wave_number / geometry.focal_length_m
+        facet_y, facet_x = (_facet(count, w) for count in cells)
         sin, cos, tan = np.sin, np.cos, np.tan
 
         def kernel(coefficient: float, rows: Real, columns: Real) -> Complex:
-            return np.asarray(np.exp(-1j * scale * coefficient * np.outer(rows, columns)))
+            return _lens_kernel(geometry, coefficient * rows, columns)
 
         area = (x_m[1] - x_m[0]) * (y_m[1] - y_m[0]) * (w / cells[0]) * (w / cells[1]) / cos(t)
         unitary = np.sqrt(area) / (geometry.wavelength_m * geometry.focal_length_m)
@@ -173,18 +213,10 @@ class PipePropagator:
         self._sheared = abs(geometry.pipe_angle) > 0
         self._steps = steps if self._sheared else 1
         self._bases = [_parity_basis(n) for n in cells]
-        w, k = geometry.pipe_width_m, geometry.wave_number
-        nk = geometry.refractive_index * k
-        k_y = np.pi * self._bases[0].mode_numbers / w
-        k_x = np.pi * self._bases[1].mode_numbers / w
-        transverse = k_y[:, None, :, None] ** 2 + k_x[None, :, None, :] ** 2
-        if transverse.max() >= nk**2:
-            raise ValueError(
-                f"modes: got transverse wave number {np.sqrt(transverse.max()):.3g}, wanted below {nk:.3g}"
-            )
+        w, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
+        y, x = (basis.mode_numbers for basis in self._bases)
+        detuning = mode_detuning(geometry, y[:, None, :, None], x[None, :, None, :])
         dz = geometry.pipe_length_m / self._steps
-        # kz - nk without cancellation
-        detuning = -transverse / (np.sqrt(nk**2 - transverse) + nk)
         self._half = np.exp(0.5j * dz * detuning).astype(np.complex64)
         coupling = np.outer(self._bases[0].couplings, self._bases[1].couplings) / w**2
         angle = dz / nk * np.sin(geometry.pipe_angle) * coupling
@@ -309,8 +341,7 @@ class WaveChannel:
     def entrance_window(self) -> Real:
         """Transmission of the SLM's pixel shape and blur at the entrance facet, [cells_y - 1, cells_x - 1]."""
         g = self.geometry
-        facet_y = (np.arange(1, self.cells[0]) / self.cells[0] - 0.5) * g.pipe_width_m
-        facet_x = (np.arange(1, self.cells[1]) / self.cells[1] - 0.5) * g.pipe_width_m
+        facet_y, facet_x = (_facet(count, g.pipe_width_m) for count in self.cells)
         along_y = facet_y[:, None] / np.cos(g.pipe_angle) - facet_x[None, :] * np.tan(g.pipe_angle)
         along_x = np.broadcast_to(facet_x[None, :], along_y.shape)
         per_metre = 1 / (g.wavelength_m * g.focal_length_m)

@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import fcntl
 import os
+import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from optics.cli import simulate
+from optics.device import Device
 from optics.profile import Profile, load_profile
+from optics.registration.calibrate import Registered
 from optics.registration.calibration import Calibration, load_calibration
+from optics.registration.parameters import NAMES
+from optics.simulator import true_parameters
+from tests.optics.small import small_profile
 
 BENCH_PAGES = 3
+SMALL_PAGES = 8
+
+
+def pytest_configure() -> None:
+    """Let Ctrl-C reach programs that tests start, even if the tests run in the background, where shells ignore it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
@@ -50,3 +63,18 @@ def _shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
     folder.mkdir(exist_ok=True)
     return folder
+
+
+@pytest.fixture(scope="session")
+def small_device(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Options that name a small device's profile, its recording of eight pages and its (right) calibration."""
+    folder = tmp_path_factory.mktemp("device")
+    profile, state = small_profile(), Device()
+    (folder / "small.toml").write_text(profile.to_toml())
+    made = f"--profile {folder}/small.toml --pages {SMALL_PAGES} --seed 4 --out {folder}/R.h5"
+    CliRunner().invoke(simulate, made.split(), standalone_mode=False, catch_exceptions=False)
+    truth, turn = true_parameters(profile, state), state.homodyne.turn_rad
+    right = Registered(truth, np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
+    Calibration.from_registered(right, profile, ["0" * 64]).save(folder / "C.toml")
+    named = {"--profile": "small.toml", "--recording": "R.h5", "--calibration": "C.toml"}
+    return [word for option, name in named.items() for word in (option, str(folder / name))]

@@ -7,13 +7,13 @@ import math
 import shlex
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.data import ConcatDataset
 
 from optics.errors import FrameError, InvalidInputError, RecordingError
 from optics.files import OutputFile, write_json
@@ -25,11 +25,13 @@ from optics.recording import Recording, hash_frames
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.known import known_pages
 from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording
-from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor
-from train.fitting import Hyperparameters, Page, best_kappa_scale, fit_network
-from train.localizers.coherent import SAMPLES, CoherentLocalizer
-from train.network import SymbolUNet
+from train.fitting import Hyperparameters
+from train.material import Material
+from train.published.decoder import LENS_CHOICES
+from train.published.localizers import NAMES as PUBLISHED
+from train.published.recipe import PublishedRecipe, published_choices
+from train.published.training import PublishedChoices
 from train.run import (
     DESCRIPTION,
     GOLDEN,
@@ -38,26 +40,31 @@ from train.run import (
     begin,
     check_begun,
     is_first_process,
-    load_network,
     load_run,
     save_arrays,
-    save_network,
+    save_weights,
     sole_writer,
 )
-from train.synthetic import MOST_NOISE, SyntheticPages, likeness
+from train.symbols import DEFAULT_SYNTHETIC_PAGES, LIKENESS_PAGES, LOCALIZERS, SymbolRecipe
 
-PUBLISHED = ("none", "mode", "ray")
-TRAINABLE = ("coherent", "wave")
-DEFAULT_SYNTHETIC_PAGES = 96
 _FEWEST_PAGES = 6
-_LIKENESS_PAGES = 2
-"""Recorded pages that the wave model is compared with: each has thousands of symbols."""
+
+
+def _default(name: str) -> str:
+    """How the help text of an option tells its default."""
+    return f"[default: {getattr(Hyperparameters, name):g}]"
 
 
 @click.command()
 @click.option("--profile", "profile_name", required=True, help="Shipped profile or TOML file.")
 @click.option("--recording", "recording_path", required=True, type=click.Path(path_type=Path), help="Known pages.")
-@click.option("--localizer", type=click.Choice([*PUBLISHED, *TRAINABLE]), default="coherent", show_default=True)
+@click.option(
+    "--localizer",
+    type=click.Choice([*PUBLISHED, *LOCALIZERS]),
+    default="coherent",
+    show_default=True,
+    help="none, mode and ray are the published decoders: their network and way of training.",
+)
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder of the run; resumed if it is there."
 )
@@ -65,40 +72,36 @@ _LIKENESS_PAGES = 2
 @click.option(
     "--steps",
     type=click.IntRange(min=10),
-    default=Hyperparameters.steps,
-    show_default=True,
-    help="Optimiser steps: 300 for a first try, thousands for all that a device gives.",
+    help="Optimiser steps: 300 for a first try, thousands for all that a device gives. "
+    f"{_default('steps')}; published: 50 passes over the pages, fewer for symbols larger than 4x4.",
 )
-@click.option(
-    "--batch", type=click.IntRange(min=1), default=Hyperparameters.batch, show_default=True, help="Pages a step."
-)
+@click.option("--batch", type=click.IntRange(min=1), help=f"Pages a step. {_default('batch')}; published: 2.")
 @click.option(
     "--channels",
     type=click.IntRange(min=4),
-    default=Hyperparameters.channels,
-    show_default=True,
-    help="Of the network.",
+    help=f"Of the network. {_default('channels')}; published: 32, and twice as many below sample pitch.",
 )
 @click.option(
     "--blocks",
     type=click.IntRange(min=1),
-    default=Hyperparameters.blocks,
-    show_default=True,
-    help="Residual blocks of the network, at each of its levels.",
+    help=f"Residual blocks of the network, at each of its levels. {_default('blocks')}; published: none to choose.",
 )
 @click.option(
     "--levels",
     type=click.IntRange(min=0, max=4),
-    default=Hyperparameters.levels,
-    show_default=True,
-    help="Levels of the network below symbol pitch; 0 is the flat one.",
+    help="Levels of the network below symbol pitch; 0 is the flat one. "
+    f"{_default('levels')}; published: none to choose.",
 )
 @click.option(
     "--learning-rate",
     type=float,
-    default=Hyperparameters.learning_rate,
-    show_default=True,
-    help="Peak of the one-cycle schedule.",
+    help=f"Peak of the one-cycle schedule, or that of the published network. {_default('learning_rate')}; published: "
+    f"{PublishedChoices.decoder_rate:g}.",
+)
+@click.option(
+    "--lenses",
+    type=click.Choice(LENS_CHOICES),
+    help=f"Lenses that the published rays are traced through. [default: {PublishedChoices.lenses}]",
 )
 @click.option(
     "--precision",
@@ -118,9 +121,8 @@ _LIKENESS_PAGES = 2
 @click.option(
     "--synthetic-pages",
     type=click.IntRange(min=0),
-    default=DEFAULT_SYNTHETIC_PAGES,
-    show_default=True,
-    help="Pages that the fitted device would show after drifts, trained on beside the recorded ones.",
+    help="Pages that the fitted device would show after drifts, trained on beside the recorded ones. "
+    f"[default: {DEFAULT_SYNTHETIC_PAGES}; published: none]",
 )
 @click.option("--start", type=click.Path(path_type=Path), help="Finished run whose weights this one begins with.")
 @click.option(
@@ -142,96 +144,88 @@ def train(
     localizer: str,
     out: Path,
     calibration_path: Path | None,
-    steps: int,
-    batch: int,
-    channels: int,
-    blocks: int,
-    levels: int,
-    learning_rate: float,
+    steps: int | None,
+    batch: int | None,
+    channels: int | None,
+    blocks: int | None,
+    levels: int | None,
+    learning_rate: float | None,
+    lenses: str | None,
     precision: str,
     validation_share: float,
     test_share: float,
-    synthetic_pages: int,
+    synthetic_pages: int | None,
     start: Path | None,
     seed: int,
     devices: int | None,
     json_path: Path | None,
 ) -> None:
     """Train a decoder on known pages; the last pages of the recording stay unseen for `lightpage evaluate`."""
-    if localizer in PUBLISHED:
-        raise InvalidInputError(
-            "--localizer", localizer, f"one of {', '.join(TRAINABLE)}; the published ones are not in this version"
-        )
-    if not (math.isfinite(learning_rate) and learning_rate > 0):
+    if learning_rate is not None and not (math.isfinite(learning_rate) and learning_rate > 0):
         raise InvalidInputError("--learning-rate", learning_rate, "a positive number")
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
-    choices = Hyperparameters(
-        channels=channels,
-        blocks=blocks,
-        levels=levels,
-        steps=steps,
-        batch=batch,
-        learning_rate=learning_rate,
-        seed=seed,
-        precision=precision,
-    )
     profile = load_profile(profile_name)
     with Recording.open(recording_path) as recording:
         recording.check_against(profile)
         if not recording.has_symbols:
             raise RecordingError(f"recording {recording_path}", "no dataset 'symbols'", "known symbols to train on")
         context.with_resource(sole_writer(out))
-        first = None if start is None else _first_network(start, profile, localizer, choices)
         hashes = _usable(recording)
         groups = _split(recording, list(hashes), validation_share, test_share)
+        chosen = {"steps": steps, "batch": batch, "seed": seed, "precision": precision}
+        recipe: SymbolRecipe | PublishedRecipe
+        if localizer in PUBLISHED:
+            recipe = _published(
+                localizer,
+                published_choices(profile, len(groups[0]), batch),
+                {**chosen, "channels": channels, "decoder_rate": learning_rate, "lenses": lenses},
+                {"--blocks": blocks, "--levels": levels, "--synthetic-pages": synthetic_pages, "--start": start},
+            )
+        else:
+            sizes = {"channels": channels, "blocks": blocks, "levels": levels, "learning_rate": learning_rate}
+            recipe = _symbols(localizer, {**chosen, **sizes}, synthetic_pages, start, {"--lenses": lenses})
+            recipe.check_start(profile)
         references = recording.references()
         options = {
             "--profile": profile.to_toml(),
             "--recording (SHA-256 of its frames)": _digest([*hashes.values(), hash_frames(references)]),
-            "--localizer": localizer,
             "--validation-share": validation_share,
             "--test-share": test_share,
-            "--synthetic-pages": synthetic_pages,
-            "--start": None if start is None else str(start.resolve()),
-            **{f"--{name.replace('_', '-')}": value for name, value in asdict(choices).items()},
+            **recipe.options(),
         }
         check_begun(out, options)
         calibration = _calibration(recording, profile_name, calibration_path, out)
         calibration.check_profile(profile)
         options["calibration"] = calibration.to_toml()
-        extractor = FeatureExtractor(profile, calibration.vector, calibration.turn_rad, references, localizer)
+        features = localizer if localizer in LOCALIZERS else LOCALIZERS[0]
+        extractor = FeatureExtractor(profile, calibration.vector, calibration.turn_rad, references, features)
         extractor.check(known_pages(recording, profile, groups[0][:1])[0], calibration.coherence_after)
         begin(out, options)
         if (out / DESCRIPTION).exists():
             _tell(load_run(out), out, json_path)
             return
-        key = _digest([options[name] for name in ("--profile", "--recording (SHA-256 of its frames)", "calibration")])
-        known = [*groups[0], *groups[1]]
-        preparing = fill(
-            out / "features",
-            f"{key} {localizer}",
-            len(known),
-            lambda first, shift: extractor.pages(recording, known[first:], shift),
-            "recorded pages",
-        )
-        synthetic = _synthetic(
-            recording, extractor, synthetic_pages, groups[0], out, calibration, profile, localizer, seed
-        )
         mask = recording.pilots()
         mask = pilot_mask(profile) if mask is None else mask
-        count = len(groups[0])
-        training: ConcatDataset[Page] = ConcatDataset(
-            [FeatureStore(out / "features", range(count)), *map(FeatureStore, synthetic)]
-        )
-        validation = FeatureStore(out / "features", range(count, len(known)))
-        fitted = fit_network(
-            out, choices, mask, recording.levels, training, validation, start=first, devices=devices or "auto"
+        trained = recipe.train(
+            Material(
+                out=out,
+                recording=recording,
+                profile=profile,
+                calibration=calibration,
+                extractor=extractor,
+                references=references,
+                training=groups[0],
+                validation=groups[1],
+                pilot_mask=mask,
+                key=_digest([options[n] for n in ("--profile", "--recording (SHA-256 of its frames)", "calibration")]),
+                devices=devices or "auto",
+            )
         )
         if not is_first_process():
             return
-        scale = best_kappa_scale(fitted.module, validation, mask)
-        save_network(fitted.module, out)
+        known = [*groups[0], *groups[1]]
+        save_weights(trained.weights, out)
         own = _own_pilots(recording, profile, mask, known)
         kept = {"in_phase": references.in_phase, "quadrature": references.quadrature, "pilots": mask}
         save_arrays(out / REFERENCES, kept if own is None else kept | {"pilot_phases": own})
@@ -241,18 +235,52 @@ def train(
             localizer=localizer,
             profile_toml=profile.to_toml(),
             calibration_toml=calibration.to_toml(),
-            hyperparameters=choices,
+            hyperparameters=recipe.choices,
             camera_bit_depth=recording.bit_depth,
             trained_pages=tuple(hashes[page] for page in known),
-            validation_air=fitted.validation_air,
-            kappa_scale=scale,
-            seconds=preparing + fitted.seconds,
+            validation_air=trained.validation_air,
+            kappa_scale=trained.kappa_scale,
+            seconds=trained.seconds,
             pages=(len(groups[0]), len(groups[1]), len(groups[2])),
-            synthetic_pages=len(training) - count,
+            synthetic_pages=trained.synthetic_pages,
             provenance={"command": shlex.join(["lightpage", *sys.argv[1:]]), "seed": seed, "commit": _commit()},
         )
         run.save(out)
     _tell(run, out, json_path)
+
+
+def _symbols(
+    localizer: str,
+    chosen: dict[str, Any],
+    synthetic_pages: int | None,
+    start: Path | None,
+    refused: dict[str, object],
+) -> SymbolRecipe:
+    """The way of training at symbol pitch; what was not chosen stays as it is by default."""
+    _check_absent(localizer, refused)
+    choices = replace(Hyperparameters(), **_given(chosen))
+    count = DEFAULT_SYNTHETIC_PAGES if synthetic_pages is None else synthetic_pages
+    return SymbolRecipe(localizer, choices, count, start)
+
+
+def _published(
+    localizer: str, defaults: PublishedChoices, chosen: dict[str, Any], refused: dict[str, object]
+) -> PublishedRecipe:
+    """The published way of training; what was not chosen stays as its authors had it."""
+    _check_absent(localizer, refused)
+    given = _given(chosen)
+    if "channels" in given:
+        given["channels"] = (given["channels"], 2 * given["channels"])
+    return PublishedRecipe(localizer, replace(defaults, **given))
+
+
+def _given(options: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _check_absent(localizer: str, options: dict[str, object]) -> None:
+    for name in _given(options):
+        raise InvalidInputError(name, options[name], f"no such option with --localizer {localizer}")
 
 
 def _tell(run: Run, folder: Path, json_path: Path | None) -> None:
@@ -304,21 +332,6 @@ def _calibration(recording: Recording, profile_name: str, path: Path | None, out
     return calibration
 
 
-def _first_network(start: Path, profile: Profile, localizer: str, choices: Hyperparameters) -> SymbolUNet:
-    """The network of a finished run, checked to be of the size that this run wants."""
-    run = load_run(start)
-    size = (run.localizer, run.profile.page_shape, *_size(run.hyperparameters))
-    wanted = (localizer, profile.page_shape, *_size(choices))
-    if size != wanted:
-        raise InvalidInputError(f"--start {start}: localizer, page, channels, blocks, levels", size, f"{wanted}")
-    coherent = CoherentLocalizer(profile).light_channels
-    return load_network(start, run, coherent if localizer == "coherent" else 2 * SAMPLES**2)
-
-
-def _size(choices: Hyperparameters) -> tuple[int, int, int]:
-    return choices.channels, choices.blocks, choices.levels
-
-
 def _split(
     recording: Recording, usable: list[int], validation_share: float, test_share: float
 ) -> tuple[list[int], list[int], list[int]]:
@@ -333,9 +346,9 @@ def _split(
     test = round(pages * test_share) if test_share == 0 else max(1, round(pages * test_share))
     validation = max(1, round(pages * validation_share))
     first = pages - test - validation
-    if first < _LIKENESS_PAGES:
+    if first < LIKENESS_PAGES:
         got = f"{validation} validation and {test} test pages of {pages}"
-        raise InvalidInputError("--validation-share and --test-share", got, f"{_LIKENESS_PAGES} pages left to train on")
+        raise InvalidInputError("--validation-share and --test-share", got, f"{LIKENESS_PAGES} pages left to train on")
     return usable[:first], usable[first : first + validation], usable[first + validation :]
 
 
@@ -355,36 +368,6 @@ def _own_pilots(
     if np.array_equal(seen[0], pilot_symbols(profile, recording.levels)[mask]):
         return None
     return symbol_phases(seen[0], recording.levels).astype(np.float32)
-
-
-def _synthetic(
-    recording: Recording,
-    extractor: FeatureExtractor,
-    count: int,
-    training: list[int],
-    out: Path,
-    calibration: Calibration,
-    profile: Profile,
-    localizer: str,
-    seed: int,
-) -> list[Path]:
-    """Folder with the features of synthetic pages; none where the wave model is not like the device."""
-    if count == 0:
-        return []
-    known = known_pages(recording, profile, training[:_LIKENESS_PAGES])
-    phases = [np.angle(page.symbols) for page in known]
-    fields = [extractor.known_field(page.pair, written) for page, written in zip(known, phases, strict=True)]
-    like = likeness(profile, calibration.vector, fields, phases)
-    if like.noise > MOST_NOISE:
-        click.echo(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
-        return []
-    click.echo(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
-    folder = out / "synthetic"
-    pages = SyntheticPages(profile, calibration.vector, like, localizer, seed)
-    key = f"{localizer} {seed} {profile.to_toml()} {calibration.to_toml()} {like.noise:.6f} "
-    key += f"{np.round(like.illumination, 6).tolist()}"
-    fill(folder, key, count, lambda first, shift: pages.pages(first), "synthetic pages")
-    return [folder]
 
 
 def _digest(parts: list[object]) -> str:

@@ -32,6 +32,19 @@ _LARGEST_STEP_PX = 0.5
 
 
 @dataclass(frozen=True)
+class PageState:
+    """What differs from page to page and no symbol explains.
+
+    Attributes:
+        shift_px: how far the image has moved (x, y) since calibration, camera pixels.
+        piston_rad: phase common to all symbols.
+    """
+
+    shift_px: tuple[float, float]
+    piston_rad: float
+
+
+@dataclass(frozen=True)
 class PageFeatures:
     """One page as a network sees it.
 
@@ -124,23 +137,29 @@ class FeatureExtractor:
 
     def page(self, field: NDArray[np.complex64], phases: Real, shift: Real) -> tuple[PageFeatures, Real]:
         """Features of one page, and its shift, found from the known phases [ny, nx] starting from `shift` (x, y)."""
-        known = np.exp(-1j * phases)
-        for _ in range(2):
-            shift = shift + self._shift_step(field, known, shift)
-        piston = np.angle(self._agreement(self._light(field, shift), known))
+        state = self.state(field, phases, shift)
+        shift, piston = np.array(state.shift_px), state.piston_rad
         light = self._light(field, shift) if self._wave is None else self._wave(moved(field, shift))
         if self._wave is not None:
             centre = light[:, 0].mean(1)
-            piston = np.angle(np.sum((centre[0] + 1j * centre[1]) * known))
+            piston = float(np.angle(np.sum((centre[0] + 1j * centre[1]) * np.exp(-1j * phases))))
         cos, sin = np.cos(piston), np.sin(piston)
         turned = np.stack([light[0] * cos + light[1] * sin, light[1] * cos - light[0] * sin])
         features = PageFeatures(
             turned.astype(np.float16),
             self.table["positions"],
             phases.astype(np.float32),
-            (float(shift[0]), float(shift[1])),
+            state.shift_px,
         )
         return features, shift
+
+    def state(self, field: NDArray[np.complex64], phases: Real, shift: Real) -> PageState:
+        """Shift and piston of a page with known phases [ny, nx]; the shift is looked for from `shift` (x, y) on."""
+        known = np.exp(-1j * phases)
+        for _ in range(2):
+            shift = shift + self._shift_step(field, known, shift)
+        piston = float(np.angle(self._agreement(self._light(field, shift), known)))
+        return PageState((float(shift[0]), float(shift[1])), piston)
 
     def _light(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.float32]:
         return demodulate(self._coherent, field, self.table, shift)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import lightning as L
 import numpy as np
@@ -18,16 +18,17 @@ from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheck
 from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from scipy import optimize
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, RandomSampler
 
 from optics.measures import achievable_rate
-from optics.pilots import Pilots, estimate_piston, remove_piston
+from optics.pilots import Pilots, estimate_piston
 from train.loss import von_mises_nll
 from train.network import SymbolUNet
 
 CHECKPOINTS = "checkpoints"
 """Folder of a run's checkpoints."""
+_LAST = "last.ckpt"
 LOOKS = 60
 """How often a run looks at its validation pages."""
 AVERAGED_SHARE = 0.05
@@ -59,33 +60,72 @@ class Hyperparameters:
     precision: str = "bf16-mixed"
 
 
-Page = tuple[Tensor, Tensor, Tensor]
-"""One page, or a batch of them: light [2 C, ny, nx], exit centroids [2, ny, nx], true phases [ny, nx]."""
+Page = tuple[Tensor, ...]
+"""One page, or a batch of them: what the decoder is told, and last its true phases [ny, nx]."""
+N = TypeVar("N", bound=nn.Module)
 
 
-class DecoderTraining(L.LightningModule):
-    """A network under the von Mises loss, with exact rotation augmentation.
+class DecoderTraining(L.LightningModule, Generic[N]):
+    """A decoder under the von Mises loss, validated by AIR.
 
     Args:
-        network: features to p.
-        hyperparameters: the run's choices.
+        network: pages without their phases to p [N, 2, ny, nx].
         pilot_mask: bool [ny, nx]; pilots are no data: neither loss nor figure counts them.
         levels: M of the pages, which bounds their AIR.
+    """
+
+    def __init__(self, network: N, pilot_mask: NDArray[np.bool_], levels: int) -> None:
+        super().__init__()
+        self.network = network
+        self.data: Tensor
+        self.register_buffer("data", torch.from_numpy(~pilot_mask))
+        self.pilot_mask, self.levels = pilot_mask, levels
+        self._seen: list[tuple[Tensor, Tensor]] = []
+
+    def forward(self, *page: Tensor) -> Tensor:
+        """A batch of pages to p [N, 2, ny, nx]."""
+        return torch.as_tensor(self.network(*page))
+
+    def loss(self, p: Tensor, phases: Tensor) -> Tensor:
+        """Mean over the data symbols, logged."""
+        loss = von_mises_nll(p, phases)[:, self.data].mean()
+        self.log("train_nll", loss, prog_bar=True)
+        self.log("train_air", air_of_nll(loss), prog_bar=True)
+        return loss
+
+    def validation_step(self, batch: Page, index: int) -> None:
+        """Collect what the network says of held-out pages."""
+        self._seen.append((self(*batch[:-1]).float().cpu(), batch[-1].cpu()))
+
+    def on_validation_epoch_end(self) -> None:
+        """AIR of the held-out pages, piston taken off by the pilots as the runtime does it."""
+        p = torch.cat([seen[0] for seen in self._seen]).numpy()
+        phases = torch.cat([seen[1] for seen in self._seen]).numpy()
+        self._seen.clear()
+        # each of several processes has seen as many pages as the others
+        air = held_out_air(p, phases, self.pilot_mask, self.levels)
+        self.log("val_air", air, prog_bar=True, sync_dist=True)
+
+
+class SymbolTraining(DecoderTraining[SymbolUNet]):
+    """The network at symbol pitch, with exact rotation augmentation.
+
+    Its pages are light [N, 2 C, ny, nx], exit centroids [N, 2, ny, nx] and true phases [N, ny, nx].
+
+    Args:
+        network, pilot_mask, levels: as for `DecoderTraining`.
+        hyperparameters: the run's choices.
     """
 
     def __init__(
         self, network: SymbolUNet, hyperparameters: Hyperparameters, pilot_mask: NDArray[np.bool_], levels: int
     ) -> None:
-        super().__init__()
-        self.network = network
+        super().__init__(network, pilot_mask, levels)
         self.choices = hyperparameters
-        self.data: Tensor
-        self.register_buffer("data", torch.from_numpy(~pilot_mask))
-        self._pilot_mask, self._levels = pilot_mask, levels
-        self._seen: list[tuple[Tensor, Tensor]] = []
 
-    def forward(self, light: Tensor, positions: Tensor) -> Tensor:
-        """Light [N, 2 C, ny, nx] and exit centroids [N, 2, ny, nx] to p [N, 2, ny, nx]."""
+    def forward(self, *page: Tensor) -> Tensor:
+        """Light and exit centroids to p [N, 2, ny, nx]."""
+        light, positions = page
         return torch.as_tensor(self.network(light.float(), positions))
 
     def training_step(self, batch: Page, index: int) -> Tensor:
@@ -95,23 +135,7 @@ class DecoderTraining(L.LightningModule):
         real, imaginary = light.chunk(2, dim=1)
         cos, sin = torch.cos(turn)[:, None], torch.sin(turn)[:, None]
         turned = torch.cat([real * cos - imaginary * sin, real * sin + imaginary * cos], dim=1)
-        loss = von_mises_nll(self(turned, positions), phases + turn)[:, self.data].mean()
-        self.log("train_nll", loss, prog_bar=True)
-        self.log("train_air", air_of_nll(loss), prog_bar=True)
-        return loss
-
-    def validation_step(self, batch: Page, index: int) -> None:
-        """Collect what the network says of held-out pages."""
-        self._seen.append((self(batch[0], batch[1]).float().cpu(), batch[2].cpu()))
-
-    def on_validation_epoch_end(self) -> None:
-        """AIR of the held-out pages, piston taken off by the pilots as the runtime does it."""
-        p = torch.cat([seen[0] for seen in self._seen]).numpy()
-        phases = torch.cat([seen[1] for seen in self._seen]).numpy()
-        self._seen.clear()
-        # each of several processes has seen as many pages as the others
-        air = held_out_air(p, phases, self._pilot_mask, self._levels)
-        self.log("val_air", air, prog_bar=True, sync_dist=True)
+        return self.loss(self(turned, positions), phases + turn)
 
     def configure_optimizers(self) -> Any:
         """AdamW under a one-cycle schedule."""
@@ -140,18 +164,32 @@ def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDAr
         levels: M of the pages.
     """
     rates = []
-    for decoded, truth in zip(p, phases, strict=True):
-        pilots = Pilots(mask, truth[mask].astype(np.float64))
-        phase = remove_piston(np.arctan2(decoded[1], decoded[0]), estimate_piston(decoded, pilots).angle_rad)
-        concentration = np.hypot(decoded[0], decoded[1])
-        true_level = np.rint(truth * (levels / (2 * np.pi))).astype(np.int64) % levels
-        air = achievable_rate(phase[~mask], concentration[~mask], true_level[~mask].astype(np.uint8), levels)
+    for page, truth in zip(p, phases, strict=True):
+        px, py = without_piston(page, truth, mask)[:, ~mask]
+        true_level = np.rint(truth[~mask] * (levels / (2 * np.pi))).astype(np.int64) % levels
+        air = achievable_rate(np.arctan2(py, px), np.hypot(px, py), true_level.astype(np.uint8), levels)
         rates.append(float(np.mean(air)))
     return float(np.mean(rates))
 
 
+def without_piston(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """p [2, ny, nx] of a page, turned by what its pilots show of the piston, as the runtime does it.
+
+    Args:
+        p: decoded.
+        phases: true phases [ny, nx].
+        mask: pilots, bool [ny, nx].
+    """
+    turn = estimate_piston(p, Pilots(mask, phases[mask].astype(np.float64))).angle_rad
+    cos, sin = np.cos(turn), np.sin(turn)
+    return np.asarray(np.stack([p[0] * cos + p[1] * sin, p[1] * cos - p[0] * sin]), dtype=np.float32)
+
+
+M = TypeVar("M", bound=DecoderTraining[Any])
+
+
 @dataclass(frozen=True)
-class Fitted:
+class Fitted(Generic[M]):
     """A trained module.
 
     Attributes:
@@ -160,7 +198,7 @@ class Fitted:
         seconds: of training, all stretches of an interrupted run together.
     """
 
-    module: DecoderTraining
+    module: M
     validation_air: float
     seconds: float
 
@@ -172,13 +210,62 @@ def fit_network(
     levels: int,
     training: Dataset[Page],
     validation: Dataset[Page],
-    callbacks: list[Callback] | None = None,
     *,
     start: SymbolUNet | None = None,
     devices: int | str = "auto",
     progress: bool = True,
-) -> Fitted:
-    """Train, or go on with, the network of a run.
+) -> Fitted[SymbolTraining]:
+    """Train, or go on with, the network of a run: see `fit`.
+
+    Args:
+        run, training, validation, devices, progress: as for `fit`.
+        hyperparameters: the run's choices.
+        pilot_mask: bool [ny, nx].
+        levels: M of the pages.
+        start: network of the same size whose weights a new run begins with; random ones if left out.
+    """
+    seed_stretch(run, hyperparameters.seed)
+    light_channels = training[0][0].shape[0]
+    network = SymbolUNet(light_channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.levels)
+    if start is not None:
+        network.load_state_dict(start.state_dict())
+    module = SymbolTraining(network, hyperparameters, pilot_mask, levels)
+    draws = hyperparameters.batch * max(1, hyperparameters.steps // LOOKS)
+    sampler = RandomSampler(training, replacement=True, num_samples=draws)  # type: ignore[arg-type]  # it has a length
+    averaged = EMAWeightAveraging(use_buffers=False, decay=1 - 1 / max(1.0, AVERAGED_SHARE * hyperparameters.steps))
+    return fit(
+        run,
+        module,
+        DataLoader(training, batch_size=hyperparameters.batch, sampler=sampler),
+        validation,
+        steps=hyperparameters.steps,
+        precision=hyperparameters.precision,
+        callbacks=[averaged],
+        devices=devices,
+        progress=progress,
+    )
+
+
+def seed_stretch(run: Path, seed: int) -> None:
+    """Seed everything for a run, or for its next stretch: that draws other pages and turns."""
+    last = run / CHECKPOINTS / _LAST
+    reached = int(_checkpoint(last)["global_step"]) if last.exists() else 0
+    L.seed_everything(seed + reached, verbose=False)
+
+
+def fit(
+    run: Path,
+    module: M,
+    training: DataLoader[Page],
+    validation: Dataset[Page],
+    *,
+    steps: int,
+    precision: str,
+    callbacks: Sequence[Callback] = (),
+    devices: int | str = "auto",
+    progress: bool = True,
+) -> Fitted[M]:
+    """Train, or go on with, the module of a run, looking at its validation pages after every pass of `training`.
 
     On several devices Lightning runs the program once for each; all of them return the same.
 
@@ -187,37 +274,26 @@ def fit_network(
     Args:
         run: folder of the run; checkpoints and TensorBoard logs go there, and the last checkpoint is resumed from: the
             caller sees to it that it belongs to these pages and choices (`train.run.begin`).
-        hyperparameters: the run's choices.
-        pilot_mask: bool [ny, nx].
-        levels: M of the pages.
-        training, validation: pages.
+        module: with its first weights.
+        training: batches of pages.
+        validation: pages.
+        steps: optimiser steps.
+        precision: Lightning's.
         callbacks: further Lightning callbacks.
-        start: network of the same size whose weights a new run begins with; random ones if left out.
         devices: how many GPUs, or processes where there is none; "auto" takes all GPUs, or one process.
         progress: whether to show a bar.
     """
     folder = run / CHECKPOINTS
-    last = folder / "last.ckpt"
-    reached = int(_checkpoint(last)["global_step"]) if last.exists() else 0
-    # another stretch of the run draws other pages and turns
-    L.seed_everything(hyperparameters.seed + reached, verbose=False)
-    light_channels = training[0][0].shape[0]
-    network = SymbolUNet(light_channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.levels)
-    if start is not None:
-        network.load_state_dict(start.state_dict())
-    module = DecoderTraining(network, hyperparameters, pilot_mask, levels)
+    last = folder / _LAST
     best = ModelCheckpoint(folder, "best", monitor="val_air", mode="max")
-    newest = ModelCheckpoint(folder, "last", save_on_train_epoch_end=True, enable_version_counter=False)
+    newest = ModelCheckpoint(folder, last.stem, save_on_train_epoch_end=True, enable_version_counter=False)
     timer = Timer()
-    averaged = EMAWeightAveraging(use_buffers=False, decay=1 - 1 / max(1.0, AVERAGED_SHARE * hyperparameters.steps))
-    draws = hyperparameters.batch * max(1, hyperparameters.steps // LOOKS)
-    sampler = RandomSampler(training, replacement=True, num_samples=draws)  # type: ignore[arg-type]  # it has a length
     with _without_hints():
         trainer = L.Trainer(
-            max_steps=hyperparameters.steps,
-            precision=hyperparameters.precision,  # type: ignore[arg-type]
+            max_steps=steps,
+            precision=precision,  # type: ignore[arg-type]
             logger=TensorBoardLogger(str(run), name="", version="tensorboard"),
-            callbacks=[averaged, best, timer, newest, *(callbacks or [])],
+            callbacks=[*callbacks, best, timer, newest],
             devices=devices,
             enable_progress_bar=progress,
             enable_model_summary=False,
@@ -230,7 +306,7 @@ def fit_network(
         with _without_hints():
             trainer.fit(
                 module,
-                DataLoader(training, batch_size=hyperparameters.batch, sampler=sampler),
+                training,
                 DataLoader(validation, batch_size=1),
                 ckpt_path=last if last.exists() else None,
                 weights_only=False,
@@ -241,7 +317,8 @@ def fit_network(
     rates = {}
     for path in {last, Path(best.best_model_path or last)}:
         module.load_state_dict(_checkpoint(path)["state_dict"])
-        rates[path] = held_out_air(*decode_pages(module.float().eval(), validation), pilot_mask, levels)
+        decoded = decode_pages(module.float().eval(), validation)
+        rates[path] = held_out_air(*decoded, module.pilot_mask, module.levels)
     chosen = max(rates, key=lambda path: rates[path])
     module.load_state_dict(_checkpoint(chosen)["state_dict"])
     return Fitted(module, rates[chosen], timer.time_elapsed())
@@ -265,27 +342,24 @@ def _checkpoint(path: Path) -> dict[str, Any]:
     return dict(torch.load(path, map_location="cpu", weights_only=False))
 
 
-def decode_pages(module: DecoderTraining, pages: Dataset[Page]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def decode_pages(module: DecoderTraining[Any], pages: Dataset[Page]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What a trained module says of pages, p [pages, 2, ny, nx], and their true phases [pages, ny, nx]."""
     outputs, truths = [], []
     with torch.no_grad():
-        for light, positions, phases in DataLoader(pages, batch_size=None):
-            outputs.append(module(light[None], positions[None])[0].float().numpy())
+        for *page, phases in DataLoader(pages, batch_size=None):
+            outputs.append(module(*(part[None] for part in page))[0].float().numpy())
             truths.append(phases.numpy())
     return np.stack(outputs), np.stack(truths)
 
 
-def best_kappa_scale(module: DecoderTraining, pages: Dataset[Page], mask: NDArray[np.bool_]) -> float:
+def best_kappa_scale(module: DecoderTraining[Any], pages: Dataset[Page], mask: NDArray[np.bool_]) -> float:
     """Factor on p under which held-out pages are most likely: the network's claim, made honest.
 
     Piston is taken off by the pilots first, as the runtime does it.
     """
     outputs, truths = [], []
     for p, truth in zip(*decode_pages(module, pages), strict=True):
-        pilots = Pilots(mask, truth[mask].astype(np.float64))
-        turn = estimate_piston(p, pilots).angle_rad
-        cos, sin = np.cos(turn), np.sin(turn)
-        outputs.append(np.stack([p[0] * cos + p[1] * sin, p[1] * cos - p[0] * sin])[:, ~mask])
+        outputs.append(without_piston(p, truth, mask)[:, ~mask])
         truths.append(truth[~mask])
     p_all = torch.from_numpy(np.concatenate(outputs, axis=1))[None]
     truth_all = torch.from_numpy(np.concatenate(truths))[None]

@@ -11,19 +11,22 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from optics.errors import InvalidInputError
 from optics.files import replace_file, replace_text
 from optics.profile import Profile, parse_profile
 from optics.registration.calibration import Calibration, parse_calibration
-from train.fitting import CHECKPOINTS, DecoderTraining, Hyperparameters
+from train.fitting import CHECKPOINTS, Hyperparameters
 from train.network import SymbolUNet
+from train.published.localizers import NAMES as PUBLISHED
+from train.published.training import PublishedChoices
 
 BEGUN = "begun.json"
 DESCRIPTION = "run.json"
@@ -56,7 +59,7 @@ class Run:
     localizer: str
     profile_toml: str
     calibration_toml: str
-    hyperparameters: Hyperparameters
+    hyperparameters: Hyperparameters | PublishedChoices
     camera_bit_depth: int
     trained_pages: tuple[str, ...]
     validation_air: float
@@ -159,7 +162,11 @@ def load_run(folder: Path) -> Run:
     path = folder / DESCRIPTION
     try:
         data = json.loads(path.read_text())
-        data["hyperparameters"] = Hyperparameters(**data["hyperparameters"])
+        choices = data["hyperparameters"]
+        if data["localizer"] in PUBLISHED:
+            data["hyperparameters"] = PublishedChoices(**choices | {"channels": tuple(choices["channels"])})
+        else:
+            data["hyperparameters"] = Hyperparameters(**choices)
         for name in ("trained_pages", "pages"):
             data[name] = tuple(data[name])
         return Run(**data)
@@ -167,9 +174,9 @@ def load_run(folder: Path) -> Run:
         raise InvalidInputError(f"run {folder}", error, f"a finished training run with {DESCRIPTION}") from None
 
 
-def save_network(module: DecoderTraining, folder: Path) -> None:
-    """Write the network's weights."""
-    replace_file(folder / WEIGHTS, partial(torch.save, module.network.state_dict()), "weights")
+def save_weights(weights: Mapping[str, Tensor], folder: Path) -> None:
+    """Write the trained weights."""
+    replace_file(folder / WEIGHTS, partial(torch.save, dict(weights)), "weights")
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -190,8 +197,11 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise InvalidInputError(f"arrays {path}", error, "the arrays of a finished run") from None
 
 
+M = TypeVar("M", bound=nn.Module)
+
+
 def load_network(folder: Path, run: Run, light_channels: int) -> SymbolUNet:
-    """The trained network of a run.
+    """The trained network of a run at symbol pitch.
 
     Args:
         folder: of the run.
@@ -202,9 +212,18 @@ def load_network(folder: Path, run: Run, light_channels: int) -> SymbolUNet:
         InvalidInputError: no weights, or weights of another network.
     """
     choices = run.hyperparameters
-    network = SymbolUNet(light_channels, choices.channels, choices.blocks, choices.levels)
+    assert isinstance(choices, Hyperparameters)
+    return load_weights(folder, SymbolUNet(light_channels, choices.channels, choices.blocks, choices.levels))
+
+
+def load_weights(folder: Path, module: M) -> M:
+    """The module with the weights of a run, in evaluation mode.
+
+    Raises:
+        InvalidInputError: no weights, or weights of another module.
+    """
     try:
-        network.load_state_dict(torch.load(folder / WEIGHTS, map_location="cpu", weights_only=True))
+        module.load_state_dict(torch.load(folder / WEIGHTS, map_location="cpu", weights_only=True))
     except (OSError, RuntimeError, EOFError, UnpicklingError) as error:
         raise InvalidInputError(f"weights {folder / WEIGHTS}", error, "the weights of this run") from None
-    return network.eval()
+    return module.eval()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-import optics.cli
+import optics.recording_job
 from optics.cli import simulate
 from optics.device import Device, load_device
 from optics.errors import InvalidInputError, ProfileError, RecordingError
@@ -67,7 +67,7 @@ def interrupt_after(pages: int, monkeypatch: pytest.MonkeyPatch) -> None:
             raise KeyboardInterrupt
         return original(self, symbols)
 
-    monkeypatch.setattr(optics.cli.Simulator, "simulate", interrupted)
+    monkeypatch.setattr(optics.recording_job.Simulator, "simulate", interrupted)
 
 
 def test_a_recording_opens_with_its_profile_levels_and_symbols(whole: Path, profile_file: Path) -> None:

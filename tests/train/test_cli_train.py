@@ -17,36 +17,22 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from optics.cli import simulate
-from optics.device import Device
 from optics.errors import CalibrationError, InvalidInputError
 from optics.page import pilot_mask
 from optics.recording import Recording
-from optics.registration.calibrate import Registered
-from optics.registration.calibration import Calibration, load_calibration
-from optics.registration.parameters import NAMES
-from optics.simulator import true_parameters
+from optics.registration.calibration import load_calibration
+from tests.conftest import SMALL_PAGES
 from tests.optics.small import small_profile
 from train.cli_train import _commit, _own_pilots, train
 from train.run import begin, sole_writer
 
-PAGES = 8
 SECONDS = 120
 
 
 @pytest.fixture(scope="module")
-def device(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """Options that name a small device's profile, recording and (right) calibration."""
-    folder = tmp_path_factory.mktemp("device")
-    profile, state = small_profile(), Device()
-    (folder / "small.toml").write_text(profile.to_toml())
-    arguments = ["--profile", str(folder / "small.toml"), "--recording", str(folder / "R.h5")]
-    made = f"--profile {folder}/small.toml --pages {PAGES} --seed 4 --out {folder}/R.h5"
-    CliRunner().invoke(simulate, made.split(), standalone_mode=False, catch_exceptions=False)
-    turn = state.homodyne.turn_rad
-    perfect = Registered(true_parameters(profile, state), np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
-    Calibration.from_registered(perfect, profile, ["0" * 64]).save(folder / "C.toml")
-    return [*arguments, "--calibration", str(folder / "C.toml"), "--channels", "8", "--blocks", "1"]
+def device(small_device: list[str]) -> list[str]:
+    """Options of a run on the small device with a small network."""
+    return [*small_device, "--channels", "8", "--blocks", "1"]
 
 
 def run(arguments: list[str]) -> str:
@@ -59,7 +45,7 @@ def test_recorded_and_synthetic_pages_are_trained_on_and_the_last_are_left(devic
     assert "6 recorded and 5 synthetic pages" in output
     described = json.loads((tmp_path / "run" / "run.json").read_text())
     assert described["synthetic_pages"] == 5
-    assert len(described["trained_pages"]) == PAGES - 1
+    assert len(described["trained_pages"]) == SMALL_PAGES - 1
     # another run begins where this one ended, and one of another size says why it cannot
     again = [
         *device,

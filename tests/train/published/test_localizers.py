@@ -1,0 +1,168 @@
+"""The published localizers: where they look, and what the mode localizer undoes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from optics.profile import Profile
+from optics.waves import WaveChannel, WaveGeometry, cells_for
+from tests.optics.small import small_profile
+from train.published.decoder import over_reference, sample_pair
+from train.published.localizers import AFFINE_START, Localizer, ModeLocalizer, NoLocalizer, RayLocalizer, page_places
+
+SAMPLES = 4
+Complex = NDArray[np.complexfloating]
+
+
+def aligned(localizer: Localizer, profile: Profile) -> Localizer:
+    """The localizer with the cameras' affine as the profile says."""
+    camera = profile.camera
+    extent = torch.tensor([camera.columns_px, camera.rows_px]) * camera.pitch_m
+    with torch.no_grad():
+        half = torch.tensor([profile.page_width_m, profile.page_height_m]) / extent
+        localizer.registration.matrix.copy_(torch.diag(half).expand(2, 2, 2))
+    return localizer
+
+
+def test_samples_cover_the_page_evenly() -> None:
+    places = page_places((2, 4))
+    assert places[..., 0].tolist() == [[-0.75, -0.25, 0.25, 0.75]] * 2
+    assert places[..., 1].tolist() == [[-0.5] * 4, [0.5] * 4]
+
+
+def test_without_a_localizer_samples_lie_where_the_page_would_be_imaged() -> None:
+    profile = small_profile()
+    localizer = NoLocalizer(profile, SAMPLES)
+    assert localizer.grid()[1, 0, -1].tolist() == pytest.approx(
+        [AFFINE_START[0] * (1 - 1 / 4 / profile.page.columns), -AFFINE_START[1] * (1 - 1 / 4 / profile.page.rows)]
+    )
+    grid = aligned(localizer, profile).grid()
+    height, width = profile.frame_shape
+    rows, columns = np.mgrid[:height, :width].astype(np.float32)
+    frames = torch.from_numpy(np.stack([columns, rows]))[None]
+    seen, level = sample_pair(frames, frames[0], grid, torch.zeros(1, 2))
+    assert torch.equal(seen, level)
+    first = (
+        np.array([width - 1, height - 1])
+        - np.array([profile.page_width_m, profile.page_height_m]) / profile.camera.pitch_m
+    ) / 2 + profile.symbol_pitch_m / SAMPLES / profile.camera.pitch_m / 2
+    assert seen[0, :, 0, 0].tolist() == pytest.approx(first.tolist(), abs=1e-3)
+
+
+def test_a_page_that_moved_is_looked_at_where_it_went() -> None:
+    profile = small_profile()
+    grid = NoLocalizer(profile, SAMPLES).grid().detach()
+    generator = torch.Generator().manual_seed(0)
+    frames = torch.rand(1, 2, *profile.frame_shape, generator=generator)
+    moved = torch.roll(frames, (3, -2), dims=(2, 3))  # three rows down, two columns to the left
+    before, level = sample_pair(frames, frames[0], grid, torch.zeros(1, 2))
+    after, _ = sample_pair(moved, frames[0], grid, torch.tensor([[-2.0, 3.0]]))
+    inside = slice(8, -8)
+    assert torch.allclose(before[..., inside, inside], after[..., inside, inside], atol=1e-4)
+    assert torch.equal(before, level)
+
+
+def test_light_is_over_the_reference_and_of_unit_strength() -> None:
+    level = torch.full((1, 2, 4, 4), 100.0)
+    bright = level + 20 * torch.randn(1, 2, 4, 4, generator=torch.Generator().manual_seed(1))
+    seen = over_reference(bright, level)
+    assert seen.square().mean() == pytest.approx(1)
+    torch.testing.assert_close(seen, over_reference(level + 2 * (bright - level), level))
+    assert torch.isfinite(over_reference(torch.zeros_like(level), torch.zeros_like(level))).all()
+
+
+def seen_by_cameras(profile: Profile, angle_deg: float) -> tuple[Complex, Complex]:
+    """A page's field, and that field behind the pipe, both at the samples of a localizer."""
+    rows, columns = (count * SAMPLES for count in profile.page_shape)
+    half = np.array([profile.page_width_m, profile.page_height_m]) / 2
+    x = half[0] * page_places((rows, columns))[0, :, 0].numpy()
+    y = half[1] * page_places((rows, columns))[:, 0, 1].numpy()
+    pipe = profile.pipe
+    geometry = WaveGeometry(
+        wavelength_m=profile.light.wavelength_m,
+        focal_length_m=profile.lens.focal_length_m,
+        pipe_length_m=pipe.length_m,
+        pipe_width_m=pipe.width_m,
+        refractive_index=pipe.refractive_index,
+        pipe_angle=float(np.deg2rad(angle_deg)),
+    )
+    cells = cells_for(geometry, x, y, half[0], half[1])
+    phases = np.random.default_rng(0).uniform(0, 2 * np.pi, profile.page_shape)
+    page = np.exp(1j * np.kron(phases, np.ones((SAMPLES, SAMPLES))))
+    return page, WaveChannel(geometry, x, y, x, y, cells, steps=32).forward(page)
+
+
+def alike(one: Complex, other: Complex) -> float:
+    return float(abs(np.vdot(one, other)) / np.linalg.norm(one) / np.linalg.norm(other))
+
+
+def told(localizer: ModeLocalizer, field: Complex) -> Complex:
+    images = torch.from_numpy(np.stack([field.real, field.imag]).astype(np.float32))[None]
+    real, imaginary = localizer(images)[0].detach().numpy()
+    return np.asarray(real + 1j * imaginary)
+
+
+def test_modes_undo_a_square_pipe_and_not_a_sheared_one() -> None:
+    profile = small_profile()
+    localizer = ModeLocalizer(profile, SAMPLES)
+    page, square = seen_by_cameras(profile, 0.0)
+    _, sheared = seen_by_cameras(profile, -1.0)
+    band = alike(page, told(localizer, square))
+    assert alike(page, square) < 0.6
+    assert band > 0.85  # what the pipe does not carry, nobody gets back
+    assert alike(page, told(localizer, sheared)) < band - 0.1
+
+
+def test_modes_know_the_sign_of_the_quadrature() -> None:
+    profile = small_profile()
+    page, square = seen_by_cameras(profile, 0.0)
+    right = told(ModeLocalizer(profile, SAMPLES), square)
+    np.testing.assert_allclose(told(ModeLocalizer(profile, SAMPLES, -1), square.conj()), right, atol=1e-4)
+    assert alike(page, told(ModeLocalizer(profile, SAMPLES), square.conj())) < 0.3
+
+
+def test_gradients_reach_the_cameras_of_every_localizer_and_the_angle_of_the_rays() -> None:
+    profile = small_profile()
+    frames = torch.rand(1, 2, *profile.frame_shape, generator=torch.Generator().manual_seed(2))
+    for localizer in (NoLocalizer(profile, 4), ModeLocalizer(profile, 4), RayLocalizer(profile, 4)):
+        seen, _ = sample_pair(frames, frames[0], localizer.grid(), torch.zeros(1, 2))
+        (localizer(seen) ** 3).sum().backward()
+        for name, parameter in localizer.named_parameters():
+            assert parameter.grad is not None, name
+            assert torch.isfinite(parameter.grad).all(), name
+            assert float(parameter.grad.abs().sum()) > 0, name
+
+
+def test_rays_look_where_the_light_of_a_short_pipe_goes() -> None:
+    profile = small_profile()
+    short = profile.model_copy(update={"pipe": profile.pipe.model_copy(update={"length_m": 1e-6})})
+    torch.testing.assert_close(RayLocalizer(short, 4).grid(), NoLocalizer(short, 4).grid(), atol=1e-5, rtol=0)
+    folded = RayLocalizer(profile, 4).grid()
+    straight = NoLocalizer(profile, 4).grid()
+    same = torch.isclose(folded, straight, atol=1e-4).all(-1).float().mean()
+    assert 0.1 < float(same) < 0.9  # the zones in the middle, and no others
+
+
+def test_a_ray_that_the_pipe_loses_is_looked_for_outside_of_the_frames() -> None:
+    profile = small_profile()
+    localizer = RayLocalizer(profile, 4)
+    traced = localizer.tracer(torch.zeros(1, 2, dtype=torch.float64), localizer.angle.double())
+    localizer.tracer.forward = lambda points, angle: replaced(points, angle)  # type: ignore[method-assign]
+
+    def replaced(points: torch.Tensor, angle: torch.Tensor) -> object:
+        return traced._replace(places=points, valid=torch.zeros(len(points), dtype=torch.bool))
+
+    assert float(localizer.grid().detach().abs().min()) > 5
+
+
+def test_the_mode_localizer_has_the_nominal_pipe() -> None:
+    profile = small_profile()
+    page, square = seen_by_cameras(profile, 0.0)
+    longer = profile.model_copy(
+        update={"pipe": profile.pipe.model_copy(update={"length_m": profile.pipe.length_m * 1.05})}
+    )
+    right, wrong = (alike(page, told(ModeLocalizer(p, SAMPLES), square)) for p in (profile, longer))
+    assert wrong < right - 0.1

@@ -1,0 +1,412 @@
+"""Claims about the published ray tracer: another program's rays, single rays in numpy, closed forms, derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from optics.errors import InvalidInputError
+from optics.lenses import LENSES, LensPrescription
+from optics.profile import Profile, load_profile
+from optics.registration.parameters import nominal
+from optics.registration.twin import BRANCHES
+from tests.optics.small import small_profile
+from train.published.rays import RayTracer, Traced, _Rays, _through
+from train.twin import RayTwin, TorchTwin
+
+ACHROMAT = LENSES["AC508-080-A"]
+SLOPED = np.deg2rad(-0.6)
+
+PARALLEL_MM: list[list[float]] = [[0, 0], [3.2, 0], [-4.4, 2.6], [6.4, 4.1], [12, -9]]
+"""Heights of rays parallel to the axis, on the lens's front focal plane."""
+FOCUSED_MM: list[list[float]] = [
+    [0, 0],
+    [-0.001394645739, 0],
+    [0.004829076422, -0.002853545159],
+    [-0.015109778538, -0.009679701876],
+    [-0.088919473627, 0.066689605220],
+]
+"""Where optiland 0.6.3 has them behind the achromat, on its back focal plane (traced once, written down here)."""
+FOCUSED_REVERSED_MM: list[list[float]] = [
+    [0, 0],
+    [-0.013697614808, 0],
+    [0.048403117041, -0.028601841888],
+    [-0.158091058955, -0.101277084643],
+    [-1.257424826346, 0.943068619759],
+]
+"""The same behind the reversed achromat."""
+OBLIQUE_MM: list[list[float]] = [[0, 0], [1.1, -0.7], [-1.6, 1.3], [0.4, 1.7]]
+OBLIQUE_SINES: list[list[float]] = [[0.06, 0.03], [-0.08, 0.05], [0.07, 0.06], [0.02, -0.05]]
+LANDED_REVERSED_MM: list[list[float]] = [
+    [4.799774430707, 2.399887215354],
+    [-6.409396921134, 4.005937777329],
+    [5.606800950923, 4.781807321474],
+    [1.600919024354, -4.006142112707],
+]
+"""Where optiland has rays that leave the front focal plane of the reversed achromat with those sines."""
+
+
+def page_points(profile: Profile, count: int, seed: int = 0) -> np.ndarray:
+    half = np.array([profile.page_width_m, profile.page_height_m]) / 2
+    return np.random.default_rng(seed).uniform(-half, half, (count, 2))
+
+
+def with_pipe(profile: Profile, **values: float) -> Profile:
+    return profile.model_copy(update={"pipe": profile.pipe.model_copy(update=values)})
+
+
+def scalar(angle: float) -> torch.Tensor:
+    return torch.tensor(angle, dtype=torch.float64)
+
+
+def trace(tracer: RayTracer, points: np.ndarray, angle: float = 0.0) -> Traced:
+    traced: Traced = tracer(torch.tensor(points), scalar(angle))
+    return traced
+
+
+def path(tracer: RayTracer, points: np.ndarray, angle: float = 0.0) -> np.ndarray:
+    return tracer.path(torch.tensor(points), scalar(angle)).numpy()
+
+
+@dataclass
+class Ray:
+    """One ray at some place: position, unit direction, and the walls that it has met, in order."""
+
+    at: np.ndarray
+    k: np.ndarray
+    met: str = ""
+    lost: bool = False
+
+    def refract(self, normal: np.ndarray, before: float, behind: float) -> None:
+        along = self.k @ normal
+        tangential = before / behind * (self.k - along * normal)
+        self.k = tangential + np.sign(along) * np.sqrt(1 - tangential @ tangential) * normal
+
+    def through_lens(self, lens: LensPrescription) -> None:
+        """From focal plane to focal plane, sphere by sphere: the roots of a quadratic, no iteration."""
+        vertex, before = self.at[2] + lens.front_focal_m, 1.0
+        for surface in lens.surfaces:
+            assert surface.conic == 0
+            centre = np.array([0, 0, vertex + surface.radius_m])
+            away = self.at - centre
+            b = self.k @ away
+            root = np.sqrt(b**2 - away @ away + surface.radius_m**2)
+            self.at = self.at + (-b - np.sign(surface.radius_m) * root) * self.k
+            self.refract((self.at - centre) / surface.radius_m, before, surface.index)
+            vertex, before = vertex + surface.thickness_m, surface.index
+        self.at = self.at + (vertex + lens.back_focal_m - self.at[2]) / self.k[2] * self.k
+
+    def through_pipe(self, profile: Profile, angle: float) -> None:
+        """A prism of six planes: of those ahead, march to the nearest, until it is the far facet."""
+        w, index, axis = profile.pipe.width_m, profile.pipe.refractive_index, np.array([0.0, 0.0, 1.0])
+        normals = {"x": np.array([1.0, 0.0, 0.0]), "y": np.array([np.sin(angle), np.cos(angle), 0.0])}
+        planes = [(name, sign * normal, w / 2) for name, normal in normals.items() for sign in (1, -1)]
+        planes += [("end", axis, self.at[2] + profile.pipe.length_m), ("start", -axis, -self.at[2])]
+        self.refract(axis, 1, index)
+        for _ in range(200):
+            ahead = [((c - n @ self.at) / (n @ self.k), name, n) for name, n, c in planes if n @ self.k > 0]
+            reach, name, normal = min(ahead, key=lambda hit: hit[0])
+            self.at = self.at + reach * self.k
+            if name == "end":
+                self.refract(axis, index, 1)
+                return
+            assert name != "start"
+            self.met += name
+            self.lost |= bool(np.arccos(normal @ self.k) < np.arcsin(1 / index))
+            self.k = self.k - 2 * (self.k @ normal) * normal
+        raise AssertionError("the ray never left the pipe")
+
+
+def follow(profile: Profile, lens: LensPrescription | None, angle: float, point: np.ndarray) -> tuple[Ray, np.ndarray]:
+    """One ray from the modulator to the camera, and where it left the pipe."""
+    f = profile.lens.focal_length_m
+    ray = Ray(np.append(point, 0.0), np.array([0.0, 0.0, 1.0]))
+    if lens is None:
+        ray = Ray(np.array([0, 0, 2 * f]), np.append(-point / f, np.sqrt(1 - point @ point / f**2)))
+    else:
+        ray.through_lens(lens)
+    ray.through_pipe(profile, angle)
+    left = ray.at
+    if lens is None:
+        ray.at = np.append(f * ray.k[:2], left[2] + 2 * f)
+    else:
+        ray.through_lens(lens.reversed())
+    return ray, left
+
+
+class TestLenses:
+    @staticmethod
+    def _landed_mm(lens: LensPrescription, heights_mm: list[list[float]], sines: list[list[float]]) -> np.ndarray:
+        across, s = np.array(heights_mm) * 1e-3, np.array(sines)
+        position = np.concatenate([across, np.zeros((len(s), 1))], axis=1)
+        direction = np.concatenate([s, np.sqrt(1 - (s**2).sum(1, keepdims=True))], axis=1)
+        rays = _Rays(torch.tensor(position), torch.tensor(direction), torch.ones(len(s), dtype=torch.bool))
+        end = _through(lens, rays)[-1]
+        assert end.valid.all()
+        return end.position[:, :2].numpy() * 1e3
+
+    def test_rays_land_where_another_program_has_them(self) -> None:
+        level = [[0.0, 0.0]] * len(PARALLEL_MM)
+        turned = ACHROMAT.reversed()
+        np.testing.assert_allclose(self._landed_mm(ACHROMAT, PARALLEL_MM, level), FOCUSED_MM, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(self._landed_mm(turned, PARALLEL_MM, level), FOCUSED_REVERSED_MM, rtol=0, atol=1e-9)
+        oblique = self._landed_mm(turned, OBLIQUE_MM, OBLIQUE_SINES)
+        np.testing.assert_allclose(oblique, LANDED_REVERSED_MM, rtol=0, atol=1e-9)
+
+    def test_behind_a_hyperboloid_all_rays_meet_in_one_point(self) -> None:
+        # closed form: light parallel to the axis in glass of index n, which ends in a surface of conic -n^2
+        index, radius = 1.5, 20e-3
+        flat = replace(ACHROMAT.surfaces[0], radius_m=np.inf, thickness_m=10e-3, index=index)
+        end = replace(flat, radius_m=-radius, thickness_m=0.0, index=1.0, conic=-(index**2))
+        lens = replace(ACHROMAT, surfaces=(flat, end))
+        landed = self._landed_mm(lens, [[2, 0], [5, -3], [-7, 8]], [[0.0, 0.0]] * 3)
+        np.testing.assert_allclose(landed, 0, atol=1e-12)
+        sphere = replace(lens, surfaces=(flat, replace(end, conic=0.0)))
+        assert np.abs(self._landed_mm(sphere, [[5, -3]], [[0.0, 0.0]])).max() > 0.1
+
+    def test_steep_rays_meet_a_sphere_where_a_quadratic_says_or_are_lost(self) -> None:
+        radius, rng, count = 20e-3, np.random.default_rng(4), 2000
+        front = replace(ACHROMAT.surfaces[0], radius_m=radius, thickness_m=5e-3, index=1.5)
+        ball = replace(ACHROMAT, diameter_m=1.0, surfaces=(front, replace(ACHROMAT.surfaces[2], radius_m=np.inf)))
+        at = np.append(rng.uniform(-25e-3, 25e-3, (count, 2)), np.zeros((count, 1)), axis=1)
+        k = np.append(rng.uniform(-0.3, 0.3, (count, 2)), np.ones((count, 1)), axis=1)
+        k /= np.linalg.norm(k, axis=1, keepdims=True)
+        first = _through(ball, _Rays(torch.tensor(at), torch.tensor(k), torch.ones(count, dtype=torch.bool)))[0]
+        away = at - [0, 0, ball.front_focal_m + radius]
+        b = (k * away).sum(1)
+        under = b**2 - (away**2).sum(1) + radius**2
+        met = at + (-b - np.sqrt(np.maximum(under, 0)))[:, None] * k
+        # only the half towards the light is the surface
+        hit = (under > 0) & (met[:, 2] < ball.front_focal_m + radius)
+        assert 200 < hit.sum() < 1800
+        valid = first.valid.numpy()
+        assert hit[valid].all()
+        # close to the rim, further out than any lens reaches, Newton's steps may lose a ray
+        assert valid[hit & (np.hypot(met[:, 0], met[:, 1]) < 0.95 * radius)].all()
+        np.testing.assert_allclose(first.position.numpy()[valid], met[valid], rtol=0, atol=1e-12)
+        assert torch.isfinite(first.position).all()
+
+    def test_the_image_of_the_axis_neighbourhood_is_the_page_itself(self) -> None:
+        near = np.array([[10e-6, 0], [-7e-6, 4e-6]])
+        places = trace(RayTracer(load_profile("paper"), ACHROMAT), near).places.numpy()
+        np.testing.assert_allclose(places, near, rtol=1e-6, atol=1e-15)
+
+
+class TestAgainstSingleRays:
+    @pytest.mark.parametrize("angle", [0.0, SLOPED, np.deg2rad(5)])
+    @pytest.mark.parametrize("lens", [None, ACHROMAT, ACHROMAT.reversed()], ids=["ideal", "thick", "reversed"])
+    def test_every_ray_goes_the_same_way(self, lens: LensPrescription | None, angle: float) -> None:
+        # seven times as long: a dozen walls, by turns
+        paper = load_profile("paper")
+        profile = with_pipe(paper, length_m=7.3 * paper.pipe.length_m)
+        points = page_points(profile, 150, seed=1)
+        tracer = RayTracer(profile, lens)
+        traced, positions = trace(tracer, points, angle), path(tracer, points, angle)
+        assert traced.valid.all()
+        leaving, walls = positions[-3 if lens is None else -2 - len(lens.surfaces)], 0
+        for index, point in enumerate(points):
+            ray, left = follow(profile, lens, angle, point)
+            assert traced.reflections[index].tolist() == [ray.met.count("x"), ray.met.count("y")]
+            assert np.abs(leaving[index] - left).max() < 1e-12
+            assert np.abs(traced.places[index].numpy() + ray.at[:2]).max() < 1e-12
+            walls = max(walls, len(ray.met))
+        assert walls >= 10
+
+    def test_without_a_single_wall_the_ray_lands_at_its_own_point(self) -> None:
+        profile = load_profile("bench")
+        points = page_points(profile, 500) / 4
+        traced = trace(RayTracer(profile), points, SLOPED)
+        assert not traced.reflections.any()
+        np.testing.assert_allclose(traced.places.numpy(), points, rtol=0, atol=1e-17)
+
+
+class TestClosedForms:
+    def test_a_square_pipe_unfolds(self) -> None:
+        small = small_profile()
+        profile = with_pipe(small, length_m=7.3 * small.pipe.length_m)
+        points = page_points(profile, 500)
+        tracer, w = RayTracer(profile), profile.pipe.width_m
+        traced = trace(tracer, points)
+        sines = -points / profile.lens.focal_length_m
+        slopes = sines / np.sqrt(profile.pipe.refractive_index**2 - (sines**2).sum(1, keepdims=True))
+        unfolded = slopes * profile.pipe.length_m / w
+        cells = np.round(unfolded)
+        assert np.abs(cells).max() > 8
+        np.testing.assert_array_equal(traced.reflections.numpy(), np.abs(cells))
+        triangle = (-1) ** cells * (unfolded - cells) * w
+        np.testing.assert_allclose(path(tracer, points)[-3, :, :2], triangle, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(traced.places.numpy(), (-1) ** cells * points, rtol=0, atol=1e-15)
+
+    def test_places_are_those_of_the_ray_twin(self) -> None:
+        profile = with_pipe(load_profile("bench"), angle_deg=-0.6)
+        points = page_points(profile, 2000)
+        traced = trace(RayTracer(profile), points, SLOPED)
+        twin = TorchTwin(RayTwin(profile)).trace(nominal(), points)
+        met = traced.reflections.numpy()
+        assert met.max() == 1
+        # which of two walls comes first is all that the single ray knows beyond its cell
+        x_first = np.abs(points[:, 0]) > np.abs(points @ [np.sin(SLOPED), np.cos(SLOPED)])
+        names = np.where(
+            met.all(1), np.where(x_first, "xy", "yx"), np.where(met[:, 0], "x", np.where(met[:, 1], "y", "direct"))
+        )
+        branch = np.array([BRANCHES.index(name) for name in names])
+        assert min(np.bincount(branch, minlength=len(BRANCHES))) > 50
+        expected = twin.places[branch, np.arange(len(points))]
+        np.testing.assert_allclose(traced.places.numpy(), expected, rtol=0, atol=1e-15)
+        # the twin counts by its unfolded cell: the same walls, but for a shear's width along the cells' edges
+        cells = np.abs(np.round(twin.positions))
+        edge = np.abs(np.abs(twin.positions) - 0.5)
+        assert (cells == met).mean() > 0.98
+        assert edge[cells != met].max() < 2 * abs(SLOPED)
+
+
+class TestLostRays:
+    def test_walls_met_below_the_critical_angle_lose_the_ray(self) -> None:
+        profile = with_pipe(small_profile(), refractive_index=1.0008)
+        points = page_points(profile, 2000)
+        tracer, index = RayTracer(profile), profile.pipe.refractive_index
+        sines = points / profile.lens.focal_length_m
+        slopes = sines / np.sqrt(index**2 - (sines**2).sum(1, keepdims=True))
+        meets = np.abs(slopes) * profile.pipe.length_m > profile.pipe.width_m / 2
+        steep = np.abs(sines) > np.sqrt(index**2 - 1)
+        lost = (meets & steep).any(1)
+        traced = trace(tracer, points)
+        assert (meets.any(1) & ~lost).sum() > 100
+        assert (meets & steep)[:, 1].sum() > 100
+        np.testing.assert_array_equal(traced.valid.numpy(), ~lost)
+        assert torch.isfinite(traced.places).all()
+        drawn = np.isfinite(path(tracer, points)).all(-1)
+        np.testing.assert_array_equal(drawn[-1], ~lost)
+        assert drawn[:3].all()
+
+    def test_it_is_the_critical_angle_to_nine_digits(self) -> None:
+        profile = with_pipe(small_profile(), refractive_index=1.0008)
+        critical = profile.lens.focal_length_m * np.sqrt(1.0008**2 - 1)
+        for axis in range(2):
+            points = np.zeros((2, 2))
+            points[:, axis] = critical * np.array([1 - 1e-9, 1 + 1e-9])
+            traced = trace(RayTracer(profile), points)
+            assert traced.valid.tolist() == [True, False]
+            assert traced.reflections.sum(1).tolist() == [1, 0]
+
+    def test_in_a_sheared_pipe_single_rays_are_lost_alike(self) -> None:
+        profile = with_pipe(small_profile(), refractive_index=1.0008)
+        points = page_points(profile, 300, seed=2)
+        expected = [not follow(profile, None, SLOPED, point)[0].lost for point in points]
+        assert 50 < sum(expected) < 250
+        assert trace(RayTracer(profile), points, SLOPED).valid.tolist() == expected
+
+    def test_the_stop_of_the_lens_and_missed_surfaces(self) -> None:
+        narrow = replace(ACHROMAT, diameter_m=10e-3)
+        heights = np.array([[4.99e-3, 0], [5.01e-3, 0], [3.54e-3, -3.54e-3]])
+        first = path(RayTracer(load_profile("paper"), narrow), heights)[1]
+        assert np.isfinite(first).all(-1).tolist() == [True, False, False]
+        # 54.9 mm is the radius of the first surface: further out there is none
+        tracer = RayTracer(load_profile("paper"), replace(ACHROMAT, diameter_m=1.0))
+        heights = np.array([[1e-3, 0], [0, 54.5e-3], [0, 55e-3], [0.4, 0]])
+        assert np.isfinite(path(tracer, heights)[1]).all(-1).tolist() == [True, True, False, False]
+        traced = trace(tracer, heights)
+        assert traced.valid.tolist() == [True, False, False, False]
+        assert torch.isfinite(traced.places).all()
+
+    def test_a_ray_beside_the_entrance(self) -> None:
+        # the achromat the wrong way round: of wide beams it makes a wide focus
+        profile, points = small_profile(), np.array([[0, 12e-3], [0, 1e-3]])
+        positions = path(RayTracer(profile, ACHROMAT.reversed()), points)
+        entrance = positions[4]
+        assert abs(entrance[0, 1]) > profile.pipe.width_m / 2 > abs(entrance[1, 1])
+        assert np.isfinite(positions[5:]).all((0, 2)).tolist() == [False, True]
+        assert np.isnan(positions[5:, 0]).all()
+
+
+class TestPath:
+    @pytest.mark.parametrize("lens", [None, ACHROMAT], ids=["ideal", "thick"])
+    def test_it_runs_from_modulator_to_camera(self, lens: LensPrescription | None) -> None:
+        profile = load_profile("paper")
+        points, tracer = page_points(profile, 100), RayTracer(profile, lens)
+        positions, traced = path(tracer, points, SLOPED), trace(tracer, points, SLOPED)
+        np.testing.assert_array_equal(positions[0], np.pad(points, ((0, 0), (0, 1))))
+        np.testing.assert_array_equal(positions[-1, :, :2], -traced.places.numpy())
+        assert (np.diff(positions[:, :, 2], axis=0) >= 0).all()
+        surfaces = 1 if lens is None else 3
+        total = 4 * profile.lens.focal_length_m + profile.pipe.length_m
+        if lens is not None:
+            total = 2 * (lens.front_focal_m + lens.back_focal_m + 18e-3) + profile.pipe.length_m
+        np.testing.assert_allclose(positions[-1, :, 2], total, rtol=1e-14)
+        entrance, walls, leaving = positions[1 + surfaces], positions[2 + surfaces : -2 - surfaces], -2 - surfaces
+        np.testing.assert_allclose(positions[leaving, :, 2] - entrance[:, 2], profile.pipe.length_m, rtol=1e-12)
+        # each wall is touched, and whoever met fewer waits where it is
+        assert len(walls) == traced.reflections.sum(1).max()
+        before = entrance
+        for row, at in enumerate(walls):
+            sheared = at[:, 0] * np.sin(SLOPED) + at[:, 1] * np.cos(SLOPED)
+            on_wall = np.abs(np.abs(np.stack([at[:, 0], sheared])) - profile.pipe.width_m / 2).min(0) < 1e-15
+            moves = traced.reflections.sum(1).numpy() > row
+            np.testing.assert_array_equal(on_wall[moves], True)
+            np.testing.assert_array_equal(at[~moves], before[~moves])
+            before = at
+
+
+class TestDerivatives:
+    @pytest.mark.parametrize("lens", [None, ACHROMAT], ids=["ideal", "thick"])
+    def test_gradients_equal_finite_differences(self, lens: LensPrescription | None) -> None:
+        paper = load_profile("paper")
+        tracer = RayTracer(with_pipe(paper, length_m=3 * paper.pipe.length_m), lens)
+        extent = paper.page_width_m / 2
+
+        def places(angle: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+            traced: Traced = tracer(at * extent, angle)
+            assert traced.valid.all()
+            assert traced.reflections.sum(1).min() > 1
+            return traced.places / extent
+
+        at = torch.tensor([[0.9, 0.5], [-0.7, 0.45], [0.6, -0.6]], dtype=torch.float64, requires_grad=True)
+        angle = scalar(SLOPED).requires_grad_(True)
+        assert torch.autograd.gradcheck(places, (angle, at), eps=1e-6, atol=1e-6, rtol=1e-6)
+        (slope,) = torch.autograd.grad(places(angle, at).abs().sum(), angle)
+        assert abs(float(slope)) > 0.1
+
+    @pytest.mark.parametrize("lens", [None, ACHROMAT], ids=["ideal", "thick"])
+    def test_lost_and_axial_rays_have_finite_ones(self, lens: LensPrescription | None) -> None:
+        tracer = RayTracer(with_pipe(load_profile("paper"), refractive_index=1.001), lens)
+        # on the axis, direct, below the critical angle, beside the lens or beyond what it can bend
+        points = torch.tensor([[0, 0], [1e-3, 0], [0, 6e-3], [0.5, 0]], dtype=torch.float64, requires_grad=True)
+        angle = scalar(0.0).requires_grad_(True)
+        traced: Traced = tracer(points, angle)
+        assert traced.valid.tolist() == [True, True, False, False]
+        slopes = torch.autograd.grad(traced.places.sum(), (points, angle))
+        assert all(torch.isfinite(slope).all() for slope in slopes)
+
+
+class TestInput:
+    @pytest.mark.parametrize(
+        ("points", "angle", "got"),
+        [
+            (torch.zeros(3, 3, dtype=torch.float64), scalar(0), r"shape \(3, 3\)"),
+            (torch.zeros(2, dtype=torch.float64), scalar(0), r"shape \(2,\)"),
+            (torch.zeros(3, 2), scalar(0), "float32"),
+            (torch.full((3, 2), torch.nan, dtype=torch.float64), scalar(0), "NaN"),
+            (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(1, dtype=torch.float64), r"shape \(1,\)"),
+            (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(()), "float32"),
+            (torch.zeros(3, 2, dtype=torch.float64), scalar(-0.6), "-0.6 rad"),
+            (torch.zeros(3, 2, dtype=torch.float64), scalar(np.nan), "nan rad"),
+        ],
+    )
+    def test_what_cannot_be_traced_is_refused(self, points: torch.Tensor, angle: torch.Tensor, got: str) -> None:
+        tracer = RayTracer(small_profile())
+        with pytest.raises(InvalidInputError, match=got):
+            tracer(points, angle)
+        with pytest.raises(InvalidInputError, match=got):
+            tracer.path(points, angle)
+
+    def test_no_points_are_no_rays(self) -> None:
+        traced = trace(RayTracer(small_profile(), ACHROMAT), np.zeros((0, 2)))
+        assert [len(value) for value in traced] == [0, 0, 0]
+
+    def test_a_lens_that_spreads_light_is_refused(self) -> None:
+        surfaces = tuple(replace(surface, radius_m=-surface.radius_m) for surface in ACHROMAT.surfaces)
+        with pytest.raises(InvalidInputError, match="focal planes"):
+            RayTracer(small_profile(), replace(ACHROMAT, surfaces=surfaces))

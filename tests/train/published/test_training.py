@@ -1,0 +1,122 @@
+"""Training of the published decoders: learning rates, clipping, and the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+from optics.errors import InvalidInputError
+from optics.page import pilot_mask
+from optics.recording import FramePair, Recording
+from tests.conftest import SMALL_PAGES
+from tests.optics.small import small_profile
+from train.cli_train import train
+from train.features import PageState
+from train.published.recipe import published_choices, published_decoder
+from train.published.training import FramePages, PublishedChoices, PublishedTraining
+from train.run import load_run
+
+STEP_RATES = (1e-3, 2e-4, 1e-4)
+
+
+def run(arguments: list[str]) -> str:
+    return CliRunner().invoke(train, arguments, standalone_mode=False, catch_exceptions=False).output
+
+
+def module(localizer: str, choices: PublishedChoices) -> PublishedTraining:
+    profile = small_profile()
+    references = FramePair(*np.full((2, *profile.frame_shape), 100, dtype=np.uint8))
+    decoder = published_decoder(localizer, choices, profile, references, turn=1.5)
+    return PublishedTraining(decoder, choices, pilot_mask(profile), 256)
+
+
+def test_rates_rise_over_two_percent_of_the_steps_and_only_the_decoder_s_falls() -> None:
+    choices = PublishedChoices(channels=(4, 8), steps=100)
+    made = module("ray", choices).configure_optimizers()
+    optimizer, schedule = made["optimizer"], made["lr_scheduler"]["scheduler"]
+    rates = []
+    for _ in range(choices.steps):
+        rates.append([group["lr"] for group in optimizer.param_groups])
+        optimizer.step()
+        schedule.step()
+    assert rates[0] == pytest.approx([rate / 2 for rate in STEP_RATES])
+    assert rates[1] == pytest.approx(STEP_RATES)
+    assert rates[79] == pytest.approx(STEP_RATES)
+    assert rates[80] == pytest.approx([5e-4, *STEP_RATES[1:]])
+    assert rates[90] == pytest.approx([2.5e-4, *STEP_RATES[1:]])
+
+
+def test_every_parameter_has_one_rate() -> None:
+    made = module("ray", PublishedChoices(channels=(4, 8)))
+    groups = made.configure_optimizers()["optimizer"].param_groups
+    sizes = [sum(parameter.numel() for parameter in group["params"]) for group in groups]
+    assert sizes[1:] == [2 * 4 + 2 * 2, 1]
+    assert sum(sizes) == sum(parameter.numel() for parameter in made.parameters())
+    assert len(module("mode", PublishedChoices(channels=(4, 8))).configure_optimizers()["optimizer"].param_groups) == 2
+
+
+def test_the_gradient_of_the_network_alone_is_clipped() -> None:
+    made = module("mode", PublishedChoices(channels=(4, 8)))
+    for parameter in made.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    made.configure_gradient_clipping()
+    gradients = [p.grad for p in made.network.unet.parameters() if p.grad is not None]
+    assert float(torch.cat([g.ravel() for g in gradients]).norm()) == pytest.approx(1, rel=1e-4)
+    for parameter in made.network.localizer.parameters():
+        assert parameter.grad is not None
+        assert torch.equal(parameter.grad, torch.ones_like(parameter))
+
+
+def test_the_authors_choices() -> None:
+    paper = small_profile()
+    assert published_choices(paper, 450) == PublishedChoices()
+    coarse = paper.model_copy(update={"page": paper.page.model_copy(update={"symbol_size_px": 16})})
+    chosen = published_choices(coarse, 450)
+    assert (chosen.steps, chosen.decay) == (15 * 225, 1.0)
+
+
+def test_pages_come_with_frames_state_and_phases(small_device: list[str]) -> None:
+    with Recording.open(small_device[3]) as recording:
+        frames, state, phases = FramePages(recording, [2], [PageState((0.5, -0.25), 1.0)])[0]
+        assert torch.equal(frames[1], torch.from_numpy(recording.frames(2).quadrature.astype(np.float32)))
+        assert state.tolist() == [0.5, -0.25, 1.0]
+        assert phases.shape == recording.page_shape
+
+
+@pytest.mark.parametrize("localizer", ["none", "mode", "ray"])
+def test_the_command_trains_each_and_says_what_it_did(localizer: str, small_device: list[str], tmp_path: Path) -> None:
+    arguments = [
+        *small_device,
+        "--localizer",
+        localizer,
+        "--channels",
+        "4",
+        "--steps",
+        "12",
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    output = run(arguments)
+    assert "6 recorded and 0 synthetic pages trained on" in output
+    described = load_run(tmp_path / "run")
+    assert described.hyperparameters == PublishedChoices(channels=(4, 8), steps=12)
+    assert run(arguments).splitlines()[-1] == output.splitlines()[-1]
+    weights = torch.load(tmp_path / "run" / "decoder.pt", weights_only=True)
+    assert ("localizer.angle" in weights) == (localizer == "ray")
+    states = json.loads((tmp_path / "run" / "states.json").read_text())["states"]
+    assert len(states) == SMALL_PAGES - 1
+
+
+def test_options_of_the_other_network_are_refused(small_device: list[str], tmp_path: Path) -> None:
+    published = [*small_device, "--localizer", "ray", "--out", str(tmp_path / "run")]
+    for option in (["--blocks", "2"], ["--levels", "1"], ["--synthetic-pages", "4"], ["--start", str(tmp_path)]):
+        with pytest.raises(InvalidInputError, match=f"{option[0]}: got .*--localizer ray"):
+            run([*published, *option])
+    with pytest.raises(InvalidInputError, match=r"--lenses: got .*--localizer wave"):
+        run([*small_device, "--localizer", "wave", "--lenses", "paraxial", "--out", str(tmp_path / "run")])
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,58 @@
+"""The published U-Net: what it sees, what it costs, what comes out."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from optics.errors import InvalidInputError
+from train.published.unet import HEAD_STRIDES, PublishedUNet, samples_for
+
+
+@pytest.mark.parametrize("samples", HEAD_STRIDES)
+@pytest.mark.parametrize("page", [(7, 11), (8, 12)])
+def test_each_symbol_gets_its_numbers_whatever_the_page(samples: int, page: tuple[int, int]) -> None:
+    network = PublishedUNet(samples, (4, 8), outputs=3)
+    assert network(torch.zeros(2, 4, samples * page[0], samples * page[1])).shape == (2, 3, *page)
+
+
+def test_table_1_of_samples_and_no_others() -> None:
+    assert [samples_for(size) for size in (2, 4, 8, 16)] == [4, 4, 8, 16]
+    with pytest.raises(InvalidInputError, match=r"samples per symbol.*5.*4, 8, 16"):
+        PublishedUNet(5)
+
+
+def test_receptive_field_of_the_path_at_sample_pitch() -> None:
+    """5, 9, 13, 17, 25 and 33 samples after each of its 5x5 convolutions: the U adds the coarser ones."""
+    torch.manual_seed(0)
+    network = PublishedUNet(4, (4, 8))
+    convolutions = [network.first, *network.head]
+    seen = []
+    for depth in range(1, len(convolutions) + 1):
+        image = torch.randn(1, 4, 96, 96, requires_grad=True)
+        x = network.first(image)
+        for number, convolution in enumerate(convolutions[1:depth]):
+            x = convolution(torch.cat([x, x], dim=1) if number == 0 else x)
+        x[0, 0, x.shape[-2] // 2, x.shape[-1] // 2].backward()
+        assert image.grad is not None
+        columns = torch.nonzero(image.grad.abs().sum((0, 1, 2)) > 0).ravel()
+        seen.append(int(columns.max() - columns.min()) + 1)
+    assert seen == [5, 9, 13, 17, 25, 33]
+
+
+def test_the_whole_network_sees_further_than_that() -> None:
+    torch.manual_seed(0)
+    image = torch.randn(1, 4, 256, 256, requires_grad=True)
+    PublishedUNet(4, (4, 8))(image)[0, 0, 32, 32].backward()
+    assert image.grad is not None
+    columns = torch.nonzero(image.grad.abs().sum((0, 1, 2)) > 0).ravel()
+    assert int(columns.max() - columns.min()) + 1 > 60
+
+
+@pytest.mark.parametrize(("channels", "megaflops"), [((16, 32), 1.5), ((32, 64), 5.9), ((64, 128), 23.6)])
+def test_what_a_symbol_costs(channels: tuple[int, int], megaflops: float) -> None:
+    rows, columns = 16, 24
+    with FlopCounterMode(display=False) as counter:
+        PublishedUNet(4, channels)(torch.zeros(1, 4, 4 * rows, 4 * columns))
+    assert counter.get_total_flops() / rows / columns / 1e6 == pytest.approx(megaflops, rel=0.02)

@@ -1,0 +1,121 @@
+"""The published decoder: raw frames of one device to the vector p of each symbol."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from optics.errors import InvalidInputError
+from optics.lenses import LENSES
+from optics.profile import Profile
+from optics.recording import FramePair
+from optics.registration.samplers import smooth_reference
+from train.published.localizers import NAMES, Localizer, ModeLocalizer, NoLocalizer, RayLocalizer
+from train.published.unet import PublishedUNet, samples_for
+
+PARAXIAL = "paraxial"
+LENS_CHOICES = (PARAXIAL, *LENSES)
+
+
+def make_localizer(
+    name: str, profile: Profile, samples: int, lenses: str = PARAXIAL, quadrature_sign: int = 1
+) -> Localizer:
+    """A published localizer by name.
+
+    Args:
+        name: of `NAMES`.
+        profile: the nominal device.
+        samples: samples per symbol and axis.
+        lenses: of `LENS_CHOICES`, for rays.
+        quadrature_sign: for modes, see `ModeLocalizer`.
+
+    Raises:
+        InvalidInputError: no such localizer or lens.
+    """
+    if lenses not in LENS_CHOICES:
+        raise InvalidInputError("lenses", repr(lenses), f"one of {', '.join(LENS_CHOICES)}")
+    if name == "none":
+        return NoLocalizer(profile, samples)
+    if name == "mode":
+        return ModeLocalizer(profile, samples, quadrature_sign)
+    if name == "ray":
+        return RayLocalizer(profile, samples, LENSES.get(lenses))
+    raise InvalidInputError("published localizer", repr(name), f"one of {', '.join(NAMES)}")
+
+
+class PublishedDecoder(nn.Module):
+    """Frames over the reference's, localizer, U-Net.
+
+    Args:
+        profile: the nominal device.
+        references: reference-only frames.
+        localizer: see `make_localizer`.
+        channels: of the U-Net.
+        outputs: numbers for each symbol.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        references: FramePair,
+        localizer: Localizer,
+        channels: tuple[int, int] = (32, 64),
+        outputs: int = 2,
+    ) -> None:
+        super().__init__()
+        levels = [smooth_reference(frame) for frame in (references.in_phase, references.quadrature)]
+        self.references: Tensor
+        self.register_buffer("references", torch.from_numpy(np.stack(levels).astype(np.float32)), persistent=False)
+        self.localizer = localizer
+        self.unet = PublishedUNet(samples_for(profile.page.symbol_size_px), channels, outputs)
+
+    def forward(self, frames: Tensor, shift_px: Tensor) -> Tensor:
+        """Raw frames [N, 2, H, W] and how far their images have moved [N, 2] to p [N, 2, ny, nx]."""
+        with torch.autocast(frames.device.type, enabled=False):
+            seen, level = sample_pair(frames.float(), self.references, self.localizer.grid(), shift_px)
+        return self.read(seen, level)
+
+    def read(self, seen: Tensor, level: Tensor) -> Tensor:
+        """Samples of the frames [N, 2, h, w] and of the references [N, 2, h, w], counts, to p [N, 2, ny, nx]."""
+        with torch.autocast(seen.device.type, enabled=False):
+            images = self.localizer(over_reference(seen, level))
+            places = self.localizer.places.float().permute(2, 0, 1).expand(len(images), -1, -1, -1)
+        return torch.as_tensor(self.unet(torch.cat([images, places], dim=1)))
+
+
+def sample_pair(frames: Tensor, references: Tensor, grid: Tensor, shift_px: Tensor) -> tuple[Tensor, Tensor]:
+    """Both frames of each pair, and the references at the same pixels, bilinearly; zero outside.
+
+    Args:
+        frames: [N, 2, H, W].
+        references: [2, H, W].
+        grid: [2, h, w, 2], (x, y) from -1 to 1 at a frame's edges.
+        shift_px: [N, 2], how many pixels (x, y) further on each page's image lies.
+
+    Returns:
+        [N, 2, h, w] both.
+    """
+    width, height = frames.shape[-1], frames.shape[-2]
+    by = shift_px * (2 / torch.tensor([width, height], dtype=shift_px.dtype, device=shift_px.device))
+    where = grid[None] + by[:, None, None, None]
+    both = torch.stack([frames, references.expand_as(frames)], dim=2)
+    seen = sample_frames(both.flatten(1, 2), where.repeat_interleave(2, dim=1))
+    return seen[:, 0::2], seen[:, 1::2]
+
+
+def sample_frames(frames: Tensor, grid: Tensor) -> Tensor:
+    """Each of the frames [N, C, H, W] at its own places [N, C, h, w, 2], bilinearly, zero outside: [N, C, h, w]."""
+    flat = functional.grid_sample(frames.flatten(0, 1)[:, None], grid.flatten(0, 1), align_corners=False)
+    return flat.reshape(*frames.shape[:2], *grid.shape[2:4])
+
+
+def over_reference(seen: Tensor, level: Tensor) -> Tensor:
+    """What a page adds to the reference, over the reference's amplitude, of unit root mean square a page.
+
+    Args:
+        seen, level: counts of the frames and of the references, [N, 2, h, w].
+    """
+    signal = (seen - level) * torch.rsqrt(level + 1e-6)
+    return signal * torch.rsqrt(signal.square().mean(dim=(1, 2, 3), keepdim=True) + 1e-12)

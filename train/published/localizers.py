@@ -1,0 +1,150 @@
+"""The published localizers, none, by modes and by rays: samples of both frames to images that lie as the page does."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from optics.lenses import LensPrescription
+from optics.profile import Profile
+from optics.waves import WaveGeometry, cells_for, mode_detuning, modes_of_plane
+from train.published.rays import RayTracer
+
+AFFINE_START = (0.98, 0.95)
+"""Page over camera along x and y, roughly: where each camera's affine starts."""
+NAMES = ("none", "mode", "ray")
+_FAR = 10.0
+"""In page half extents: off every camera, where samples are zero."""
+
+
+class Registration(nn.Module):
+    """A trainable affine for each camera, from the page's coordinates to the frame's: both run from -1 to 1."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.matrix = nn.Parameter(torch.diag(torch.tensor(AFFINE_START)).expand(2, 2, 2).clone())
+        self.offset = nn.Parameter(torch.zeros(2, 2))
+
+    def forward(self, places: Tensor) -> Tensor:
+        """Places [h, w, 2] (x, y) to those in each frame, [2, h, w, 2]."""
+        return torch.einsum("cij,hwj->chwi", self.matrix, places) + self.offset[:, None, None]
+
+
+def page_places(shape: tuple[int, int]) -> Tensor:
+    """Centres of h x w samples that cover the page, (x, y) from -1 to 1 at its edges, [h, w, 2]."""
+    y, x = ((torch.arange(count, dtype=torch.float64) * 2 + 1) / count - 1 for count in shape)
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+
+
+class Localizer(nn.Module):
+    """What the three share: where samples lie on the page, and how each camera lies to it.
+
+    Args:
+        profile: the nominal device.
+        samples: samples per symbol and axis.
+    """
+
+    def __init__(self, profile: Profile, samples: int) -> None:
+        super().__init__()
+        rows, columns = profile.page_shape
+        self.places: Tensor
+        self.register_buffer("places", page_places((rows * samples, columns * samples)), persistent=False)
+        self.registration = Registration()
+
+    def grid(self) -> Tensor:
+        """Where both frames are sampled, [2, h, w, 2], (x, y) from -1 to 1 at their edges."""
+        return torch.as_tensor(self.registration(self.places.float()))
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Samples of both frames [N, 2, h, w], over the reference's, to two images of the page, [N, 2, h, w]."""
+        return seen
+
+
+class NoLocalizer(Localizer):
+    """Every sample is taken where it would lie without a pipe."""
+
+
+class ModeLocalizer(Localizer):
+    """Undoes a square pipe of nominal measures by its sine modes (supplement S9).
+
+    Both frames are sampled evenly, weighed and offset by a 1x1 convolution each, and put together to a field, which
+    goes back through de-launch lens, pipe and launch lens: matrix products along the axes, and one phase for each mode.
+
+    Args:
+        profile: the nominal device.
+        samples: samples per symbol and axis.
+        quadrature_sign: +1 where the quadrature camera shows the sine of the phase, -1 where its opposite.
+    """
+
+    def __init__(self, profile: Profile, samples: int, quadrature_sign: int = 1) -> None:
+        super().__init__(profile, samples)
+        self.weight = nn.Parameter(torch.ones(2, 1, 1))
+        self.bias = nn.Parameter(torch.zeros(2, 1, 1))
+        self._sign = float(quadrature_sign)
+        geometry = WaveGeometry(
+            wavelength_m=profile.light.wavelength_m,
+            focal_length_m=profile.lens.focal_length_m,
+            pipe_length_m=profile.pipe.length_m,
+            pipe_width_m=profile.pipe.width_m,
+            refractive_index=profile.pipe.refractive_index,
+        )
+        half = np.array([profile.page_width_m, profile.page_height_m]) / 2
+        axes = [half[0] * self.places[0, :, 0].numpy(), half[1] * self.places[:, 0, 1].numpy()]
+        cells_y, cells_x = cells_for(geometry, axes[0], axes[1], half[0], half[1])
+        x, y = (modes_of_plane(geometry, axis, n) for axis, n in zip(axes, (cells_x, cells_y), strict=True))
+        detuning = mode_detuning(geometry, np.arange(1.0, cells_y)[:, None], np.arange(1.0, cells_x)[None, :])
+        phase = -geometry.pipe_length_m * detuning
+        self.x: Tensor
+        self.y: Tensor
+        self.pipe: Tensor
+        for name, value in (("x", x.T), ("y", y), ("pipe", np.exp(1j * phase))):
+            parts = np.stack([value.real, value.imag]).astype(np.float32)
+            self.register_buffer(name, torch.from_numpy(parts), persistent=False)
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Samples of both frames [N, 2, h, w] to real and imaginary part of the field on the modulator."""
+        seen = seen * self.weight + self.bias
+        x, y = (self.x[0], self.x[1]), (self.y[0], self.y[1])
+        real, imaginary = _times(_times(y, (seen[:, 0], self._sign * seen[:, 1])), x)
+        cos, sin = self.pipe[0], self.pipe[1]
+        modes = real * cos - imaginary * sin, real * sin + imaginary * cos
+        return torch.stack(_times(_times(_adjoint(y), modes), _adjoint(x)), dim=1)
+
+
+_Parts = tuple[Tensor, Tensor]
+"""Real and imaginary part: exported graphs know no complex numbers."""
+
+
+def _times(left: _Parts, right: _Parts) -> _Parts:
+    """Matrix product."""
+    return left[0] @ right[0] - left[1] @ right[1], left[0] @ right[1] + left[1] @ right[0]
+
+
+def _adjoint(matrix: _Parts) -> _Parts:
+    return matrix[0].T, -matrix[1].T
+
+
+class RayLocalizer(Localizer):
+    """Samples the frames where a ray from each sample of the page lands (supplement S10).
+
+    Affine of each camera and the pipe's angle are trained; the sampling grid is a constant once they are.
+
+    Args:
+        profile: the nominal device.
+        samples: samples per symbol and axis.
+        lens: prescription of both lenses; ideal ones if left out.
+    """
+
+    def __init__(self, profile: Profile, samples: int, lens: LensPrescription | None = None) -> None:
+        super().__init__(profile, samples)
+        self.tracer = RayTracer(profile, lens)
+        self.angle = nn.Parameter(torch.tensor(np.deg2rad(profile.pipe.angle_deg), dtype=torch.float32))
+        self._half = (profile.page_width_m / 2, profile.page_height_m / 2)
+
+    def grid(self) -> Tensor:
+        """Where both frames are sampled; a ray that the pipe loses lies outside them."""
+        half = torch.tensor(self._half, dtype=torch.float64, device=self.places.device)
+        traced = self.tracer((self.places * half).reshape(-1, 2), self.angle.double())
+        landed = torch.where(traced.valid[:, None], traced.places / half, _FAR)
+        return torch.as_tensor(self.registration(landed.reshape(self.places.shape).float()))

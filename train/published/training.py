@@ -1,0 +1,168 @@
+"""Training of the published decoders as published (supplement S6), on frames as the cameras gave them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from optics.page import symbol_phases
+from optics.recording import Recording
+from train.features import PageState
+from train.fitting import DecoderTraining, Fitted, Page, fit
+from train.published.decoder import PublishedDecoder
+from train.published.localizers import RayLocalizer
+
+WARM_UP = 0.02
+"""Share of the steps over which learning rates rise."""
+DECAYS = (0.8, 0.9)
+"""Shares of the steps at which the decoder's learning rate falls."""
+LARGEST_GRADIENT = 1.0
+"""Norm of the decoder's gradient beyond which it is scaled down."""
+
+
+@dataclass(frozen=True)
+class PublishedChoices:
+    """Hyperparameters of a published decoder; the defaults are its authors' for 4x4 symbols.
+
+    Attributes:
+        channels: of the U-Net, at sample pitch and below.
+        steps: optimiser steps: 50 epochs of 450 pages, two at a time.
+        batch: pages a step.
+        decoder_rate, affine_rate, angle_rate: learning rates of U-Net, registration and pipe angle (radians).
+        decay: factor on the decoder's learning rate at each of `DECAYS`.
+        lenses: of `train.published.decoder.LENS_CHOICES`.
+        seed: of initial weights and batches.
+        precision: Lightning's.
+    """
+
+    channels: tuple[int, int] = (32, 64)
+    steps: int = 11_250
+    batch: int = 2
+    decoder_rate: float = 1e-3
+    affine_rate: float = 2e-4
+    angle_rate: float = 1e-4
+    decay: float = 0.5
+    lenses: str = "paraxial"
+    seed: int = 0
+    precision: str = "bf16-mixed"
+
+
+class FramePages(Dataset[Page]):
+    """Recorded pages as a published decoder takes them: frames [2, H, W], state [3], true phases [ny, nx].
+
+    A state is the image's shift (x, y) in pixels and the piston in radians.
+
+    Args:
+        recording: with symbols; stays open.
+        pages: which of its pages.
+        states: of those pages.
+    """
+
+    def __init__(self, recording: Recording, pages: Sequence[int], states: Sequence[PageState]) -> None:
+        self._recording, self._pages, self._states = recording, pages, states
+
+    def __len__(self) -> int:
+        """Pages."""
+        return len(self._pages)
+
+    def __getitem__(self, index: int) -> Page:
+        """One page."""
+        page, state = self._pages[index], self._states[index]
+        pair, symbols = self._recording.frames(page), self._recording.symbols(page)
+        assert symbols is not None
+        phases = symbol_phases(symbols, self._recording.levels).astype(np.float32)
+        return (
+            torch.from_numpy(np.stack([pair.in_phase, pair.quadrature]).astype(np.float32)),
+            torch.tensor([*state.shift_px, state.piston_rad], dtype=torch.float32),
+            torch.from_numpy(phases),
+        )
+
+
+class PublishedTraining(DecoderTraining[PublishedDecoder]):
+    """A published decoder, with Adam at three learning rates.
+
+    Frames without a known piston cannot show phases, so each page's piston is added to the phases that it is asked for,
+    and its shift to where it is looked at. Its authors' device stood still.
+
+    Args:
+        network, pilot_mask, levels: as for `DecoderTraining`.
+        choices: the run's.
+    """
+
+    def __init__(
+        self, network: PublishedDecoder, choices: PublishedChoices, pilot_mask: NDArray[np.bool_], levels: int
+    ) -> None:
+        super().__init__(network, pilot_mask, levels)
+        self.choices = choices
+
+    def forward(self, *page: Tensor) -> Tensor:
+        """Frames [N, 2, H, W] and states [N, 3] to p [N, 2, ny, nx]."""
+        frames, state = page
+        return torch.as_tensor(self.network(frames, state[:, :2]))
+
+    def training_step(self, batch: Page, index: int) -> Tensor:
+        """Loss of the phases as the page's piston turns them."""
+        frames, state, phases = batch
+        localizer = self.network.localizer
+        if isinstance(localizer, RayLocalizer):
+            self.log("angle_deg", math.degrees(localizer.angle.detach().item()))
+        return self.loss(self(frames, state), phases + state[:, 2, None, None])
+
+    def configure_optimizers(self) -> Any:
+        """Adam; all rates warm up, the decoder's falls towards the end."""
+        choices, localizer = self.choices, self.network.localizer
+        angle = [localizer.angle] if isinstance(localizer, RayLocalizer) else []
+        affine = list(localizer.registration.parameters())
+        apart = {id(parameter) for parameter in (*angle, *affine)}
+        decoder = [parameter for parameter in self.network.parameters() if id(parameter) not in apart]
+        groups: list[tuple[list[nn.Parameter], float, float]] = [
+            (decoder, choices.decoder_rate, choices.decay),
+            (affine, choices.affine_rate, 1.0),
+            (angle, choices.angle_rate, 1.0),
+        ]
+        groups = [group for group in groups if group[0]]
+        optimizer = torch.optim.Adam([{"params": parameters, "lr": rate} for parameters, rate, _ in groups])
+
+        def course(decay: float) -> Any:
+            warm_up = max(1.0, WARM_UP * choices.steps)
+            falls = [share * choices.steps for share in DECAYS]
+            return lambda step: min(1.0, (step + 1) / warm_up) * decay ** sum(step >= at for at in falls)
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, [course(decay) for _, _, decay in groups])
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def configure_gradient_clipping(self, *_: Any, **__: Any) -> None:
+        """The U-Net's gradient, as one vector."""
+        nn.utils.clip_grad_norm_(self.network.unet.parameters(), LARGEST_GRADIENT)
+
+
+def fit_published(
+    run: Path,
+    module: PublishedTraining,
+    training: Dataset[Page],
+    validation: Dataset[Page],
+    *,
+    devices: int | str = "auto",
+    progress: bool = True,
+) -> Fitted[PublishedTraining]:
+    """Train, or go on with, a published decoder; arguments as for `train.fitting.fit`."""
+    choices = module.choices
+    return fit(
+        run,
+        module,
+        DataLoader(training, batch_size=choices.batch, shuffle=True),
+        validation,
+        steps=choices.steps,
+        precision=choices.precision,
+        devices=devices,
+        progress=progress,
+    )

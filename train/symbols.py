@@ -1,0 +1,138 @@
+"""The way of training decoders at symbol pitch: features of recorded and synthetic pages, then the network."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import click
+import numpy as np
+from torch.utils.data import ConcatDataset
+
+from optics.errors import InvalidInputError
+from optics.profile import Profile
+from optics.registration.known import known_pages
+from train.feature_store import FeatureStore, fill
+from train.fitting import Hyperparameters, Page, best_kappa_scale, fit_network
+from train.localizers.coherent import SAMPLES, CoherentLocalizer
+from train.material import Material, Trained
+from train.network import SymbolUNet
+from train.run import load_network, load_run
+from train.synthetic import MOST_NOISE, SyntheticPages, likeness
+
+LOCALIZERS = ("coherent", "wave")
+DEFAULT_SYNTHETIC_PAGES = 96
+LIKENESS_PAGES = 2
+"""Recorded pages that the wave model is compared with: each has thousands of symbols."""
+
+
+@dataclass(frozen=True)
+class SymbolRecipe:
+    """Trains the network at symbol pitch.
+
+    Attributes:
+        localizer: of `LOCALIZERS`.
+        choices: the run's.
+        synthetic_pages: pages of the drifted device to train on beside the recorded ones.
+        start: finished run whose weights are begun with.
+    """
+
+    localizer: str
+    choices: Hyperparameters
+    synthetic_pages: int
+    start: Path | None
+
+    def options(self) -> dict[str, object]:
+        """Everything that a run must go on with, by the names of the command line."""
+        return {
+            "--localizer": self.localizer,
+            "--synthetic-pages": self.synthetic_pages,
+            "--start": None if self.start is None else str(self.start.resolve()),
+            **{f"--{name.replace('_', '-')}": value for name, value in asdict(self.choices).items()},
+        }
+
+    def train(self, material: Material) -> Trained:
+        """Train, or go on with, the run; raises KeyboardInterrupt after Ctrl-C, with nothing lost.
+
+        Raises:
+            InvalidInputError: a start that is no finished run, or of another size.
+        """
+        first = None if self.start is None else self._first_network(material.profile)
+        known = [*material.training, *material.validation]
+        features = material.out / "features"
+        preparing = fill(
+            features,
+            f"{material.key} {self.localizer}",
+            len(known),
+            lambda first, shift: material.extractor.pages(material.recording, known[first:], shift),
+            "recorded pages",
+        )
+        count = len(material.training)
+        training: ConcatDataset[Page] = ConcatDataset(
+            [FeatureStore(features, range(count)), *map(FeatureStore, self._synthetic(material))]
+        )
+        validation = FeatureStore(features, range(count, len(known)))
+        fitted = fit_network(
+            material.out,
+            self.choices,
+            material.pilot_mask,
+            material.recording.levels,
+            training,
+            validation,
+            start=first,
+            devices=material.devices,
+        )
+        return Trained(
+            weights=fitted.module.network.state_dict(),
+            validation_air=fitted.validation_air,
+            kappa_scale=best_kappa_scale(fitted.module, validation, material.pilot_mask),
+            seconds=preparing + fitted.seconds,
+            synthetic_pages=len(training) - count,
+        )
+
+    def check_start(self, profile: Profile) -> None:
+        """Check that the run to start from, if any, has a network of this size.
+
+        Raises:
+            InvalidInputError: see `train`.
+        """
+        if self.start is not None:
+            self._first_network(profile)
+
+    def _first_network(self, profile: Profile) -> SymbolUNet:
+        assert self.start is not None
+        run = load_run(self.start)
+        size = (run.localizer, run.profile.page_shape, *_size(run.hyperparameters))
+        wanted = (self.localizer, profile.page_shape, *_size(self.choices))
+        if size != wanted:
+            raise InvalidInputError(
+                f"--start {self.start}: localizer, page, channels, blocks, levels", size, f"{wanted}"
+            )
+        coherent = CoherentLocalizer(profile).light_channels
+        return load_network(self.start, run, coherent if self.localizer == "coherent" else 2 * SAMPLES**2)
+
+    def _synthetic(self, material: Material) -> list[Path]:
+        """Folder with the features of synthetic pages; none where the wave model is not like the device."""
+        if self.synthetic_pages == 0:
+            return []
+        profile, vector, seed = material.profile, material.calibration.vector, self.choices.seed
+        known = known_pages(material.recording, profile, material.training[:LIKENESS_PAGES])
+        phases = [np.angle(page.symbols) for page in known]
+        fields = [
+            material.extractor.known_field(page.pair, written) for page, written in zip(known, phases, strict=True)
+        ]
+        like = likeness(profile, vector, fields, phases)
+        if like.noise > MOST_NOISE:
+            click.echo(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
+            return []
+        click.echo(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
+        folder = material.out / "synthetic"
+        pages = SyntheticPages(profile, vector, like, self.localizer, seed)
+        key = f"{self.localizer} {seed} {profile.to_toml()} {material.calibration.to_toml()} {like.noise:.6f} "
+        key += f"{np.round(like.illumination, 6).tolist()}"
+        fill(folder, key, self.synthetic_pages, lambda first, shift: pages.pages(first), "synthetic pages")
+        return [folder]
+
+
+def _size(choices: object) -> tuple[object, ...]:
+    return tuple(getattr(choices, name, None) for name in ("channels", "blocks", "levels"))
