@@ -41,6 +41,7 @@ SUMMARIES = {
     "rollback": "Put a service's previous model back in service.",
     "serve": "Run the service.",
     "simulate": "Record pages of a simulated device.",
+    "study": "Answer a question about the device or its decoders in a table and a picture.",
     "train": "Train a decoder on a recording.",
 }
 """What the overview says of a command, so that it need not be imported to be listed."""

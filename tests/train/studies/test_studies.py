@@ -1,0 +1,173 @@
+"""Studies: what they measure, and that the command keeps what is done."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from optics.device import Device
+from optics.errors import InvalidInputError
+from optics.profile import load_profile
+from optics.simulator import TrueOptics
+from tests.optics.small import small_profile
+from train.studies import STUDIES, cross_section, drift, folding, imaging_condition, rays, receptive_field, scaling
+from train.studies.cli_study import study
+from train.studies.study import Settings, aligned, measured
+
+SMALL = small_profile()
+
+
+def run(*arguments: str) -> str:
+    return CliRunner().invoke(study, arguments, standalone_mode=False, catch_exceptions=False).output
+
+
+@pytest.mark.parametrize("name", [name for name in STUDIES if not STUDIES[name].trains])
+def test_each_makes_a_table_and_a_picture_and_is_gone_on_with(name: str, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL.to_toml())
+    out = tmp_path / "out"
+    arguments = (name, "--quick", "--profile", str(tmp_path / "small.toml"), "--out", str(out))
+    printed = run(*arguments, "--json", str(tmp_path / "F.json"))
+    written = json.loads((tmp_path / "F.json").read_text())
+    assert len(written["rows"]) >= 1
+    assert all(len(row) == len(written["header"]) for row in written["rows"])
+    assert str(written["header"][0]) in printed
+    assert STUDIES[name].title in (out / "table.txt").read_text()
+    with Image.open(out / "figure.png") as figure:
+        pixels = np.asarray(figure.convert("L"))
+    assert min(pixels.shape) > 200
+    assert pixels.std() > 5  # something is drawn
+    before = {path: path.stat().st_mtime_ns for path in (out / "results").iterdir()}
+    run(*arguments)
+    assert {path: path.stat().st_mtime_ns for path in (out / "results").iterdir()} == before
+    with pytest.raises(InvalidInputError, match="quick"):
+        run(name, "--profile", str(tmp_path / "small.toml"), "--out", str(out))
+
+
+def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"--full.*--profile"):
+        run("rays", "--full", "--profile", "bench", "--out", str(tmp_path / "out"))
+
+
+def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) -> None:
+    settings, case = Settings(SMALL, quick=True), {"name": "square-diagonal", "shape": "square", "centroid": (1, 1)}
+    told = []
+    first = measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: told.append(what))
+    again = measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: told.append(what))
+    assert told == ["trace"]
+    np.testing.assert_array_equal(first["landed"], again["landed"])
+    assert first["spots"] == again["spots"] == 1
+
+
+def test_a_table_lines_up() -> None:
+    assert aligned(("a", "long"), [("x", 1.23456), ("yy", float("nan"))]) == " a   long\n x  1.235\nyy      -"
+
+
+def test_layers_see_what_strides_of_two_let_them() -> None:
+    assert tuple(receptive_field.field_of_layers()) == receptive_field.EXPECTED
+
+
+def test_single_pixels_are_too_fine_for_the_full_size_pipe_and_pairs_are_not() -> None:
+    paper = load_profile("paper")
+    assert imaging_condition.needed_width_m(paper, 1) * 1e3 == pytest.approx(4.63, abs=0.01)
+    assert imaging_condition.needed_width_m(paper, 2) < paper.pipe.width_m < imaging_condition.needed_width_m(paper, 1)
+
+
+def test_a_square_pipe_makes_one_two_or_four_spots_and_a_round_one_smears() -> None:
+    paper = load_profile("paper")
+    counts = {}
+    for shape, trace in (("square", cross_section.square_exit), ("round", cross_section.round_exit)):
+        for name, centroid in cross_section._POINTS.items():
+            places, sines = cross_section.bundle(paper, centroid, 41)
+            landed = trace(paper, places, sines) * paper.pipe.refractive_index * paper.lens.focal_length_m
+            counts[shape, name] = cross_section.spots(landed, 0.02 * paper.pipe.width_m)
+            # walls turn light, they neither steepen nor flatten it
+            np.testing.assert_allclose(np.linalg.norm(trace(paper, places, sines), axis=1), np.linalg.norm(sines))
+    square = [
+        counts["square", name] for name in ("centre", "edge of a zone", "next zone", "corner of zones", "diagonal")
+    ]
+    assert square == [1, 2, 1, 4, 1]
+    assert counts["round", "centre"] == 1
+    assert min(counts["round", name] for name in cross_section._POINTS if name != "centre") > 10
+
+
+def test_a_square_pipe_lays_no_zone_on_another_and_a_sheared_one_does() -> None:
+    settings = Settings(load_profile("bench"))
+    shared = {}
+    for case in rays.STUDY.cases(settings):
+        result = rays.STUDY.measure(settings, case, Path(), lambda what, share: None)
+        for _, x, y, _, share in rays.STUDY.rows([case], [result]):
+            shared[case["angle_deg"], x, y] = share
+    assert max(share for (angle, _, _), share in shared.items() if angle == 0) == 0
+    # the diagonal zones suffer most
+    sheared = {zone: share for (angle, *zone_), share in shared.items() if angle != 0 for zone in [tuple(zone_)]}
+    assert max(sheared, key=lambda zone: sheared[zone]) == (1, 1)
+    assert sheared[1, 1] > 0.03
+
+
+def test_the_middle_of_a_picture_stays_and_its_neighbours_are_mirrored() -> None:
+    bench = load_profile("bench")
+    picture = folding.test_picture((112, 174))
+    folded = folding.folded_by_rays(bench, picture, 0.0)
+    assert folded.sum() == pytest.approx(picture.sum())  # rays are neither lost nor added
+    border = folding._BORDER
+    inside = folded[border:-border, border:-border]
+    middle = (slice(40, 72), slice(60, 114))
+    np.testing.assert_allclose(inside[middle], picture[middle])
+    left = inside[40:72, 4:40]  # what lies there was written on the right, mirrored
+    mirrored = picture[40:72, ::-1]
+    best = max(np.corrcoef(left.ravel(), mirrored[:, k : k + 36].ravel())[0, 1] for k in range(60))
+    assert best > 0.8
+
+
+def test_crosshairs_tell_a_shift_of_the_image() -> None:
+    profile = load_profile("bench")
+    settings = Settings(profile, quick=True, seed=3)
+    result = drift._crosshairs(settings, lambda what, share: None)
+    assert result["measured"].shape == result["true"].shape == (6, 2)
+    assert np.abs(result["measured"] - result["true"]).max() < 0.1
+    assert np.linalg.norm(result["true"], axis=1).max() > 0.5
+
+
+def test_the_ground_between_crosshairs_is_dark() -> None:
+    optics = TrueOptics(SMALL, Device())
+    phases = drift.crosshair_phases(optics)
+    assert 0.9 < np.mean(np.abs(np.diff(phases, axis=1)) > 1) < 1
+    power = np.abs(optics.camera_field(optics.exit_field(phases))) ** 2
+    assert np.median(power) < 0.02 * power.max()
+
+
+def test_recalibration_is_due_where_the_air_crosses_the_limit() -> None:
+    assert drift.recalibrate_at([(1.0, 0.99), (2.0, 0.97)], 0.98) == pytest.approx(1.5)
+    assert drift.recalibrate_at([(1.0, 0.96)], 0.98) == pytest.approx(0.5)
+    assert drift.recalibrate_at([(1.0, 0.999)], 0.98) is None
+
+
+def test_a_turned_pipe_costs_the_shipped_decoder_some_of_its_rate(tmp_path: Path) -> None:
+    settings = Settings(load_profile("bench"), quick=True)
+    cases = drift.STUDY.cases(settings)[1:]
+    rates = [drift.STUDY.measure(settings, case, tmp_path, lambda what, share: None)["air"] for case in cases]
+    assert 4.5 < rates[0] < 6.5
+    assert 0.5 * rates[0] < rates[1] < rates[0] - 0.02
+
+
+def test_an_enlarged_device_has_the_same_zones() -> None:
+    bench, large = load_profile("bench"), scaling.enlarged(load_profile("bench"), 2)
+    assert large.page.columns * large.page.rows == 4 * bench.page.columns * bench.page.rows
+    ratio = [p.page_width_m * p.pipe.length_m / p.lens.focal_length_m / p.pipe.width_m for p in (bench, large)]
+    assert ratio[0] == pytest.approx(ratio[1])
+
+
+def test_a_matrix_that_does_not_fit_is_extrapolated_and_says_so() -> None:
+    cases = [{"name": str(n), "method": "matrix", "factor": n} for n in (1, 2)]
+    results = [{"symbols": 100, "seconds": 1.0, "bytes": 80_000}, {"symbols": 400, "seconds": None, "bytes": 1_280_000}]
+    others = [{"name": m, "method": m, "factor": 1} for m in ("modes", "coherent")]
+    other_results = [{"symbols": 100, "seconds": 1.0, "bytes": 1}] * 2
+    rows = scaling._rows([*cases, *others], [*results, *other_results])
+    assert rows[0][-1] == "measured"
+    assert rows[1][-1] == "extrapolated"
+    assert rows[1][2] == pytest.approx(16.0)

@@ -1,0 +1,25 @@
+"""Studies of the device and its decoders: each asks one question, and answers it in a table and a picture."""
+
+from __future__ import annotations
+
+from train.studies import (
+    cross_section,
+    drift,
+    folding,
+    imaging_condition,
+    rays,
+    receptive_field,
+    scaling,
+)
+from train.studies.study import Study
+
+STUDIES: dict[str, Study] = {
+    "folding": folding.STUDY,
+    "rays": rays.STUDY,
+    "cross-section": cross_section.STUDY,
+    "imaging-condition": imaging_condition.STUDY,
+    "receptive-field": receptive_field.STUDY,
+    "drift": drift.STUDY,
+    "scaling": scaling.STUDY,
+}
+"""By the names of the command line."""

@@ -1,0 +1,74 @@
+"""The command `lightpage study`: one question about the device or its decoders, answered in a table and a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import torch
+
+from optics.errors import InvalidInputError
+from optics.files import OutputFile, replace_file, replace_text, write_json
+from optics.profile import load_profile
+from optics.progress import percent_bar
+from train.run import begin, sole_writer
+from train.studies import STUDIES
+from train.studies.study import Settings, aligned, measured
+
+_FULL = "paper"
+_RESULTS = "results"
+
+
+@click.command(epilog="\n\n".join(f"{name}: {study.title} ({study.source})" for name, study in STUDIES.items()))
+@click.argument("name", type=click.Choice(list(STUDIES)))
+@click.option(
+    "--out", required=True, type=click.Path(path_type=Path), help="Folder of the study; gone on with if it is there."
+)
+@click.option("--profile", "profile_name", help="Shipped profile or TOML file.  [default: bench]")
+@click.option("--quick", is_flag=True, help="Few and small cases, to see that it works.")
+@click.option("--full", is_flag=True, help=f"At full scale, profile {_FULL}; what trains needs a GPU there.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--json", "json_path", type=OutputFile(), help="Write settings and table to this file too.")
+def study(
+    name: str, out: Path, profile_name: str | None, quick: bool, full: bool, seed: int, json_path: Path | None
+) -> None:
+    """Measure the cases of study NAME, write OUT/table.txt, OUT/figure.png and OUT/study.json, and print the table."""
+    if full and profile_name is not None:
+        raise InvalidInputError("--full", f"--profile {profile_name} beside it", "one of them")
+    chosen = STUDIES[name]
+    if full and chosen.trains and not torch.cuda.is_available():
+        raise InvalidInputError(f"study {name} --full", "no CUDA device", "one: it trains networks at full scale")
+    context = click.get_current_context()
+    context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
+    settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed)
+    context.with_resource(sole_writer(out))
+    begin(out, {"study": name, **settings.key()})
+    results_folder = out / _RESULTS
+    results_folder.mkdir(exist_ok=True)
+    cases, results = chosen.cases(settings), []
+    with percent_bar() as progress:
+        for number, case in enumerate(cases):
+            results.append(
+                measured(
+                    chosen,
+                    settings,
+                    case,
+                    results_folder,
+                    lambda what, share, n=number, c=case: progress(f"{c['name']}: {what}", (n + share) / len(cases)),  # type: ignore[misc]
+                )
+            )
+    rows = chosen.rows(cases, results)
+    table = aligned(chosen.header, rows)
+    figure = chosen.plot(settings, cases, results)
+    replace_file(out / "figure.png", lambda file: figure.savefig(file, format="png", dpi=110), "picture of the study")
+    replace_text(out / "table.txt", f"{chosen.title} ({chosen.source})\n\n{table}\n", "table of the study")
+    figures = {
+        "study": name,
+        **settings.key(),
+        "header": list(chosen.header),
+        "rows": [list(row) for row in rows],
+    }
+    for path in (out / "study.json", json_path):
+        if path is not None:
+            write_json(path, figures)
+    click.echo(f"{table}\n\nwritten to {out}")

@@ -1,0 +1,117 @@
+"""Where rays go: through lenses and pipe, and from the page's zones to the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from optics.lenses import LENSES
+from optics.profile import Profile
+from optics.progress import Progress
+from train.published.localizers import page_places
+from train.published.rays import RayTracer
+from train.studies.study import Case, Result, Row, Settings, Study
+
+ANGLES_DEG = (0.0, -0.6)
+_GRID = (90, 140)
+_QUICK_GRID = (18, 28)
+_DRAWN = 9
+"""Rays drawn along each axis."""
+_THICK_WITHIN = 0.05
+"""A prescription stands for the profile's lenses if its focal length is that close to theirs."""
+
+
+def tracer_for(profile: Profile) -> RayTracer:
+    """A tracer through the prescription that the profile's focal length suggests, else through ideal lenses."""
+    focal = profile.lens.focal_length_m
+    suited = [lens for lens in LENSES.values() if abs(lens.effective_focal_m / focal - 1) < _THICK_WITHIN]
+    return RayTracer(profile, suited[0] if suited else None)
+
+
+def _cases(settings: Settings) -> list[Case]:
+    return [{"name": f"{angle:+.1f}-degree", "angle_deg": angle} for angle in ANGLES_DEG]
+
+
+def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
+    profile = settings.profile
+    half = torch.tensor([profile.page_width_m, profile.page_height_m], dtype=torch.float64) / 2
+    places = page_places(_QUICK_GRID if settings.quick else _GRID)
+    angle = torch.deg2rad(torch.tensor(case["angle_deg"], dtype=torch.float64))
+    tracer = tracer_for(profile)
+    progress("trace the page", 0.0)
+    traced = tracer((places * half).reshape(-1, 2), angle)
+    line = torch.linspace(-1, 1, _DRAWN, dtype=torch.float64)
+    zero = torch.zeros_like(line)
+    along = [torch.stack(pair, dim=-1) * half for pair in ((line, zero), (zero, line))]
+    return {
+        "places": traced.places.reshape(places.shape).numpy(),
+        "valid": traced.valid.reshape(places.shape[:2]).numpy(),
+        "reflections": traced.reflections.reshape(places.shape).numpy(),
+        "path_x": tracer.path(along[0], angle).numpy(),
+        "path_y": tracer.path(along[1], angle).numpy(),
+    }
+
+
+def shared_with_others(places: NDArray[np.float64], zones: NDArray[np.int64], cell_m: float) -> NDArray[np.bool_]:
+    """Whether a ray lands in a cell of the camera plane where one of another zone lands too, [N].
+
+    Args:
+        places: on the camera plane, metres, [N, 2].
+        zones: reflections of each ray, [N, 2].
+        cell_m: edge of a cell.
+    """
+    cells = np.floor(places / cell_m).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    _, zone = np.unique(zones, axis=0, return_inverse=True)
+    pairs = np.unique(np.stack([cell.ravel(), zone.ravel()]), axis=1)
+    return np.asarray(np.bincount(pairs[0])[cell.ravel()] > 1)
+
+
+def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
+    rows: list[Row] = []
+    for case, result in zip(cases, results, strict=True):
+        zones, places = result["reflections"].reshape(-1, 2), result["places"].reshape(-1, 2)
+        step = float(np.ptp(result["places"][..., 0])) / result["places"].shape[1]
+        shared = shared_with_others(places, zones, 2 * step)
+        for x, y in np.unique(zones, axis=0):
+            chosen = (zones == (x, y)).all(1)
+            rows.append((f"{case['angle_deg']:g}", int(x), int(y), float(chosen.mean()), float(shared[chosen].mean())))
+    return rows
+
+
+def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) -> Figure:
+    figure = Figure(figsize=(15, 4.2 * len(cases)), layout="constrained")
+    axes = figure.subplots(len(cases), 4, squeeze=False)
+    shape = results[0]["places"].shape[:2]
+    page = page_places(shape).numpy()
+    for row, case, result in zip(axes, cases, results, strict=True):
+        for axis, name, component in ((row[0], "path_x", 0), (row[1], "path_y", 1)):
+            path = result[name]
+            axis.plot(path[:, :, 2] * 1e3, path[:, :, component] * 1e3, linewidth=0.8)
+            axis.set_xlabel("z, mm")
+            axis.set_ylabel(f"{'xy'[component]}, mm")
+            axis.set_title(f"{case['angle_deg']:g} degree: rays in {'xy'[component]}-z")
+        for axis, component in ((row[2], 0), (row[3], 1)):
+            places = result["places"] * 1e3
+            axis.scatter(places[..., 0], places[..., 1], c=page[..., component], s=2, cmap="viridis")
+            axis.set_aspect("equal")
+            axis.invert_yaxis()
+            axis.set_xlabel("x on the camera, mm")
+            axis.set_title(f"where rays land, coloured by {'xy'[component]} on the page")
+    return figure
+
+
+STUDY = Study(
+    title="where rays go, and which zones lie on top of themselves",
+    source="figure 4A and 4D",
+    cases=_cases,
+    measure=_measure,
+    header=("angle", "reflections x", "reflections y", "share of page", "on another zone"),
+    rows=_rows,
+    plot=_plot,
+)

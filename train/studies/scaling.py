@@ -1,0 +1,179 @@
+"""Time and memory of decoding against the number of symbols: transmission matrix, modes, coherent branches."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from optics.profile import Profile
+from optics.progress import Progress
+from optics.registration.parameters import nominal
+from optics.registration.table import sampling_table
+from train.field import FieldRecovery
+from train.fitting import Hyperparameters
+from train.localizers.coherent import CoherentLocalizer
+from train.network import SymbolUNet
+from train.published.localizers import ModeLocalizer
+from train.published.unet import samples_for
+from train.studies.study import Case, Result, Row, Settings, Study
+from train.twin import RayTwin, TorchTwin
+
+_ENLARGED = (1, 2, 4, 8)
+"""Linear sizes over the profile's: with bench, 5,000 to 312,000 symbols."""
+_MOST_BYTES = 4 << 30
+"""A transmission matrix beyond that is not made but extrapolated."""
+_REPEATS = 3
+METHODS = ("matrix", "modes", "coherent")
+_EXPECTED = {"matrix": 2.0, "modes": 1.5, "coherent": 1.0}
+"""Powers of the number of symbols."""
+
+
+def enlarged(profile: Profile, factor: int) -> Profile:
+    """The device with all lengths but pixels and wavelength multiplied: page, pipe, lenses, cameras grow together."""
+    return profile.model_copy(
+        update={
+            "name": f"{profile.name} x {factor}",
+            "lens": profile.lens.model_copy(update={"focal_length_m": factor * profile.lens.focal_length_m}),
+            "pipe": profile.pipe.model_copy(
+                update={"length_m": factor * profile.pipe.length_m, "width_m": factor * profile.pipe.width_m}
+            ),
+            "page": profile.page.model_copy(
+                update={"columns": factor * profile.page.columns, "rows": factor * profile.page.rows}
+            ),
+            "camera": profile.camera.model_copy(
+                update={
+                    "columns_px": factor * profile.camera.columns_px,
+                    "rows_px": factor * profile.camera.rows_px,
+                }
+            ),
+        }
+    )
+
+
+def _matrix(profile: Profile) -> tuple[Callable[[], object], int]:
+    count = profile.page.columns * profile.page.rows
+    matrix = torch.zeros(count, count, dtype=torch.complex64)
+    light = torch.randn(count, dtype=torch.complex64)
+    return lambda: matrix @ light, matrix.nbytes
+
+
+def _modes(profile: Profile) -> tuple[Callable[[], object], int]:
+    samples = samples_for(profile.page.symbol_size_px)
+    localizer = ModeLocalizer(profile, samples)
+    seen = torch.randn(1, 2, *localizer.places.shape[:2])
+    return lambda: localizer(seen), _bytes((localizer.x, localizer.y, localizer.pipe))
+
+
+def _coherent(profile: Profile) -> tuple[Callable[[], object], int]:
+    table = sampling_table(TorchTwin(RayTwin(profile)), nominal(), np.pi / 2, profile)
+    tensors = {name: torch.from_numpy(value) for name, value in table.items()}
+    recovery, localizer = FieldRecovery(profile).eval(), CoherentLocalizer(profile).eval()
+    choices = Hyperparameters()
+    network = SymbolUNet(localizer.light_channels, choices.channels, choices.blocks, choices.levels).eval()
+    reference = torch.full(profile.frame_shape, 100.0)
+    generator = torch.Generator().manual_seed(0)
+    frames = [reference + 20 * torch.randn(profile.frame_shape, generator=generator) for _ in range(2)]
+
+    def decode() -> object:
+        field, _ = recovery(*frames, reference, reference, tensors["registration"], tensors["homodyne"])
+        light = localizer(field, tensors["places"], tensors["place_gradients"], tensors["phases"])
+        return network(light.flatten(0, 2)[None], tensors["positions"][None])
+
+    return decode, _bytes((*tensors.values(), *network.parameters()))
+
+
+def _bytes(tensors: Iterable[Tensor]) -> int:
+    return sum(tensor.nbytes for tensor in tensors)
+
+
+_MAKERS = {"matrix": _matrix, "modes": _modes, "coherent": _coherent}
+
+
+def _cases(settings: Settings) -> list[Case]:
+    factors = _ENLARGED[:2] if settings.quick else _ENLARGED
+    return [
+        {"name": f"{method}-{factor}", "method": method, "factor": factor} for method in METHODS for factor in factors
+    ]
+
+
+def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
+    profile = enlarged(settings.profile, case["factor"])
+    count = profile.page.columns * profile.page.rows
+    if case["method"] == "matrix" and 8 * count**2 > _MOST_BYTES:
+        return {"symbols": count, "seconds": None, "bytes": 8 * count**2}
+    progress("prepare", 0.0)
+    with torch.inference_mode():
+        run, size = _MAKERS[case["method"]](profile)
+        run()
+        seconds = []
+        for repeat in range(_REPEATS):
+            progress("time", repeat / _REPEATS)
+            start = time.perf_counter()
+            run()
+            seconds.append(time.perf_counter() - start)
+    return {"symbols": count, "seconds": min(seconds), "bytes": size}
+
+
+def _series(
+    cases: Sequence[Case], results: Sequence[Result], method: str
+) -> tuple[list[Result], list[float], list[bool]]:
+    """Results of a method, seconds, and whether they were measured: what does not fit goes on as its power says."""
+    chosen = [result for case, result in zip(cases, results, strict=True) if case["method"] == method]
+    last = next(result for result in reversed(chosen) if result["seconds"] is not None)
+    seconds = [
+        last["seconds"] * (result["symbols"] / last["symbols"]) ** _EXPECTED[method]
+        if result["seconds"] is None
+        else result["seconds"]
+        for result in chosen
+    ]
+    return chosen, seconds, [result["seconds"] is not None for result in chosen]
+
+
+def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
+    rows: list[Row] = []
+    for method in METHODS:
+        chosen, seconds, measured = _series(cases, results, method)
+        first = seconds[0] / chosen[0]["symbols"]
+        for result, taken, real in zip(chosen, seconds, measured, strict=True):
+            each = taken / result["symbols"]
+            how = "measured" if real else "extrapolated"
+            rows.append((method, result["symbols"], taken, 1e6 * each, each / first, result["bytes"] / 1e6, how))
+    return rows
+
+
+def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) -> Figure:
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    time_axis, memory_axis = figure.subplots(1, 2)
+    for method, colour in zip(METHODS, ("tab:red", "tab:orange", "tab:blue"), strict=True):
+        chosen, seconds, measured = _series(cases, results, method)
+        symbols = [result["symbols"] for result in chosen]
+        time_axis.loglog(symbols, seconds, color=colour, label=f"{method}, power {_EXPECTED[method]:g} expected")
+        for axis, values in ((time_axis, seconds), (memory_axis, [result["bytes"] / 1e6 for result in chosen])):
+            for x, y, real in zip(symbols, values, measured, strict=True):
+                axis.plot(x, y, "o", color=colour, fillstyle="full" if real else "none")
+        memory_axis.loglog(symbols, [result["bytes"] / 1e6 for result in chosen], color=colour, label=method)
+    time_axis.set_ylabel("seconds a page")
+    memory_axis.set_ylabel("what the decoder holds of the device, MB")
+    for axis in (time_axis, memory_axis):
+        axis.set_xlabel("symbols on a page")
+        axis.grid(alpha=0.3)
+        axis.legend()
+    time_axis.set_title("open: extrapolated")
+    return figure
+
+
+STUDY = Study(
+    title="time and memory against the number of symbols",
+    source="the scaling that its introduction argues with",
+    cases=_cases,
+    measure=_measure,
+    header=("decoder", "symbols", "seconds", "us a symbol", "over the smallest", "MB", ""),
+    rows=_rows,
+    plot=_plot,
+)
