@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
@@ -151,6 +152,7 @@ def fit_published(
     training: Dataset[Page],
     validation: Dataset[Page],
     *,
+    callbacks: Sequence[Callback] = (),
     devices: int | str = "auto",
     progress: bool = True,
 ) -> Fitted[PublishedTraining]:
@@ -163,6 +165,7 @@ def fit_published(
         validation,
         steps=choices.steps,
         precision=choices.precision,
+        callbacks=callbacks,
         devices=devices,
         progress=progress,
     )

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from train.studies import (
+    angle,
     cross_section,
     drift,
     folding,
     imaging_condition,
+    pipe_length,
     rays,
     receptive_field,
     scaling,
+    symbol_size,
 )
 from train.studies.study import Study
 
@@ -21,5 +24,8 @@ STUDIES: dict[str, Study] = {
     "receptive-field": receptive_field.STUDY,
     "drift": drift.STUDY,
     "scaling": scaling.STUDY,
+    "symbol-size": symbol_size.STUDY,
+    "pipe-length": pipe_length.STUDY,
+    "angle": angle.STUDY,
 }
 """By the names of the command line."""

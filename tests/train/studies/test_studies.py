@@ -15,9 +15,21 @@ from optics.errors import InvalidInputError
 from optics.profile import load_profile
 from optics.simulator import TrueOptics
 from tests.optics.small import small_profile
-from train.studies import STUDIES, cross_section, drift, folding, imaging_condition, rays, receptive_field, scaling
+from train.studies import (
+    STUDIES,
+    cross_section,
+    drift,
+    folding,
+    imaging_condition,
+    pipe_length,
+    rays,
+    receptive_field,
+    scaling,
+    symbol_size,
+)
 from train.studies.cli_study import study
 from train.studies.study import Settings, aligned, measured
+from train.studies.trained import with_symbols_of
 
 SMALL = small_profile()
 
@@ -171,3 +183,42 @@ def test_a_matrix_that_does_not_fit_is_extrapolated_and_says_so() -> None:
     assert rows[0][-1] == "measured"
     assert rows[1][-1] == "extrapolated"
     assert rows[1][2] == pytest.approx(16.0)
+
+
+@pytest.mark.parametrize("name", [name for name in STUDIES if STUDIES[name].trains])
+def test_each_that_trains_makes_maps_of_every_case_and_shares_its_light(name: str, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL.to_toml())
+    out = tmp_path / "out"
+    run(name, "--quick", "--profile", str(tmp_path / "small.toml"), "--out", str(out))
+    cases = STUDIES[name].cases(Settings(SMALL, quick=True))
+    assert len(list(out.glob("results/*.h5"))) == len(cases) // 2  # two decoders on the same light
+    written = json.loads((out / "study.json").read_text())
+    assert len(written["rows"]) == len(cases)
+    for case in cases:
+        with np.load(out / "results" / f"{case['name']}.npz") as maps:
+            result = json.loads((out / "results" / f"{case['name']}.json").read_text())
+            assert float(np.nanmean(maps["air_map"])) == pytest.approx(result["air"], abs=1e-3)
+            assert np.isnan(maps["own_mi_map"]).any()  # pilots carry nothing
+            assert len(maps["validation_curve"]) > 1
+            assert (len(maps["angles"]) > 0) == (case["localizer"] == "ray")
+
+
+def test_what_trains_at_full_scale_asks_for_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(InvalidInputError, match="CUDA"):
+        run("angle", "--full", "--out", str(tmp_path / "out"))
+
+
+def test_a_smaller_device_has_a_shorter_pipe_with_as_many_walls() -> None:
+    bench, paper = load_profile("bench"), load_profile("paper")
+    assert pipe_length.scaled_length_m(paper, 75) == pytest.approx(0.075)
+    assert pipe_length.scaled_length_m(bench, 75) == pytest.approx(0.01875, rel=0.01)
+    assert pipe_length.LENGTHS_MM[-1] == 400
+
+
+def test_symbols_of_another_size_cover_the_same_page() -> None:
+    bench = load_profile("bench")
+    for size in symbol_size.SIZES_PX:
+        other = with_symbols_of(bench, size)
+        assert other.page_width_m == pytest.approx(bench.page_width_m, abs=16 * bench.slm.pitch_m)
+        assert other.page.symbol_size_px == size
