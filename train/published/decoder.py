@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -53,7 +55,7 @@ class PublishedDecoder(nn.Module):
         references: reference-only frames.
         localizer: see `make_localizer`.
         channels: of the U-Net.
-        outputs: numbers for each symbol.
+        classes: levels that it tells apart as classes; 0 for p itself.
     """
 
     def __init__(
@@ -62,27 +64,52 @@ class PublishedDecoder(nn.Module):
         references: FramePair,
         localizer: Localizer,
         channels: tuple[int, int] = (32, 64),
-        outputs: int = 2,
+        classes: int = 0,
     ) -> None:
         super().__init__()
         levels = [smooth_reference(frame) for frame in (references.in_phase, references.quadrature)]
         self.references: Tensor
         self.register_buffer("references", torch.from_numpy(np.stack(levels).astype(np.float32)), persistent=False)
         self.localizer = localizer
-        self.unet = PublishedUNet(samples_for(profile.page.symbol_size_px), channels, outputs)
+        self.unet = PublishedUNet(samples_for(profile.page.symbol_size_px), channels, classes or 2)
+        self._classes = classes
 
     def forward(self, frames: Tensor, shift_px: Tensor) -> Tensor:
         """Raw frames [N, 2, H, W] and how far their images have moved [N, 2] to p [N, 2, ny, nx]."""
+        return self._p(self.scores(frames, shift_px))
+
+    def scores(self, frames: Tensor, shift_px: Tensor) -> Tensor:
+        """The same to what the U-Net says: p itself, or the logit of each class [N, classes, ny, nx]."""
         with torch.autocast(frames.device.type, enabled=False):
             seen, level = sample_pair(frames.float(), self.references, self.localizer.grid(), shift_px)
-        return self.read(seen, level)
+        return self._scores(seen, level)
 
     def read(self, seen: Tensor, level: Tensor) -> Tensor:
         """Samples of the frames [N, 2, h, w] and of the references [N, 2, h, w], counts, to p [N, 2, ny, nx]."""
+        return self._p(self._scores(seen, level))
+
+    def _p(self, scores: Tensor) -> Tensor:
+        return p_of_classes(scores) if self._classes else scores
+
+    def _scores(self, seen: Tensor, level: Tensor) -> Tensor:
         with torch.autocast(seen.device.type, enabled=False):
             images = self.localizer(over_reference(seen, level))
             places = self.localizer.places.float().permute(2, 0, 1).expand(len(images), -1, -1, -1)
         return torch.as_tensor(self.unet(torch.cat([images, places], dim=1)))
+
+
+def p_of_classes(logits: Tensor) -> Tensor:
+    """The von Mises belief with the mean direction of a belief in M classes, [N, M, ny, nx] to p [N, 2, ny, nx].
+
+    Its concentration is that of the mean resultant's length R, R (2 - R^2) / (1 - R^2) to a few percent (Banerjee et
+    al., 2005).
+    """
+    levels = logits.shape[1]
+    belief = torch.softmax(logits.float(), dim=1)
+    angles = torch.arange(levels, device=logits.device) * (2 * math.pi / levels)
+    mean = torch.stack([torch.einsum("nmyx,m->nyx", belief, wave(angles)) for wave in (torch.cos, torch.sin)], dim=1)
+    squared = mean.square().sum(1, keepdim=True)
+    return torch.as_tensor(mean * (2 - squared) / (1 - squared).clamp(min=1e-5))
 
 
 def sample_pair(frames: Tensor, references: Tensor, grid: Tensor, shift_px: Tensor) -> tuple[Tensor, Tensor]:

@@ -84,4 +84,4 @@ def published_decoder(
     sign = 1 if np.sin(turn) > 0 else -1
     samples = samples_for(profile.page.symbol_size_px)
     chosen = make_localizer(localizer, profile, samples, choices.lenses, sign)
-    return PublishedDecoder(profile, references, chosen, choices.channels)
+    return PublishedDecoder(profile, references, chosen, choices.channels, choices.classes)

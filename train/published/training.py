@@ -13,6 +13,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 from torch.utils.data import DataLoader, Dataset
 
 from optics.page import symbol_phases
@@ -43,6 +44,7 @@ class PublishedChoices:
         lenses: of `train.published.decoder.LENS_CHOICES`.
         seed: of initial weights and batches.
         precision: Lightning's.
+        classes: levels that the decoder tells apart by cross-entropy; 0 for the von Mises likelihood.
     """
 
     channels: tuple[int, int] = (32, 64)
@@ -55,6 +57,7 @@ class PublishedChoices:
     lenses: str = "paraxial"
     seed: int = 0
     precision: str = "bf16-mixed"
+    classes: int = 0
 
 
 class FramePages(Dataset[Page]):
@@ -116,7 +119,12 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
         localizer = self.network.localizer
         if isinstance(localizer, RayLocalizer):
             self.log("angle_deg", math.degrees(localizer.angle.detach().item()))
-        return self.loss(self(frames, state), phases + state[:, 2, None, None])
+        asked, scores = phases + state[:, 2, None, None], self.network.scores(frames, state[:, :2])
+        if not self.choices.classes:
+            return self.loss(scores, asked)
+        loss = functional.cross_entropy(scores.float(), nearest_class(asked, self.choices.classes), reduction="none")
+        self.log("train_air", math.log2(self.choices.classes) - loss.detach()[:, self.data].mean() / math.log(2))
+        return loss[:, self.data].mean()
 
     def configure_optimizers(self) -> Any:
         """Adam; all rates warm up, the decoder's falls towards the end."""
@@ -144,6 +152,11 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
     def configure_gradient_clipping(self, *_: Any, **__: Any) -> None:
         """The U-Net's gradient, as one vector."""
         nn.utils.clip_grad_norm_(self.network.unet.parameters(), LARGEST_GRADIENT)
+
+
+def nearest_class(phases: Tensor, classes: int) -> Tensor:
+    """The level nearest to each phase, int64; half a level is lost where a piston turns the phases between levels."""
+    return torch.round(phases * (classes / (2 * math.pi))).long() % classes
 
 
 def fit_published(

@@ -7,6 +7,7 @@ from train.studies import (
     cross_section,
     drift,
     folding,
+    heads,
     imaging_condition,
     pipe_length,
     rays,
@@ -27,5 +28,6 @@ STUDIES: dict[str, Study] = {
     "symbol-size": symbol_size.STUDY,
     "pipe-length": pipe_length.STUDY,
     "angle": angle.STUDY,
+    "heads": heads.STUDY,
 }
 """By the names of the command line."""

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from optics.device import Device
 from optics.progress import Progress
 from train.studies.study import Case, Result, Row, Settings, Study
-from train.studies.trained import trained
+from train.studies.trained import Light, trained
 
 
 def _cases(settings: Settings) -> list[Case]:
@@ -19,7 +19,8 @@ def _cases(settings: Settings) -> list[Case]:
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    return trained(settings, settings.profile, Device(), case["localizer"], "light", work, progress)
+    light = Light("light", settings.profile, Device())
+    return trained(settings, light, case["localizer"], work, progress)
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:

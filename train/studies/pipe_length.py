@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from optics.profile import Profile, load_profile
 from optics.progress import Progress
 from train.studies.study import Case, Result, Row, Settings, Study
-from train.studies.trained import ideal_device, trained
+from train.studies.trained import Light, ideal_device, trained
 
 LENGTHS_MM = tuple(10 + 32.5 * step for step in range(13))
 """Of the full-size pipe, 10 to 400; those of a smaller device are as much shorter as its focal length."""
@@ -45,8 +45,8 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
     length = scaled_length_m(settings.profile, case["length_mm"])
     pipe = settings.profile.pipe.model_copy(update={"length_m": length, "angle_deg": 0.0})
     profile = settings.profile.model_copy(update={"pipe": pipe})
-    light = f"light-{case['length_mm']:g}mm"
-    return trained(settings, profile, ideal_device(), case["localizer"], light, work, progress)
+    light = Light(f"light-{case['length_mm']:g}mm", profile, ideal_device())
+    return trained(settings, light, case["localizer"], work, progress)
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import lightning as L
 import numpy as np
+import torch
 from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -23,7 +26,7 @@ from optics.device import (
     Reference,
     SlmDefects,
 )
-from optics.measures import achievable_rate, own_information
+from optics.measures import achievable_rate, decide_with_confidence, expected_calibration_error, own_information
 from optics.page import pilot_mask
 from optics.profile import Profile
 from optics.progress import Progress
@@ -32,7 +35,13 @@ from optics.recording_job import RecordingJob
 from train.features import PageState
 from train.fitting import best_kappa_scale, decode_pages, seed_stretch, without_piston
 from train.published.recipe import published_choices, published_decoder
-from train.published.training import FramePages, PublishedChoices, PublishedTraining, fit_published
+from train.published.training import (
+    FramePages,
+    PublishedChoices,
+    PublishedTraining,
+    fit_published,
+    nearest_class,
+)
 from train.run import begin
 from train.studies.study import Result, Settings
 
@@ -67,8 +76,24 @@ def with_symbols_of(profile: Profile, size_px: int) -> Profile:
     return profile.model_copy(update={"page": page.model_copy(update=update)})
 
 
+@dataclass(frozen=True)
+class Light:
+    """A recording of a simulated device that several decoders are trained on.
+
+    Attributes:
+        name: of its file, beside the folders of the cases.
+        profile, device: nominal and true.
+        levels: M of its pages.
+    """
+
+    name: str
+    profile: Profile
+    device: Device
+    levels: int = LEVELS
+
+
 def trained(
-    settings: Settings, profile: Profile, device: Device, localizer: str, light: str, work: Path, progress: Progress
+    settings: Settings, light: Light, localizer: str, work: Path, progress: Progress, *, classes: int = 0
 ) -> Result:
     """What a published decoder reaches on held-out pages of a simulated device, trained as its authors did.
 
@@ -76,57 +101,58 @@ def trained(
 
     Args:
         settings: of the study.
-        profile, device: nominal and true.
+        light: what is recorded.
         localizer: none, mode or ray.
-        light: name of the recording, which decoders of the same light share.
-        work: folder of the case; recordings lie beside it.
+        work: folder of the case.
         progress: told of the steps.
+        classes: see `PublishedChoices`.
 
     Returns:
-        air, own_mi: bits per data symbol; air_kB, own_mi_kB a page; steps; the maps air_map, own_mi_map and error_map
-        (root mean square phase error, radians), [ny, nx], NaN at pilots; curves: [points, 3] of step, AIR on the
-        training batch and on the validation pages; angles: [points, 2] of step and fitted pipe angle, degrees.
+        air, own_mi: bits per data symbol; air_kB, own_mi_kB a page; ece; steps; the maps air_map, own_mi_map and
+        error_map (root mean square phase error, radians), [ny, nx], NaN at pilots; training_curve, validation_curve
+        (AIR) and angles (fitted pipe angle, degrees), [points, 2] with the step first. With classes, air_map,
+        own_mi_map and ece are those of its beliefs in classes, and air_of_p is that of p.
     """
+    profile, device, levels = light.profile, light.device, light.levels
     pages = _QUICK_PAGES if settings.quick else PAGES
-    path = work.parent / f"{light}.h5"
+    path = work.parent / f"{light.name}.h5"
     progress("record", 0.0)
     if not path.exists():
-        job = RecordingJob(profile, device, LEVELS, settings.seed, truth=True, out=path)
+        job = RecordingJob(profile, device, levels, settings.seed, truth=True, out=path)
         job.claim(force=False)
         job.run(pages)
     held = max(2, round(_HELD_SHARE * pages))
     first, second = pages - 2 * held, pages - held
-    training, validation, unseen = range(first), range(first, second), range(second, pages)
-    choices = replace(published_choices(profile, len(training)), seed=settings.seed)
+    choices = replace(published_choices(profile, first), seed=settings.seed, classes=classes)
     if settings.quick:
         choices = replace(choices, **_QUICK)  # type: ignore[arg-type]
     mask = pilot_mask(profile)
     begin(work, asdict(choices) | {"channels": list(choices.channels), "localizer": localizer})
     with Recording.open(path) as recording:
         states = _true_states(path)
-        parts = [
-            FramePages(recording, part, [states[page] for page in part]) for part in (training, validation, unseen)
-        ]
+        training, validation, unseen = (
+            FramePages(recording, part, [states[page] for page in part])
+            for part in (range(first), range(first, second), range(second, pages))
+        )
         seed_stretch(work, choices.seed)
-        turn = device.homodyne.turn_rad
-        decoder = published_decoder(localizer, choices, profile, recording.references(), turn)
-        module = PublishedTraining(decoder, choices, mask, LEVELS)
+        decoder = published_decoder(localizer, choices, profile, recording.references(), device.homodyne.turn_rad)
+        module = PublishedTraining(decoder, choices, mask, levels)
         tell = _Tell(progress, choices)
-        fitted = fit_published(work, module, parts[0], parts[1], callbacks=[tell], progress=False)
-        scale = best_kappa_scale(fitted.module, parts[1], mask)
-        p, phases = decode_pages(fitted.module, parts[2])
-    maps = _maps(p * scale, phases, mask)
-    air, own = (float(np.nanmean(maps[name])) for name in ("air_map", "own_mi_map"))
-    data = int((~mask).sum())
-    curves = _curves(work / "tensorboard")
+        fitted = fit_published(work, module, training, validation, callbacks=[tell], progress=False)
+        scale = best_kappa_scale(fitted.module, validation, mask)
+        p, phases = decode_pages(fitted.module, unseen)
+        figures = _of_p(p * scale, phases, mask, levels)
+        if classes:
+            figures = {"air_of_p": _mean(figures["air_map"])} | figures | _of_classes(fitted.module, unseen, mask)
+    air, own, data = _mean(figures["air_map"]), _mean(figures["own_mi_map"]), int((~mask).sum())
     return {
         "air": air,
         "own_mi": own,
         "air_kB": air * data / 8000,
         "own_mi_kB": own * data / 8000,
         "steps": choices.steps,
-        **maps,
-        **curves,
+        **figures,
+        **_curves(work / "tensorboard"),
     }
 
 
@@ -146,20 +172,54 @@ def _true_states(path: Path) -> list[PageState]:
     return [PageState((float(x), float(y)), float(p)) for (x, y), p in zip(shifts, pistons, strict=True)]
 
 
-def _maps(
-    p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_]
-) -> dict[str, NDArray[np.float32]]:
-    """Means over the pages, symbol by symbol."""
-    rates, claims, errors = [], [], []
+def _mean(values: NDArray[np.float32]) -> float:
+    return float(np.nanmean(values))
+
+
+def _of_p(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> dict[str, Any]:
+    """Means over the pages, symbol by symbol, of what von Mises beliefs carry, claim and miss; and their ECE."""
+    rates, claims, errors, beliefs, right = [], [], [], [], []
     for page, truth in zip(p, phases, strict=True):
         px, py = without_piston(page, truth, mask)
         mu, kappa = np.arctan2(py, px), np.hypot(px, py)
-        symbols = (np.rint(truth * (LEVELS / (2 * np.pi))).astype(np.int64) % LEVELS).astype(np.uint8)
-        rates.append(achievable_rate(mu, kappa, symbols, LEVELS))
-        claims.append(own_information(kappa, LEVELS))
+        symbols = (np.rint(truth * (levels / (2 * np.pi))).astype(np.int64) % levels).astype(np.uint8)
+        rates.append(achievable_rate(mu, kappa, symbols, levels))
+        claims.append(own_information(kappa, levels))
         errors.append(np.angle(np.exp(1j * (mu - truth))) ** 2)
-    means = {"air_map": np.mean(rates, 0), "own_mi_map": np.mean(claims, 0), "error_map": np.sqrt(np.mean(errors, 0))}
-    return {name: np.where(mask, np.nan, value).astype(np.float32) for name, value in means.items()}
+        decided, confidence = decide_with_confidence(mu, kappa, levels)
+        beliefs.append(confidence[~mask])
+        right.append((decided == symbols)[~mask])
+    return {
+        "air_map": _over_pages(rates, mask),
+        "own_mi_map": _over_pages(claims, mask),
+        "error_map": np.sqrt(_over_pages(errors, mask)),
+        "ece": expected_calibration_error(np.concatenate(beliefs), np.concatenate(right)),
+    }
+
+
+def _of_classes(module: PublishedTraining, pages: FramePages, mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """The same of beliefs in classes, without errors of the phase."""
+    classes = module.choices.classes
+    rates, claims, beliefs, right = [], [], [], []
+    with torch.no_grad():
+        for frames, state, phases in (pages[index] for index in range(len(pages))):
+            scores = module.network.scores(frames[None], state[None, :2])[0].double()
+            log = torch.log_softmax(scores, dim=0) / math.log(2)
+            symbols = nearest_class(phases + state[2], classes)
+            rates.append((math.log2(classes) + log.gather(0, symbols[None])[0]).numpy())
+            claims.append((math.log2(classes) + (log.exp2() * log).sum(0)).numpy())
+            confidence, decided = log.exp2().max(0)
+            beliefs.append(confidence.numpy()[~mask])
+            right.append((decided == symbols).numpy()[~mask])
+    return {
+        "air_map": _over_pages(rates, mask),
+        "own_mi_map": _over_pages(claims, mask),
+        "ece": expected_calibration_error(np.concatenate(beliefs), np.concatenate(right)),
+    }
+
+
+def _over_pages(values: Sequence[NDArray[np.floating]], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    return np.where(mask, np.nan, np.mean(values, axis=0)).astype(np.float32)
 
 
 def _curves(folder: Path) -> dict[str, NDArray[np.float64]]:

@@ -200,7 +200,7 @@ def test_each_that_trains_makes_maps_of_every_case_and_shares_its_light(name: st
             assert float(np.nanmean(maps["air_map"])) == pytest.approx(result["air"], abs=1e-3)
             assert np.isnan(maps["own_mi_map"]).any()  # pilots carry nothing
             assert len(maps["validation_curve"]) > 1
-            assert (len(maps["angles"]) > 0) == (case["localizer"] == "ray")
+            assert (len(maps["angles"]) > 0) == (case.get("localizer") == "ray")
 
 
 def test_what_trains_at_full_scale_asks_for_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
