@@ -14,7 +14,7 @@ IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo test bench image check-image proto lint format clean
+.PHONY: help setup demo test bench bench-decoders image check-image proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -46,6 +46,10 @@ lint: $(STAMP)  ## ruff, mypy --strict, hadolint
 format: $(STAMP)  ## let ruff put the code in order
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+bench-decoders: $(STAMP)  ## every decoder on the same light, against the oracle: days on two cores, resumed when run again
+	$(BIN)/python -m benchmarks.decoders --angle 0 --angle -0.6 --symbol-size 4 --symbol-size 2 --pages 500 \
+	    --out runs/bench-decoders
 
 bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 	$(BIN)/lightpage bench

@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +100,22 @@ class Bench:
     training: range
     validation: range
     unseen: range
+
+    @classmethod
+    def of(cls, recording: Recording, profile: Profile, device: Device, out: Path) -> Bench:
+        """Calibrated, and split into pages for training, for validation and for the figures."""
+        pages = recording.pages - CALIBRATED
+        held, last = max(2, round(HELD_OUT_SHARE * pages)), recording.pages
+        return cls(
+            recording=recording,
+            profile=profile,
+            device=device,
+            fitted=calibrated(profile, recording, out / "calibration.toml"),
+            out=out,
+            training=range(CALIBRATED, last - 2 * held),
+            validation=range(last - 2 * held, last - held),
+            unseen=range(last - held, last),
+        )
 
     @property
     def mask(self) -> NDArray[np.bool_]:
@@ -252,8 +270,19 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
 
 @click.command()
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
-@click.option("--angle", "angle_deg", type=float, default=-0.6, show_default=True, help="Pipe angle, degrees.")
-@click.option("--full-well", type=float, default=32.0, show_default=True, help="Electrons; sets the noise.")
+@click.option(
+    "--angle", "angles_deg", type=float, multiple=True, default=(-0.6,), show_default=True, help="Pipe angle, degrees."
+)
+@click.option(
+    "--full-well", "full_wells", type=float, multiple=True, default=(32.0,), show_default=True, help="Electrons: noise."
+)
+@click.option(
+    "--symbol-size",
+    "symbol_sizes",
+    type=click.IntRange(1, 64),
+    multiple=True,
+    help="Edge of a symbol, modulator pixels; the profile's if left out.",
+)
 @click.option(
     "--pages", type=click.IntRange(12), default=240, show_default=True, help="With 8% validation, 8% held out."
 )
@@ -274,8 +303,9 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for features, runs, figures.json.")
 def main(
     profile_name: str,
-    angle_deg: float,
-    full_well: float,
+    angles_deg: tuple[float, ...],
+    full_wells: tuple[float, ...],
+    symbol_sizes: tuple[int, ...],
     pages: int,
     steps: int,
     sizes: tuple[str, ...],
@@ -285,61 +315,64 @@ def main(
     seed: int,
     out: Path,
 ) -> None:
-    """Train every arm on the same pages and print what it says of held-out ones."""
-    profile = load_profile(profile_name)
-    device = Device(sensor=Sensor(full_well_e=full_well)).with_settings([f"geometry.pipe_angle_deg={angle_deg}"])
+    """Train every arm on the same pages, light by light, and print what it says of held-out ones."""
+    nominal = load_profile(profile_name)
     click.get_current_context().with_resource(sole_writer(out))
-    begin(out, {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed})
-    path = out / "recording.h5"
+    lights: list[dict[str, Any]] = []
+    symbol_sizes = symbol_sizes or (nominal.page.symbol_size_px,)
+    for angle_deg, full_well, size_px in product(angles_deg, full_wells, symbol_sizes):
+        profile = nominal.with_symbols_of(size_px)
+        device = Device(sensor=Sensor(full_well_e=full_well)).with_settings([f"geometry.pipe_angle_deg={angle_deg}"])
+        folder = out / f"{angle_deg:g}deg-{full_well:g}e-{size_px}px"
+        folder.mkdir(exist_ok=True)
+        with recorded(profile, device, pages, seed, folder) as recording:
+            bench = Bench.of(recording, profile, device, folder)
+            runs: list[Callable[[], Outcome]] = []
+            for name in names:
+                if name in PUBLISHED:
+                    authors = replace(published_choices(profile, len(bench.training)), seed=seed)
+                    authors = authors if published_steps is None else replace(authors, steps=published_steps)
+                    widths = [replace(authors, channels=(width, 2 * width)) for width in published_channels]
+                    runs += [partial(bench.published_arm, name, choices) for choices in widths]
+                else:
+                    common = Hyperparameters(steps=steps, seed=seed)
+                    runs += [partial(bench.symbol_arm, name, size, common) for size in sizes]
+            outcomes: list[Outcome] = []
+            for run in runs:
+                outcomes = compared([*outcomes, run()])
+                light = {
+                    "angle_deg": angle_deg,
+                    "angle_error_deg": bench.fitted.angle_deg(profile) - angle_deg,
+                    "full_well_e": full_well,
+                    "symbol_size_px": size_px,
+                    "outcomes": [asdict(outcome) for outcome in outcomes],
+                }
+                write_json(out / "figures.json", {"pages": pages, "seed": seed, "lights": [*lights, light]})
+        lights.append(light)
+        click.echo(f"\n{angle_deg:g} degree, full well {full_well:g} e-, symbols of {size_px}x{size_px} pixels")
+        click.echo("\n".join([HEADER, *(outcome.line() for outcome in outcomes)]))
+
+
+@contextmanager
+def recorded(profile: Profile, device: Device, pages: int, seed: int, folder: Path) -> Iterator[Recording]:
+    """The recording of a light, with pages to calibrate on before the others; made if it is not there."""
+    begin(folder, {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed})
+    path = folder / "recording.h5"
     if not path.exists():
         job = RecordingJob(profile, device, LEVELS, seed, truth=True, out=path)
         job.claim(force=False)
         job.run(pages + CALIBRATED)
-    held = max(2, round(HELD_OUT_SHARE * pages))
-    last = CALIBRATED + pages
     with Recording.open(path) as recording:
-        bench = Bench(
-            recording=recording,
-            profile=profile,
-            device=device,
-            fitted=calibrated(profile, recording, out / "calibration.toml"),
-            out=out,
-            training=range(CALIBRATED, last - 2 * held),
-            validation=range(last - 2 * held, last - held),
-            unseen=range(last - held, last),
-        )
-        runs: list[Callable[[], Outcome]] = []
-        for name in names:
-            if name in PUBLISHED:
-                for width in published_channels:
-                    choices = replace(published_choices(profile, len(bench.training)), channels=(width, 2 * width))
-                    choices = choices if published_steps is None else replace(choices, steps=published_steps)
-                    runs.append(partial(bench.published_arm, name, replace(choices, seed=seed)))
-            else:
-                common = Hyperparameters(steps=steps, seed=seed)
-                runs += [partial(bench.symbol_arm, name, size, common) for size in sizes]
-        outcomes: list[Outcome] = []
-        for run in runs:
-            outcomes = against_oracle([*outcomes, run()])
-            figures = {
-                "angle_deg": angle_deg,
-                "angle_error_deg": bench.fitted.angle_deg(profile) - angle_deg,
-                "full_well_e": full_well,
-                "pages": pages,
-                "seed": seed,
-                "outcomes": [asdict(outcome) for outcome in outcomes],
-            }
-            write_json(out / "figures.json", figures)
-    click.echo("\n".join([HEADER, *(outcome.line() for outcome in outcomes)]))
+        yield recording
 
 
-def against_oracle(outcomes: list[Outcome]) -> list[Outcome]:
-    """The outcomes with their share of what the oracle reached with a network of the same size, where it was run."""
-    oracle = {outcome.size: outcome.air for outcome in outcomes if outcome.arm == "oracle"}
-    return [
-        replace(outcome, over_oracle=outcome.air / oracle[outcome.size]) if outcome.size in oracle else outcome
-        for outcome in outcomes
-    ]
+def compared(outcomes: list[Outcome]) -> list[Outcome]:
+    """The outcomes with their share of what the oracle reached, with a network of the same size if there was one."""
+    oracles = {outcome.size: outcome.air for outcome in outcomes if outcome.arm == ORACLE}
+    if not oracles:
+        return outcomes
+    best = max(oracles.values())
+    return [replace(outcome, over_oracle=outcome.air / oracles.get(outcome.size, best)) for outcome in outcomes]
 
 
 if __name__ == "__main__":

@@ -127,6 +127,13 @@ class Profile(Table):
         """Camera pixels as (rows, columns)."""
         return self.camera.rows_px, self.camera.columns_px
 
+    def with_symbols_of(self, size_px: int) -> Profile:
+        """The same device with symbols of another size, SLM pixels, on as much of its page as whole symbols cover."""
+        page = self.page
+        columns, rows = (count * page.symbol_size_px // size_px for count in (page.columns, page.rows))
+        update = {"columns": columns, "rows": rows, "symbol_size_px": size_px}
+        return self.model_copy(update={"page": page.model_copy(update=update)})
+
     def to_toml(self) -> str:
         """The profile as TOML text; `parse_profile` reads it back to an equal profile."""
         return to_toml(self)

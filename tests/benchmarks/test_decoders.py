@@ -64,21 +64,25 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     profile = tmp_path / "small.toml"
     profile.write_text(PROFILE.to_toml())
     out = tmp_path / "out"
-    out.mkdir()
-    calibration_of(Device()).save(out / "calibration.toml")
+    light = out / "-0.6deg-32e-4px"
+    light.mkdir(parents=True)
+    calibration_of(Device()).save(light / "calibration.toml")
     arguments = f"--profile {profile} --pages 12 --steps 20 --size 8x1x0 --arm coherent --arm oracle --arm none"
     arguments += f" --published-channels 4 --published-steps 12 --out {out}"
     first = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert first.exit_code == 0, first.output
-    figures = json.loads((out / "figures.json").read_text())
+    assert "-0.6 degree, full well 32 e-, symbols of 4x4 pixels" in first.output
+    (figures,) = json.loads((out / "figures.json").read_text())["lights"]
     coherent, oracle, none = figures["outcomes"]
     assert (coherent["arm"], oracle["arm"], oracle["over_oracle"]) == ("coherent", "oracle", 1)
     assert coherent["over_oracle"] == pytest.approx(coherent["air"] / oracle["air"])
     assert (none["arm"], none["size"], none["steps"]) == ("none", "4/8", 12)
+    assert none["over_oracle"] == pytest.approx(none["air"] / oracle["air"])
     assert figures["angle_error_deg"] == pytest.approx(0, abs=1e-9)
     again = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert "page/s" not in again.output
-    for one, other in zip(json.loads((out / "figures.json").read_text())["outcomes"], figures["outcomes"], strict=True):
+    outcomes = json.loads((out / "figures.json").read_text())["lights"][0]["outcomes"]
+    for one, other in zip(outcomes, figures["outcomes"], strict=True):
         # training is timed up to the last checkpoint, some moments before its end
         assert 0 < one.pop("training_seconds") <= other.pop("training_seconds")
         assert one == other

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from optics.device import Device
 from optics.progress import Progress
 from train.studies.study import Case, Result, Row, Settings, Study
-from train.studies.trained import Light, trained, with_symbols_of
+from train.studies.trained import Light, trained
 
 SIZES_PX = (16, 8, 4, 2)
 LOCALIZERS = ("mode", "ray")
@@ -27,7 +27,7 @@ def _cases(settings: Settings) -> list[Case]:
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    light = Light(f"light-{case['size']}", with_symbols_of(settings.profile, case["size"]), Device())
+    light = Light(f"light-{case['size']}", settings.profile.with_symbols_of(case["size"]), Device())
     return trained(settings, light, case["localizer"], work, progress)
 
 

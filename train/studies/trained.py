@@ -68,14 +68,6 @@ def ideal_device() -> Device:
     )
 
 
-def with_symbols_of(profile: Profile, size_px: int) -> Profile:
-    """The device with symbols of another size on about the same part of the modulator."""
-    page = profile.page
-    columns, rows = (count * page.symbol_size_px // size_px for count in (page.columns, page.rows))
-    update = {"columns": columns, "rows": rows, "symbol_size_px": size_px}
-    return profile.model_copy(update={"page": page.model_copy(update=update)})
-
-
 @dataclass(frozen=True)
 class Light:
     """A recording of a simulated device that several decoders are trained on.

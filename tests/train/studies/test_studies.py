@@ -29,7 +29,6 @@ from train.studies import (
 )
 from train.studies.cli_study import study
 from train.studies.study import Settings, aligned, measured
-from train.studies.trained import with_symbols_of
 
 SMALL = small_profile()
 
@@ -219,6 +218,6 @@ def test_a_smaller_device_has_a_shorter_pipe_with_as_many_walls() -> None:
 def test_symbols_of_another_size_cover_the_same_page() -> None:
     bench = load_profile("bench")
     for size in symbol_size.SIZES_PX:
-        other = with_symbols_of(bench, size)
+        other = bench.with_symbols_of(size)
         assert other.page_width_m == pytest.approx(bench.page_width_m, abs=16 * bench.slm.pitch_m)
         assert other.page.symbol_size_px == size
