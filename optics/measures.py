@@ -115,23 +115,51 @@ def gray_rate(
     return total
 
 
-def expected_calibration_error(
+@dataclass(frozen=True)
+class ConfidenceBin:
+    """Symbols of similar confidence: what was claimed of them against how often it was right."""
+
+    low: float
+    high: float
+    count: int
+    confidence: float
+    """Mean over the bin."""
+    accuracy: float
+    """Share of right decisions."""
+
+
+def reliability(
     confidence: NDArray[np.floating], correct: NDArray[np.bool_], bins: int = ECE_BINS
-) -> float:
-    """ECE: mean over symbols of |accuracy - mean confidence| of their bin, `bins` bins of equal width on 0..1.
+) -> list[ConfidenceBin]:
+    """Claim and accuracy in `bins` bins of equal width on 0..1, in order; empty bins are left out.
 
     Args:
         confidence: posterior of each decided symbol, any shape.
         correct: whether the decision was right, same shape.
         bins: number of bins.
+
+    Raises:
+        PageError: no symbols.
     """
     c = np.asarray(confidence, np.float64).ravel()
     if c.size == 0:
         raise PageError("confidences", "none", "at least one")
     index = np.clip((c * bins).astype(int), 0, bins - 1)
-    hits = np.bincount(index, np.asarray(correct, np.float64).ravel(), bins)
-    claims = np.bincount(index, c, bins)
-    return float(np.abs(hits - claims).sum() / c.size)
+    counts = np.bincount(index, minlength=bins)
+    claimed = np.bincount(index, c, bins) / np.maximum(counts, 1)
+    right = np.bincount(index, np.asarray(correct, np.float64).ravel(), bins) / np.maximum(counts, 1)
+    return [
+        ConfidenceBin(n / bins, (n + 1) / bins, int(counts[n]), float(claimed[n]), float(right[n]))
+        for n in np.flatnonzero(counts).tolist()
+    ]
+
+
+def expected_calibration_error(
+    confidence: NDArray[np.floating], correct: NDArray[np.bool_], bins: int = ECE_BINS
+) -> float:
+    """ECE: mean over symbols of |accuracy - mean confidence| of their bin; arguments and errors of `reliability`."""
+    found = reliability(confidence, correct, bins)
+    return sum(b.count * abs(b.accuracy - b.confidence) for b in found) / sum(b.count for b in found)
 
 
 @dataclass(frozen=True)
@@ -211,6 +239,52 @@ def measure(
         symbol_error_rate=float(1 - correct.mean()),
         ece=expected_calibration_error(confidence, correct),
     )
+
+
+@dataclass(frozen=True)
+class SymbolMaps:
+    """Means over pages at every place of the page, float64 [ny, nx], NaN at pilots.
+
+    Attributes:
+        air: bits.
+        own_mi: bits, as the decoder claims.
+        error_rad: of the phase error's magnitude, radians.
+    """
+
+    air: Floats
+    own_mi: Floats
+    error_rad: Floats
+
+
+def symbol_maps(
+    mu: NDArray[np.floating],
+    kappa: NDArray[np.floating],
+    symbols: NDArray[np.integer],
+    levels: int,
+    data: NDArray[np.bool_],
+) -> SymbolMaps:
+    """What `measure` averages over the page, place by place.
+
+    Args:
+        mu, kappa, symbols: of the data symbols, [pages, number of Trues in data] in row order.
+        levels: M.
+        data: where the data symbols are, bool [ny, nx].
+
+    Raises:
+        PageError: as `log_posterior`, or the number of symbols is not that of `data`.
+    """
+    m, phase, k, s = _checked(mu, kappa, symbols, levels)
+    if phase.ndim != 2 or phase.shape[1] != np.count_nonzero(data):
+        raise PageError("data symbols", f"shape {phase.shape}", f"(pages, {np.count_nonzero(data)})")
+
+    def spread(values: Floats) -> Floats:
+        page = np.full(data.shape, np.nan)
+        page[data] = values.mean(axis=0)
+        return page
+
+    turned = s * (2 * np.pi / m) - phase
+    error = np.abs(turned - 2 * np.pi * np.rint(turned / (2 * np.pi)))
+    return SymbolMaps(spread(achievable_rate(phase, k, s, m)), spread(own_information(k, m)), spread(error))
 
 
 def _log_partition(phase: Floats, kappa: Floats, levels: int) -> Floats:

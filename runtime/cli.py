@@ -26,7 +26,7 @@ EXIT_INTERRUPTED = 130
 """128 + SIGINT, as shells have it."""
 
 EXTRAS = {
-    "train": frozenset({"torch", "torchmetrics", "lightning", "tensorboard", "onnx", "onnxscript"}),
+    "train": frozenset({"torch", "torchmetrics", "lightning", "tensorboard", "jinja2", "onnx", "onnxscript"}),
     "camera": frozenset({"harvesters", "genicam"}),
 }
 
@@ -38,6 +38,7 @@ SUMMARIES = {
     "evaluate": "Measure a bundle on a recording with known symbols.",
     "export": "Turn a training run into a bundle.",
     "recalibrate": "Re-fit a drifted device's geometry and write a new bundle.",
+    "report": "Show a training run or an evaluation as an HTML page.",
     "rollback": "Put a service's previous model back in service.",
     "serve": "Run the service.",
     "simulate": "Record pages of a simulated device.",

@@ -9,15 +9,29 @@ from typing import Any
 import numpy as np
 
 from optics.errors import InvalidInputError, RecordingError
-from optics.measures import ConcentrationBin, PageMeasures, concentration_calibration, measure
-from optics.pilots import Pilots
+from optics.measures import (
+    ConcentrationBin,
+    ConfidenceBin,
+    PageMeasures,
+    SymbolMaps,
+    concentration_calibration,
+    decide_with_confidence,
+    measure,
+    reliability,
+    symbol_maps,
+)
+from optics.pilots import Pilots, estimate_piston
 from optics.recording import FramePair, Recording, hash_frames
 from runtime.decoder import Decoder
 from runtime.frames import narrow
+from runtime.manifest import GOLDEN
 from runtime.refused import RefusedPage, refusal
 from runtime.tracking import Tracker, decode_tracked
 
 PageDone = Callable[[], object]
+
+_MAP_DECIMALS = 4
+"""Of maps in JSON: finer than the noise of any number of pages, and short enough to write."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +48,9 @@ class Evaluation:
         inference_seconds_per_page: median of the inference alone.
         air_per_page: AIR of each page, bits per symbol.
         concentration_bins: what concentrations promise against what happened.
+        maps: means over the pages at every place of the page.
+        confidence_bins: what confidences claim against what was right.
+        bundle: what made the bundle and where it lay, as JSON can keep it.
         refused: pages that could not be decoded; no figure counts them.
     """
 
@@ -46,6 +63,9 @@ class Evaluation:
     inference_seconds_per_page: float
     air_per_page: tuple[float, ...]
     concentration_bins: tuple[ConcentrationBin, ...]
+    maps: SymbolMaps
+    confidence_bins: tuple[ConfidenceBin, ...]
+    bundle: dict[str, Any]
     refused: tuple[RefusedPage, ...] = ()
 
     @property
@@ -73,6 +93,9 @@ class Evaluation:
             "inference_seconds_per_page": self.inference_seconds_per_page,
             "air_per_page": list(self.air_per_page),
             "concentration_bins": [asdict(part) for part in self.concentration_bins],
+            "confidence_bins": [asdict(part) for part in self.confidence_bins],
+            "maps": {name: page.round(_MAP_DECIMALS).tolist() for name, page in vars(self.maps).items()},
+            "bundle": self.bundle,
             "refused_pages": [asdict(page) for page in self.refused],
         }
 
@@ -145,6 +168,7 @@ def evaluate(
             "pages that the bundle has not seen",
         )
     phase, concentration, truth = np.concatenate(phases), np.concatenate(concentrations), np.concatenate(truths)
+    decided, confidence = decide_with_confidence(phase, concentration, levels)
     return Evaluation(
         bundle_version=decoder.version,
         figures=measure(phase, concentration, truth, levels),
@@ -157,5 +181,23 @@ def evaluate(
             measure(*page, levels).air_bits_per_symbol for page in zip(phases, concentrations, truths, strict=True)
         ),
         concentration_bins=tuple(concentration_calibration(phase, concentration, truth, levels)),
+        maps=symbol_maps(np.stack(phases), np.stack(concentrations), np.stack(truths), levels, data),
+        confidence_bins=tuple(reliability(confidence, decided == truth)),
+        bundle=_describe(decoder, levels),
         refused=tuple(refused),
     )
+
+
+def _describe(decoder: Decoder, levels: int) -> dict[str, Any]:
+    """The bundle's device and origin, the hash of its golden page, and the piston in the answer to that, radians."""
+    bundle, manifest = decoder.bundle, decoder.bundle.manifest
+    return {
+        "path": str(bundle.path.resolve()),
+        "name": manifest.name,
+        "profile": manifest.profile,
+        "calibration": manifest.calibration,
+        "metrics": manifest.metrics,
+        "provenance": manifest.provenance.model_dump(),
+        "golden_sha256": manifest.files[GOLDEN],
+        "golden_piston_rad": estimate_piston(bundle.golden.p, decoder.pilots(levels)).angle_rad,
+    }

@@ -112,6 +112,35 @@ def test_ece_is_the_gap_between_claim_and_accuracy() -> None:
     assert measures.expected_calibration_error(two_bins, correct) == pytest.approx(0.05)
 
 
+def test_bins_of_confidence_hold_every_symbol_once_with_its_claim_and_outcome() -> None:
+    confidence = np.repeat([0.95, 0.55, 1.0, 0.25], [500, 400, 100, 1])
+    bins = measures.reliability(confidence, np.arange(1001) % 4 > 0, bins=10)
+    counted = [(round(b.low, 9), round(b.high, 9), b.count) for b in bins]
+    assert counted == [(0.2, 0.3, 1), (0.5, 0.6, 400), (0.9, 1.0, 600)]
+    assert [b.confidence for b in bins] == pytest.approx([0.25, 0.55, (500 * 0.95 + 100) / 600])
+    assert [b.accuracy for b in bins] == [0, 0.75, 0.75]
+    with pytest.raises(PageError, match="confidences"):
+        measures.reliability(np.empty(0), np.empty(0, bool))
+
+
+def test_maps_average_to_the_figures_of_the_page() -> None:
+    data = np.random.default_rng(8).random((5, 7)) > 0.2
+    kappa = np.random.default_rng(9).gamma(2.0, 20.0, (3, np.count_nonzero(data)))
+    symbols, mu = drawn_page(64, kappa, 10)
+    maps, figures = measures.symbol_maps(mu, kappa, symbols, 64, data), measures.measure(mu, kappa, symbols, 64)
+    assert np.nanmean(maps.air) == pytest.approx(figures.air_bits_per_symbol)
+    assert np.nanmean(maps.own_mi) == pytest.approx(figures.own_mi_bits_per_symbol)
+    for page in (maps.air, maps.own_mi, maps.error_rad):
+        assert np.array_equal(np.isfinite(page), data)
+    # each symbol's errors stay at its own place, whatever the winding
+    off = symbols * (2 * np.pi / 64) + np.arange(kappa.shape[1]) * 0.01 * np.array([1, -1, 1])[:, None] + 4 * np.pi
+    assert measures.symbol_maps(off, kappa, symbols, 64, data).error_rad[data] == pytest.approx(
+        np.arange(kappa.shape[1]) * 0.01
+    )
+    with pytest.raises(PageError, match="data symbols"):
+        measures.symbol_maps(mu[:, 1:], kappa[:, 1:], symbols[:, 1:], 64, data)
+
+
 def test_honest_concentrations_keep_their_promise_in_every_bin_and_doubled_ones_do_not() -> None:
     kappa = np.random.default_rng(6).gamma(2.0, 5.0, 100_000)
     symbols, mu = drawn_page(64, kappa, 7)

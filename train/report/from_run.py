@@ -1,0 +1,194 @@
+"""A report's contents from the folder of a finished training run: its validation pages, decoded again."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.utils.data import Dataset
+
+from optics.errors import InvalidInputError, RecordingError
+from optics.measures import concentration_calibration, decide_with_confidence, measure, reliability, symbol_maps
+from optics.page import MAX_LEVELS, MIN_LEVELS
+from optics.recording import FramePair, Recording
+from train.feature_store import FeatureStore
+from train.features import PageState
+from train.fitting import DecoderTraining, Page, SymbolTraining, decode_pages, without_piston
+from train.published.localizers import RayLocalizer
+from train.published.recipe import published_decoder
+from train.published.training import FramePages, PublishedChoices, PublishedTraining
+from train.report.data import Curve, Golden, Rays, ReportData, how_long
+from train.run import GOLDEN, REFERENCES, Run, load_arrays, load_network, load_run, load_weights
+
+TAGS = ("train_nll", "train_air", "val_air", "angle_deg")
+"""What training logs and a report draws; the angle is that of a decoder by rays."""
+
+_PHASE_TOLERANCE = 1e-2
+"""Of a level: phases are kept in float32, which knows 2 pi to 1e-5 of 256 levels."""
+
+Decodable = tuple[DecoderTraining[Any], Dataset[Page]]
+
+
+def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportData:
+    """Decode the validation pages of a run and measure them.
+
+    Args:
+        folder: of the run.
+        recording_path: that it was trained on; needed for a published decoder, which reads its frames.
+
+    Raises:
+        InvalidInputError: no finished run, or one that lacks a part; a recording that is missing or not the run's.
+    """
+    run, kept = load_run(folder), load_arrays(folder / REFERENCES)
+    mask = kept["pilots"]
+    with _decodable(folder, run, kept, recording_path) as (module, pages):
+        outputs, phases = decode_pages(module.eval(), pages)
+    levels = levels_of(phases)
+    p = np.stack([without_piston(run.kappa_scale * o, t, mask) for o, t in zip(outputs, phases, strict=True)])
+    symbols = np.rint(phases[:, ~mask] * (levels / (2 * np.pi))).astype(np.int64) % levels
+    phase, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])[:, ~mask]
+    mu = phase[:, ~mask]
+    decided, confidence = decide_with_confidence(mu, kappa, levels)
+    golden = load_arrays(folder / GOLDEN)
+    return ReportData(
+        title=f"Training run on {run.profile.name}",
+        pages=f"All figures are of the {len(p)} validation pages of this run. No weights were fitted to them, but "
+        "which weights were kept and how their concentrations are scaled was chosen by them: they are no held-out "
+        "test. For that, make the report of an evaluation.",
+        facts=_facts(run, module),
+        profile=run.profile,
+        calibration=run.calibration,
+        rays=_rays(run, module),
+        measures=measure(mu, kappa, symbols, levels),
+        maps=symbol_maps(mu, kappa, symbols, levels, ~mask),
+        confidence_bins=reliability(confidence, decided == symbols),
+        concentration_bins=concentration_calibration(mu, kappa, symbols, levels),
+        curves=curves_of(folder),
+        golden=Golden(FramePair(golden["in_phase"], golden["quadrature"]), phase[0]),
+    )
+
+
+@contextmanager
+def _decodable(
+    folder: Path, run: Run, kept: dict[str, NDArray[Any]], recording_path: Path | None
+) -> Iterator[Decodable]:
+    """The trained decoder and the validation pages as it takes them."""
+    choices = run.hyperparameters
+    if recording_path is None:
+        if isinstance(choices, PublishedChoices):
+            wanted = f"the recording of the run: its decoder, {run.localizer}, reads camera frames"
+            raise InvalidInputError("--recording", "none", wanted)
+        yield _at_symbol_pitch(folder, run, kept)
+        return
+    with Recording.open(recording_path) as recording:
+        validation = validation_pages(run, recording)
+        if not isinstance(choices, PublishedChoices):
+            yield _at_symbol_pitch(folder, run, kept)
+            return
+        references = FramePair(kept["in_phase"], kept["quadrature"])
+        decoder = published_decoder(run.localizer, choices, run.profile, references, run.calibration.turn_rad)
+        module = PublishedTraining(load_weights(folder, decoder), choices, kept["pilots"], recording.levels)
+        yield module, FramePages(recording, validation, _states(folder, run))
+
+
+def _at_symbol_pitch(folder: Path, run: Run, kept: dict[str, NDArray[Any]]) -> Decodable:
+    first, validated, _ = run.pages
+    try:
+        store = FeatureStore(folder / "features", range(first, first + validated))
+        light = store[0][0]
+    except (OSError, ValueError, IndexError) as error:
+        raise InvalidInputError(f"run {folder}: features", error, "the features that training left there") from None
+    choices = run.hyperparameters
+    assert not isinstance(choices, PublishedChoices)
+    return SymbolTraining(load_network(folder, run, len(light)), choices, kept["pilots"], MAX_LEVELS), store
+
+
+def validation_pages(run: Run, recording: Recording) -> list[int]:
+    """Where the validation pages of a run lie in its recording.
+
+    Raises:
+        RecordingError: it is not that recording.
+    """
+    recording.check_against(run.profile)
+    thing = f"recording {recording.path}"
+    if not recording.has_symbols:
+        raise RecordingError(thing, "no symbols", "the recording that the run was trained on")
+    wanted = run.trained_pages[run.pages[0] :]
+    found: dict[str, int] = {}
+    for page in range(recording.pages):
+        found.setdefault(recording.page_hash(page), page)
+        if all(page_hash in found for page_hash in wanted):
+            return [found[page_hash] for page_hash in wanted]
+    there = f"{sum(page_hash in found for page_hash in wanted)} of {len(wanted)} validation pages"
+    raise RecordingError(thing, there, "the recording that the run was trained on")
+
+
+def _states(folder: Path, run: Run) -> list[PageState]:
+    path = folder / "states.json"
+    try:
+        kept = json.loads(path.read_text())["states"][run.pages[0] :]
+        return [PageState((s["shift_px"][0], s["shift_px"][1]), s["piston_rad"]) for s in kept]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InvalidInputError(f"states {path}", error, "the states of the pages that training left there") from None
+
+
+def levels_of(phases: NDArray[np.floating]) -> int:
+    """The fewest levels that hold all of these phases, radians: M where thousands of symbols were drawn from M.
+
+    Raises:
+        InvalidInputError: no level count up to 256 does.
+    """
+    turns = np.unique(phases).astype(np.float64) / (2 * np.pi)
+    for levels in range(MIN_LEVELS, MAX_LEVELS + 1):
+        if np.abs(turns * levels - np.rint(turns * levels)).max() < _PHASE_TOLERANCE:
+            return levels
+    raise InvalidInputError("phases of the validation pages", "no equal steps", f"at most {MAX_LEVELS} levels")
+
+
+def curves_of(folder: Path) -> dict[str, Curve] | str:
+    """What TensorBoard files of a run say, by tag; a sentence where there are none."""
+    logs = folder / "tensorboard"
+    if not any(logs.glob("events.*")):
+        return "There are no curves: the run has no TensorBoard files any more."
+    events = EventAccumulator(str(logs), size_guidance={"scalars": 0})
+    events.Reload()
+    tags = [tag for tag in TAGS if tag in events.Tags()["scalars"]]
+    # an interrupted run repeats the steps behind its last checkpoint; what came later holds
+    return {tag: sorted({e.step: float(e.value) for e in events.Scalars(tag)}.items()) for tag in tags}
+
+
+def _rays(run: Run, module: DecoderTraining[Any]) -> Rays:
+    localizer = getattr(module.network, "localizer", None)
+    if isinstance(localizer, RayLocalizer):
+        angle = math.degrees(localizer.angle.item())
+        return Rays(angle, "the angle that the decoder was trained to", localizer.tracer.lens, own=True)
+    return Rays(run.calibration.angle_deg(run.profile), "the calibrated angle")
+
+
+def _facts(run: Run, module: DecoderTraining[Any]) -> list[tuple[str, str]]:
+    choices, (trained, validated, left) = run.hyperparameters, run.pages
+    size = sum(parameter.numel() for parameter in module.network.parameters())
+    if isinstance(choices, PublishedChoices):
+        network = "published U-Net of {} and {} channels".format(*choices.channels)
+    else:
+        network = f"{choices.channels} channels, {choices.blocks} blocks, {choices.levels} levels below symbol pitch"
+    provenance = run.provenance
+    return [
+        ("Localizer", run.localizer),
+        ("Network", f"{network}; {size:,} parameters"),
+        ("Training pages", f"{trained} recorded, {run.synthetic_pages} synthetic"),
+        ("Other pages", f"{validated} for validation, {left} left for an evaluation"),
+        ("Training", f"{choices.steps:,} steps of {choices.batch} pages in {how_long(run.seconds)}"),
+        ("Validation AIR in training", f"{run.validation_air:.3f} bit/symbol, before concentrations were scaled"),
+        ("Scale of the concentrations", f"{run.kappa_scale:.3f}"),
+        ("Trained by", str(provenance.get("command", "")) or "not noted"),
+        ("Seed", str(provenance.get("seed", "not noted"))),
+        ("Commit", str(provenance.get("commit", "")) or "not noted"),
+    ]
