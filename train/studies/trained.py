@@ -26,7 +26,7 @@ from optics.device import (
     Reference,
     SlmDefects,
 )
-from optics.measures import achievable_rate, decide_with_confidence, expected_calibration_error, own_information
+from optics.measures import expected_calibration_error, measure, symbol_maps
 from optics.page import pilot_mask
 from optics.profile import Profile
 from optics.progress import Progress
@@ -101,8 +101,8 @@ def trained(
 
     Returns:
         air, own_mi: bits per data symbol; air_kB, own_mi_kB a page; ece; steps; the maps air_map, own_mi_map and
-        error_map (root mean square phase error, radians), [ny, nx], NaN at pilots; training_curve, validation_curve
-        (AIR) and angles (fitted pipe angle, degrees), [points, 2] with the step first. With classes, air_map,
+        error_map (mean magnitude of the phase error, radians), [ny, nx], NaN at pilots; training_curve and
+        validation_curve (AIR) and angles (pipe angle, degrees), [points, 2], step first. With classes, air_map,
         own_mi_map and ece are those of its beliefs in classes, and air_of_p is that of p.
     """
     profile, device, levels = light.profile, light.device, light.levels
@@ -169,24 +169,13 @@ def _mean(values: NDArray[np.float32]) -> float:
 
 
 def _of_p(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> dict[str, Any]:
-    """Means over the pages, symbol by symbol, of what von Mises beliefs carry, claim and miss; and their ECE."""
-    rates, claims, errors, beliefs, right = [], [], [], [], []
-    for page, truth in zip(p, phases, strict=True):
-        px, py = without_piston(page, truth, mask)
-        mu, kappa = np.arctan2(py, px), np.hypot(px, py)
-        symbols = (np.rint(truth * (levels / (2 * np.pi))).astype(np.int64) % levels).astype(np.uint8)
-        rates.append(achievable_rate(mu, kappa, symbols, levels))
-        claims.append(own_information(kappa, levels))
-        errors.append(np.angle(np.exp(1j * (mu - truth))) ** 2)
-        decided, confidence = decide_with_confidence(mu, kappa, levels)
-        beliefs.append(confidence[~mask])
-        right.append((decided == symbols)[~mask])
-    return {
-        "air_map": _over_pages(rates, mask),
-        "own_mi_map": _over_pages(claims, mask),
-        "error_map": np.sqrt(_over_pages(errors, mask)),
-        "ece": expected_calibration_error(np.concatenate(beliefs), np.concatenate(right)),
-    }
+    """What von Mises beliefs carry, claim and miss, as means over the pages, symbol by symbol; and their ECE."""
+    px, py = np.stack([without_piston(*page, mask)[:, ~mask] for page in zip(p, phases, strict=True)], axis=1)
+    mu, kappa = np.arctan2(py, px), np.hypot(px, py)
+    symbols = np.rint(phases[:, ~mask] * (levels / (2 * np.pi))).astype(np.int64) % levels
+    maps = symbol_maps(mu, kappa, symbols, levels, ~mask)
+    figures = measure(mu, kappa, symbols, levels)
+    return {"air_map": maps.air, "own_mi_map": maps.own_mi, "error_map": maps.error_rad, "ece": figures.ece}
 
 
 def _of_classes(module: PublishedTraining, pages: FramePages, mask: NDArray[np.bool_]) -> dict[str, Any]:
