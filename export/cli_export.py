@@ -10,10 +10,19 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from export.graph import FRAME_INPUTS, DecoderGraph, Graph, PublishedGraph, published_tensors, table_tensors
+from export.graph import (
+    FRAME_INPUTS,
+    WAVE_TABLE_INPUTS,
+    DecoderGraph,
+    Graph,
+    PublishedGraph,
+    WaveGraph,
+    published_tensors,
+    table_tensors,
+)
 from export.onnx_files import decoder_onnx, twin_onnx
 from export.parity import check_parity, torch_answer
-from optics.errors import BundleError, InvalidInputError
+from optics.errors import BundleError
 from optics.files import NewPath, OutputFile, write_json
 from optics.progress import Progress, percent_bar
 from optics.recording import FramePair
@@ -24,7 +33,7 @@ from runtime.frames import narrow
 from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version
 from runtime.ort import open_session
 from train.localizers.coherent import CoherentLocalizer
-from train.published.localizers import NAMES as PUBLISHED
+from train.localizers.wave import WaveLocalizer
 from train.published.recipe import published_decoder
 from train.published.training import PublishedChoices
 from train.run import GOLDEN as RUN_GOLDEN
@@ -68,7 +77,7 @@ def export_run(
         The bundle as opened again, and the relative error of p against torch on the golden page.
 
     Raises:
-        InvalidInputError: the run is unfinished or of a localizer that has no exported graph.
+        InvalidInputError: the run is unfinished.
         BundleError: `version` is none, or the exported decoder does not say what torch says; nothing stays at `out`.
     """
     check_version(version, "--version")
@@ -129,20 +138,22 @@ def _graph(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tupl
     """A run's decoder as a graph, and the defaults of its table.
 
     Raises:
-        InvalidInputError: a localizer that has no graph, or no weights.
+        InvalidInputError: no weights.
     """
     profile, calibration, choices = run.profile, run.calibration, run.hyperparameters
     if isinstance(choices, PublishedChoices):
         decoder = published_decoder(run.localizer, choices, profile, references, calibration.turn_rad)
         published = PublishedGraph(load_weights(folder, decoder), run.kappa_scale).eval()
         return published, published_tensors(decoder)
-    if run.localizer != "coherent":
-        wanted = f"'coherent' or one of {', '.join(PUBLISHED)}, which have a graph"
-        raise InvalidInputError(f"run {folder}: localizer", repr(run.localizer), wanted)
-    network = load_network(folder, run, CoherentLocalizer(profile).light_channels)
     table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
-    graph = DecoderGraph(profile, network, run.kappa_scale).eval()
-    return graph, table_tensors(table, references.in_phase, references.quadrature)
+    frames = references.in_phase, references.quadrature
+    if run.localizer == "wave":
+        localizer = WaveLocalizer(profile, calibration.vector)
+        network = load_network(folder, run, localizer.light_channels)
+        waves = WaveGraph(profile, localizer, network, run.kappa_scale).eval()
+        return waves, table_tensors(table, *frames, WAVE_TABLE_INPUTS)
+    network = load_network(folder, run, CoherentLocalizer(profile).light_channels)
+    return DecoderGraph(profile, network, run.kappa_scale).eval(), table_tensors(table, *frames)
 
 
 def _residual_limit(graph: Graph, pair: FramePair, defaults: Tensors) -> float | None:

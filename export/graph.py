@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from optics.profile import Profile
 from train.field import FieldRecovery, relative_power
 from train.localizers.coherent import CoherentLocalizer
+from train.localizers.wave import WaveLocalizer
 from train.network import SymbolUNet
 from train.published.decoder import PublishedDecoder, sample_frames
 
@@ -27,6 +28,8 @@ TABLE_INPUTS = (
     "positions",
 )
 """Inputs that carry the calibrated table as their default and may be fed instead."""
+WAVE_TABLE_INPUTS = tuple(name for name in TABLE_INPUTS if name not in ("places", "place_gradients", "phases"))
+"""The same of a decoder by waves, which holds the pipe's geometry itself."""
 PUBLISHED_TABLE_INPUTS = ("grid", "levels")
 """The same of a published decoder: where it samples the frames, and the references there."""
 OUTPUTS = (*ANSWERS, "residual", "field", "unexplained")
@@ -78,6 +81,48 @@ class DecoderGraph(nn.Module):
         return *_answers(p), relative_power(left, field), field, left
 
 
+class WaveGraph(nn.Module):
+    """Field recovery, wave localizer and network behind each other; the geometry is a constant of the graph.
+
+    Args:
+        profile: the nominal device.
+        localizer: of the fitted device.
+        network: trained.
+        kappa_scale: factor on p that makes its length an honest concentration.
+    """
+
+    outputs = OUTPUTS
+
+    def __init__(self, profile: Profile, localizer: WaveLocalizer, network: SymbolUNet, kappa_scale: float) -> None:
+        super().__init__()
+        self.recovery = FieldRecovery(profile)
+        self.localizer = localizer
+        self.network = network
+        self.kappa_scale = kappa_scale
+
+    def forward(
+        self,
+        in_phase: Tensor,
+        quadrature: Tensor,
+        reference_in_phase: Tensor,
+        reference_quadrature: Tensor,
+        registration: Tensor,
+        homodyne: Tensor,
+        positions: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """Decode one pair; see `OUTPUTS` and, for the table, `optics.registration.table`."""
+        field, left = self.recovery(
+            in_phase.to(torch.float32),
+            quadrature.to(torch.float32),
+            reference_in_phase.to(torch.float32),
+            reference_quadrature.to(torch.float32),
+            registration,
+            homodyne,
+        )
+        p = self.network(self.localizer(field).flatten(0, 2)[None], positions[None])[0] * self.kappa_scale
+        return *_answers(p), relative_power(left, field), field, left
+
+
 class PublishedGraph(nn.Module):
     """A published decoder with its sampling grid as a constant.
 
@@ -105,11 +150,14 @@ def _answers(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def table_tensors(
-    table: dict[str, NDArray[np.float32]], in_phase: NDArray[np.integer], quadrature: NDArray[np.integer]
+    table: dict[str, NDArray[np.float32]],
+    in_phase: NDArray[np.integer],
+    quadrature: NDArray[np.integer],
+    names: tuple[str, ...] = TABLE_INPUTS,
 ) -> dict[str, NDArray[np.generic]]:
-    """The defaults of `TABLE_INPUTS`, in order: the sampling table and the reference-only frames."""
+    """The defaults of `names`, in order: from the sampling table and the reference-only frames."""
     tensors = {"reference_in_phase": in_phase, "reference_quadrature": quadrature, **table}
-    return {name: tensors[name] for name in TABLE_INPUTS}
+    return {name: tensors[name] for name in names}
 
 
 def published_tensors(decoder: PublishedDecoder) -> dict[str, NDArray[np.generic]]:
@@ -120,5 +168,5 @@ def published_tensors(decoder: PublishedDecoder) -> dict[str, NDArray[np.generic
     return dict(zip(PUBLISHED_TABLE_INPUTS, (grid.numpy(), levels.numpy()), strict=True))
 
 
-Graph = DecoderGraph | PublishedGraph
+Graph = DecoderGraph | WaveGraph | PublishedGraph
 """Frames and then, in the order of their defaults, table tensors in; `outputs` out."""

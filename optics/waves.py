@@ -134,6 +134,10 @@ class FourierLens:
         geometry: the device.
         x_m, y_m: sample positions on the plane, uniform, [nx] and [ny].
         cells: sample intervals of the pipe along (y', x).
+
+    Attributes:
+        x_to_x, y_and_x, y_to_y: the three couplings that factor, [nx, fx], [ny, fx] and [fy, ny].
+        facet_terms, plane_terms: terms of the fourth, [R, fy] and [R, nx].
     """
 
     def __init__(self, geometry: WaveGeometry, x_m: Real, y_m: Real, cells: tuple[int, int]) -> None:
@@ -147,17 +151,17 @@ class FourierLens:
 
         area = (x_m[1] - x_m[0]) * (y_m[1] - y_m[0]) * (w / cells[0]) * (w / cells[1]) / cos(t)
         unitary = np.sqrt(area) / (geometry.wavelength_m * geometry.focal_length_m)
-        self._x_to_x = (unitary * kernel(cos(roll) + tan(t) * sin(roll), x_m, facet_x)).astype(np.complex64)
-        self._y_and_x = kernel(sin(roll) - tan(t) * cos(roll), y_m, facet_x).astype(np.complex64)
-        self._y_to_y = kernel(cos(roll) / cos(t), facet_y, y_m).astype(np.complex64)
-        self._facet_terms, self._plane_terms = _separated(kernel(-sin(roll) / cos(t), facet_y, x_m), facet_y, x_m)
+        self.x_to_x = (unitary * kernel(cos(roll) + tan(t) * sin(roll), x_m, facet_x)).astype(np.complex64)
+        self.y_and_x = kernel(sin(roll) - tan(t) * cos(roll), y_m, facet_x).astype(np.complex64)
+        self.y_to_y = kernel(cos(roll) / cos(t), facet_y, y_m).astype(np.complex64)
+        self.facet_terms, self.plane_terms = _separated(kernel(-sin(roll) / cos(t), facet_y, x_m), facet_y, x_m)
 
     def to_facet(self, field: Complex) -> Complex:
         """Field on the plane [ny, nx] to the facet's grid [cells_y - 1, cells_x - 1]."""
         field = field.astype(np.complex64)
         total: Complex | None = None
-        for on_facet, on_plane in zip(self._facet_terms, self._plane_terms, strict=True):
-            term = self._y_to_y @ (((field * on_plane) @ self._x_to_x) * self._y_and_x)
+        for on_facet, on_plane in zip(self.facet_terms, self.plane_terms, strict=True):
+            term = self.y_to_y @ (((field * on_plane) @ self.x_to_x) * self.y_and_x)
             term *= on_facet[:, None]
             total = term if total is None else total + term
         assert total is not None
@@ -167,9 +171,9 @@ class FourierLens:
         """The adjoint of `to_facet`: a field on the facet's grid to the plane [ny, nx], kernel exp(+i ...)."""
         field = field.astype(np.complex64)
         total: Complex | None = None
-        for on_facet, on_plane in zip(self._facet_terms, self._plane_terms, strict=True):
-            inner = (self._y_to_y.conj().T @ (field * on_facet.conj()[:, None])) * self._y_and_x.conj()
-            term = (inner @ self._x_to_x.conj().T) * on_plane.conj()
+        for on_facet, on_plane in zip(self.facet_terms, self.plane_terms, strict=True):
+            inner = (self.y_to_y.conj().T @ (field * on_facet.conj()[:, None])) * self.y_and_x.conj()
+            term = (inner @ self.x_to_x.conj().T) * on_plane.conj()
             total = term if total is None else total + term
         assert total is not None
         return total
@@ -205,23 +209,28 @@ class PipePropagator:
         geometry: the device.
         cells: sample intervals along (y', x).
         steps: splitting steps over the whole pipe; 1 suffices without shear.
+
+    Attributes:
+        bases: sine modes along (y', x), by parity.
+        half: phasors of half a step, [2, 2, Ky, Kx] by parity.
+        cos, sin: of the turn of each pair of modes in a step, [Ky, Kx].
+        steps: splitting steps.
+        sheared: whether modes couple at all.
     """
 
     def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], steps: int) -> None:
-        self._geometry = geometry
-        self._cells = cells
-        self._sheared = abs(geometry.pipe_angle) > 0
-        self._steps = steps if self._sheared else 1
-        self._bases = [_parity_basis(n) for n in cells]
+        self.sheared = abs(geometry.pipe_angle) > 0
+        self.steps = steps if self.sheared else 1
+        self.bases = [_parity_basis(n) for n in cells]
         w, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
-        y, x = (basis.mode_numbers for basis in self._bases)
+        y, x = (basis.mode_numbers for basis in self.bases)
         detuning = mode_detuning(geometry, y[:, None, :, None], x[None, :, None, :])
-        dz = geometry.pipe_length_m / self._steps
-        self._half = np.exp(0.5j * dz * detuning).astype(np.complex64)
-        coupling = np.outer(self._bases[0].couplings, self._bases[1].couplings) / w**2
+        dz = geometry.pipe_length_m / self.steps
+        self.half = np.exp(0.5j * dz * detuning).astype(np.complex64)
+        coupling = np.outer(self.bases[0].couplings, self.bases[1].couplings) / w**2
         angle = dz / nk * np.sin(geometry.pipe_angle) * coupling
-        self._cos = np.cos(angle).astype(np.float32)
-        self._sin = np.sin(angle).astype(np.float32)
+        self.cos = np.cos(angle).astype(np.float32)
+        self.sin = np.sin(angle).astype(np.float32)
 
     def forward(self, field: Complex) -> Complex:
         """Entrance facet [cells_y - 1, cells_x - 1] to exit facet."""
@@ -232,21 +241,30 @@ class PipePropagator:
         return self._run(field, adjoint=True)
 
     def _run(self, field: Complex, *, adjoint: bool) -> Complex:
-        y, x = self._bases
+        y, x = self.bases
         modes = _split(y.sine_by_parity, field, x.sine_by_parity)
-        half = self._half.conj() if adjoint else self._half
+        half = self.half.conj() if adjoint else self.half
         full = half * half
-        sine = -self._sin if adjoint else self._sin
+        sine = -self.sin if adjoint else self.sin
         modes = modes * half
-        for step in range(self._steps):
-            if self._sheared:
-                modes = _rotate(modes, y.singular, x.singular, self._cos, sine)
-            modes = modes * (full if step < self._steps - 1 else half)
+        for step in range(self.steps):
+            if self.sheared:
+                modes = _rotate(modes, y.singular, x.singular, self.cos, sine)
+            modes = modes * (full if step < self.steps - 1 else half)
         return _join(y.sine_by_parity, modes, x.sine_by_parity)
 
 
-class _ParityBasis:
-    """Sine modes of one axis ordered by parity, [2, K], with the singular basis of the derivative between them."""
+class ParityBasis:
+    """Sine modes of one axis ordered by parity, with the singular basis of the derivative between them.
+
+    Args:
+        cells: sample intervals.
+
+    Attributes:
+        sine_by_parity: samples of the modes, [2, K, cells - 1], zero where a parity has one mode less.
+        mode_numbers: [2, K].
+        singular, couplings: singular vectors on either side, [2, K, K], and values [K] of the derivative.
+    """
 
     def __init__(self, cells: int) -> None:
         count = cells - 1
@@ -269,9 +287,9 @@ class _ParityBasis:
 
 
 @lru_cache(maxsize=8)
-def _parity_basis(cells: int) -> _ParityBasis:
+def _parity_basis(cells: int) -> ParityBasis:
     """It depends on nothing else, and takes as long as the rest of a small propagator."""
-    return _ParityBasis(cells)
+    return ParityBasis(cells)
 
 
 def _real_products(left: Real, stack: Complex, right: Real) -> Complex:

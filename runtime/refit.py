@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from optics.errors import CalibrationError
+from optics.errors import BundleError, CalibrationError
 from optics.page import symbol_phases
 from optics.progress import Progress
 from optics.recording import FramePair, hash_frames
@@ -17,6 +17,8 @@ from runtime.decoder import Decoder
 from runtime.recalibration import FitReport, FitResult, KnownPages
 from runtime.twin import OnnxTwin
 
+_RETRACED = "places"
+"""The input that a re-traced geometry is fed to."""
 _TWIN_THREADS = 1
 """The twin traces few points at a time; a second thread would only spin."""
 
@@ -35,8 +37,11 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
     Raises:
         CalibrationError: the pages fit no geometry near the earlier calibration, there are no reference frames, or the
             bundle holds no calibration to start from.
-        BundleError: the bundle's graphs do not show the field or the geometry.
+        BundleError: the bundle's graphs do not show the field, or hold a geometry that cannot be fed instead.
     """
+    if _RETRACED not in decoder.table_shapes:
+        wanted = f"{_RETRACED} among them: this decoder holds its geometry itself; calibrate, train and export anew"
+        raise BundleError(f"{bundle.thing}: table inputs", sorted(decoder.table_shapes), wanted)
     profile, earlier = bundle.profile, calibration_of(bundle)
     references = pages.references or _kept_references(bundle)
     if references is None:

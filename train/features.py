@@ -23,6 +23,7 @@ from optics.registration.twin import BRANCHES
 from train.field import FieldRecovery, TorchFieldSolver
 from train.localizers.coherent import CoherentLocalizer
 from train.localizers.wave import WaveLocalizer
+from train.parts import stacked
 from train.twin import RayTwin, TorchTwin
 
 Real = NDArray[np.float64]
@@ -139,7 +140,7 @@ class FeatureExtractor:
         """Features of one page, and its shift, found from the known phases [ny, nx] starting from `shift` (x, y)."""
         state = self.state(field, phases, shift)
         shift, piston = np.array(state.shift_px), state.piston_rad
-        light = self._light(field, shift) if self._wave is None else self._wave(moved(field, shift))
+        light = self._light(field, shift) if self._wave is None else localized(self._wave, moved(field, shift))
         if self._wave is not None:
             centre = light[:, 0].mean(1)
             piston = float(np.angle(np.sum((centre[0] + 1j * centre[1]) * np.exp(-1j * phases))))
@@ -192,11 +193,18 @@ def demodulate(
         places = places + (shift / GRID_STEP_PX).astype(np.float32)[None, :, None, None]
     with torch.no_grad():
         light: NDArray[np.float32] = localizer(
-            torch.from_numpy(np.stack([field.real, field.imag]).astype(np.float32, copy=False)),
+            stacked(field),
             torch.from_numpy(places),
             torch.from_numpy(table["place_gradients"]),
             torch.from_numpy(table["phases"]),
         ).numpy()
+    return light
+
+
+def localized(waves: WaveLocalizer, field: NDArray[np.complexfloating]) -> NDArray[np.float32]:
+    """The wave localizer's light [2, 1, S, ny, nx] of a field [Gy, Gx]."""
+    with torch.no_grad():
+        light: NDArray[np.float32] = waves(stacked(field)).numpy()
     return light
 
 

@@ -20,7 +20,7 @@ from optics.profile import Profile
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
 from optics.registration.parameters import NAMES
 from optics.registration.table import sampling_table
-from train.features import PageFeatures, demodulate
+from train.features import PageFeatures, demodulate, localized
 from train.localizers.coherent import SAMPLES, CoherentLocalizer
 from train.localizers.wave import WaveLocalizer
 from train.twin import RayTwin, TorchTwin
@@ -125,7 +125,7 @@ class SyntheticPages:
         drift = np.array([_DRIFT.get(name, 0.0) for name in NAMES]) * rng.uniform(-1, 1, len(NAMES))
         parameters = self._parameters + drift
         waves = FittedWaves(profile, parameters, SAMPLES, filled=True)
-        wave_localizer = WaveLocalizer(profile, parameters) if self._by_waves else None
+        waves_back = WaveLocalizer(profile, parameters) if self._by_waves else None
         table = sampling_table(self._twin, parameters, np.pi / 2, profile)
         light_on = sum(
             factor * term for factor, term in zip(self._like.illumination, illumination_terms(waves), strict=True)
@@ -134,7 +134,7 @@ class SyntheticPages:
             phases = symbol_phases(symbols, MAX_LEVELS)
             field = waves.to_camera(on_modulator(phases, SAMPLES) * light_on)
             field = (self._like.seen * (field + self._noise(field, rng))).astype(np.complex64)
-            light = demodulate(self._coherent, field, table) if wave_localizer is None else wave_localizer(field)
+            light = demodulate(self._coherent, field, table) if waves_back is None else localized(waves_back, field)
             yield PageFeatures(light.astype(np.float16), table["positions"], phases.astype(np.float32), (0.0, 0.0))
 
     def _noise(self, field: Complex, rng: np.random.Generator) -> Complex:

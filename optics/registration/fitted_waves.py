@@ -34,6 +34,8 @@ class FittedWaves:
 
     Attributes:
         x, y: places of the modulator's samples over the page's half width and half height, [nx samples], [ny samples].
+        channel: lenses and pipe.
+        launch: [ny samples, nx samples] phasor of the smooth phases at the launch side.
         against_reference: [Gy, Gx] phasor of the smooth phases at the camera, which multiplies all light there.
     """
 
@@ -68,11 +70,11 @@ class FittedWaves:
         self.x, self.y = x / half_width, y / half_height
         page = x + value["page_centre_x_m"], y + value["page_centre_y_m"]
         self._sampling = geometry, value["page_centre_x_m"], value["page_centre_y_m"], samples, filled, stride, steps
-        self._channel: WaveChannel
+        self.channel: WaveChannel
         if like is not None and like._sampling == self._sampling:
-            self._channel = like._channel
+            self.channel = like.channel
         else:
-            self._channel = WaveChannel(
+            self.channel = WaveChannel(
                 geometry,
                 *page,
                 grid_x,
@@ -92,17 +94,17 @@ class FittedWaves:
         )
         at_launch = at_launch - ramp[0] * x[None, :] - ramp[1] * y[:, None]
         at_camera = at_camera + ramp[0] * grid_x[None, :] + ramp[1] * grid_y[:, None]
-        self._launch: Complex = np.exp(1j * at_launch)
+        self.launch: Complex = np.exp(1j * at_launch)
         self.against_reference: Complex = np.exp(1j * at_camera)
         self._camera = self.against_reference / stride  # samples that stand for more area are larger
 
     def to_camera(self, field: Complex) -> Complex:
         """Field on the modulator [ny samples, nx samples] to the common grid [Gy, Gx], against the reference."""
-        return np.asarray(self._channel.forward(field * self._launch) * self._camera)
+        return np.asarray(self.channel.forward(field * self.launch) * self._camera)
 
     def to_page(self, field: Complex) -> Complex:
         """Field on the common grid [Gy, Gx] back to the modulator, by the adjoint."""
-        return np.asarray(self._channel.adjoint(field * self._camera.conj()) * self._launch.conj())
+        return np.asarray(self.channel.adjoint(field * self._camera.conj()) * self.launch.conj())
 
 
 def on_modulator(phases: Real, samples: int) -> Complex:

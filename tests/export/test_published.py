@@ -52,8 +52,8 @@ def test_a_published_decoder_runs_without_torch_and_says_the_same(
     asked = ["--bundle", str(out), "--recording", small_device[3], "--json", str(figures)]
     CliRunner().invoke(evaluate, asked, standalone_mode=False, catch_exceptions=False)
     assert json.loads(figures.read_text())["pages"] == 1
-    # its geometry is in its weights: there is no field to fit to
+    # its geometry is in its weights: nothing to re-trace
     pages = KnownPages(pairs, (symbols[0], symbols[1]), 256, references)
-    with pytest.raises(BundleError, match="field"):
+    with pytest.raises(BundleError, match=r"table inputs.*places among them"):
         recalibrate(decoder, pages, tmp_path / "again.zip", "2", refit, lambda step, share: None)
     assert bundle.manifest.residual_limit is None

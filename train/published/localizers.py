@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from optics.lenses import LensPrescription
 from optics.profile import Profile
 from optics.waves import WaveGeometry, cells_for, mode_detuning, modes_of_plane
+from train.parts import adjoint, matmul, multiply, parts, stacked
 from train.published.rays import RayTracer
 
 AFFINE_START = (0.98, 0.95)
@@ -99,30 +100,15 @@ class ModeLocalizer(Localizer):
         self.y: Tensor
         self.pipe: Tensor
         for name, value in (("x", x.T), ("y", y), ("pipe", np.exp(1j * phase))):
-            parts = np.stack([value.real, value.imag]).astype(np.float32)
-            self.register_buffer(name, torch.from_numpy(parts), persistent=False)
+            self.register_buffer(name, stacked(value), persistent=False)
 
     def forward(self, seen: Tensor) -> Tensor:
         """Samples of both frames [N, 2, h, w] to real and imaginary part of the field on the modulator."""
         seen = seen * self.weight + self.bias
-        x, y = (self.x[0], self.x[1]), (self.y[0], self.y[1])
-        real, imaginary = _times(_times(y, (seen[:, 0], self._sign * seen[:, 1])), x)
-        cos, sin = self.pipe[0], self.pipe[1]
-        modes = real * cos - imaginary * sin, real * sin + imaginary * cos
-        return torch.stack(_times(_times(_adjoint(y), modes), _adjoint(x)), dim=1)
-
-
-_Parts = tuple[Tensor, Tensor]
-"""Real and imaginary part: exported graphs know no complex numbers."""
-
-
-def _times(left: _Parts, right: _Parts) -> _Parts:
-    """Matrix product."""
-    return left[0] @ right[0] - left[1] @ right[1], left[0] @ right[1] + left[1] @ right[0]
-
-
-def _adjoint(matrix: _Parts) -> _Parts:
-    return matrix[0].T, -matrix[1].T
+        x, y = parts(self.x), parts(self.y)
+        modes = matmul(matmul(y, (seen[:, 0], self._sign * seen[:, 1])), x)
+        modes = multiply(modes, parts(self.pipe))
+        return torch.stack(matmul(matmul(adjoint(y), modes), adjoint(x)), dim=1)
 
 
 class RayLocalizer(Localizer):
