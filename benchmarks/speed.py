@@ -1,0 +1,158 @@
+"""Time to decode a page from raw frames, every decoder in the same ONNX Runtime, taking turns in one run.
+
+    python -m benchmarks.speed --profile bench
+
+Weights are random: time does not depend on them. Ratios are over the coherent decoder.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import click
+import numpy as np
+from torch import nn
+
+from export.graph import (
+    FRAME_INPUTS,
+    WAVE_TABLE_INPUTS,
+    DecoderGraph,
+    Graph,
+    PublishedGraph,
+    WaveGraph,
+    published_tensors,
+    table_tensors,
+)
+from export.onnx_files import decoder_onnx
+from optics.files import OutputFile, write_json
+from optics.profile import Profile, load_profile
+from optics.recording import FramePair
+from optics.registration.parameters import nominal
+from optics.registration.table import sampling_table
+from runtime.cpus import available_cpus
+from runtime.ort import Session, open_session
+from train.fitting import Hyperparameters
+from train.localizers.coherent import CoherentLocalizer
+from train.localizers.wave import WaveLocalizer
+from train.network import SymbolUNet
+from train.published.recipe import published_decoder
+from train.published.training import PublishedChoices
+from train.twin import RayTwin, TorchTwin
+
+Tensors = dict[str, np.ndarray]
+WIDTHS = {"ray 16/32": (16, 32), "ray 32/64": (32, 64), "ray 64/128": (64, 128)}
+"""The published decoder with its ray grid, by the channels of its U-Net."""
+
+
+def reference(profile: Profile) -> FramePair:
+    """Reference-only frames of an even beam."""
+    frame = np.full(profile.frame_shape, 100, dtype=np.uint8)
+    return FramePair(frame, frame)
+
+
+def network(channels: int) -> SymbolUNet:
+    """A network of the usual size."""
+    choices = Hyperparameters()
+    return SymbolUNet(channels, choices.channels, choices.blocks, choices.levels)
+
+
+def coherent(profile: Profile) -> tuple[Graph, Tensors]:
+    """The decoder that is shipped."""
+    table = sampling_table(TorchTwin(RayTwin(profile)), nominal(), np.pi / 2, profile)
+    frames = reference(profile)
+    graph = DecoderGraph(profile, network(CoherentLocalizer(profile).light_channels), 1.0)
+    return graph, table_tensors(table, frames.in_phase, frames.quadrature)
+
+
+def wave(profile: Profile) -> tuple[Graph, Tensors]:
+    """The decoder by waves, at an angle of -0.6 degree: a square pipe would need no steps."""
+    parameters = nominal()
+    parameters[0] = np.deg2rad(-0.6)
+    table = sampling_table(TorchTwin(RayTwin(profile)), parameters, np.pi / 2, profile)
+    frames, localizer = reference(profile), WaveLocalizer(profile, parameters)
+    graph = WaveGraph(profile, localizer, network(localizer.light_channels), 1.0)
+    return graph, table_tensors(table, frames.in_phase, frames.quadrature, WAVE_TABLE_INPUTS)
+
+
+def published(profile: Profile, localizer: str, channels: tuple[int, int]) -> tuple[Graph, Tensors]:
+    """A published decoder."""
+    choices = PublishedChoices(channels=channels)
+    decoder = published_decoder(localizer, choices, profile, reference(profile), np.pi / 2)
+    return PublishedGraph(decoder, 1.0), published_tensors(decoder)
+
+
+def makers(profile: Profile) -> dict[str, Callable[[], tuple[Graph, Tensors]]]:
+    """Every decoder by name, the one that others are compared with first."""
+    rays = {name: lambda width=width: published(profile, "ray", width) for name, width in WIDTHS.items()}
+    return {
+        "coherent": lambda: coherent(profile),
+        "wave": lambda: wave(profile),
+        **rays,
+        "mode 32/64": lambda: published(profile, "mode", (32, 64)),
+    }
+
+
+@dataclass(frozen=True)
+class Timed:
+    """Median seconds of one decoder, and over the first one's."""
+
+    decoder: str
+    seconds: float
+    ratio: float
+    parameters: int
+
+
+def session_of(profile: Profile, graph: Graph, tensors: Tensors, threads: int) -> Session:
+    """The graph in the runtime that serves."""
+    return open_session(decoder_onnx(graph.eval(), "uint8", profile.frame_shape, tensors), "speed", threads)
+
+
+def weights(graph: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in graph.parameters())
+
+
+@click.command()
+@click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
+@click.option("--decoder", "names", multiple=True, help="Only these; all if left out.")
+@click.option("--repeats", type=click.IntRange(1, 1000), default=15, show_default=True)
+@click.option("--threads", type=click.IntRange(1), help="Of one decode; the usable cores if left out.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int | None, json_path: Path | None) -> None:
+    """Time all decoders side by side and print medians and ratios."""
+    profile = load_profile(profile_name)
+    known = makers(profile)
+    for name in names:
+        if name not in known:
+            raise click.BadParameter(f"{name!r}: wanted one of {', '.join(known)}", param_hint="--decoder")
+    threads = threads or available_cpus()
+    sessions, sizes = {}, {}
+    for name, make in known.items():
+        if not names or name in names:
+            graph, tensors = make()
+            sessions[name], sizes[name] = session_of(profile, graph, tensors, threads), weights(graph)
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(60, 140, profile.frame_shape, dtype=np.uint8) for _ in FRAME_INPUTS]
+    feeds = dict(zip(FRAME_INPUTS, frames, strict=True))
+    taken: dict[str, list[float]] = {name: [] for name in sessions}
+    for repeat in range(repeats + 1):
+        for name, session in sessions.items():  # taking turns: a slow moment meets all of them
+            start = time.perf_counter()
+            session.run(["p"], feeds)
+            if repeat:
+                taken[name].append(time.perf_counter() - start)
+    medians = {name: float(np.median(values)) for name, values in taken.items()}
+    first = next(iter(medians.values()))
+    results = [Timed(name, seconds, seconds / first, sizes[name]) for name, seconds in medians.items()]
+    click.echo(f"{'decoder':<12} {'ms a page':>10} {'ratio':>7} {'weights':>10}")
+    for result in results:
+        click.echo(f"{result.decoder:<12} {1e3 * result.seconds:>10.1f} {result.ratio:>7.2f} {result.parameters:>10,}")
+    if json_path is not None:
+        figures = {"profile": profile.name, "threads": threads, "repeats": repeats}
+        write_json(json_path, figures | {"decoders": [asdict(result) for result in results]})
+
+
+if __name__ == "__main__":
+    main()
