@@ -39,10 +39,10 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
             bundle holds no calibration to start from.
         BundleError: the bundle's graphs do not show the field, or hold a geometry that cannot be fed instead.
     """
+    profile, earlier = bundle.profile, calibration_of(bundle)
     if _RETRACED not in decoder.table_shapes:
         wanted = f"{_RETRACED} among them: this decoder holds its geometry itself; calibrate, train and export anew"
         raise BundleError(f"{bundle.thing}: table inputs", sorted(decoder.table_shapes), wanted)
-    profile, earlier = bundle.profile, calibration_of(bundle)
     references = pages.references or _kept_references(bundle)
     if references is None:
         raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
