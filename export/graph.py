@@ -68,14 +68,8 @@ class DecoderGraph(nn.Module):
         positions: Tensor,
     ) -> tuple[Tensor, ...]:
         """Decode one pair; see `OUTPUTS` and, for the table, `optics.registration.table`."""
-        field, left = self.recovery(
-            in_phase.to(torch.float32),
-            quadrature.to(torch.float32),
-            reference_in_phase.to(torch.float32),
-            reference_quadrature.to(torch.float32),
-            registration,
-            homodyne,
-        )
+        frames = (in_phase, quadrature, reference_in_phase, reference_quadrature)
+        field, left = self.recovery(*(frame.to(torch.float32) for frame in frames), registration, homodyne)
         light = self.localizer(field, places, place_gradients, phases)
         p = self.network(light.flatten(0, 2)[None], positions[None])[0] * self.kappa_scale
         return *_answers(p), relative_power(left, field), field, left
@@ -111,14 +105,8 @@ class WaveGraph(nn.Module):
         positions: Tensor,
     ) -> tuple[Tensor, ...]:
         """Decode one pair; see `OUTPUTS` and, for the table, `optics.registration.table`."""
-        field, left = self.recovery(
-            in_phase.to(torch.float32),
-            quadrature.to(torch.float32),
-            reference_in_phase.to(torch.float32),
-            reference_quadrature.to(torch.float32),
-            registration,
-            homodyne,
-        )
+        frames = (in_phase, quadrature, reference_in_phase, reference_quadrature)
+        field, left = self.recovery(*(frame.to(torch.float32) for frame in frames), registration, homodyne)
         p = self.network(self.localizer(field).flatten(0, 2)[None], positions[None])[0] * self.kappa_scale
         return *_answers(p), relative_power(left, field), field, left
 

@@ -139,6 +139,21 @@ class Device(Table):
         return validate(Device, data, "device settings")
 
 
+def ideal_device() -> Device:
+    """A device without any defect but camera noise, its pipe square: as its profile says."""
+    pose = CameraPose()
+    return Device(
+        geometry=Geometry(pipe_angle_deg=0, page_shift_x_px=0, page_shift_y_px=0, pipe_roll_deg=0),
+        in_phase_camera=pose,
+        quadrature_camera=pose,
+        aberration=Aberration(distortion_relative=0, defocus_rad=0, astigmatism_rad=0, coma_rad=0),
+        reference=Reference(ripple_relative=0, tilt_x_rad=0, tilt_y_rad=0, curvature_rad=0),
+        homodyne=Homodyne(quadrature_error_deg=0, quadrature_gain=1),
+        slm=SlmDefects(phase_noise_rad=0, blur_px=0, falloff_relative=0),
+        drift=Drift(piston_rad=0, shift_px=0),
+    )
+
+
 def load_device(path: str | Path) -> Device:
     """Load a device state from a TOML file; keys left out keep their realistic default.
 

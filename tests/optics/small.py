@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from optics.device import Aberration, CameraPose, Device, Drift, Geometry, Homodyne, Reference, SlmDefects
+from optics.device import CameraPose, Device, ideal_device
 from optics.profile import Camera, Lens, PageLayout, Pipe, Profile, load_profile
 
 PLAIN_POSE = CameraPose()
@@ -30,17 +30,7 @@ def small_profile() -> Profile:
 
 def perfect_device(**tables: object) -> Device:
     """A device as its profile says, with no defect but those given, by table: `perfect_device(slm=SlmDefects(...))`."""
-    plain = Device(
-        geometry=Geometry(pipe_angle_deg=0, page_shift_x_px=0, page_shift_y_px=0, pipe_roll_deg=0),
-        in_phase_camera=PLAIN_POSE,
-        quadrature_camera=PLAIN_POSE,
-        aberration=Aberration(distortion_relative=0, defocus_rad=0, astigmatism_rad=0, coma_rad=0),
-        reference=Reference(ripple_relative=0, tilt_x_rad=0, tilt_y_rad=0, curvature_rad=0),
-        homodyne=Homodyne(quadrature_error_deg=0, quadrature_gain=1),
-        slm=SlmDefects(phase_noise_rad=0, blur_px=0, falloff_relative=0),
-        drift=Drift(piston_rad=0, shift_px=0),
-    )
-    return plain.model_copy(update=tables)
+    return ideal_device().model_copy(update=tables)
 
 
 def random_phases(profile: Profile, seed: int = 0) -> np.ndarray:

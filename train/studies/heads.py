@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from optics.device import ideal_device
 from optics.progress import Progress
 from train.studies.study import Case, Result, Row, Settings, Study
-from train.studies.trained import Light, ideal_device, trained
+from train.studies.trained import Light, trained
 
 LEVELS = (16, 256)
 HEADS = ("von Mises", "classes")

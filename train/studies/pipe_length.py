@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from optics.device import ideal_device
 from optics.profile import Profile, load_profile
 from optics.progress import Progress
 from train.studies.study import Case, Result, Row, Settings, Study
-from train.studies.trained import Light, ideal_device, trained
+from train.studies.trained import Light, trained
 
 LENGTHS_MM = tuple(10 + 32.5 * step for step in range(13))
 """Of the full-size pipe, 10 to 400; those of a smaller device are as much shorter as its focal length."""

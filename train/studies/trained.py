@@ -16,16 +16,7 @@ from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from optics.device import (
-    Aberration,
-    CameraPose,
-    Device,
-    Drift,
-    Geometry,
-    Homodyne,
-    Reference,
-    SlmDefects,
-)
+from optics.device import Device
 from optics.measures import expected_calibration_error, measure, symbol_maps
 from optics.page import pilot_mask
 from optics.profile import Profile
@@ -51,21 +42,6 @@ PAGES = 500
 _QUICK_PAGES = 12
 _QUICK = {"channels": (4, 8), "steps": 12}
 _HELD_SHARE = 0.05
-
-
-def ideal_device() -> Device:
-    """A device without any defect but camera noise, its pipe square: as the publication simulates it."""
-    pose = CameraPose()
-    return Device(
-        geometry=Geometry(pipe_angle_deg=0, page_shift_x_px=0, page_shift_y_px=0, pipe_roll_deg=0),
-        in_phase_camera=pose,
-        quadrature_camera=pose,
-        aberration=Aberration(distortion_relative=0, defocus_rad=0, astigmatism_rad=0, coma_rad=0),
-        reference=Reference(ripple_relative=0, tilt_x_rad=0, tilt_y_rad=0, curvature_rad=0),
-        homodyne=Homodyne(quadrature_error_deg=0, quadrature_gain=1),
-        slm=SlmDefects(phase_noise_rad=0, blur_px=0, falloff_relative=0),
-        drift=Drift(piston_rad=0, shift_px=0),
-    )
 
 
 @dataclass(frozen=True)
