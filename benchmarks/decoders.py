@@ -64,7 +64,7 @@ LEVELS = 256
 ORACLE = "oracle"
 ARMS = (*PUBLISHED, *LOCALIZERS, ORACLE)
 CALIBRATED = 2
-HELD_OUT_SHARE = 0.08
+HELD_OUT_SHARE = 0.05
 LAST_SHARE = 0.2
 
 
@@ -284,7 +284,7 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
     help="Edge of a symbol, modulator pixels; the profile's if left out.",
 )
 @click.option(
-    "--pages", type=click.IntRange(12), default=240, show_default=True, help="With 8% validation, 8% held out."
+    "--pages", type=click.IntRange(12), default=500, show_default=True, help="With 5% validation, 5% held out."
 )
 @click.option("--steps", type=click.IntRange(10), default=6000, show_default=True)
 @click.option(
