@@ -3,10 +3,11 @@
     python -m benchmarks.decoders --angle -0.6 --out runs/decoders
     python -m benchmarks.decoders --arm coherent --size 64x2x0 --size 96x2x1 --steps 1500 --out runs/decoders
 
-Coherent, wave and oracle share network, steps and seeds. The oracle knows the simulated truth: geometry, cameras,
-reference; the signal's own power is taken off its frames; then the wave adjoint and the same network. None, mode and
-ray are the published decoders, with their own network and training. Image shift and piston of every page, held-out ones
-too, are found from all of its symbols, for each arm alike. Interrupted, it goes on where it was; all lies in --out.
+Coherent, wave and oracle share network, steps and seeds; refined is coherent, and then looks again. The oracle knows
+the simulated truth: geometry, cameras, reference; the signal's own power is taken off its frames; then the wave adjoint
+and the same network. None, mode and ray are the published decoders, with their own network and training. Image shift
+and piston of every page, held-out ones too, are found from all of its symbols, for each arm alike. Interrupted, it goes
+on where it was; all lies in --out.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from optics.recording_job import RecordingJob
 from optics.registration.calibrate import calibrate
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.known import known_pages
+from train.decoder import LOCALIZERS
 from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
 from train.field import FieldRecovery, TorchFieldSolver
@@ -46,6 +48,7 @@ from train.fitting import (
     Fitted,
     Hyperparameters,
     Page,
+    SymbolTraining,
     best_kappa_scale,
     decode_pages,
     fit_network,
@@ -56,13 +59,15 @@ from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import published_choices, published_decoder
 from train.published.states import page_states
 from train.published.training import FramePages, PublishedChoices, PublishedTraining, fit_published
+from train.refinement import Prediction, RefinementPages, fit_prediction, fit_refinements
 from train.run import begin, sole_writer
-from train.symbols import LOCALIZERS
+from train.symbols import LIKENESS_PAGES
 from train.twin import RayTwin, TorchTwin
 
 LEVELS = 256
 ORACLE = "oracle"
-ARMS = (*PUBLISHED, *LOCALIZERS, ORACLE)
+REFINED = "refined"
+ARMS = (*PUBLISHED, *LOCALIZERS, REFINED, ORACLE)
 CALIBRATED = 2
 HELD_OUT_SHARE = 0.05
 LAST_SHARE = 0.2
@@ -134,6 +139,38 @@ class Bench:
 
     def symbol_arm(self, name: str, size: str, choices: Hyperparameters) -> Outcome:
         """Features, then the network at symbol pitch."""
+        channels, blocks, levels = map(int, size.split("x"))
+        choices = replace(choices, channels=channels, blocks=blocks, levels=levels)
+        folder, features, first, preparing = self.first_look("coherent" if name == REFINED else name, size, choices)
+        if name != REFINED:
+            validation, unseen = self.held_out(features)
+            return self.outcome(name, size, choices.steps, folder, first, validation, unseen, preparing)
+        choices = replace(choices, refinements=choices.refinements or 1)
+        prediction = Prediction(self.profile, self.fitted.vector)
+        extractor = self.extractor("coherent")
+        known = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
+        written = [np.angle(page.symbols) for page in known]
+        pairs = [page.pair for page in known]
+        fit_prediction(prediction, extractor, self.profile, self.fitted.vector, pairs, written)
+        counts = len(self.training), len(self.validation)
+        material = RefinementPages(self.recording, self.pages, *counts, features)
+        key = self.fitted.to_toml()
+        refined = fit_refinements(folder, choices, material, extractor, prediction, first, key, devices=1)
+        at = folder / f"refinement-{choices.refinements}"
+        return self.outcome(
+            f"{name} {choices.refinements}",
+            size,
+            choices.of_refinement().steps,
+            at,
+            refined.last,
+            *self.held_out(at / "features"),
+            refined.seconds - refined.last.seconds,
+        )
+
+    def first_look(
+        self, name: str, size: str, choices: Hyperparameters
+    ) -> tuple[Path, Path, Fitted[SymbolTraining], float]:
+        """Run, features, trained network, and seconds that the features took."""
         features = self.out / name / "features"
         key = "" if name == ORACLE else self.fitted.to_toml()
 
@@ -143,16 +180,19 @@ class Bench:
             return self.extractor(name).pages(self.recording, self.pages[start:], shift)
 
         preparing = fill(features, key, len(self.pages), make, f"features of {name}")
-        first = self.training.start
-        training, validation, unseen = (
-            FeatureStore(features, range(part.start - first, part.stop - first))
-            for part in (self.training, self.validation, self.unseen)
+        training, (validation, _) = FeatureStore(features, range(len(self.training))), self.held_out(features)
+        folder = self.begun(self.out / name / f"{size}-{choices.steps}", asdict(replace(choices, refinements=0)))
+        return (
+            folder,
+            features,
+            fit_network(folder, choices, self.mask, LEVELS, training, validation, devices=1),
+            preparing,
         )
-        channels, blocks, levels = map(int, size.split("x"))
-        choices = replace(choices, channels=channels, blocks=blocks, levels=levels)
-        folder = self.begun(self.out / name / f"{size}-{choices.steps}", asdict(choices))
-        trained = fit_network(folder, choices, self.mask, LEVELS, training, validation, devices=1)
-        return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing)
+
+    def held_out(self, features: Path) -> tuple[FeatureStore, FeatureStore]:
+        """Features of the validation pages, and of those for the figures."""
+        first, last, end = len(self.training), len(self.training) + len(self.validation), len(self.pages)
+        return FeatureStore(features, range(first, last)), FeatureStore(features, range(last, end))
 
     def published_arm(self, name: str, choices: PublishedChoices) -> Outcome:
         """States of the pages, then a published decoder on raw frames."""
@@ -290,6 +330,7 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
 @click.option(
     "--size", "sizes", type=Size(), multiple=True, default=(DEFAULT_SIZE,), show_default=True, help="Network."
 )
+@click.option("--refinements", type=click.IntRange(1, 4), default=1, show_default=True, help="Of the refined arm.")
 @click.option(
     "--published-steps",
     type=click.IntRange(10),
@@ -309,6 +350,7 @@ def main(
     pages: int,
     steps: int,
     sizes: tuple[str, ...],
+    refinements: int,
     published_steps: int | None,
     published_channels: tuple[int, ...],
     names: tuple[str, ...],
@@ -335,7 +377,7 @@ def main(
                     widths = [replace(authors, channels=(width, 2 * width)) for width in published_channels]
                     runs += [partial(bench.published_arm, name, choices) for choices in widths]
                 else:
-                    common = Hyperparameters(steps=steps, seed=seed)
+                    common = Hyperparameters(steps=steps, seed=seed, refinements=refinements)
                     runs += [partial(bench.symbol_arm, name, size, common) for size in sizes]
             outcomes: list[Outcome] = []
             for run in runs:

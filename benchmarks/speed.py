@@ -18,11 +18,9 @@ from torch import nn
 
 from export.graph import (
     FRAME_INPUTS,
-    WAVE_TABLE_INPUTS,
     DecoderGraph,
     Graph,
     PublishedGraph,
-    WaveGraph,
     published_tensors,
     table_tensors,
 )
@@ -34,10 +32,8 @@ from optics.registration.parameters import nominal
 from optics.registration.table import sampling_table
 from runtime.cpus import available_cpus
 from runtime.ort import Session, open_session
+from train.decoder import SymbolDecoder
 from train.fitting import Hyperparameters
-from train.localizers.coherent import CoherentLocalizer
-from train.localizers.wave import WaveLocalizer
-from train.network import SymbolUNet
 from train.published.recipe import published_decoder
 from train.published.training import PublishedChoices
 from train.twin import RayTwin, TorchTwin
@@ -53,28 +49,13 @@ def reference(profile: Profile) -> FramePair:
     return FramePair(frame, frame)
 
 
-def network(channels: int) -> SymbolUNet:
-    """A network of the usual size."""
-    choices = Hyperparameters()
-    return SymbolUNet(channels, choices.channels, choices.blocks, choices.levels)
-
-
-def coherent(profile: Profile) -> tuple[Graph, Tensors]:
-    """The decoder that is shipped."""
-    table = sampling_table(TorchTwin(RayTwin(profile)), nominal(), np.pi / 2, profile)
-    frames = reference(profile)
-    graph = DecoderGraph(profile, network(CoherentLocalizer(profile).light_channels), 1.0)
-    return graph, table_tensors(table, frames.in_phase, frames.quadrature)
-
-
-def wave(profile: Profile) -> tuple[Graph, Tensors]:
-    """The decoder by waves, at an angle of -0.6 degree: a square pipe would need no steps."""
+def at_symbol_pitch(profile: Profile, localizer: str, refinements: int = 0) -> tuple[Graph, Tensors]:
+    """A decoder of ours, at an angle of -0.6 degree: a square pipe would need no splitting steps."""
     parameters = nominal()
     parameters[0] = np.deg2rad(-0.6)
     table = sampling_table(TorchTwin(RayTwin(profile)), parameters, np.pi / 2, profile)
-    frames, localizer = reference(profile), WaveLocalizer(profile, parameters)
-    graph = WaveGraph(profile, localizer, network(localizer.light_channels), 1.0)
-    return graph, table_tensors(table, frames.in_phase, frames.quadrature, WAVE_TABLE_INPUTS)
+    decoder = SymbolDecoder(profile, parameters, localizer, Hyperparameters(refinements=refinements))
+    return DecoderGraph(profile, decoder, 1.0), table_tensors(localizer, table, reference(profile))
 
 
 def published(profile: Profile, localizer: str, channels: tuple[int, int]) -> tuple[Graph, Tensors]:
@@ -88,8 +69,9 @@ def makers(profile: Profile) -> dict[str, Callable[[], tuple[Graph, Tensors]]]:
     """Every decoder by name, the one that others are compared with first."""
     rays = {name: lambda width=width: published(profile, "ray", width) for name, width in WIDTHS.items()}
     return {
-        "coherent": lambda: coherent(profile),
-        "wave": lambda: wave(profile),
+        "coherent": lambda: at_symbol_pitch(profile, "coherent"),
+        "refined": lambda: at_symbol_pitch(profile, "coherent", refinements=1),
+        "wave": lambda: at_symbol_pitch(profile, "wave"),
         **rays,
         "mode 32/64": lambda: published(profile, "mode", (32, 64)),
     }

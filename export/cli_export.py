@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 
 from export.graph import (
     FRAME_INPUTS,
-    WAVE_TABLE_INPUTS,
     DecoderGraph,
     Graph,
     PublishedGraph,
-    WaveGraph,
     published_tensors,
     table_tensors,
 )
@@ -32,12 +30,10 @@ from runtime.decoder import Decoder
 from runtime.frames import narrow
 from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version
 from runtime.ort import open_session
-from train.localizers.coherent import CoherentLocalizer
-from train.localizers.wave import WaveLocalizer
 from train.published.recipe import published_decoder
 from train.published.training import PublishedChoices
 from train.run import GOLDEN as RUN_GOLDEN
-from train.run import REFERENCES, Run, load_arrays, load_network, load_run, load_weights
+from train.run import REFERENCES, Run, load_arrays, load_decoder, load_run, load_weights
 from train.twin import RayTwin, TorchTwin
 
 Tensors = dict[str, NDArray[np.generic]]
@@ -146,14 +142,8 @@ def _graph(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tupl
         published = PublishedGraph(load_weights(folder, decoder), run.kappa_scale).eval()
         return published, published_tensors(decoder)
     table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
-    frames = references.in_phase, references.quadrature
-    if run.localizer == "wave":
-        localizer = WaveLocalizer(profile, calibration.vector)
-        network = load_network(folder, run, localizer.light_channels)
-        waves = WaveGraph(profile, localizer, network, run.kappa_scale).eval()
-        return waves, table_tensors(table, *frames, WAVE_TABLE_INPUTS)
-    network = load_network(folder, run, CoherentLocalizer(profile).light_channels)
-    return DecoderGraph(profile, network, run.kappa_scale).eval(), table_tensors(table, *frames)
+    graph = DecoderGraph(profile, load_decoder(folder, run), run.kappa_scale).eval()
+    return graph, table_tensors(run.localizer, table, references)
 
 
 def _residual_limit(graph: Graph, pair: FramePair, defaults: Tensors) -> float | None:

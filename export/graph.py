@@ -8,28 +8,17 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from optics.profile import Profile
+from optics.recording import FramePair
+from train.decoder import GEOMETRY, SymbolDecoder
 from train.field import FieldRecovery, relative_power
-from train.localizers.coherent import CoherentLocalizer
-from train.localizers.wave import WaveLocalizer
-from train.network import SymbolUNet
 from train.published.decoder import PublishedDecoder, sample_frames
 
 FRAME_INPUTS = ("in_phase", "quadrature")
 ANSWERS = ("p", "phase", "concentration")
 """What every decoder says."""
-TABLE_INPUTS = (
-    "reference_in_phase",
-    "reference_quadrature",
-    "registration",
-    "homodyne",
-    "places",
-    "place_gradients",
-    "phases",
-    "positions",
-)
-"""Inputs that carry the calibrated table as their default and may be fed instead."""
-WAVE_TABLE_INPUTS = tuple(name for name in TABLE_INPUTS if name not in ("places", "place_gradients", "phases"))
-"""The same of a decoder by waves, which holds the pipe's geometry itself."""
+TABLE_INPUTS = ("reference_in_phase", "reference_quadrature", "registration", "homodyne", "positions")
+"""Inputs of every decoder at symbol pitch that carry the calibrated table as their default and may be fed instead;
+those of its localizer come behind them (`train.decoder.GEOMETRY`)."""
 PUBLISHED_TABLE_INPUTS = ("grid", "levels")
 """The same of a published decoder: where it samples the frames, and the references there."""
 OUTPUTS = (*ANSWERS, "residual", "field", "unexplained")
@@ -37,61 +26,20 @@ OUTPUTS = (*ANSWERS, "residual", "field", "unexplained")
 
 
 class DecoderGraph(nn.Module):
-    """Field recovery, coherent localizer and network behind each other.
+    """Field recovery and the decoder at symbol pitch behind each other.
 
     Args:
         profile: the nominal device.
-        network: trained.
+        decoder: trained.
         kappa_scale: factor on p that makes its length an honest concentration.
     """
 
     outputs = OUTPUTS
 
-    def __init__(self, profile: Profile, network: SymbolUNet, kappa_scale: float) -> None:
+    def __init__(self, profile: Profile, decoder: SymbolDecoder, kappa_scale: float) -> None:
         super().__init__()
         self.recovery = FieldRecovery(profile)
-        self.localizer = CoherentLocalizer(profile)
-        self.network = network
-        self.kappa_scale = kappa_scale
-
-    def forward(
-        self,
-        in_phase: Tensor,
-        quadrature: Tensor,
-        reference_in_phase: Tensor,
-        reference_quadrature: Tensor,
-        registration: Tensor,
-        homodyne: Tensor,
-        places: Tensor,
-        place_gradients: Tensor,
-        phases: Tensor,
-        positions: Tensor,
-    ) -> tuple[Tensor, ...]:
-        """Decode one pair; see `OUTPUTS` and, for the table, `optics.registration.table`."""
-        frames = (in_phase, quadrature, reference_in_phase, reference_quadrature)
-        field, left = self.recovery(*(frame.to(torch.float32) for frame in frames), registration, homodyne)
-        light = self.localizer(field, places, place_gradients, phases)
-        p = self.network(light.flatten(0, 2)[None], positions[None])[0] * self.kappa_scale
-        return *_answers(p), relative_power(left, field), field, left
-
-
-class WaveGraph(nn.Module):
-    """Field recovery, wave localizer and network behind each other; the geometry is a constant of the graph.
-
-    Args:
-        profile: the nominal device.
-        localizer: of the fitted device.
-        network: trained.
-        kappa_scale: factor on p that makes its length an honest concentration.
-    """
-
-    outputs = OUTPUTS
-
-    def __init__(self, profile: Profile, localizer: WaveLocalizer, network: SymbolUNet, kappa_scale: float) -> None:
-        super().__init__()
-        self.recovery = FieldRecovery(profile)
-        self.localizer = localizer
-        self.network = network
+        self.decoder = decoder
         self.kappa_scale = kappa_scale
 
     def forward(
@@ -103,12 +51,14 @@ class WaveGraph(nn.Module):
         registration: Tensor,
         homodyne: Tensor,
         positions: Tensor,
+        *geometry: Tensor,
     ) -> tuple[Tensor, ...]:
         """Decode one pair; see `OUTPUTS` and, for the table, `optics.registration.table`."""
-        frames = (in_phase, quadrature, reference_in_phase, reference_quadrature)
-        field, left = self.recovery(*(frame.to(torch.float32) for frame in frames), registration, homodyne)
-        p = self.network(self.localizer(field).flatten(0, 2)[None], positions[None])[0] * self.kappa_scale
-        return *_answers(p), relative_power(left, field), field, left
+        measured = self.recovery.measure(
+            in_phase, quadrature, reference_in_phase, reference_quadrature, registration, homodyne
+        )
+        p, field, left = self.decoder(self.recovery, measured, positions, *geometry)
+        return *_answers(p * self.kappa_scale), relative_power(left, field), field, left
 
 
 class PublishedGraph(nn.Module):
@@ -138,14 +88,15 @@ def _answers(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def table_tensors(
-    table: dict[str, NDArray[np.float32]],
-    in_phase: NDArray[np.integer],
-    quadrature: NDArray[np.integer],
-    names: tuple[str, ...] = TABLE_INPUTS,
+    localizer: str, table: dict[str, NDArray[np.float32]], references: FramePair
 ) -> dict[str, NDArray[np.generic]]:
-    """The defaults of `names`, in order: from the sampling table and the reference-only frames."""
-    tensors = {"reference_in_phase": in_phase, "reference_quadrature": quadrature, **table}
-    return {name: tensors[name] for name in names}
+    """The defaults of `TABLE_INPUTS` and of what the localizer takes, in order."""
+    tensors: dict[str, NDArray[np.generic]] = {
+        "reference_in_phase": references.in_phase,
+        "reference_quadrature": references.quadrature,
+        **table,
+    }
+    return {name: tensors[name] for name in (*TABLE_INPUTS, *GEOMETRY[localizer])}
 
 
 def published_tensors(decoder: PublishedDecoder) -> dict[str, NDArray[np.generic]]:
@@ -156,5 +107,5 @@ def published_tensors(decoder: PublishedDecoder) -> dict[str, NDArray[np.generic
     return dict(zip(PUBLISHED_TABLE_INPUTS, (grid.numpy(), levels.numpy()), strict=True))
 
 
-Graph = DecoderGraph | WaveGraph | PublishedGraph
+Graph = DecoderGraph | PublishedGraph
 """Frames and then, in the order of their defaults, table tensors in; `outputs` out."""

@@ -25,6 +25,7 @@ from optics.recording import Recording, hash_frames
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.known import known_pages
 from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording
+from train.decoder import LOCALIZERS
 from train.features import FeatureExtractor
 from train.fitting import Hyperparameters
 from train.material import Material
@@ -45,7 +46,7 @@ from train.run import (
     save_weights,
     sole_writer,
 )
-from train.symbols import DEFAULT_SYNTHETIC_PAGES, LIKENESS_PAGES, LOCALIZERS, SymbolRecipe
+from train.symbols import DEFAULT_SYNTHETIC_PAGES, LIKENESS_PAGES, SymbolRecipe
 
 _FEWEST_PAGES = 6
 
@@ -91,6 +92,12 @@ def _default(name: str) -> str:
     type=click.IntRange(min=0, max=4),
     help="Levels of the network below symbol pitch; 0 is the flat one. "
     f"{_default('levels')}; published: none to choose.",
+)
+@click.option(
+    "--refinements",
+    type=click.IntRange(min=0, max=4),
+    help="How often the decoder looks again, for what the symbols decoded so far do not explain. "
+    f"{_default('refinements')}; published: none to choose.",
 )
 @click.option(
     "--learning-rate",
@@ -149,6 +156,7 @@ def train(
     channels: int | None,
     blocks: int | None,
     levels: int | None,
+    refinements: int | None,
     learning_rate: float | None,
     lenses: str | None,
     precision: str,
@@ -180,11 +188,18 @@ def train(
                 localizer,
                 published_choices(profile, len(groups[0]), batch),
                 {**chosen, "channels": channels, "decoder_rate": learning_rate, "lenses": lenses},
-                {"--blocks": blocks, "--levels": levels, "--synthetic-pages": synthetic_pages, "--start": start},
+                {
+                    "--blocks": blocks,
+                    "--levels": levels,
+                    "--refinements": refinements,
+                    "--synthetic-pages": synthetic_pages,
+                    "--start": start,
+                },
             )
         else:
-            sizes = {"channels": channels, "blocks": blocks, "levels": levels, "learning_rate": learning_rate}
-            recipe = _symbols(localizer, {**chosen, **sizes}, synthetic_pages, start, {"--lenses": lenses})
+            sizes = {"channels": channels, "blocks": blocks, "levels": levels, "refinements": refinements}
+            wanted = {**chosen, **sizes, "learning_rate": learning_rate}
+            recipe = _symbols(localizer, wanted, synthetic_pages, start, {"--lenses": lenses})
             recipe.check_start(profile)
         references = recording.references()
         options = {

@@ -11,23 +11,27 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.lib.format import open_memmap
-from torch import Tensor
 from torch.utils.data import Dataset
 from tqdm import tqdm
 
 from optics.files import replace_text
-from train.features import PageFeatures
+from train.features import PageFeatures, PageState
+from train.fitting import Page
 
 _STATE = "state.json"
+_SHOWN = ("light", "positions", "belief", "phases")
+"""Arrays of `PageFeatures`, in the order in which a page's item has them."""
+_PAGE_STATE = "page_states"
 
 Maker = Callable[[int, tuple[float, float]], Iterator[PageFeatures]]
 """Makes the features from a page number on; told of the shift of the page before it."""
 
 
-class FeatureStore(Dataset[tuple[Tensor, Tensor, Tensor]]):
+class FeatureStore(Dataset[Page]):
     """Pages of features in a folder, as arrays that are mapped and not loaded.
 
-    An item is a page's light [2 C, ny, nx] float16, positions [2, ny, nx] and true phases [ny, nx].
+    An item is a page's light [2 C, ny, nx] float16, positions [2, ny, nx], what an earlier look believed [2, ny, nx]
+    if there was one, and true phases [ny, nx].
 
     Args:
         folder: with arrays that `fill` has completed.
@@ -35,24 +39,24 @@ class FeatureStore(Dataset[tuple[Tensor, Tensor, Tensor]]):
     """
 
     def __init__(self, folder: Path, pages: range | None = None) -> None:
-        self._light, self._positions, self._phases = (
-            np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("light", "positions", "phases")
-        )
-        self._pages = range(len(self._light)) if pages is None else pages
+        names = [name for name in _SHOWN if (folder / f"{name}.npy").exists()]
+        self._arrays = [np.load(folder / f"{name}.npy", mmap_mode="r") for name in names]
+        self._states = np.load(folder / f"{_PAGE_STATE}.npy", mmap_mode="r")
+        self._pages = range(len(self._states)) if pages is None else pages
 
     def __len__(self) -> int:
         """Pages."""
         return len(self._pages)
 
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
+    def __getitem__(self, index: int) -> Page:
         """One page."""
-        page = self._pages[index]
-        light = np.array(self._light[page])
-        return (
-            torch.from_numpy(light.reshape(-1, *light.shape[-2:])),
-            torch.from_numpy(np.array(self._positions[page])),
-            torch.from_numpy(np.array(self._phases[page])),
-        )
+        light, *others = (torch.from_numpy(np.array(array[self._pages[index]])) for array in self._arrays)
+        return light.flatten(0, -3), *others
+
+    def state(self, index: int) -> PageState:
+        """Image shift and piston that were taken off a page."""
+        x, y, piston = map(float, self._states[self._pages[index]])
+        return PageState((x, y), piston)
 
 
 def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
@@ -76,12 +80,17 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
     start, seconds = time.monotonic() - before, before
     if done == 0:
         (folder / _STATE).unlink(missing_ok=True)  # before its arrays are
+        for old in folder.glob("*.npy"):
+            old.unlink()
     arrays: dict[str, np.memmap[Any, Any]] = {}
     with torch.inference_mode():
         pages = tqdm(make(done, shift), desc=what, unit="page", initial=done, total=count)
         for number, page in zip(range(done, count), pages, strict=False):
-            for name in ("light", "positions", "phases"):
-                value = getattr(page, name)
+            values = {name: getattr(page, name) for name in _SHOWN}
+            values[_PAGE_STATE] = np.array([*page.state.shift_px, page.state.piston_rad])
+            for name, value in values.items():
+                if value is None:
+                    continue
                 if name not in arrays:
                     path = folder / f"{name}.npy"
                     arrays[name] = (
@@ -92,7 +101,7 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
                 arrays[name][number] = value
                 arrays[name].flush()
             seconds = time.monotonic() - start
-            state = {"key": key, "done": number + 1, "shift_px": page.shift_px, "seconds": seconds}
+            state = {"key": key, "done": number + 1, "shift_px": page.state.shift_px, "seconds": seconds}
             replace_text(folder / _STATE, json.dumps(state), "state of the features")
     return seconds
 

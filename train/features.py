@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import ndimage
+from torch import Tensor
 
 from optics.errors import CalibrationError
 from optics.grid import GRID_STEP_PX, field_grid
@@ -20,7 +21,7 @@ from optics.registration.coherence import COHERENT_BRANCHES, branch_shares, page
 from optics.registration.samplers import FieldSampler
 from optics.registration.table import Table, sampling_table
 from optics.registration.twin import BRANCHES
-from train.field import FieldRecovery, TorchFieldSolver
+from train.field import FieldRecovery, Measured, TorchFieldSolver
 from train.localizers.coherent import CoherentLocalizer
 from train.localizers.wave import WaveLocalizer
 from train.parts import stacked
@@ -53,13 +54,15 @@ class PageFeatures:
         light: demodulated samples [2, B, S, ny, nx], float16, piston taken off.
         positions: exit centroids [2, ny, nx], float32, over the pipe's width.
         phases: true phases [ny, nx], float32, radians.
-        shift_px: image shift of the page (x, y) that was taken off, camera pixels.
+        state: image shift and piston of the page that were taken off.
+        belief: p [2, ny, nx], float32, that an earlier look came to and this one starts from; None for the first look.
     """
 
     light: NDArray[np.float16]
     positions: NDArray[np.float32]
     phases: NDArray[np.float32]
-    shift_px: tuple[float, float]
+    state: PageState
+    belief: NDArray[np.float32] | None = None
 
 
 class FeatureExtractor:
@@ -86,7 +89,8 @@ class FeatureExtractor:
     ) -> None:
         self._profile, self._parameters, self._twin = profile, parameters, TorchTwin(RayTwin(profile))
         self.table: Table = sampling_table(self._twin, parameters, turn, profile)
-        self._solve = TorchFieldSolver(FieldRecovery(profile, with_signal_power=with_signal_power))
+        self.recovery = FieldRecovery(profile, with_signal_power=with_signal_power)
+        self._solve = TorchFieldSolver(self.recovery)
         self._coherent = CoherentLocalizer(profile)
         self._wave = WaveLocalizer(profile, parameters) if localizer == "wave" else None
         self._references = references
@@ -97,6 +101,15 @@ class FeatureExtractor:
     def field(self, pair: FramePair) -> NDArray[np.complex64]:
         """Recovered field on the common grid."""
         return self._solve(pair, self._references, self.table["registration"], self.table["homodyne"])[0]
+
+    def look(self, pair: FramePair, shift_px: tuple[float, float]) -> tuple[Measured, Tensor]:
+        """What was measured on the calibrated grid of a page whose image has moved by (x, y), and its field there."""
+        registration = self.table["registration"].copy()
+        registration[..., 0] += np.array(shift_px, dtype=np.float32)
+        seen = (pair.in_phase, pair.quadrature, self._references.in_phase, self._references.quadrature)
+        tensors = [*(frame.astype(np.float32) for frame in seen), registration, self.table["homodyne"]]
+        measured = self.recovery.measure(*map(torch.from_numpy, tensors))
+        return measured, self.recovery.solve(measured)[0]
 
     def check(self, page: KnownPage, calibrated: float) -> None:
         """Check that a known page shows its symbols where this calibration says.
@@ -122,7 +135,7 @@ class FeatureExtractor:
     def known_field(self, pair: FramePair, phases: Real) -> NDArray[np.complex64]:
         """Recovered field of a known page, its image shift taken off."""
         field = self.field(pair)
-        return moved(field, np.array(self.page(field, phases, np.zeros(2))[0].shift_px))
+        return moved(field, np.array(self.page(field, phases, np.zeros(2))[0].state.shift_px))
 
     def pages(
         self, recording: Recording, indices: Sequence[int], shift_px: tuple[float, float] = (0.0, 0.0)
@@ -150,7 +163,7 @@ class FeatureExtractor:
             turned.astype(np.float16),
             self.table["positions"],
             phases.astype(np.float32),
-            state.shift_px,
+            PageState(state.shift_px, piston),
         )
         return features, shift
 

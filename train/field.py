@@ -10,6 +10,8 @@ where `turn` is +90 or -90 degrees, by the sign of Q, plus the quadrature error.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -29,6 +31,43 @@ _STEP = 0.9
 _MOMENTUM = 0.5
 _FLOOR = 0.1
 """Least reference, as a share of its mean, that frames are divided by: outside the beam there is nothing to learn."""
+
+
+class Measured(NamedTuple):
+    """What the cameras measured on the common grid, [ny, nx] each but the turn's cosine and sine.
+
+    Attributes:
+        a, b: left sides of the two equations, zero where a camera has no reference.
+        cos, sin: of the turn between the arms.
+        amplitude: the reference's over its mean, by which e becomes E.
+        lit: one where both cameras have a reference, else zero.
+    """
+
+    a: Tensor
+    b: Tensor
+    cos: Tensor
+    sin: Tensor
+    amplitude: Tensor
+    lit: Tensor
+
+    def left(self, e: Tensor) -> tuple[Tensor, Tensor]:
+        """What is left of the two equations at e, [2, ny, nx] real and imaginary part."""
+        real, imaginary = e[0], e[1]
+        half_power = (real * real + imaginary * imaginary) / 2
+        return self.a - real - half_power, self.b - self.cos * real - self.sin * imaginary - half_power
+
+    def pull(self, e: Tensor, floor: Tensor | float) -> Tensor:
+        """How the measurements pull at e: the gradient of their likelihood, [2, ny, nx].
+
+        An equation's variance is that of its camera's photons, |1 + e|^2 or |exp(i turn) + e|^2, and of its
+        electronics, the `floor`. The first is also the squared length of its gradient, so a step along the sum needs
+        no matrix.
+        """
+        left_a, left_b = self.left(e)
+        a_re, a_im, b_re, b_im = 1 + e[0], e[1], self.cos + e[0], self.sin + e[1]
+        pull_a = left_a / (a_re * a_re + a_im * a_im + floor)
+        pull_b = left_b / (b_re * b_re + b_im * b_im + floor)
+        return torch.stack([a_re * pull_a + b_re * pull_b, a_im * pull_a + b_im * pull_b])
 
 
 class FieldRecovery(nn.Module):
@@ -77,8 +116,21 @@ class FieldRecovery(nn.Module):
             residual: [2, ny, nx], what is left of the two equations inside the pipe's band, over the mean reference
                 amplitude; large against the field when the frames do not belong to this calibration.
         """
+        measured = self.measure(in_phase, quadrature, reference_in_phase, reference_quadrature, registration, homodyne)
+        return self.solve(measured)
+
+    def measure(
+        self,
+        in_phase: Tensor,
+        quadrature: Tensor,
+        reference_in_phase: Tensor,
+        reference_quadrature: Tensor,
+        registration: Tensor,
+        homodyne: Tensor,
+    ) -> Measured:
+        """Both cameras' measurements on the common grid; arguments as for `forward`."""
         frames = torch.stack([in_phase, quadrature]).to(torch.float32)
-        references = torch.stack([reference_in_phase, reference_quadrature])
+        references = torch.stack([reference_in_phase, reference_quadrature]).to(torch.float32)
         stack = torch.stack([frames - references, references], dim=1)
         stack = self.prefilter(stack.reshape(4, self.rows_px, self.columns_px))
         stack = stack.reshape(2, 2, self.rows_px, self.columns_px)
@@ -89,27 +141,41 @@ class FieldRecovery(nn.Module):
         floor = _FLOOR * references.mean(dim=(1, 2))[:, None, None]
         lit = (reference > floor).to(torch.float32).prod(dim=0)
         reference = torch.maximum(reference, floor)
-        measured = lit * on_grid[:, 0] / (2 * reference)
+        a, b = lit * on_grid[:, 0] / (2 * reference)
         amplitude = torch.sqrt(reference[0])
-        amplitude = amplitude / amplitude.mean()
-        real, imaginary = self._solve(measured[0], measured[1], homodyne[0], homodyne[1], amplitude)
-        half_power = (real * real + imaginary * imaginary) / 2
-        left_a = measured[0] - real - half_power
-        left_b = measured[1] - homodyne[0] * real - homodyne[1] * imaginary - half_power
-        residual = self.band(torch.stack([left_a, left_b]) * amplitude)
-        return torch.stack([real, imaginary]) * amplitude, residual
+        return Measured(a, b, homodyne[0], homodyne[1], amplitude / amplitude.mean(), lit)
 
-    def _solve(self, a: Tensor, b: Tensor, cos: Tensor, sin: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
-        """Solve the two equations for (Re e, Im e), [ny, nx] each.
+    def solve(self, measured: Measured) -> tuple[Tensor, Tensor]:
+        """Field and residual of what was measured, as `forward` returns them."""
+        e = self._solve(measured)
+        residual = self.band(torch.stack(measured.left(e)) * measured.amplitude)
+        return e * measured.amplitude, residual
+
+    def innovation(self, measured: Measured, field: Tensor, floor: Tensor | float) -> Tensor:
+        """What was measured beyond what a predicted field would show, as a change of the field.
+
+        Args:
+            measured: of the frames.
+            field: predicted E [2, ny, nx], as `forward` returns it.
+            floor: see `Measured.pull`.
+
+        Returns:
+            [2, ny, nx], inside the pipe's band; the mean over both equations, each weighted by what it tells.
+        """
+        pull = measured.lit * measured.pull(field / measured.amplitude, floor)
+        return torch.as_tensor(self.band(pull * measured.amplitude))
+
+    def _solve(self, measured: Measured) -> Tensor:
+        """Solve the two equations for e, [2, ny, nx].
 
         Each sample alone is a quadratic with two roots, which meet where the signal outshines the reference. So: the
         closed root nearer to the linear estimate, then descent with momentum towards the most likely field in the
-        pipe's band. An equation's variance is that of its camera's photons, |1 + e|^2 or |exp(i turn) + e|^2, and of
-        its electronics; this is also the squared length of its gradient, so no step needs a matrix.
+        pipe's band.
         """
+        a, b, cos, sin, amplitude, _ = measured
         start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) / amplitude
         if not self.with_signal_power:
-            return start[0], start[1]
+            return torch.as_tensor(start)
         # Im e = slope Re e - offset, from the difference of the equations; then a quadratic in Re e
         slope, offset = (1 - cos) / sin, (a - b) / sin
         quadratic = 1 + slope * slope
@@ -120,14 +186,9 @@ class FieldRecovery(nn.Module):
         before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) / amplitude
         for _ in range(_ROUNDS):
             ahead = estimate + _MOMENTUM * (estimate - before)
-            real, imaginary = ahead[0], ahead[1]
-            half_power = (real * real + imaginary * imaginary) / 2
-            a_re, a_im, b_re, b_im = 1 + real, imaginary, cos + real, sin + imaginary
-            pull_a = (a - real - half_power) / (a_re * a_re + a_im * a_im + READ_NOISE)
-            pull_b = (b - cos * real - sin * imaginary - half_power) / (b_re * b_re + b_im * b_im + READ_NOISE)
-            step = torch.stack([a_re * pull_a + b_re * pull_b, a_im * pull_a + b_im * pull_b])
-            before, estimate = estimate, self.band((ahead + _STEP * step) * amplitude) / amplitude
-        return estimate[0], estimate[1]
+            step = _STEP * measured.pull(ahead, READ_NOISE)
+            before, estimate = estimate, self.band((ahead + step) * amplitude) / amplitude
+        return torch.as_tensor(estimate)
 
     def _where(self, registration: Tensor) -> Tensor:
         """Sampling grid [2, ny, nx, 2] in grid_sample's coordinates."""

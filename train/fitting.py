@@ -7,7 +7,7 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -24,13 +24,15 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 from optics.measures import achievable_rate
 from optics.pilots import Pilots, estimate_piston
 from train.loss import von_mises_nll
-from train.network import SymbolUNet
+from train.network import Refiner, SymbolUNet
 
 CHECKPOINTS = "checkpoints"
 """Folder of a run's checkpoints."""
 _LAST = "last.ckpt"
 LOOKS = 60
 """How often a run looks at its validation pages."""
+_REFINEMENT_STEPS = 0.25
+"""Steps of a refinement's network over those of the first."""
 AVERAGED_SHARE = 0.05
 """Share of a run's steps over which its weights are averaged, exponentially: what is validated, kept and exported."""
 
@@ -41,6 +43,7 @@ class Hyperparameters:
 
     Attributes:
         channels, blocks, levels: size of the network, see `SymbolUNet`.
+        refinements: how often the decoder looks again, see `train.refinement`.
         steps: optimiser steps.
         batch: pages a step.
         learning_rate: peak of the one-cycle schedule.
@@ -52,6 +55,7 @@ class Hyperparameters:
     channels: int = 96
     blocks: int = 2
     levels: int = 0
+    refinements: int = 0
     steps: int = 6000
     batch: int = 4
     learning_rate: float = 4e-3
@@ -59,7 +63,13 @@ class Hyperparameters:
     seed: int = 0
     precision: str = "bf16-mixed"
 
+    def of_refinement(self) -> Hyperparameters:
+        """The choices for a refinement's network, which starts from a good belief and sees little light."""
+        steps = max(1, round(_REFINEMENT_STEPS * self.steps))
+        return replace(self, channels=max(1, self.channels * 2 // 3), blocks=1, levels=0, refinements=0, steps=steps)
 
+
+SymbolNetwork = SymbolUNet | Refiner
 Page = tuple[Tensor, ...]
 """One page, or a batch of them: what the decoder is told, and last its true phases [ny, nx]."""
 N = TypeVar("N", bound=nn.Module)
@@ -107,10 +117,11 @@ class DecoderTraining(L.LightningModule, Generic[N]):
         self.log("val_air", air, prog_bar=True, sync_dist=True)
 
 
-class SymbolTraining(DecoderTraining[SymbolUNet]):
-    """The network at symbol pitch, with exact rotation augmentation.
+class SymbolTraining(DecoderTraining[SymbolNetwork]):
+    """A network at symbol pitch, with exact rotation augmentation.
 
-    Its pages are light [N, 2 C, ny, nx], exit centroids [N, 2, ny, nx] and true phases [N, ny, nx].
+    Its pages are light [N, 2 C, ny, nx], exit centroids [N, 2, ny, nx], for a `Refiner` what is believed so far
+    [N, 2, ny, nx], and true phases [N, ny, nx].
 
     Args:
         network, pilot_mask, levels: as for `DecoderTraining`.
@@ -118,24 +129,22 @@ class SymbolTraining(DecoderTraining[SymbolUNet]):
     """
 
     def __init__(
-        self, network: SymbolUNet, hyperparameters: Hyperparameters, pilot_mask: NDArray[np.bool_], levels: int
+        self, network: SymbolNetwork, hyperparameters: Hyperparameters, pilot_mask: NDArray[np.bool_], levels: int
     ) -> None:
         super().__init__(network, pilot_mask, levels)
         self.choices = hyperparameters
 
     def forward(self, *page: Tensor) -> Tensor:
-        """Light and exit centroids to p [N, 2, ny, nx]."""
-        light, positions = page
-        return torch.as_tensor(self.network(light.float(), positions))
+        """Light, exit centroids and what is believed so far to p [N, 2, ny, nx]."""
+        light, *others = page
+        return torch.as_tensor(self.network(light.float(), *others))
 
     def training_step(self, batch: Page, index: int) -> Tensor:
         """Loss of pages whose field and symbols were turned by one random angle each: piston is no information."""
-        light, positions, phases = batch[0].float(), batch[1], batch[2]
+        light, positions, *belief, phases = batch
         turn = 2 * math.pi * torch.rand(len(light), 1, 1, device=light.device)
-        real, imaginary = light.chunk(2, dim=1)
-        cos, sin = torch.cos(turn)[:, None], torch.sin(turn)[:, None]
-        turned = torch.cat([real * cos - imaginary * sin, real * sin + imaginary * cos], dim=1)
-        return self.loss(self(turned, positions), phases + turn)
+        shown = [_turned(part, turn) for part in (light.float(), *belief)]
+        return self.loss(self(shown[0], positions, *shown[1:]), phases + turn)
 
     def configure_optimizers(self) -> Any:
         """AdamW under a one-cycle schedule."""
@@ -147,6 +156,13 @@ class SymbolTraining(DecoderTraining[SymbolUNet]):
             optimizer, self.choices.learning_rate, total_steps=self.choices.steps, pct_start=warm_up
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def _turned(parts: Tensor, by: Tensor) -> Tensor:
+    """Real parts and then imaginary parts [N, 2 C, ny, nx], turned by an angle [N, 1, 1] each."""
+    real, imaginary = parts.chunk(2, dim=1)
+    cos, sin = torch.cos(by)[:, None], torch.sin(by)[:, None]
+    return torch.cat([real * cos - imaginary * sin, real * sin + imaginary * cos], dim=1)
 
 
 def air_of_nll(nll: Tensor) -> Tensor:
@@ -211,7 +227,8 @@ def fit_network(
     training: Dataset[Page],
     validation: Dataset[Page],
     *,
-    start: SymbolUNet | None = None,
+    kind: type[SymbolUNet] | type[Refiner] = SymbolUNet,
+    start: SymbolNetwork | None = None,
     devices: int | str = "auto",
     progress: bool = True,
 ) -> Fitted[SymbolTraining]:
@@ -222,11 +239,12 @@ def fit_network(
         hyperparameters: the run's choices.
         pilot_mask: bool [ny, nx].
         levels: M of the pages.
-        start: network of the same size whose weights a new run begins with; random ones if left out.
+        kind: of the network.
+        start: network of the same kind and size whose weights a new run begins with; random ones if left out.
     """
     seed_stretch(run, hyperparameters.seed)
     light_channels = training[0][0].shape[0]
-    network = SymbolUNet(light_channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.levels)
+    network = kind(light_channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.levels)
     if start is not None:
         network.load_state_dict(start.state_dict())
     module = SymbolTraining(network, hyperparameters, pilot_mask, levels)

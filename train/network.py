@@ -12,6 +12,9 @@ _HARMONICS = (0.5, 1.0, 2.0)
 """Turns a pipe width of the exit centroid: zones of even and odd reflections alternate, each has two edges."""
 _CONDITIONS = 6 + 4 * len(_HARMONICS)
 _CONDITION_WIDTH = 64
+_TYPICAL_LOG_KAPPA = 5.0
+_KAPPA_UNIT = 20.0
+"""What an output of one adds to p: with concentrations in the hundreds, the net need not learn large numbers."""
 
 
 class PositionModulation(nn.Module):
@@ -115,3 +118,25 @@ class SymbolUNet(nn.Module):
             raised = functional.interpolate(up(x), scale_factor=2.0, mode="nearest")
             x = outward(skip + raised[..., : skip.shape[-2], : skip.shape[-1]])
         return torch.as_tensor(self.head(functional.gelu(x)))
+
+
+class Refiner(nn.Module):
+    """What an earlier look believed, and the light that this leaves unexplained, to a better belief.
+
+    Unexplained light adds to the natural parameter p of a von Mises belief, as any further measurement of the phase
+    does. Who to trust is learnt.
+
+    Args:
+        light_channels, channels, blocks, levels: as for `SymbolUNet`.
+    """
+
+    def __init__(self, light_channels: int, channels: int = 96, blocks: int = 2, levels: int = 0) -> None:
+        super().__init__()
+        self.unet = SymbolUNet(light_channels + 3, channels, blocks, levels)
+        self.trust = nn.Parameter(torch.ones(()))
+
+    def forward(self, light: Tensor, positions: Tensor, belief: Tensor) -> Tensor:
+        """Unexplained light, exit centroids and the earlier p, [N, 2, ny, nx], to p: see `SymbolUNet`."""
+        kappa = torch.sqrt(belief.square().sum(1, keepdim=True) + 1e-12)
+        known = torch.cat([light, belief / kappa, torch.log(kappa) - _TYPICAL_LOG_KAPPA], dim=1)
+        return torch.as_tensor(self.trust * belief + _KAPPA_UNIT * self.unet(known, positions))

@@ -23,8 +23,8 @@ from optics.errors import InvalidInputError
 from optics.files import replace_file, replace_text
 from optics.profile import Profile, parse_profile
 from optics.registration.calibration import Calibration, parse_calibration
+from train.decoder import SymbolDecoder
 from train.fitting import CHECKPOINTS, Hyperparameters
-from train.network import SymbolUNet
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.training import PublishedChoices
 
@@ -33,7 +33,7 @@ DESCRIPTION = "run.json"
 WEIGHTS = "decoder.pt"
 REFERENCES = "references.npz"
 GOLDEN = "golden.npz"
-FORMAT = 2
+FORMAT = 3
 """Of what a run keeps while it is made: raised when features, network or checkpoints of an earlier version would not go
 together with those of this one."""
 
@@ -200,20 +200,15 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 M = TypeVar("M", bound=nn.Module)
 
 
-def load_network(folder: Path, run: Run, light_channels: int) -> SymbolUNet:
-    """The trained network of a run at symbol pitch.
-
-    Args:
-        folder: of the run.
-        run: its description.
-        light_channels: channels of the localizer's light.
+def load_decoder(folder: Path, run: Run) -> SymbolDecoder:
+    """The trained decoder of a run at symbol pitch.
 
     Raises:
-        InvalidInputError: no weights, or weights of another network.
+        InvalidInputError: no weights, or weights of another decoder.
     """
     choices = run.hyperparameters
     assert isinstance(choices, Hyperparameters)
-    return load_weights(folder, SymbolUNet(light_channels, choices.channels, choices.blocks, choices.levels))
+    return load_weights(folder, SymbolDecoder(run.profile, run.calibration.vector, run.localizer, choices))
 
 
 def load_weights(folder: Path, module: M) -> M:

@@ -7,20 +7,22 @@ from pathlib import Path
 
 import click
 import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, nn
 from torch.utils.data import ConcatDataset
 
 from optics.errors import InvalidInputError
 from optics.profile import Profile
+from optics.registration.calibrate import KnownPage
 from optics.registration.known import known_pages
 from train.feature_store import FeatureStore, fill
-from train.fitting import Hyperparameters, Page, best_kappa_scale, fit_network
-from train.localizers.coherent import SAMPLES, CoherentLocalizer
+from train.fitting import Fitted, Hyperparameters, Page, SymbolTraining, best_kappa_scale, fit_network
 from train.material import Material, Trained
 from train.network import SymbolUNet
-from train.run import load_network, load_run
+from train.refinement import Prediction, Refined, RefinementPages, fit_prediction, fit_refinements
+from train.run import load_decoder, load_run
 from train.synthetic import MOST_NOISE, SyntheticPages, likeness
 
-LOCALIZERS = ("coherent", "wave")
 DEFAULT_SYNTHETIC_PAGES = 96
 LIKENESS_PAGES = 2
 """Recorded pages that the wave model is compared with: each has thousands of symbols."""
@@ -82,13 +84,45 @@ class SymbolRecipe:
             start=first,
             devices=material.devices,
         )
+        weights = {f"network.{name}": value for name, value in fitted.module.network.state_dict().items()}
+        seconds, last = preparing + fitted.seconds, fitted
+        if self.choices.refinements:
+            refined = self._refined(
+                material,
+                RefinementPages(material.recording, known, count, len(material.validation), features),
+                fitted,
+                weights,
+            )
+            seconds, last, validation = seconds + refined.seconds, refined.last, refined.validation
         return Trained(
-            weights=fitted.module.network.state_dict(),
-            validation_air=fitted.validation_air,
-            kappa_scale=best_kappa_scale(fitted.module, validation, material.pilot_mask),
-            seconds=preparing + fitted.seconds,
+            weights=weights,
+            validation_air=last.validation_air,
+            kappa_scale=best_kappa_scale(last.module, validation, material.pilot_mask),
+            seconds=seconds,
             synthetic_pages=len(training) - count,
         )
+
+    def _refined(
+        self, material: Material, pages: RefinementPages, first: Fitted[SymbolTraining], weights: dict[str, Tensor]
+    ) -> Refined:
+        """Trained refinements, which add what they have learnt to the weights."""
+        prediction = Prediction(material.profile, material.calibration.vector)
+        known, phases = self._likeness_pages(material)
+        pairs = [page.pair for page in known]
+        fit_prediction(prediction, material.extractor, material.profile, material.calibration.vector, pairs, phases)
+        refined = fit_refinements(
+            material.out,
+            self.choices,
+            pages,
+            material.extractor,
+            prediction,
+            first,
+            f"{material.key} {self.localizer}",
+            material.devices,
+        )
+        for name, module in {"prediction": prediction, "refiners": nn.ModuleList(refined.refiners)}.items():
+            weights |= {f"{name}.{key}": value for key, value in module.state_dict().items()}
+        return refined
 
     def check_start(self, profile: Profile) -> None:
         """Check that the run to start from, if any, has a network of this size.
@@ -108,16 +142,19 @@ class SymbolRecipe:
             raise InvalidInputError(
                 f"--start {self.start}: localizer, page, channels, blocks, levels", size, f"{wanted}"
             )
-        coherent = CoherentLocalizer(profile).light_channels
-        return load_network(self.start, run, coherent if self.localizer == "coherent" else 2 * SAMPLES**2)
+        return load_decoder(self.start, run).network
+
+    def _likeness_pages(self, material: Material) -> tuple[list[KnownPage], list[NDArray[np.float64]]]:
+        """Recorded pages that the wave model is compared with, and the phases that were written on them."""
+        known = known_pages(material.recording, material.profile, material.training[:LIKENESS_PAGES])
+        return known, [np.angle(page.symbols) for page in known]
 
     def _synthetic(self, material: Material) -> list[Path]:
         """Folder with the features of synthetic pages; none where the wave model is not like the device."""
         if self.synthetic_pages == 0:
             return []
         profile, vector, seed = material.profile, material.calibration.vector, self.choices.seed
-        known = known_pages(material.recording, profile, material.training[:LIKENESS_PAGES])
-        phases = [np.angle(page.symbols) for page in known]
+        known, phases = self._likeness_pages(material)
         fields = [
             material.extractor.known_field(page.pair, written) for page, written in zip(known, phases, strict=True)
         ]

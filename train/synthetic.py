@@ -20,7 +20,7 @@ from optics.profile import Profile
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
 from optics.registration.parameters import NAMES
 from optics.registration.table import sampling_table
-from train.features import PageFeatures, demodulate, localized
+from train.features import PageFeatures, PageState, demodulate, localized
 from train.localizers.coherent import SAMPLES, CoherentLocalizer
 from train.localizers.wave import WaveLocalizer
 from train.twin import RayTwin, TorchTwin
@@ -135,7 +135,8 @@ class SyntheticPages:
             field = waves.to_camera(on_modulator(phases, SAMPLES) * light_on)
             field = (self._like.seen * (field + self._noise(field, rng))).astype(np.complex64)
             light = demodulate(self._coherent, field, table) if waves_back is None else localized(waves_back, field)
-            yield PageFeatures(light.astype(np.float16), table["positions"], phases.astype(np.float32), (0.0, 0.0))
+            written, still = phases.astype(np.float32), PageState((0.0, 0.0), 0.0)
+            yield PageFeatures(light.astype(np.float16), table["positions"], written, still)
 
     def _noise(self, field: Complex, rng: np.random.Generator) -> Complex:
         """White noise in the pipe's band with the power that the model leaves unexplained."""

@@ -67,13 +67,16 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     light = out / "-0.6deg-32e-4px"
     light.mkdir(parents=True)
     calibration_of(Device()).save(light / "calibration.toml")
-    arguments = f"--profile {profile} --pages 12 --steps 20 --size 8x1x0 --arm coherent --arm oracle --arm none"
+    arguments = (
+        f"--profile {profile} --pages 12 --steps 20 --size 8x1x0 --arm coherent --arm refined --arm oracle --arm none"
+    )
     arguments += f" --published-channels 4 --published-steps 12 --out {out}"
     first = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert first.exit_code == 0, first.output
     assert "-0.6 degree, full well 32 e-, symbols of 4x4 pixels" in first.output
     (figures,) = json.loads((out / "figures.json").read_text())["lights"]
-    coherent, oracle, none = figures["outcomes"]
+    coherent, refined, oracle, none = figures["outcomes"]
+    assert (refined["arm"], refined["steps"]) == ("refined 1", 5)
     assert (coherent["arm"], oracle["arm"], oracle["over_oracle"]) == ("coherent", "oracle", 1)
     assert coherent["over_oracle"] == pytest.approx(coherent["air"] / oracle["air"])
     assert (none["arm"], none["size"], none["steps"]) == ("none", "4/8", 12)

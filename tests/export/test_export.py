@@ -26,9 +26,8 @@ from runtime.bundle import Bundle
 from runtime.decoder import Decoder
 from runtime.ort import open_session
 from tests.optics.small import small_profile
+from train.decoder import GEOMETRY, SymbolDecoder
 from train.fitting import Hyperparameters
-from train.localizers.coherent import CoherentLocalizer
-from train.network import SymbolUNet
 from train.run import GOLDEN, REFERENCES, WEIGHTS, Run, load_run
 from train.twin import RayTwin, TorchTwin
 
@@ -48,9 +47,8 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     turn = device.homodyne.turn_rad
     fitted = Registered(true_parameters(profile, device), np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
     torch.manual_seed(0)
-    features = CoherentLocalizer(profile).light_channels
-    network = SymbolUNet(features, CHOICES.channels, CHOICES.blocks, CHOICES.levels)
-    torch.save(network.state_dict(), folder / WEIGHTS)
+    decoder = SymbolDecoder(profile, fitted.parameters, "coherent", CHOICES)
+    torch.save(decoder.state_dict(), folder / WEIGHTS)
     np.savez(folder / GOLDEN, in_phase=pair.in_phase, quadrature=pair.quadrature)
     np.savez(
         folder / REFERENCES,
@@ -109,7 +107,7 @@ def test_the_table_is_a_default_that_can_be_fed_instead(exported: tuple[Bundle, 
     plain = decoder.infer(golden.pair).p
     phases = decoder.table_shapes["phases"]
     fed = decoder.infer(golden.pair, {"phases": np.zeros([n or 1 for n in phases], dtype=np.float32)}).p
-    assert set(decoder.table_shapes) == set(TABLE_INPUTS)
+    assert set(decoder.table_shapes) == {*TABLE_INPUTS, *GEOMETRY["coherent"]}
     assert np.linalg.norm(fed - plain) > 0.01 * np.linalg.norm(plain)
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from train.feature_store import FeatureStore, fill
-from train.features import PageFeatures
+from train.features import PageFeatures, PageState
 
 
 class Pages:
@@ -31,7 +31,7 @@ class Pages:
                 np.full((2, 3, 4, 5, 6), number, np.float16),
                 np.full((2, 5, 6), number, np.float32),
                 np.full((5, 6), number, np.float32),
-                (number + 0.5, -number),
+                PageState((number + 0.5, -number), 0.25),
             )
 
 

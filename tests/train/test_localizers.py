@@ -50,24 +50,6 @@ def test_the_coherent_localizer_brings_out_each_symbol_where_its_branch_has_the_
         assert abs(np.angle(z.mean())) < 0.02
 
 
-@pytest.mark.parametrize("angle_rad", [0.0, -0.01])
-def test_the_wave_localizer_is_the_adjoint_of_the_fitted_waves(angle_rad: float) -> None:
-    profile = small_profile()
-    parameters = true_parameters(profile, Device())
-    parameters[NAMES.index("pipe_angle_rad")] = angle_rad
-    waves = FittedWaves(profile, parameters, SAMPLES)
-    rng = np.random.default_rng(0)
-    shape = waves.against_reference.shape
-    field = (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
-    rows, columns = profile.page_shape
-    light = localized(WaveLocalizer(profile, parameters), field)
-    at_slm = (light[0] + 1j * light[1]).reshape(SAMPLES, SAMPLES, rows, columns).transpose(2, 0, 3, 1)
-    expected = waves.to_page(field)
-    expected = expected / np.sqrt(np.mean(np.abs(expected) ** 2))
-    found = at_slm.reshape(expected.shape)
-    assert np.linalg.norm(found - expected) < 1e-4 * np.linalg.norm(expected)
-
-
 def test_the_wave_localizer_brings_out_nearly_all_of_the_page(page) -> None:
     phases, features, _ = page
     light = features["wave"]

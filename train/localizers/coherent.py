@@ -28,8 +28,8 @@ class CoherentLocalizer(nn.Module):
         steps = (torch.arange(SAMPLES, dtype=torch.float32) + 0.5) / SAMPLES - 0.5
         self.offset_x: Tensor
         self.offset_y: Tensor
-        self.register_buffer("offset_x", steps.repeat(SAMPLES).reshape(1, -1, 1, 1))
-        self.register_buffer("offset_y", steps.repeat_interleave(SAMPLES).reshape(1, -1, 1, 1))
+        self.register_buffer("offset_x", steps.repeat(SAMPLES).reshape(1, -1, 1, 1), persistent=False)
+        self.register_buffer("offset_y", steps.repeat_interleave(SAMPLES).reshape(1, -1, 1, 1), persistent=False)
 
     @property
     def light_channels(self) -> int:

@@ -21,11 +21,12 @@ from optics.recording import FramePair, Recording
 from train.feature_store import FeatureStore
 from train.features import PageState
 from train.fitting import DecoderTraining, Page, SymbolTraining, decode_pages, without_piston
+from train.network import Refiner, SymbolUNet
 from train.published.localizers import RayLocalizer
 from train.published.recipe import published_decoder
 from train.published.training import FramePages, PublishedChoices, PublishedTraining
 from train.report.data import Curve, Golden, Rays, ReportData, how_long
-from train.run import GOLDEN, REFERENCES, Run, load_arrays, load_network, load_run, load_weights
+from train.run import GOLDEN, REFERENCES, Run, load_arrays, load_decoder, load_run, load_weights
 
 TAGS = ("train_nll", "train_air", "val_air", "angle_deg")
 """What training logs and a report draws; the angle is that of a decoder by rays."""
@@ -100,14 +101,18 @@ def _decodable(
 
 def _at_symbol_pitch(folder: Path, run: Run, kept: dict[str, NDArray[Any]]) -> Decodable:
     first, validated, _ = run.pages
-    try:
-        store = FeatureStore(folder / "features", range(first, first + validated))
-        light = store[0][0]
-    except (OSError, ValueError, IndexError) as error:
-        raise InvalidInputError(f"run {folder}: features", error, "the features that training left there") from None
     choices = run.hyperparameters
     assert not isinstance(choices, PublishedChoices)
-    return SymbolTraining(load_network(folder, run, len(light)), choices, kept["pilots"], MAX_LEVELS), store
+    last = folder / f"refinement-{choices.refinements}" if choices.refinements else folder
+    try:
+        store = FeatureStore(last / "features", range(first, first + validated))
+        _ = store[0]
+    except (OSError, ValueError, IndexError) as error:
+        raise InvalidInputError(f"run {folder}: features", error, "the features that training left there") from None
+    decoder = load_decoder(folder, run)
+    network = decoder.refiners[-1] if choices.refinements else decoder.network
+    assert isinstance(network, SymbolUNet | Refiner)
+    return SymbolTraining(network, choices, kept["pilots"], MAX_LEVELS), store
 
 
 def validation_pages(run: Run, recording: Recording) -> list[int]:

@@ -1,0 +1,45 @@
+"""The wave model in torch against the one in numpy, both ways."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from optics.device import Device
+from optics.registration.fitted_waves import FittedWaves
+from optics.registration.parameters import NAMES
+from optics.simulator import true_parameters
+from tests.optics.small import small_profile
+from train.localizers.coherent import SAMPLES
+from train.parts import stacked
+from train.waves import Waves
+
+PROFILE = small_profile()
+
+
+@pytest.fixture(scope="module", params=[(0.0, True), (-0.01, True), (-0.01, False)], ids=str)
+def models(request: pytest.FixtureRequest) -> tuple[FittedWaves, Waves]:
+    angle_rad, filled = request.param
+    parameters = true_parameters(PROFILE, Device())
+    parameters[NAMES.index("pipe_angle_rad")] = angle_rad
+    return FittedWaves(PROFILE, parameters, SAMPLES, filled=filled), Waves(PROFILE, parameters, filled=filled)
+
+
+def noise(shape: tuple[int, ...]) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
+
+
+def check(found: torch.Tensor, expected: np.ndarray) -> None:
+    assert np.linalg.norm(found[0].numpy() + 1j * found[1].numpy() - expected) < 1e-4 * np.linalg.norm(expected)
+
+
+def test_a_page_lights_the_camera_as_in_the_fitted_waves(models: tuple[FittedWaves, Waves]) -> None:
+    page = noise(models[0].launch.shape)
+    check(models[1].to_camera(stacked(page)), models[0].to_camera(page))
+
+
+def test_a_field_comes_back_to_the_page_as_in_the_fitted_waves(models: tuple[FittedWaves, Waves]) -> None:
+    field = noise(models[0].against_reference.shape)
+    check(models[1].to_page(stacked(field)), models[0].to_page(field))

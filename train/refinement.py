@@ -1,0 +1,245 @@
+"""Looking again: what the decoded page would have shown, against what was seen.
+
+A first look knows neither |E|^2 nor what neighbouring symbols spill into a symbol. Once most is decoded, the wave model
+says both: the expected page is sent through the device, its light is taken off both frames with each measurement
+weighted by what it tells at that light, and what remains is brought back to the page. That is one step of Gauss and
+Newton towards the most likely page; a small network takes it, for the waves are not quite the device's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from optics.profile import Profile
+from optics.recording import FramePair, Recording
+from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
+from train.feature_store import FeatureStore, fill
+from train.features import FeatureExtractor, PageFeatures
+from train.field import FieldRecovery, Measured
+from train.fitting import Fitted, Hyperparameters, SymbolTraining, fit_network
+from train.localizers.coherent import SAMPLES
+from train.localizers.wave import by_symbol
+from train.network import Refiner
+from train.parts import conjugate, multiply, parts, stacked
+from train.waves import Real, Waves
+
+LIGHT_CHANNELS = 2 * SAMPLES**2
+"""Features that carry unexplained light: real parts of a symbol's samples, then imaginary parts."""
+_FLOORS = (0.05, 20.0)
+"""Least and largest `Measured.pull` floor that is believed."""
+
+
+class Prediction(nn.Module):
+    """What decoded symbols leave unexplained of both frames, on the modulator.
+
+    Args:
+        profile: the nominal device.
+        parameters: [P] fitted; `illumination` and `floor` are still those of an ideal device (`fit_prediction`).
+    """
+
+    def __init__(self, profile: Profile, parameters: Real) -> None:
+        super().__init__()
+        self.page_shape = profile.page_shape
+        self.waves = Waves(profile, parameters, filled=True)
+        rows, columns = (count * SAMPLES for count in profile.page_shape)
+        even = torch.stack([torch.ones(rows, columns), torch.zeros(rows, columns)])
+        self.illumination: Tensor
+        self.floor: Tensor
+        self.register_buffer("illumination", even)
+        self.register_buffer("floor", torch.ones(()))
+
+    def field(self, p: Tensor) -> Tensor:
+        """Expected field on the common grid, [2, Gy, Gx], of a believed page p [2, ny, nx]; its scale is open."""
+        written = expected_phasors(p).repeat_interleave(SAMPLES, dim=1).repeat_interleave(SAMPLES, dim=2)
+        return self.waves.to_camera(torch.stack(multiply(parts(written), parts(self.illumination))))
+
+    def forward(self, recovery: FieldRecovery, measured: Measured, field: Tensor, p: Tensor) -> Tensor:
+        """Light that a believed page leaves unexplained.
+
+        Args:
+            recovery: of the same device.
+            measured, field: of the page; the field says how strong its light is.
+            p: [2, ny, nx].
+
+        Returns:
+            [2, 1, S, ny, nx], as a localizer gives it.
+        """
+        expected = self.field(p)
+        real, imaginary = multiply(parts(field), conjugate(parts(expected)))
+        gain = torch.stack([real.sum(), imaginary.sum()]) / (expected.square().sum() + 1e-12)
+        expected = torch.stack(multiply(parts(expected), parts(gain)))
+        left = recovery.innovation(measured, expected, self.floor)
+        return by_symbol(self.waves.to_page(left), self.page_shape)
+
+
+def expected_phasors(p: Tensor) -> Tensor:
+    """Mean of exp(i phase) under von Mises beliefs, [2, ...] to [2, ...].
+
+    Its length, a ratio of Bessel functions, lies within 3% of kappa / (1/2 + sqrt(kappa^2 + 9/4)), one of the bounds of
+    Amos (Math. Comp. 28, 1974).
+    """
+    return p / (0.5 + torch.sqrt(p.square().sum(0, keepdim=True) + 2.25))
+
+
+def fit_prediction(
+    prediction: Prediction,
+    extractor: FeatureExtractor,
+    profile: Profile,
+    parameters: Real,
+    pairs: Sequence[FramePair],
+    phases: Sequence[Real],
+) -> None:
+    """Set illumination and floor by known pages.
+
+    Args:
+        prediction: of that device.
+        extractor: of that device.
+        profile, parameters: the device.
+        pairs: frames of known pages.
+        phases: what was written on them, [ny, nx] radians.
+    """
+    waves = FittedWaves(profile, parameters, SAMPLES, filled=True)
+    terms = illumination_terms(waves)
+    coefficients, squares, lengths = [], [], []
+    for pair, written in zip(pairs, phases, strict=True):
+        state = extractor.state(extractor.field(pair), written, np.zeros(2))
+        with torch.no_grad():
+            measured, solved = extractor.look(pair, state.shift_px)
+        lit, field = measured.lit.numpy().astype(bool), solved[0].numpy() + 1j * solved[1].numpy()
+        page = on_modulator(written, SAMPLES)
+        shown = np.stack([waves.to_camera(page * term) for term in terms], axis=-1)
+        factors = np.linalg.lstsq(shown[lit], field[lit], rcond=None)[0]
+        coefficients.append(factors / factors[0])
+        e = stacked(shown @ factors) / measured.amplitude
+        for left, arm in zip(measured.left(e), (1.0, complex(measured.cos, measured.sin)), strict=True):
+            squares.append(left.numpy()[lit] ** 2)
+            lengths.append(np.abs(arm + e[0].numpy() + 1j * e[1].numpy())[lit] ** 2)
+    # an equation's variance is that of a photon count times (|arm + e|^2 + floor)
+    by_light, constant = np.polyfit(np.concatenate(lengths), np.concatenate(squares), 1)
+    floor = constant / by_light if by_light > 0 else np.inf
+    prediction.illumination.copy_(stacked(np.tensordot(np.mean(coefficients, axis=0), np.stack(terms), 1)))
+    prediction.floor.fill_(float(np.clip(floor, *_FLOORS)))
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Trained refinements.
+
+    Attributes:
+        refiners: their networks, in order.
+        last: the last one's training.
+        validation: its features of the validation pages.
+        seconds: of all of it, features and training, all stretches together.
+    """
+
+    refiners: list[Refiner]
+    last: Fitted[SymbolTraining]
+    validation: FeatureStore
+    seconds: float
+
+
+@dataclass(frozen=True)
+class RefinementPages:
+    """Recorded pages that refinements are trained on.
+
+    Attributes:
+        recording: with their frames.
+        pages: page numbers: those trained on, those validated on, then others.
+        training, validation: how many of them.
+        features: their features for the first look, in the same order.
+    """
+
+    recording: Recording
+    pages: list[int]
+    training: int
+    validation: int
+    features: Path
+
+
+def fit_refinements(
+    folder: Path,
+    choices: Hyperparameters,
+    material: RefinementPages,
+    extractor: FeatureExtractor,
+    prediction: Prediction,
+    first: Fitted[SymbolTraining],
+    key: str,
+    devices: int | str = "auto",
+) -> Refined:
+    """Train, or go on with, the refinements of a run, one behind the other.
+
+    Args:
+        folder: of the run.
+        choices: the run's; `choices.refinements` of them, at least one.
+        material: pages.
+        extractor, prediction: of the device.
+        first: the first look's training.
+        key: everything that the first look's features depend on.
+        devices: see `fit_network`.
+    """
+    refiners, trained, features, seconds = list[Refiner](), first, material.features, 0.0
+    count, seen = len(material.pages), material.training + material.validation
+    chosen = choices.of_refinement()
+    for number in range(1, choices.refinements + 1):
+        earlier, module = FeatureStore(features), trained.module
+        at = folder / f"refinement-{number}"
+        features = at / "features"
+        key = f"{key} {number} {trained.validation_air}"
+
+        def make(start: int, shift: tuple[float, float], earlier: FeatureStore = earlier) -> Iterator[PageFeatures]:
+            return refined_pages(extractor, prediction, material, earlier, module, start)  # noqa: B023
+
+        seconds += fill(features, key, count, make, f"pages of refinement {number}")
+        training, validation = (
+            FeatureStore(features, part) for part in (range(material.training), range(material.training, seen))
+        )
+        mask, levels = first.module.pilot_mask, first.module.levels
+        trained = fit_network(at, chosen, mask, levels, training, validation, kind=Refiner, devices=devices)
+        assert isinstance(trained.module.network, Refiner)
+        refiners.append(trained.module.network)
+        seconds += trained.seconds
+    return Refined(refiners, trained, validation, seconds)
+
+
+def refined_pages(
+    extractor: FeatureExtractor,
+    prediction: Prediction,
+    material: RefinementPages,
+    earlier: FeatureStore,
+    module: SymbolTraining,
+    start: int = 0,
+) -> Iterator[PageFeatures]:
+    """Features for a refinement.
+
+    Args:
+        extractor, prediction: of the device.
+        material: pages.
+        earlier: their features for the look before.
+        module: which was trained on such features.
+        start: first page.
+    """
+    for number in range(start, len(material.pages)):
+        *shown, phases = earlier[number]
+        state = earlier.state(number)
+        measured, field = extractor.look(material.recording.frames(material.pages[number]), state.shift_px)
+        belief = module(*(part[None] for part in shown))[0]
+        light = prediction(extractor.recovery, measured, field, turned(belief, state.piston_rad))
+        yield PageFeatures(
+            turned(light, -state.piston_rad).numpy().astype(np.float16),
+            shown[1].numpy(),
+            phases.numpy(),
+            state,
+            belief.numpy(),
+        )
+
+
+def turned(stack: Tensor, by: float) -> Tensor:
+    """Real and imaginary part [2, ...] of what is turned by an angle."""
+    cos, sin = np.cos(by), np.sin(by)
+    return torch.stack([stack[0] * cos - stack[1] * sin, stack[0] * sin + stack[1] * cos])
