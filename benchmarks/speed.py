@@ -55,7 +55,8 @@ def at_symbol_pitch(profile: Profile, localizer: str, refinements: int = 0) -> t
     parameters[0] = np.deg2rad(-0.6)
     table = sampling_table(TorchTwin(RayTwin(profile)), parameters, np.pi / 2, profile)
     decoder = SymbolDecoder(profile, parameters, localizer, Hyperparameters(refinements=refinements))
-    return DecoderGraph(profile, decoder, 1.0), table_tensors(localizer, table, reference(profile))
+    graph = DecoderGraph(profile, decoder, 1.0)
+    return graph, table_tensors(graph, table, reference(profile))
 
 
 def published(profile: Profile, localizer: str, channels: tuple[int, int]) -> tuple[Graph, Tensors]:

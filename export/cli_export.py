@@ -143,7 +143,7 @@ def _graph(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tupl
         return published, published_tensors(decoder)
     table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
     graph = DecoderGraph(profile, load_decoder(folder, run), run.kappa_scale).eval()
-    return graph, table_tensors(run.localizer, table, references)
+    return graph, table_tensors(graph, table, references)
 
 
 def _residual_limit(graph: Graph, pair: FramePair, defaults: Tensors) -> float | None:

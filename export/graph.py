@@ -9,16 +9,16 @@ from torch import Tensor, nn
 
 from optics.profile import Profile
 from optics.recording import FramePair
-from train.decoder import GEOMETRY, SymbolDecoder
+from train.decoder import SymbolDecoder
 from train.field import FieldRecovery, relative_power
 from train.published.decoder import PublishedDecoder, sample_frames
 
 FRAME_INPUTS = ("in_phase", "quadrature")
 ANSWERS = ("p", "phase", "concentration")
 """What every decoder says."""
-TABLE_INPUTS = ("reference_in_phase", "reference_quadrature", "registration", "homodyne", "positions")
+TABLE_INPUTS = ("reference_in_phase", "reference_quadrature", "registration", "homodyne")
 """Inputs of every decoder at symbol pitch that carry the calibrated table as their default and may be fed instead;
-those of its localizer come behind them (`train.decoder.GEOMETRY`)."""
+behind them come those of `SymbolDecoder.table_inputs`."""
 PUBLISHED_TABLE_INPUTS = ("grid", "levels")
 """The same of a published decoder: where it samples the frames, and the references there."""
 OUTPUTS = (*ANSWERS, "residual", "field", "unexplained")
@@ -41,6 +41,7 @@ class DecoderGraph(nn.Module):
         self.recovery = FieldRecovery(profile)
         self.decoder = decoder
         self.kappa_scale = kappa_scale
+        self.table_inputs = (*TABLE_INPUTS, *decoder.table_inputs)
 
     def forward(
         self,
@@ -50,14 +51,14 @@ class DecoderGraph(nn.Module):
         reference_quadrature: Tensor,
         registration: Tensor,
         homodyne: Tensor,
-        positions: Tensor,
-        *geometry: Tensor,
+        *others: Tensor,
     ) -> tuple[Tensor, ...]:
         """Decode one pair; see `OUTPUTS` and, for the table, `optics.registration.table`."""
         measured = self.recovery.measure(
             in_phase, quadrature, reference_in_phase, reference_quadrature, registration, homodyne
         )
-        p, field, left = self.decoder(self.recovery, measured, positions, *geometry)
+        table = dict(zip(self.decoder.table_inputs, others, strict=True))
+        p, field, left = self.decoder(self.recovery, measured, table)
         return *_answers(p * self.kappa_scale), relative_power(left, field), field, left
 
 
@@ -88,15 +89,15 @@ def _answers(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def table_tensors(
-    localizer: str, table: dict[str, NDArray[np.float32]], references: FramePair
+    graph: DecoderGraph, table: dict[str, NDArray[np.float32]], references: FramePair
 ) -> dict[str, NDArray[np.generic]]:
-    """The defaults of `TABLE_INPUTS` and of what the localizer takes, in order."""
+    """The defaults of a graph's table inputs, in order."""
     tensors: dict[str, NDArray[np.generic]] = {
         "reference_in_phase": references.in_phase,
         "reference_quadrature": references.quadrature,
         **table,
     }
-    return {name: tensors[name] for name in (*TABLE_INPUTS, *GEOMETRY[localizer])}
+    return {name: tensors[name] for name in graph.table_inputs}
 
 
 def published_tensors(decoder: PublishedDecoder) -> dict[str, NDArray[np.generic]]:

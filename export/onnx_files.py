@@ -16,6 +16,7 @@ from torch import nn
 from export.graph import FRAME_INPUTS, Graph
 from optics.registration.parameters import nominal
 from train.twin import RayTwin
+from train.waves import Waves
 
 OPSET = 20
 TWIN_INPUTS = ("parameters", "points", "anchors", "camera_places")
@@ -75,6 +76,8 @@ def _export(
             dynamic_shapes=shapes,
             external_data=False,
             verbose=False,
+            # the rewriter would take minutes over a pipe's unrolled steps, for a tenth of a decode's time
+            optimize=not any(isinstance(part, Waves) for part in module.modules()),
         )
     assert program is not None
     return _anonymous(program.model_proto)

@@ -6,8 +6,10 @@ y' = +-w/2 with y' = x sin t + y cos t, and the field vanishes on them. The comm
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
@@ -105,7 +107,47 @@ def mode_detuning(geometry: WaveGeometry, rows: Real, columns: Real) -> Real:
     transverse = (np.pi / geometry.pipe_width_m) ** 2 * (rows**2 + columns**2)
     if transverse.max() >= nk**2:
         raise ValueError(f"modes: got transverse wave number {np.sqrt(transverse.max()):.3g}, wanted below {nk:.3g}")
-    return np.asarray(-transverse / (np.sqrt(nk**2 - transverse) + nk))  # without cancellation
+    return np.asarray(detuning(nk, transverse, np.sqrt))
+
+
+def detuning(nk: Any, transverse: Any, sqrt: Callable[[Any], Any]) -> Any:
+    """kz - nk of a wave with a squared transverse wave number, without cancellation; in numpy or torch, by its sqrt."""
+    return -transverse / (sqrt(nk * nk - transverse) + nk)
+
+
+class Couplings(NamedTuple):
+    """Factors on k/f in a lens's phase between a point (x, y) of its plane and one (X, Y') of the oblique facet."""
+
+    x_to_x: Any
+    y_to_x: Any
+    y_to_y: Any
+    x_to_y: Any
+
+
+def couplings(geometry: WaveGeometry, xp: Any = np) -> Couplings:
+    """The couplings for a pipe's shear and roll; `xp` is numpy, or torch for a geometry of tensors."""
+    t, roll = geometry.pipe_angle, geometry.pipe_roll
+    sin, cos, tan = xp.sin(roll), xp.cos(roll), xp.tan(t)
+    return Couplings(cos + tan * sin, sin - tan * cos, cos / xp.cos(t), -sin / xp.cos(t))
+
+
+def entrance_window(
+    geometry: WaveGeometry, facet_x_m: Any, facet_y_m: Any, envelope_m: float, blur_m: float = 0.0, xp: Any = np
+) -> Any:
+    """Transmission of the SLM's pixel shape and blur at the entrance facet, [fy, fx].
+
+    Args:
+        geometry: the device.
+        facet_x_m, facet_y_m: sample positions along the facet's axes, [fx] and [fy].
+        envelope_m, blur_m: see `WaveChannel`.
+        xp: as for `couplings`.
+    """
+    t = geometry.pipe_angle
+    per_metre = 1 / (geometry.wavelength_m * geometry.focal_length_m)
+    fy = (facet_y_m[:, None] / xp.cos(t) - facet_x_m[None, :] * xp.tan(t)) * per_metre
+    fx = facet_x_m[None, :] * per_metre
+    pixel = xp.sinc(fx * envelope_m) * xp.sinc(fy * envelope_m)
+    return pixel * xp.exp(-2 * (np.pi * blur_m) ** 2 * (fx**2 + fy**2))
 
 
 def modes_of_plane(geometry: WaveGeometry, plane_m: Real, cells: int) -> Complex:
@@ -142,19 +184,18 @@ class FourierLens:
 
     def __init__(self, geometry: WaveGeometry, x_m: Real, y_m: Real, cells: tuple[int, int]) -> None:
         w = geometry.pipe_width_m
-        t, roll = geometry.pipe_angle, geometry.pipe_roll
         facet_y, facet_x = (_facet(count, w) for count in cells)
-        sin, cos, tan = np.sin, np.cos, np.tan
+        factors = couplings(geometry)
 
-        def kernel(coefficient: float, rows: Real, columns: Real) -> Complex:
-            return _lens_kernel(geometry, coefficient * rows, columns)
+        def kernel(factor: float, rows: Real, columns: Real) -> Complex:
+            return _lens_kernel(geometry, factor * rows, columns)
 
-        area = (x_m[1] - x_m[0]) * (y_m[1] - y_m[0]) * (w / cells[0]) * (w / cells[1]) / cos(t)
+        area = (x_m[1] - x_m[0]) * (y_m[1] - y_m[0]) * (w / cells[0]) * (w / cells[1]) / np.cos(geometry.pipe_angle)
         unitary = np.sqrt(area) / (geometry.wavelength_m * geometry.focal_length_m)
-        self.x_to_x = (unitary * kernel(cos(roll) + tan(t) * sin(roll), x_m, facet_x)).astype(np.complex64)
-        self.y_and_x = kernel(sin(roll) - tan(t) * cos(roll), y_m, facet_x).astype(np.complex64)
-        self.y_to_y = kernel(cos(roll) / cos(t), facet_y, y_m).astype(np.complex64)
-        self.facet_terms, self.plane_terms = _separated(kernel(-sin(roll) / cos(t), facet_y, x_m), facet_y, x_m)
+        self.x_to_x = (unitary * kernel(factors.x_to_x, x_m, facet_x)).astype(np.complex64)
+        self.y_and_x = kernel(factors.y_to_x, y_m, facet_x).astype(np.complex64)
+        self.y_to_y = kernel(factors.y_to_y, facet_y, y_m).astype(np.complex64)
+        self.facet_terms, self.plane_terms = _separated(kernel(factors.x_to_y, facet_y, x_m), facet_y, x_m)
 
     def to_facet(self, field: Complex) -> Complex:
         """Field on the plane [ny, nx] to the facet's grid [cells_y - 1, cells_x - 1]."""
@@ -358,15 +399,9 @@ class WaveChannel:
     @cached_property
     def entrance_window(self) -> Real:
         """Transmission of the SLM's pixel shape and blur at the entrance facet, [cells_y - 1, cells_x - 1]."""
-        g = self.geometry
-        facet_y, facet_x = (_facet(count, g.pipe_width_m) for count in self.cells)
-        along_y = facet_y[:, None] / np.cos(g.pipe_angle) - facet_x[None, :] * np.tan(g.pipe_angle)
-        along_x = np.broadcast_to(facet_x[None, :], along_y.shape)
-        per_metre = 1 / (g.wavelength_m * g.focal_length_m)
-        fx, fy = along_x * per_metre, along_y * per_metre
-        pixel = np.sinc(fx * self.envelope_m) * np.sinc(fy * self.envelope_m)
-        blur = np.exp(-2 * (np.pi * self.blur_m) ** 2 * (fx**2 + fy**2))
-        return np.asarray(pixel * blur, dtype=np.float32)
+        facet_y, facet_x = (_facet(count, self.geometry.pipe_width_m) for count in self.cells)
+        window = entrance_window(self.geometry, facet_x, facet_y, self.envelope_m, self.blur_m)
+        return np.asarray(window, dtype=np.float32)
 
     def forward(self, field: Complex) -> Complex:
         """Field on the SLM [ny, nx] to the field on the camera plane."""

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from optics.grid import GRID_STEP_PX
 from optics.pilots import Pilots
-from optics.registration.table import sampling_table
+from optics.registration.table import registration_coefficients, shifted
 from runtime.bundle import Table
 from runtime.calibrated import calibration_of
 from runtime.decoder import DecodedPage, Decoder
@@ -68,14 +67,14 @@ class PhaseShift:
     """Measures the remaining shift of decoded pages and moves the table by a total shift.
 
     Args:
-        places: the table's places without shift, float32 [B, 2, ny, nx], grid samples.
-        sensitivity: change of each symbol's decoded phase with the places' shift along x and y, [2, ny, nx], radians
-            a camera pixel.
+        registration: the table's registration without shift, float32 [2, 2, 10].
+        sensitivity: change of each symbol's decoded phase with a shift along x and y, [2, ny, nx], radians a camera
+            pixel.
         pilots: the known symbols of pages of M levels that come without their own.
     """
 
-    def __init__(self, places: NDArray[np.float32], sensitivity: Real, pilots: Callable[[int], Pilots]) -> None:
-        self._places, self._sensitivity, self._pilots = places, sensitivity, pilots
+    def __init__(self, registration: NDArray[np.float32], sensitivity: Real, pilots: Callable[[int], Pilots]) -> None:
+        self._registration, self._sensitivity, self._pilots = registration, sensitivity, pilots
 
     @classmethod
     def of_decoder(cls, decoder: Decoder) -> PhaseShift:
@@ -85,19 +84,19 @@ class PhaseShift:
             BundleError: the twin cannot be traced.
             CalibrationError: the bundle holds no calibration.
         """
-        places = default_places(decoder)
+        registration = default_registration(decoder)
         pair = decoder.bundle.golden.pair
         moved = [
-            [decoder.infer(pair, _moved(places, sign * PROBE_PX * axis)).phase for sign in (1, -1)]
+            [decoder.infer(pair, _moved(registration, sign * PROBE_PX * axis)).phase for sign in (1, -1)]
             for axis in np.eye(2)
         ]
         slopes = [np.angle(np.exp(1j * (plus - minus))) / (2 * PROBE_PX) for plus, minus in moved]
         smooth = np.stack([ndimage.median_filter(slope, SMOOTHING) for slope in slopes])
-        return cls(places, smooth.astype(np.float64), decoder.pilots)
+        return cls(registration, smooth.astype(np.float64), decoder.pilots)
 
     def move(self, shift_px: Real) -> Table:
         """The table of an image that lies `shift_px` (x, y) from where calibration saw it."""
-        return _moved(self._places, shift_px) if np.any(shift_px) else {}
+        return _moved(self._registration, shift_px) if np.any(shift_px) else {}
 
     def measure(self, page: DecodedPage, pilots: Pilots | None = None) -> Estimate | None:
         """Remaining shift of a page, or None where it does not show it reliably."""
@@ -143,19 +142,16 @@ class PhaseShift:
         return estimate.constant_rad - self.bend(estimate.shift_px)
 
 
-def default_places(decoder: Decoder) -> NDArray[np.float32]:
-    """The places that a decode takes where none are fed: the bundle's re-traced ones, else those of its calibration."""
+def default_registration(decoder: Decoder) -> NDArray[np.float32]:
+    """The registration that a decode takes where none is fed: the bundle's re-fitted one, else its calibration's."""
     bundle = decoder.bundle
-    if (kept := bundle.table.get("places")) is not None:
+    if (kept := bundle.table.get("registration")) is not None:
         return kept
-    calibration = calibration_of(bundle)
-    table = sampling_table(OnnxTwin(bundle, 1), calibration.vector, calibration.turn_rad, bundle.profile)
-    return table["places"]
+    return registration_coefficients(OnnxTwin(bundle, 1), calibration_of(bundle).vector, bundle.profile)
 
 
-def _moved(places: NDArray[np.float32], shift_px: Real) -> Table:
-    step = (np.asarray(shift_px) / GRID_STEP_PX).astype(np.float32)
-    return {"places": places + step[None, :, None, None]}
+def _moved(registration: NDArray[np.float32], shift_px: Real) -> Table:
+    return {"registration": shifted(registration, shift_px)}
 
 
 def _solve(residual: Real, sensitivity: Real, weight: Real) -> Estimate | None:

@@ -17,8 +17,8 @@ from runtime.decoder import Decoder
 from runtime.recalibration import FitReport, FitResult, KnownPages
 from runtime.twin import OnnxTwin
 
-_RETRACED = "places"
-"""The input that a re-traced geometry is fed to."""
+_REFITTED = frozenset({"places", "parameters"})
+"""Inputs that a re-fitted geometry is fed to, by one of which a decoder knows it."""
 _TWIN_THREADS = 1
 """The twin traces few points at a time; a second thread would only spin."""
 
@@ -40,8 +40,9 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         BundleError: the bundle's graphs do not show the field, or hold a geometry that cannot be fed instead.
     """
     profile, earlier = bundle.profile, calibration_of(bundle)
-    if _RETRACED not in decoder.table_shapes:
-        wanted = f"{_RETRACED} among them: this decoder holds its geometry itself; calibrate, train and export anew"
+    if not _REFITTED & decoder.table_shapes.keys():
+        among = f"{' or '.join(sorted(_REFITTED))} among them"
+        wanted = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
         raise BundleError(f"{bundle.thing}: table inputs", sorted(decoder.table_shapes), wanted)
     references = pages.references or _kept_references(bundle)
     if references is None:
@@ -77,7 +78,7 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         **sampling_table(twin, registered.parameters, registered.turn, profile),
     }
     return FitResult(
-        table=table,
+        table={name: value for name, value in table.items() if name in decoder.table_shapes},
         calibration_toml=fitted.to_toml(),
         report=FitReport(
             angle_deg=fitted.angle_deg(profile),

@@ -191,7 +191,7 @@ def tracker_for(decoder: Decoder) -> Tracker:
     Raises:
         BundleError, CalibrationError: see `PhaseShift.of_decoder`.
     """
-    return ShiftTracker(_PhaseReader(decoder)) if "places" in decoder.table_shapes else NoTracker()
+    return ShiftTracker(_PhaseReader(decoder)) if "registration" in decoder.table_shapes else NoTracker()
 
 
 class _PhaseReader:

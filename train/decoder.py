@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from torch import Tensor, nn
 
 from optics.profile import Profile
@@ -15,8 +17,8 @@ from train.waves import Real
 
 COHERENT, WAVE = "coherent", "wave"
 LOCALIZERS = (COHERENT, WAVE)
-GEOMETRY = {COHERENT: ("places", "place_gradients", "phases"), WAVE: ()}
-"""Tensors of the sampling table that a localizer takes beside the field."""
+_BY_RAYS = ("places", "place_gradients", "phases")
+_BY_WAVES = ("parameters",)
 
 
 class SymbolDecoder(nn.Module):
@@ -39,25 +41,29 @@ class SymbolDecoder(nn.Module):
             Refiner(LIGHT_CHANNELS, small.channels, small.blocks, small.levels) for _ in range(choices.refinements)
         )
         self.prediction = Prediction(profile, parameters) if choices.refinements else None
+        self._geometry = _BY_RAYS if localizer == COHERENT else _BY_WAVES
+        waves = _BY_WAVES if localizer == WAVE or choices.refinements else ()
+        self.table_inputs = ("positions", *(_BY_RAYS if localizer == COHERENT else ()), *waves)
 
     def forward(
-        self, recovery: FieldRecovery, measured: Measured, positions: Tensor, *geometry: Tensor
+        self, recovery: FieldRecovery, measured: Measured, table: Mapping[str, Tensor]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Decode one page.
 
         Args:
             recovery: of the same device.
             measured: of the page.
-            positions: exit centroids over the pipe's width, [2, ny, nx].
-            geometry: what the localizer takes, see `GEOMETRY`.
+            table: tensors of the sampling table by name, at least `table_inputs`.
 
         Returns:
             p [2, ny, nx]; field and what is left of the homodyne equations, [2, Gy, Gx], see `FieldRecovery`.
         """
         field, left = recovery.solve(measured)
-        p = self.network(self.localizer(field, *geometry).flatten(0, 2)[None], positions[None])
+        light = self.localizer(field, *(table[name] for name in self._geometry))
+        positions = table["positions"][None]
+        p = self.network(light.flatten(0, 2)[None], positions)
         for refiner in self.refiners:
             assert self.prediction is not None
-            light = self.prediction(recovery, measured, field, p[0])
-            p = refiner(light.flatten(0, 2)[None], positions[None], p)
+            light = self.prediction(recovery, measured, field, p[0], table["parameters"])
+            p = refiner(light.flatten(0, 2)[None], positions, p)
         return p[0], field, left

@@ -19,7 +19,7 @@ from optics.recording import FramePair, Recording
 from optics.registration.calibrate import LEAST_KEPT, KnownPage, least_coherence
 from optics.registration.coherence import COHERENT_BRANCHES, branch_shares, page_coherence
 from optics.registration.samplers import FieldSampler
-from optics.registration.table import Table, sampling_table
+from optics.registration.table import Table, sampling_table, shifted
 from optics.registration.twin import BRANCHES
 from train.field import FieldRecovery, Measured, TorchFieldSolver
 from train.localizers.coherent import CoherentLocalizer
@@ -104,8 +104,7 @@ class FeatureExtractor:
 
     def look(self, pair: FramePair, shift_px: tuple[float, float]) -> tuple[Measured, Tensor]:
         """What was measured on the calibrated grid of a page whose image has moved by (x, y), and its field there."""
-        registration = self.table["registration"].copy()
-        registration[..., 0] += np.array(shift_px, dtype=np.float32)
+        registration = shifted(self.table["registration"], np.array(shift_px))
         seen = (pair.in_phase, pair.quadrature, self._references.in_phase, self._references.quadrature)
         tensors = [*(frame.astype(np.float32) for frame in seen), registration, self.table["homodyne"]]
         measured = self.recovery.measure(*map(torch.from_numpy, tensors))

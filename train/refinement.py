@@ -27,7 +27,7 @@ from train.localizers.coherent import SAMPLES
 from train.localizers.wave import by_symbol
 from train.network import Refiner
 from train.parts import conjugate, multiply, parts, stacked
-from train.waves import Real, Waves
+from train.waves import Real, WaveMatrices, Waves
 
 LIGHT_CHANNELS = 2 * SAMPLES**2
 """Features that carry unexplained light: real parts of a symbol's samples, then imaginary parts."""
@@ -54,28 +54,32 @@ class Prediction(nn.Module):
         self.register_buffer("illumination", even)
         self.register_buffer("floor", torch.ones(()))
 
-    def field(self, p: Tensor) -> Tensor:
+    def field(self, at: WaveMatrices, p: Tensor) -> Tensor:
         """Expected field on the common grid, [2, Gy, Gx], of a believed page p [2, ny, nx]; its scale is open."""
         written = expected_phasors(p).repeat_interleave(SAMPLES, dim=1).repeat_interleave(SAMPLES, dim=2)
-        return self.waves.to_camera(torch.stack(multiply(parts(written), parts(self.illumination))))
+        return self.waves.to_camera(at, torch.stack(multiply(parts(written), parts(self.illumination))))
 
-    def forward(self, recovery: FieldRecovery, measured: Measured, field: Tensor, p: Tensor) -> Tensor:
+    def forward(
+        self, recovery: FieldRecovery, measured: Measured, field: Tensor, p: Tensor, parameters: Tensor | None = None
+    ) -> Tensor:
         """Light that a believed page leaves unexplained.
 
         Args:
             recovery: of the same device.
             measured, field: of the page; the field says how strong its light is.
             p: [2, ny, nx].
+            parameters: [P] of a device that has drifted since.
 
         Returns:
             [2, 1, S, ny, nx], as a localizer gives it.
         """
-        expected = self.field(p)
+        at = self.waves.matrices(parameters)
+        expected = self.field(at, p)
         real, imaginary = multiply(parts(field), conjugate(parts(expected)))
         gain = torch.stack([real.sum(), imaginary.sum()]) / (expected.square().sum() + 1e-12)
         expected = torch.stack(multiply(parts(expected), parts(gain)))
         left = recovery.innovation(measured, expected, self.floor)
-        return by_symbol(self.waves.to_page(left), self.page_shape)
+        return by_symbol(self.waves.to_page(at, left), self.page_shape)
 
 
 def expected_phasors(p: Tensor) -> Tensor:

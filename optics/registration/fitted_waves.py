@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +21,47 @@ _STEPS = 64
 """Splitting steps: a field error of 0.006. With 24 it is 0.04, and a fit to it errs in the angle."""
 _ILLUMINATION = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Powers of (x, y) in an illumination."""
+
+
+def fitted_geometry(profile: Profile, value: Mapping[str, Any]) -> WaveGeometry:
+    """The geometry of fitted parameters by name, numbers or tensors."""
+    return WaveGeometry(
+        wavelength_m=profile.light.wavelength_m,
+        focal_length_m=profile.lens.focal_length_m * (1 + value["focal_length_relative"]),
+        pipe_length_m=profile.pipe.length_m * (1 + value["pipe_length_relative"]),
+        pipe_width_m=profile.pipe.width_m * (1 + value["pipe_width_relative"]),
+        refractive_index=profile.pipe.refractive_index,
+        pipe_angle=np.deg2rad(profile.pipe.angle_deg) + value["pipe_angle_rad"],
+        pipe_roll=value["pipe_roll_rad"],
+    )
+
+
+def modulator_axes(profile: Profile, samples: int) -> tuple[Real, Real]:
+    """Places of so many samples per symbol and axis from the page's centre, [nx samples] and [ny samples], metres."""
+    rows, columns = (count * samples for count in profile.page_shape)
+    pitch = profile.symbol_pitch_m / samples
+    x, y = ((np.arange(count) - (count - 1) / 2) * pitch for count in (columns, rows))
+    return np.asarray(x), np.asarray(y)
+
+
+def fitted_launch_phase(profile: Profile, value: Mapping[str, Any], geometry: WaveGeometry, x_m: Any, y_m: Any) -> Any:
+    """Smooth phase at the launch side, radians, of places from the page's centre; numbers, arrays or tensors."""
+    corner = profile.corner_m
+    at = launch_phase(value, x_m / corner, y_m / corner)
+    return at - _ramp(value, geometry, x_m, y_m)
+
+
+def fitted_camera_phase(profile: Profile, value: Mapping[str, Any], geometry: WaveGeometry, x_m: Any, y_m: Any) -> Any:
+    """Smooth phase against the reference at places of the camera plane, radians; numbers, arrays or tensors."""
+    corner = profile.corner_m
+    edges = profile.page_width_m / 2 / corner, profile.page_height_m / 2 / corner
+    return camera_phase(value, x_m / corner, y_m / corner, *edges) + _ramp(value, geometry, x_m, y_m)
+
+
+def _ramp(value: Mapping[str, Any], geometry: WaveGeometry, x_m: Any, y_m: Any) -> Any:
+    """What a pipe off the lenses' axis does."""
+    per_metre = geometry.wave_number / geometry.focal_length_m
+    return per_metre * (value["pipe_centre_x_m"] * x_m + value["pipe_centre_y_m"] * y_m)
 
 
 class FittedWaves:
@@ -51,23 +95,12 @@ class FittedWaves:
         like: FittedWaves | None = None,
     ) -> None:
         value = as_dict(parameters)
-        geometry = WaveGeometry(
-            wavelength_m=profile.light.wavelength_m,
-            focal_length_m=profile.lens.focal_length_m * (1 + value["focal_length_relative"]),
-            pipe_length_m=profile.pipe.length_m * (1 + value["pipe_length_relative"]),
-            pipe_width_m=profile.pipe.width_m * (1 + value["pipe_width_relative"]),
-            refractive_index=profile.pipe.refractive_index,
-            pipe_angle=np.deg2rad(profile.pipe.angle_deg) + value["pipe_angle_rad"],
-            pipe_roll=value["pipe_roll_rad"],
-        )
+        geometry = fitted_geometry(profile, value)
         grid = field_grid(profile)
         grid_x, grid_y = grid.x_m[::stride], grid.y_m[::stride]
-        rows, columns = profile.page_shape
+        x, y = modulator_axes(profile, samples)
         pitch = profile.symbol_pitch_m / samples
-        x = (np.arange(columns * samples) - (columns * samples - 1) / 2) * pitch
-        y = (np.arange(rows * samples) - (rows * samples - 1) / 2) * pitch
-        half_width, half_height = profile.page_width_m / 2, profile.page_height_m / 2
-        self.x, self.y = x / half_width, y / half_height
+        self.x, self.y = x / (profile.page_width_m / 2), y / (profile.page_height_m / 2)
         page = x + value["page_centre_x_m"], y + value["page_centre_y_m"]
         self._sampling = geometry, value["page_centre_x_m"], value["page_centre_y_m"], samples, filled, stride, steps
         self.channel: WaveChannel
@@ -83,17 +116,8 @@ class FittedWaves:
                 steps=steps,
                 envelope_m=pitch if filled else 0.0,
             )
-        corner = profile.corner_m
-        edges = half_width / corner, half_height / corner
-        at_camera = camera_phase(value, grid_x[None, :] / corner, grid_y[:, None] / corner, *edges)
-        at_launch = launch_phase(value, x[None, :] / corner, y[:, None] / corner)
-        ramp = (
-            geometry.wave_number
-            / geometry.focal_length_m
-            * np.array([value["pipe_centre_x_m"], value["pipe_centre_y_m"]])
-        )
-        at_launch = at_launch - ramp[0] * x[None, :] - ramp[1] * y[:, None]
-        at_camera = at_camera + ramp[0] * grid_x[None, :] + ramp[1] * grid_y[:, None]
+        at_launch = fitted_launch_phase(profile, value, geometry, x[None, :], y[:, None])
+        at_camera = fitted_camera_phase(profile, value, geometry, grid_x[None, :], grid_y[:, None])
         self.launch: Complex = np.exp(1j * at_launch)
         self.against_reference: Complex = np.exp(1j * at_camera)
         self._camera = self.against_reference / stride  # samples that stand for more area are larger

@@ -16,7 +16,7 @@ from optics.registration.twin import Twin
 Real = NDArray[np.float64]
 Table = dict[str, NDArray[np.float32]]
 
-SAMPLING_TABLE = ("registration", "homodyne", "places", "place_gradients", "phases", "positions")
+SAMPLING_TABLE = ("registration", "homodyne", "parameters", "places", "place_gradients", "phases", "positions")
 """Names of the table's tensors, as inputs of an exported decoder."""
 
 _FIT_POINTS = 9
@@ -47,6 +47,13 @@ def registration_coefficients(twin: Twin, parameters: Real, profile: Profile) ->
     return np.stack(coefficients).astype(np.float32)
 
 
+def shifted(registration: NDArray[np.float32], shift_px: Real) -> NDArray[np.float32]:
+    """The registration [2, 2, 10] of an image that lies (x, y) camera pixels from where calibration saw it."""
+    moved = registration.copy()
+    moved[..., monomial_powers().index((0, 0))] += np.asarray(shift_px, dtype=np.float32)
+    return moved
+
+
 def sampling_table(twin: Twin, parameters: Real, turn: float, profile: Profile) -> Table:
     """Trace the whole page.
 
@@ -57,10 +64,10 @@ def sampling_table(twin: Twin, parameters: Real, turn: float, profile: Profile) 
         profile: the nominal device.
 
     Returns:
-        registration [2, 2, 10]; homodyne [2] (cosine and sine of the turn); with one symbol pitch as the unit of
-        offset: places [B, 2, ny, nx] in grid samples (column, row), place_gradients [B, 4, ny, nx] as (dx/dx, dx/dy,
-        dy/dx, dy/dy), phases [B, 6, ny, nx] as (value, d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2), the value within
-        +-pi; positions [2, ny, nx], exit centroid over the pipe's width.
+        registration [2, 2, 10]; homodyne [2] (cosine and sine of the turn); parameters [P] themselves; with one symbol
+        pitch as the unit of offset: places [B, 2, ny, nx] in grid samples (column, row), place_gradients [B, 4, ny, nx]
+        as (dx/dx, dx/dy, dy/dx, dy/dy), phases [B, 6, ny, nx] as (value, d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2), the
+        value within +-pi; positions [2, ny, nx], exit centroid over the pipe's width.
     """
     grid = field_grid(profile)
     rows, columns = profile.page_shape
@@ -96,6 +103,7 @@ def sampling_table(twin: Twin, parameters: Real, turn: float, profile: Profile) 
     return {
         "registration": registration_coefficients(twin, parameters, profile),
         "homodyne": np.array([np.cos(turn), np.sin(turn)], dtype=np.float32),
+        "parameters": parameters.astype(np.float32),
         "places": as_maps(middle),
         "place_gradients": as_maps(gradients),
         "phases": as_maps(np.stack(taylor, axis=-1)),

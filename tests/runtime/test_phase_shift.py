@@ -14,11 +14,11 @@ from tests.runtime import toy
 NY, NX = toy.PAGE
 Y, X = np.meshgrid(np.linspace(-1, 1, NY), np.linspace(-1, 1, NX), indexing="ij")
 SENSITIVITY = np.stack([0.5 * np.sign(X) + 0.2 * Y, 0.4 * np.cos(3 * Y) - 0.3 * X])
-PLACES = np.zeros((5, 2, NY, NX), np.float32)
+REGISTRATION = np.zeros((2, 2, 10), np.float32)
 
 
 def reader() -> PhaseShift:
-    return PhaseShift(PLACES, SENSITIVITY, lambda levels: Pilots.of_profile(toy.PROFILE, levels))
+    return PhaseShift(REGISTRATION, SENSITIVITY, lambda levels: Pilots.of_profile(toy.PROFILE, levels))
 
 
 def page(
@@ -99,9 +99,9 @@ def test_a_shift_that_is_plain_to_see_is_told_however_roughly() -> None:
     assert reader().measure(near) is None
 
 
-def test_the_table_moves_half_a_grid_sample_a_pixel_and_not_at_all_without_shift() -> None:
+def test_both_cameras_are_looked_at_where_the_image_has_moved_to() -> None:
     assert reader().move(np.zeros(2)) == {}
-    places = reader().move(np.array([1.0, -0.5]))["places"]
-    assert places.dtype == np.float32
-    assert np.all(places[:, 0] == 0.5)
-    assert np.all(places[:, 1] == -0.25)
+    moved = reader().move(np.array([1.0, -0.5]))["registration"]
+    assert moved.dtype == np.float32
+    np.testing.assert_array_equal(moved[:, :, 0], [[1.0, -0.5]] * 2)
+    assert not moved[:, :, 1:].any()

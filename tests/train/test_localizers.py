@@ -8,13 +8,9 @@ import pytest
 from optics.device import Device, Drift, SlmDefects
 from optics.page import random_symbols, symbol_phases
 from optics.registration.coherence import COHERENT_BRANCHES, branch_shares
-from optics.registration.fitted_waves import FittedWaves
-from optics.registration.parameters import NAMES
 from optics.simulator import Simulator, true_parameters
 from tests.optics.small import small_profile
-from train.features import FeatureExtractor, localized
-from train.localizers.coherent import SAMPLES
-from train.localizers.wave import WaveLocalizer
+from train.features import FeatureExtractor
 
 SEED = 3
 

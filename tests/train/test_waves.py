@@ -8,7 +8,7 @@ import torch
 
 from optics.device import Device
 from optics.registration.fitted_waves import FittedWaves
-from optics.registration.parameters import NAMES
+from optics.registration.parameters import NAMES, PRIORS
 from optics.simulator import true_parameters
 from tests.optics.small import small_profile
 from train.localizers.coherent import SAMPLES
@@ -23,7 +23,7 @@ def models(request: pytest.FixtureRequest) -> tuple[FittedWaves, Waves]:
     angle_rad, filled = request.param
     parameters = true_parameters(PROFILE, Device())
     parameters[NAMES.index("pipe_angle_rad")] = angle_rad
-    return FittedWaves(PROFILE, parameters, SAMPLES, filled=filled), Waves(PROFILE, parameters, filled=filled)
+    return FittedWaves(PROFILE, parameters, SAMPLES, filled=filled, steps=48), Waves(PROFILE, parameters, filled=filled)
 
 
 def noise(shape: tuple[int, ...]) -> np.ndarray:
@@ -32,14 +32,26 @@ def noise(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def check(found: torch.Tensor, expected: np.ndarray) -> None:
-    assert np.linalg.norm(found[0].numpy() + 1j * found[1].numpy() - expected) < 1e-4 * np.linalg.norm(expected)
+    assert np.linalg.norm(found[0].numpy() + 1j * found[1].numpy() - expected) < 1e-3 * np.linalg.norm(expected)
 
 
 def test_a_page_lights_the_camera_as_in_the_fitted_waves(models: tuple[FittedWaves, Waves]) -> None:
     page = noise(models[0].launch.shape)
-    check(models[1].to_camera(stacked(page)), models[0].to_camera(page))
+    check(models[1].to_camera(models[1].matrices(), stacked(page)), models[0].to_camera(page))
 
 
 def test_a_field_comes_back_to_the_page_as_in_the_fitted_waves(models: tuple[FittedWaves, Waves]) -> None:
     field = noise(models[0].against_reference.shape)
-    check(models[1].to_page(stacked(field)), models[0].to_page(field))
+    check(models[1].to_page(models[1].matrices(), stacked(field)), models[0].to_page(field))
+
+
+def test_other_parameters_make_the_waves_of_the_device_that_has_drifted() -> None:
+    parameters = true_parameters(PROFILE, Device())
+    drifted = parameters + 0.02 * PRIORS
+    drifted[NAMES.index("page_centre_y_m")] -= 0.02 * PRIORS[NAMES.index("page_centre_y_m")]  # it changes the sampling
+    expected, waves = (
+        FittedWaves(PROFILE, drifted, SAMPLES, filled=True, steps=48),
+        Waves(PROFILE, parameters, filled=True),
+    )
+    page = noise(expected.launch.shape)
+    check(waves.to_camera(waves.matrices(torch.from_numpy(drifted).float()), stacked(page)), expected.to_camera(page))

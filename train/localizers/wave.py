@@ -27,9 +27,17 @@ class WaveLocalizer(nn.Module):
         """Features that carry light: real parts of a symbol's samples, then imaginary parts."""
         return 2 * SAMPLES**2
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Field [2, Gy, Gx] to samples [2, 1, S, ny, nx], as the coherent localizer gives them with a single branch."""
-        return by_symbol(self.waves.to_page(field), self.page_shape)
+    def forward(self, field: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Field to samples of one branch, as the coherent localizer gives those of many.
+
+        Args:
+            field: [2, Gy, Gx] on the common grid.
+            parameters: [P], of a device that has drifted since.
+
+        Returns:
+            [2, 1, S, ny, nx].
+        """
+        return by_symbol(self.waves.to_page(self.waves.matrices(parameters), field), self.page_shape)
 
 
 def by_symbol(page: Tensor, page_shape: tuple[int, int]) -> Tensor:

@@ -1,0 +1,88 @@
+"""Decoders that know waves as bundles: parity with torch, decoding without it, and following a device that drifts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy import ndimage
+
+from export.cli_export import export_run
+from optics.device import Device
+from optics.measures import measure
+from optics.page import random_symbols
+from optics.pilots import Pilots
+from optics.recording import FramePair, Recording
+from optics.registration.table import sampling_table
+from optics.simulator import Simulator, true_parameters
+from runtime.cli_evaluate import evaluate
+from runtime.decoder import Decoder
+from runtime.phase_shift import PhaseShift
+from runtime.tracking import ShiftTracker, tracker_for
+from tests.optics.small import small_profile
+from train.cli_train import train
+from train.run import load_run
+from train.twin import RayTwin, TorchTwin
+
+DEVICE = Device()
+
+
+@pytest.fixture(scope="module", params=["--localizer wave", "--refinements 1"])
+def made(
+    request: pytest.FixtureRequest, small_device: list[str], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path, float]:
+    """Run, bundle, and how far the bundle is from torch."""
+    folder = tmp_path_factory.mktemp("by-waves")
+    size = ["--channels", "12", "--blocks", "1", "--steps", "120", "--synthetic-pages", "0"]
+    options = [*small_device, *request.param.split(), *size, "--out", str(folder / "run")]
+    CliRunner().invoke(train, options, standalone_mode=False, catch_exceptions=False)
+    _, error = export_run(folder / "run", folder / "bundle.zip")
+    return folder / "run", folder / "bundle.zip", error
+
+
+def test_the_bundle_decodes_without_torch_what_the_run_decoded(
+    made: tuple[Path, Path, float], small_device: list[str], tmp_path: Path
+) -> None:
+    run, bundle, error = made
+    assert error <= 1e-3
+    asked = ["--bundle", str(bundle), "--recording", small_device[3], "--json", str(tmp_path / "E.json")]
+    CliRunner().invoke(evaluate, asked, standalone_mode=False, catch_exceptions=False)
+    # of the same light as the validation page, with honest concentrations on top; a dozen pilots show the piston
+    found = json.loads((tmp_path / "E.json").read_text())["air_bits_per_symbol"]
+    assert found > load_run(run).validation_air - 0.6 > 1
+
+
+def test_fed_with_the_drifted_devices_table_it_decodes_the_drifted_device(made: tuple[Path, Path, float]) -> None:
+    profile, decoder = small_profile(), Decoder.load(made[1])
+    drifted = DEVICE.with_settings([f"geometry.pipe_angle_deg={DEVICE.geometry.pipe_angle_deg + 0.12}"])
+    symbols = random_symbols(profile, 256, 1, np.random.default_rng(9))[0]
+    pair = Simulator(profile, drifted, seed=9).page(symbols)
+    twin, parameters = TorchTwin(RayTwin(profile)), true_parameters(profile, drifted)
+    table = sampling_table(twin, parameters, drifted.homodyne.turn_rad, profile)
+    fed = {name: value for name, value in table.items() if name in decoder.table_shapes}
+    mask = decoder.pilots(256).mask
+
+    def air(table: dict[str, np.ndarray] | None) -> float:
+        page = decoder.decode(pair, 256, table, Pilots.of_symbols(mask, symbols, 256))
+        return measure(page.phase[~mask], page.concentration[~mask], symbols[~mask], 256).air_bits_per_symbol
+
+    assert air(fed) > air(None) + 0.5
+
+
+def test_the_image_is_followed(made: tuple[Path, Path, float], small_device: list[str]) -> None:
+    decoder = Decoder.load(made[1])
+    assert isinstance(tracker_for(decoder), ShiftTracker)
+    with Recording.open(small_device[3]) as recording:
+        pair = recording.frames(0)
+    by = (0.0, 0.3)  # rows, columns
+    moved = [np.rint(ndimage.shift(f.astype(float), by, mode="nearest")) for f in (pair.in_phase, pair.quadrature)]
+    seen = decoder.decode(FramePair(*(frame.astype(np.uint8) for frame in moved)), 256)
+    plain = decoder.decode(pair, 256)
+    shift = PhaseShift.of_decoder(decoder)
+    found, before = shift.estimate(seen), shift.estimate(plain)
+    assert found is not None
+    assert before is not None
+    np.testing.assert_allclose(found.shift_px - before.shift_px, (0.3, 0.0), atol=0.06)
