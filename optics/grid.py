@@ -18,6 +18,8 @@ GRID_STEP_PX = 2
 _MARGIN_PX = 70
 """Grid beyond the nominal image of the page, camera pixels on each side: page shift and diffraction."""
 _PREFILTER_TAPS = 11
+_PASS_STEPS = 8
+"""Straight pieces of the prefilter's gain in its pass band."""
 _BAND_TAPS = 31
 _BAND_HEADROOM = 1.06
 """Pass band over the pipe's nominal band, for misalignment of the pipe against the lens axes."""
@@ -31,7 +33,8 @@ class FieldGrid:
 
     Attributes:
         x_m, y_m: uniform axes, metres from the optical axis, [nx] and [ny].
-        prefilter: taps applied along each axis of a raw frame before it is resampled to the grid.
+        prefilter: taps applied along each axis of a raw frame before it is resampled to the grid, linearly: they make
+            good, on average over the places between two pixels, what that takes off high frequencies.
         band: taps applied along each axis of the field on the grid: the pipe's band.
     """
 
@@ -96,7 +99,7 @@ def field_grid(profile: Profile) -> FieldGrid:
     return FieldGrid(
         x_m=axis(profile.page_width_m),
         y_m=axis(profile.page_height_m),
-        prefilter=_low_pass(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / GRID_STEP_PX - edge * pixel, 0.36)),
+        prefilter=_before_linear(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / GRID_STEP_PX - edge * pixel, 0.36)),
         band=_low_pass(_BAND_TAPS, _BAND_HEADROOM * edge * pitch, 1.36 * edge * pitch),
     )
 
@@ -104,4 +107,13 @@ def field_grid(profile: Profile) -> FieldGrid:
 def _low_pass(taps: int, passed: float, stopped: float) -> Real:
     """Equiripple low-pass with unit gain at zero; band edges in cycles per sample."""
     kernel = signal.remez(taps, [0, passed, stopped, 0.5], [1, 0], weight=[3, 1], fs=1.0)
+    return np.asarray(kernel / kernel.sum())
+
+
+def _before_linear(taps: int, passed: float, stopped: float) -> Real:
+    """Least-squares low-pass with the inverse of linear interpolation's mean gain, sinc^2, in its pass band."""
+    steps = np.linspace(0, passed, _PASS_STEPS + 1)
+    bands = [*np.repeat(steps, 2)[1:-1], stopped, 0.5]
+    gains = [*(1 / np.sinc(bands[:-2]) ** 2), 0, 0]
+    kernel = signal.firls(taps, bands, gains, weight=[1] * _PASS_STEPS + [1.3], fs=1.0)
     return np.asarray(kernel / kernel.sum())

@@ -29,6 +29,11 @@ _ROUNDS = 6
 _STEP = 0.9
 """Along the weighted gradient: the weights bound the curvature by 2, and step times curvature must stay below 2."""
 _MOMENTUM = 0.5
+_CUBIC = 3
+_REFERENCE_BLOCK_PX = 4
+"""Side of the blocks of pixels whose mean stands for a reference."""
+_REFERENCE_STEP = 4
+"""Grid samples from one place to the next where those are read."""
 _FLOOR = 0.1
 """Least reference, as a share of its mean, that frames are divided by: outside the beam there is nothing to learn."""
 
@@ -90,8 +95,14 @@ class FieldRecovery(nn.Module):
         self.band = SeparableFilter(grid.band)
         self.u: Tensor
         self.v: Tensor
-        self.register_buffer("u", torch.tensor(grid.x_m / corner, dtype=torch.float32))
-        self.register_buffer("v", torch.tensor(grid.y_m / corner, dtype=torch.float32))
+        self.between_x: Tensor
+        self.between_y: Tensor
+        for name, axis in (("u", grid.x_m / corner), ("v", grid.y_m / corner)):
+            powers = np.stack([axis**power for power in range(_CUBIC + 1)])
+            self.register_buffer(name, torch.tensor(powers, dtype=torch.float32))
+            self.register_buffer(
+                f"between_{'x' if name == 'u' else 'y'}", torch.tensor(_interpolation(len(axis)), dtype=torch.float32)
+            )
 
     def forward(
         self,
@@ -131,17 +142,20 @@ class FieldRecovery(nn.Module):
         """Both cameras' measurements on the common grid; arguments as for `forward`."""
         frames = torch.stack([in_phase, quadrature]).to(torch.float32)
         references = torch.stack([reference_in_phase, reference_quadrature]).to(torch.float32)
-        stack = torch.stack([frames - references, references], dim=1)
-        stack = self.prefilter(stack.reshape(4, self.rows_px, self.columns_px))
-        stack = stack.reshape(2, 2, self.rows_px, self.columns_px)
-        on_grid = functional.grid_sample(
-            stack, self._where(registration), mode="bicubic", padding_mode="zeros", align_corners=True
-        )
-        reference = on_grid[:, 1]
+        where = self._where(registration)
+        gained = functional.grid_sample(
+            self.prefilter(frames - references)[:, None],
+            where,
+            mode="bilinear",
+            padding_mode="zeros",
+            align_corners=True,
+        )[:, 0]
+        reference = self._reference(references, where)
         floor = _FLOOR * references.mean(dim=(1, 2))[:, None, None]
-        lit = (reference > floor).to(torch.float32).prod(dim=0)
+        seen = (where.abs() <= 1).all(dim=-1) & (reference > floor)
+        lit = seen.to(torch.float32).prod(dim=0)
         reference = torch.maximum(reference, floor)
-        a, b = lit * on_grid[:, 0] / (2 * reference)
+        a, b = lit * gained / (2 * reference)
         amplitude = torch.sqrt(reference[0])
         return Measured(a, b, homodyne[0], homodyne[1], amplitude / amplitude.mean(), lit)
 
@@ -192,11 +206,34 @@ class FieldRecovery(nn.Module):
 
     def _where(self, registration: Tensor) -> Tensor:
         """Sampling grid [2, ny, nx, 2] in grid_sample's coordinates."""
-        x, y = self.u[None, :], self.v[:, None]
         size = registration.new_tensor([self.columns_px - 1, self.rows_px - 1])
-        terms = [registration[:, :, term, None, None] * (x**i * y**j) for term, (i, j) in enumerate(monomial_powers())]
-        pixels = torch.stack(terms).sum(0)
-        return (2 * pixels / size[None, :, None, None] - 1).permute(0, 2, 3, 1)
+        cubic = 2 * registration / size[:, None]
+        cubic = torch.cat([cubic[..., :1] - 1, cubic[..., 1:], torch.zeros_like(cubic[..., :1])], dim=-1)
+        powers = monomial_powers()
+        absent = len(powers)
+        table = [
+            [powers.index((i, j)) if (i, j) in powers else absent for i in range(_CUBIC + 1)] for j in range(_CUBIC + 1)
+        ]
+        by_power = cubic[..., torch.tensor(table, device=cubic.device)]  # [2, 2, powers of y, powers of x]
+        return (self.v.T @ by_power @ self.u).permute(0, 2, 3, 1)
+
+    def _reference(self, references: Tensor, where: Tensor) -> Tensor:
+        """The references on the grid, [2, ny, nx]: beams are smooth, so block means are interpolated."""
+        side = _REFERENCE_BLOCK_PX
+        blocks = functional.avg_pool2d(references[:, None], side, ceil_mode=True, count_include_pad=False)
+        size = where.new_tensor([self.columns_px, self.rows_px])
+        counts = where.new_tensor([blocks.shape[-1], blocks.shape[-2]])
+        # pixels' centres from -1 to 1 there, blocks' edges here
+        coarse = where[:, ::_REFERENCE_STEP, ::_REFERENCE_STEP] * ((size - 1) / size)
+        coarse = (coarse + 1) * (size / (counts * side)) - 1
+        sampled = functional.grid_sample(blocks, coarse, mode="bilinear", padding_mode="border", align_corners=False)
+        return torch.as_tensor((self.between_y @ sampled @ self.between_x.T)[:, 0])
+
+
+def _interpolation(count: int) -> NDArray[np.float64]:
+    """Linear interpolation from every `_REFERENCE_STEP`-th of so many samples to all, [count, coarse]."""
+    coarse = np.arange(0, count, _REFERENCE_STEP)
+    return np.stack([np.interp(np.arange(count), coarse, unit) for unit in np.eye(len(coarse))], axis=1)
 
 
 def relative_power(residual: Tensor, field: Tensor) -> Tensor:
