@@ -38,7 +38,7 @@ class DecoderGraph(nn.Module):
 
     def __init__(self, profile: Profile, decoder: SymbolDecoder, kappa_scale: float) -> None:
         super().__init__()
-        self.recovery = FieldRecovery(profile)
+        self.recovery = FieldRecovery(profile, rounds=decoder.choices.field_rounds)
         self.decoder = decoder
         self.kappa_scale = kappa_scale
         self.table_inputs = (*TABLE_INPUTS, *decoder.table_inputs)

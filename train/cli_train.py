@@ -27,6 +27,7 @@ from optics.registration.known import known_pages
 from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording
 from train.decoder import LOCALIZERS
 from train.features import FeatureExtractor
+from train.field import ROUNDS
 from train.fitting import Hyperparameters
 from train.material import Material
 from train.published.decoder import LENS_CHOICES
@@ -100,6 +101,12 @@ def _default(name: str) -> str:
     f"{_default('refinements')}; published: none to choose.",
 )
 @click.option(
+    "--field-rounds",
+    type=click.IntRange(min=0, max=20),
+    help="Of descent to the field: fewer are faster, and lose most where the light is bright. "
+    f"{_default('field_rounds')}; published: none to choose.",
+)
+@click.option(
     "--learning-rate",
     type=float,
     help=f"Peak of the one-cycle schedule, or that of the published network. {_default('learning_rate')}; published: "
@@ -157,6 +164,7 @@ def train(
     blocks: int | None,
     levels: int | None,
     refinements: int | None,
+    field_rounds: int | None,
     learning_rate: float | None,
     lenses: str | None,
     precision: str,
@@ -192,13 +200,14 @@ def train(
                     "--blocks": blocks,
                     "--levels": levels,
                     "--refinements": refinements,
+                    "--field-rounds": field_rounds,
                     "--synthetic-pages": synthetic_pages,
                     "--start": start,
                 },
             )
         else:
             sizes = {"channels": channels, "blocks": blocks, "levels": levels, "refinements": refinements}
-            wanted = {**chosen, **sizes, "learning_rate": learning_rate}
+            wanted = {**chosen, **sizes, "field_rounds": field_rounds, "learning_rate": learning_rate}
             recipe = _symbols(localizer, wanted, synthetic_pages, start, {"--lenses": lenses})
             recipe.check_start(profile)
         references = recording.references()
@@ -214,7 +223,10 @@ def train(
         calibration.check_profile(profile)
         options["calibration"] = calibration.to_toml()
         features = localizer if localizer in LOCALIZERS else LOCALIZERS[0]
-        extractor = FeatureExtractor(profile, calibration.vector, calibration.turn_rad, references, features)
+        rounds = recipe.choices.field_rounds if isinstance(recipe, SymbolRecipe) else ROUNDS
+        extractor = FeatureExtractor(
+            profile, calibration.vector, calibration.turn_rad, references, features, rounds=rounds
+        )
         extractor.check(known_pages(recording, profile, groups[0][:1])[0], calibration.coherence_after)
         begin(out, options)
         if (out / DESCRIPTION).exists():

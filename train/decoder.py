@@ -12,7 +12,7 @@ from train.fitting import Hyperparameters
 from train.localizers.coherent import CoherentLocalizer
 from train.localizers.wave import WaveLocalizer
 from train.network import Refiner, SymbolUNet
-from train.refinement import LIGHT_CHANNELS, Prediction
+from train.refinement import Prediction
 from train.waves import Real
 
 COHERENT, WAVE = "coherent", "wave"
@@ -33,14 +33,16 @@ class SymbolDecoder(nn.Module):
 
     def __init__(self, profile: Profile, parameters: Real, localizer: str, choices: Hyperparameters) -> None:
         super().__init__()
+        self.choices = choices
         chosen = CoherentLocalizer(profile) if localizer == COHERENT else WaveLocalizer(profile, parameters)
         self.localizer: CoherentLocalizer | WaveLocalizer = chosen
         self.network = SymbolUNet(chosen.light_channels, choices.channels, choices.blocks, choices.levels)
         small = choices.of_refinement()
-        self.refiners = nn.ModuleList(
-            Refiner(LIGHT_CHANNELS, small.channels, small.blocks, small.levels) for _ in range(choices.refinements)
-        )
         self.prediction = Prediction(profile, parameters) if choices.refinements else None
+        unexplained = self.prediction.light_channels if self.prediction else 0
+        self.refiners = nn.ModuleList(
+            Refiner(unexplained, small.channels, small.blocks, small.levels) for _ in range(choices.refinements)
+        )
         self._geometry = _BY_RAYS if localizer == COHERENT else _BY_WAVES
         waves = _BY_WAVES if localizer == WAVE or choices.refinements else ()
         self.table_inputs = ("positions", *(_BY_RAYS if localizer == COHERENT else ()), *waves)

@@ -21,7 +21,7 @@ from optics.registration.coherence import COHERENT_BRANCHES, branch_shares, page
 from optics.registration.samplers import FieldSampler
 from optics.registration.table import Table, sampling_table, shifted
 from optics.registration.twin import BRANCHES
-from train.field import FieldRecovery, Measured, TorchFieldSolver
+from train.field import ROUNDS, FieldRecovery, Measured, TorchFieldSolver
 from train.localizers.coherent import CoherentLocalizer
 from train.localizers.wave import WaveLocalizer
 from train.parts import stacked
@@ -74,7 +74,7 @@ class FeatureExtractor:
         turn: angle between the homodyne arms, radians.
         references: reference-only frames.
         localizer: `coherent` or `wave`.
-        with_signal_power: see `FieldRecovery`.
+        with_signal_power, rounds: see `FieldRecovery`.
     """
 
     def __init__(
@@ -86,10 +86,11 @@ class FeatureExtractor:
         localizer: str = "coherent",
         *,
         with_signal_power: bool = True,
+        rounds: int = ROUNDS,
     ) -> None:
         self._profile, self._parameters, self._twin = profile, parameters, TorchTwin(RayTwin(profile))
         self.table: Table = sampling_table(self._twin, parameters, turn, profile)
-        self.recovery = FieldRecovery(profile, with_signal_power=with_signal_power)
+        self.recovery = FieldRecovery(profile, with_signal_power=with_signal_power, rounds=rounds)
         self._solve = TorchFieldSolver(self.recovery)
         self._coherent = CoherentLocalizer(profile)
         self._wave = WaveLocalizer(profile, parameters) if localizer == "wave" else None

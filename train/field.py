@@ -25,7 +25,8 @@ from optics.registration.table import monomial_powers
 from optics.registration.wave_fit import READ_NOISE
 from train.filters import SeparableFilter
 
-_ROUNDS = 6
+ROUNDS = 6
+"""Of descent; beyond these the band filter's ripple adds up."""
 _STEP = 0.9
 """Along the weighted gradient: the weights bound the curvature by 2, and step times curvature must stay below 2."""
 _MOMENTUM = 0.5
@@ -82,11 +83,12 @@ class FieldRecovery(nn.Module):
         profile: the nominal device.
         with_signal_power: whether the frames hold |E|^2; an oracle takes it off beforehand, and the equations are then
             linear.
+        rounds: of descent.
     """
 
-    def __init__(self, profile: Profile, *, with_signal_power: bool = True) -> None:
+    def __init__(self, profile: Profile, *, with_signal_power: bool = True, rounds: int = ROUNDS) -> None:
         super().__init__()
-        self.with_signal_power = with_signal_power
+        self.with_signal_power, self.rounds = with_signal_power, rounds
         grid = field_grid(profile)
         self.grid: FieldGrid = grid
         self.rows_px, self.columns_px = profile.frame_shape
@@ -198,7 +200,7 @@ class FieldRecovery(nn.Module):
         middle = -linear / quadratic
         real = middle + torch.sign(start[0] - middle) * torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
         before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) / amplitude
-        for _ in range(_ROUNDS):
+        for _ in range(self.rounds):
             ahead = estimate + _MOMENTUM * (estimate - before)
             step = _STEP * measured.pull(ahead, READ_NOISE)
             before, estimate = estimate, self.band((ahead + step) * amplitude) / amplitude

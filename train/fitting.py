@@ -23,6 +23,7 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 
 from optics.measures import achievable_rate
 from optics.pilots import Pilots, estimate_piston
+from train.field import ROUNDS
 from train.loss import von_mises_nll
 from train.network import Refiner, SymbolUNet
 
@@ -44,6 +45,7 @@ class Hyperparameters:
     Attributes:
         channels, blocks, levels: size of the network, see `SymbolUNet`.
         refinements: how often the decoder looks again, see `train.refinement`.
+        field_rounds: of the field's recovery, see `train.field.FieldRecovery`.
         steps: optimiser steps.
         batch: pages a step.
         learning_rate: peak of the one-cycle schedule.
@@ -56,6 +58,7 @@ class Hyperparameters:
     blocks: int = 2
     levels: int = 0
     refinements: int = 0
+    field_rounds: int = ROUNDS
     steps: int = 6000
     batch: int = 4
     learning_rate: float = 4e-3

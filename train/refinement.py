@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from optics.grid import symbol_samples
 from optics.profile import Profile
 from optics.recording import FramePair, Recording
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
@@ -23,14 +24,11 @@ from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
 from train.field import FieldRecovery, Measured
 from train.fitting import Fitted, Hyperparameters, SymbolTraining, fit_network
-from train.localizers.coherent import SAMPLES
 from train.localizers.wave import by_symbol
 from train.network import Refiner
 from train.parts import conjugate, multiply, parts, stacked
 from train.waves import Real, WaveMatrices, Waves
 
-LIGHT_CHANNELS = 2 * SAMPLES**2
-"""Features that carry unexplained light: real parts of a symbol's samples, then imaginary parts."""
 _FLOORS = (0.05, 20.0)
 """Least and largest `Measured.pull` floor that is believed."""
 
@@ -45,18 +43,23 @@ class Prediction(nn.Module):
 
     def __init__(self, profile: Profile, parameters: Real) -> None:
         super().__init__()
-        self.page_shape = profile.page_shape
         self.waves = Waves(profile, parameters, filled=True)
-        rows, columns = (count * SAMPLES for count in profile.page_shape)
+        rows, columns = (count * self.waves.samples for count in profile.page_shape)
         even = torch.stack([torch.ones(rows, columns), torch.zeros(rows, columns)])
         self.illumination: Tensor
         self.floor: Tensor
         self.register_buffer("illumination", even)
         self.register_buffer("floor", torch.ones(()))
 
+    @property
+    def light_channels(self) -> int:
+        """Features that carry unexplained light: real parts of a symbol's samples, then imaginary parts."""
+        return 2 * self.waves.samples**2
+
     def field(self, at: WaveMatrices, p: Tensor) -> Tensor:
         """Expected field on the common grid, [2, Gy, Gx], of a believed page p [2, ny, nx]; its scale is open."""
-        written = expected_phasors(p).repeat_interleave(SAMPLES, dim=1).repeat_interleave(SAMPLES, dim=2)
+        samples = self.waves.samples
+        written = expected_phasors(p).repeat_interleave(samples, dim=1).repeat_interleave(samples, dim=2)
         return self.waves.to_camera(at, torch.stack(multiply(parts(written), parts(self.illumination))))
 
     def forward(
@@ -79,7 +82,7 @@ class Prediction(nn.Module):
         gain = torch.stack([real.sum(), imaginary.sum()]) / (expected.square().sum() + 1e-12)
         expected = torch.stack(multiply(parts(expected), parts(gain)))
         left = recovery.innovation(measured, expected, self.floor)
-        return by_symbol(self.waves.to_page(at, left), self.page_shape)
+        return by_symbol(self.waves.to_page(at, left), self.waves.samples)
 
 
 def expected_phasors(p: Tensor) -> Tensor:
@@ -108,7 +111,8 @@ def fit_prediction(
         pairs: frames of known pages.
         phases: what was written on them, [ny, nx] radians.
     """
-    waves = FittedWaves(profile, parameters, SAMPLES, filled=True)
+    samples = symbol_samples(profile)
+    waves = FittedWaves(profile, parameters, samples, filled=True)
     terms = illumination_terms(waves)
     coefficients, squares, lengths = [], [], []
     for pair, written in zip(pairs, phases, strict=True):
@@ -116,7 +120,7 @@ def fit_prediction(
         with torch.no_grad():
             measured, solved = extractor.look(pair, state.shift_px)
         lit, field = measured.lit.numpy().astype(bool), solved[0].numpy() + 1j * solved[1].numpy()
-        page = on_modulator(written, SAMPLES)
+        page = on_modulator(written, samples)
         shown = np.stack([waves.to_camera(page * term) for term in terms], axis=-1)
         factors = np.linalg.lstsq(shown[lit], field[lit], rcond=None)[0]
         coefficients.append(factors / factors[0])

@@ -64,7 +64,7 @@ class SymbolRecipe:
         features = material.out / "features"
         preparing = fill(
             features,
-            f"{material.key} {self.localizer}",
+            f"{material.key} {self.localizer} {self.choices.field_rounds}",
             len(known),
             lambda first, shift: material.extractor.pages(material.recording, known[first:], shift),
             "recorded pages",
@@ -117,7 +117,7 @@ class SymbolRecipe:
             material.extractor,
             prediction,
             first,
-            f"{material.key} {self.localizer}",
+            f"{material.key} {self.localizer} {self.choices.field_rounds}",
             material.devices,
         )
         for name, module in {"prediction": prediction, "refiners": nn.ModuleList(refined.refiners)}.items():

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from optics.grid import field_grid
+from optics.grid import field_grid, symbol_samples
 from optics.page import MAX_LEVELS, random_symbols, symbol_phases
 from optics.profile import Profile
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
 from optics.registration.parameters import NAMES
 from optics.registration.table import sampling_table
 from train.features import PageFeatures, PageState, demodulate, localized
-from train.localizers.coherent import SAMPLES, CoherentLocalizer
+from train.localizers.coherent import CoherentLocalizer
 from train.localizers.wave import WaveLocalizer
 from train.twin import RayTwin, TorchTwin
 
@@ -80,11 +80,11 @@ def likeness(profile: Profile, parameters: Real, fields: Sequence[Complex], phas
         fields: recovered fields [Gy, Gx] of known pages, image shift taken off.
         phases: what was written, [ny, nx] radians, one a field.
     """
-    waves = FittedWaves(profile, parameters, SAMPLES, filled=True)
+    waves = FittedWaves(profile, parameters, symbol_samples(profile), filled=True)
     seen = _seen(profile, parameters)
     found, left = [], []
     for field, written in zip(fields, phases, strict=True):
-        page = on_modulator(written, SAMPLES)
+        page = on_modulator(written, symbol_samples(profile))
         shown = np.stack([waves.to_camera(page * term)[seen] for term in illumination_terms(waves)], axis=1)
         light = field[seen]
         factors = np.linalg.lstsq(shown, light, rcond=None)[0]
@@ -124,7 +124,7 @@ class SyntheticPages:
         rng = np.random.default_rng([self._seed, number])
         drift = np.array([_DRIFT.get(name, 0.0) for name in NAMES]) * rng.uniform(-1, 1, len(NAMES))
         parameters = self._parameters + drift
-        waves = FittedWaves(profile, parameters, SAMPLES, filled=True)
+        waves = FittedWaves(profile, parameters, symbol_samples(profile), filled=True)
         waves_back = WaveLocalizer(profile, parameters) if self._by_waves else None
         table = sampling_table(self._twin, parameters, np.pi / 2, profile)
         light_on = sum(
@@ -132,7 +132,7 @@ class SyntheticPages:
         )
         for symbols in random_symbols(profile, MAX_LEVELS, PAGES_PER_STATE, rng):
             phases = symbol_phases(symbols, MAX_LEVELS)
-            field = waves.to_camera(on_modulator(phases, SAMPLES) * light_on)
+            field = waves.to_camera(on_modulator(phases, symbol_samples(profile)) * light_on)
             field = (self._like.seen * (field + self._noise(field, rng))).astype(np.complex64)
             light = demodulate(self._coherent, field, table) if waves_back is None else localized(waves_back, field)
             written, still = phases.astype(np.float32), PageState((0.0, 0.0), 0.0)

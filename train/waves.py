@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from optics.grid import field_grid
+from optics.grid import field_grid, symbol_samples
 from optics.profile import Profile
 from optics.registration.fitted_waves import (
     FittedWaves,
@@ -25,7 +25,6 @@ from optics.registration.fitted_waves import (
 )
 from optics.registration.parameters import NAMES, as_dict
 from optics.waves import PipePropagator, WaveGeometry, couplings, detuning, entrance_window
-from train.localizers.coherent import SAMPLES
 from train.parts import Parts, adjoint, conjugate, matmul, multiply, parts
 
 Real = NDArray[np.float64]
@@ -64,19 +63,23 @@ class WaveMatrices(NamedTuple):
 
 
 class Waves(nn.Module):
-    """Modulator, with `SAMPLES` a symbol and axis, to common grid and back.
+    """Modulator to common grid and back.
 
     Args:
         profile: the nominal device.
         parameters: [P] of the ray twin, fitted (or, for an oracle, true): they say how finely the pipe is sampled.
         filled: see `FittedWaves`.
+
+    Attributes:
+        samples: on the modulator, per symbol and axis.
     """
 
     def __init__(self, profile: Profile, parameters: Real, *, filled: bool = False) -> None:
         super().__init__()
-        waves = FittedWaves(profile, parameters, SAMPLES, filled=filled, steps=_STEPS)
+        self.samples = symbol_samples(profile)
+        waves = FittedWaves(profile, parameters, self.samples, filled=filled, steps=_STEPS)
         channel, grid = waves.channel, field_grid(profile)
-        x, y = modulator_axes(profile, SAMPLES)
+        x, y = modulator_axes(profile, self.samples)
         self._profile, self._envelope_m = profile, channel.envelope_m
         self.x_m: Tensor
         self.y_m: Tensor
@@ -123,7 +126,7 @@ class Waves(nn.Module):
         )
 
     def to_camera(self, at: WaveMatrices, page: Tensor) -> Tensor:
-        """Field on the modulator [2, ny SAMPLES, nx SAMPLES] to the common grid [2, Gy, Gx], against the reference."""
+        """Field on the modulator [2, ny samples, nx samples] to the common grid [2, Gy, Gx], against the reference."""
         real, imaginary = _to_facet(at.launch, multiply(parts(page), at.at_launch))
         exit_field = self._pipe.run((real * at.window, imaginary * at.window), at, backwards=False)
         return torch.stack(multiply(_to_plane(at.delaunch, exit_field), at.against_reference))

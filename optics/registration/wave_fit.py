@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from optics.grid import field_grid
+from optics.grid import field_grid, symbol_samples
 from optics.profile import Profile
 from optics.recording import FramePair
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
@@ -42,8 +42,6 @@ _LEAST_STRIDE = 2
 """Grid samples from one equation to the next: the grid has twice the rate that the light needs."""
 _INSIDE = 0.98
 """Share of the page's image that is compared, to either side."""
-_SAMPLES = 4
-"""Samples per symbol and axis on the modulator."""
 _DIFFERENCE = 1e-3
 """Finite difference of the derivatives, in standard deviations of the priors."""
 _CAMERAS = ("in_phase", "quadrature")
@@ -111,7 +109,8 @@ class WaveFit:
         self, twin: Twin, profile: Profile, pair: FramePair, references: FramePair, symbols: NDArray[np.complex128]
     ) -> None:
         self._twin, self._profile, self._symbols = twin, profile, symbols.size
-        page = on_modulator(np.angle(symbols), _SAMPLES)
+        self._samples = symbol_samples(profile)
+        page = on_modulator(np.angle(symbols), self._samples)
         waves = self._waves(np.zeros(len(PARAMETERS)))
         self._pages = np.stack([page * term for term in illumination_terms(waves)])
         grid = field_grid(profile)
@@ -174,7 +173,7 @@ class WaveFit:
         return best
 
     def _waves(self, parameters: Real) -> FittedWaves:
-        return FittedWaves(self._profile, parameters, _SAMPLES, filled=True)
+        return FittedWaves(self._profile, parameters, self._samples, filled=True)
 
     def _light(self, parameters: Real, light: Complex) -> Complex:
         """The page's light on the common grid, [Gy, Gx]."""
@@ -192,7 +191,9 @@ class WaveFit:
     def _slopes(self, state: _State, of_light: list[int], of_cameras: list[int]) -> _Slopes:
         def waves(parameters: Real, like: FittedWaves | None = None) -> FittedWaves:
             stride, steps = self._stride, _CHORD_STEPS
-            return FittedWaves(self._profile, parameters, _SAMPLES, filled=True, stride=stride, steps=steps, like=like)
+            return FittedWaves(
+                self._profile, parameters, self._samples, filled=True, stride=stride, steps=steps, like=like
+            )
 
         def stepped(index: int) -> tuple[Real, float]:
             there, step = state.parameters.copy(), _DIFFERENCE * PRIORS[index]

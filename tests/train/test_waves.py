@@ -11,11 +11,11 @@ from optics.registration.fitted_waves import FittedWaves
 from optics.registration.parameters import NAMES, PRIORS
 from optics.simulator import true_parameters
 from tests.optics.small import small_profile
-from train.localizers.coherent import SAMPLES
 from train.parts import stacked
 from train.waves import Waves
 
 PROFILE = small_profile()
+SAMPLES = 4
 
 
 @pytest.fixture(scope="module", params=[(0.0, True), (-0.01, True), (-0.01, False)], ids=str)

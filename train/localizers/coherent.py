@@ -6,12 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from optics.grid import field_grid
+from optics.grid import field_grid, symbol_samples
 from optics.profile import Profile
 from optics.registration.twin import BRANCHES
-
-SAMPLES = 4
-"""Samples per symbol and axis: the field's own rate at four SLM pixels a symbol."""
 
 
 class CoherentLocalizer(nn.Module):
@@ -25,16 +22,17 @@ class CoherentLocalizer(nn.Module):
         super().__init__()
         self.grid_shape = field_grid(profile).shape
         self.page_shape = profile.page_shape
-        steps = (torch.arange(SAMPLES, dtype=torch.float32) + 0.5) / SAMPLES - 0.5
+        self.samples = symbol_samples(profile)
+        steps = (torch.arange(self.samples, dtype=torch.float32) + 0.5) / self.samples - 0.5
         self.offset_x: Tensor
         self.offset_y: Tensor
-        self.register_buffer("offset_x", steps.repeat(SAMPLES).reshape(1, -1, 1, 1), persistent=False)
-        self.register_buffer("offset_y", steps.repeat_interleave(SAMPLES).reshape(1, -1, 1, 1), persistent=False)
+        self.register_buffer("offset_x", steps.repeat(self.samples).reshape(1, -1, 1, 1), persistent=False)
+        self.register_buffer("offset_y", steps.repeat_interleave(self.samples).reshape(1, -1, 1, 1), persistent=False)
 
     @property
     def light_channels(self) -> int:
         """Features that carry light: real parts of all branches' samples, then imaginary parts."""
-        return 2 * len(BRANCHES) * SAMPLES**2
+        return 2 * len(BRANCHES) * self.samples**2
 
     def forward(self, field: Tensor, places: Tensor, gradients: Tensor, phases: Tensor) -> Tensor:
         """Demodulated samples.
@@ -57,7 +55,7 @@ class CoherentLocalizer(nn.Module):
         ny, nx = self.page_shape
         sampled = functional.grid_sample(
             field[None], where.reshape(1, -1, nx, 2), mode="bicubic", padding_mode="zeros", align_corners=True
-        ).reshape(2, len(BRANCHES), SAMPLES**2, ny, nx)
+        ).reshape(2, len(BRANCHES), self.samples**2, ny, nx)
         cos, sin = torch.cos(phase), torch.sin(phase)
         scale = torch.rsqrt((field * field).mean() * 2 + 1e-12)
         real = (sampled[0] * cos + sampled[1] * sin) * scale
