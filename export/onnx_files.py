@@ -11,12 +11,12 @@ import onnx
 import torch
 from numpy.typing import NDArray
 from onnx import numpy_helper
+from onnxscript import optimizer
 from torch import nn
 
 from export.graph import FRAME_INPUTS, Graph
 from optics.registration.parameters import nominal
 from train.twin import RayTwin
-from train.waves import Waves
 
 OPSET = 20
 TWIN_INPUTS = ("parameters", "points", "anchors", "camera_places")
@@ -76,10 +76,12 @@ def _export(
             dynamic_shapes=shapes,
             external_data=False,
             verbose=False,
-            # the rewriter would take minutes over a pipe's unrolled steps, for a tenth of a decode's time
-            optimize=not any(isinstance(part, Waves) for part in module.modules()),
+            optimize=False,
         )
-    assert program is not None
+        assert program is not None
+        # all that pays of the exporter's optimiser, whose rewriter takes minutes over a pipe's unrolled steps
+        optimizer.fold_constants(program.model)
+        optimizer.remove_unused_nodes(program.model)
     return _anonymous(program.model_proto)
 
 

@@ -23,7 +23,7 @@ def models(request: pytest.FixtureRequest) -> tuple[FittedWaves, Waves]:
     angle_rad, filled = request.param
     parameters = true_parameters(PROFILE, Device())
     parameters[NAMES.index("pipe_angle_rad")] = angle_rad
-    return FittedWaves(PROFILE, parameters, SAMPLES, filled=filled, steps=48), Waves(PROFILE, parameters, filled=filled)
+    return FittedWaves(PROFILE, parameters, SAMPLES, filled=filled, steps=32), Waves(PROFILE, parameters, filled=filled)
 
 
 def noise(shape: tuple[int, ...]) -> np.ndarray:
@@ -50,7 +50,7 @@ def test_other_parameters_make_the_waves_of_the_device_that_has_drifted() -> Non
     drifted = parameters + 0.02 * PRIORS
     drifted[NAMES.index("page_centre_y_m")] -= 0.02 * PRIORS[NAMES.index("page_centre_y_m")]  # it changes the sampling
     expected, waves = (
-        FittedWaves(PROFILE, drifted, SAMPLES, filled=True, steps=48),
+        FittedWaves(PROFILE, drifted, SAMPLES, filled=True, steps=32),
         Waves(PROFILE, parameters, filled=True),
     )
     page = noise(expected.launch.shape)
