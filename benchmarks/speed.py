@@ -39,6 +39,11 @@ from train.published.training import PublishedChoices
 from train.twin import RayTwin, TorchTwin
 
 Tensors = dict[str, np.ndarray]
+SETTLE_S = 0.2
+"""Pause before a decode: the threads of the one before spin for a while, and would be in its way."""
+USUAL = Hyperparameters()
+FAST = Hyperparameters(channels=64, field_rounds=1)
+"""Of the coherent decoder when time counts more than the last tenth of a bit."""
 WIDTHS = {"ray 16/32": (16, 32), "ray 32/64": (32, 64), "ray 64/128": (64, 128)}
 """The published decoder with its ray grid, by the channels of its U-Net."""
 
@@ -49,12 +54,12 @@ def reference(profile: Profile) -> FramePair:
     return FramePair(frame, frame)
 
 
-def at_symbol_pitch(profile: Profile, localizer: str, refinements: int = 0) -> tuple[Graph, Tensors]:
+def at_symbol_pitch(profile: Profile, localizer: str, choices: Hyperparameters = USUAL) -> tuple[Graph, Tensors]:
     """A decoder of ours, at an angle of -0.6 degree: a square pipe would need no splitting steps."""
     parameters = nominal()
     parameters[0] = np.deg2rad(-0.6)
     table = sampling_table(TorchTwin(RayTwin(profile)), parameters, np.pi / 2, profile)
-    decoder = SymbolDecoder(profile, parameters, localizer, Hyperparameters(refinements=refinements))
+    decoder = SymbolDecoder(profile, parameters, localizer, choices)
     graph = DecoderGraph(profile, decoder, 1.0)
     return graph, table_tensors(graph, table, reference(profile))
 
@@ -71,7 +76,8 @@ def makers(profile: Profile) -> dict[str, Callable[[], tuple[Graph, Tensors]]]:
     rays = {name: lambda width=width: published(profile, "ray", width) for name, width in WIDTHS.items()}
     return {
         "coherent": lambda: at_symbol_pitch(profile, "coherent"),
-        "refined": lambda: at_symbol_pitch(profile, "coherent", refinements=1),
+        "refined": lambda: at_symbol_pitch(profile, "coherent", Hyperparameters(refinements=1)),
+        "fast": lambda: at_symbol_pitch(profile, "coherent", FAST),
         "wave": lambda: at_symbol_pitch(profile, "wave"),
         **rays,
         "mode 32/64": lambda: published(profile, "mode", (32, 64)),
@@ -122,6 +128,7 @@ def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int |
     taken: dict[str, list[float]] = {name: [] for name in sessions}
     for repeat in range(repeats + 1):
         for name, session in sessions.items():  # taking turns: a slow moment meets all of them
+            time.sleep(SETTLE_S)
             start = time.perf_counter()
             session.run(["p"], feeds)
             if repeat:

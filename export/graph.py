@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -21,6 +23,8 @@ TABLE_INPUTS = ("reference_in_phase", "reference_quadrature", "registration", "h
 behind them come those of `SymbolDecoder.table_inputs`."""
 PUBLISHED_TABLE_INPUTS = ("grid", "levels")
 """The same of a published decoder: where it samples the frames, and the references there."""
+HALVED = ("network", "refiners")
+"""Parts of a decoder at symbol pitch whose weights its file keeps as float16."""
 OUTPUTS = (*ANSWERS, "residual", "field", "unexplained")
 """`unexplained` is what is left of the homodyne equations, [2, Gy, Gx]; `residual` its power over the field's."""
 
@@ -30,7 +34,7 @@ class DecoderGraph(nn.Module):
 
     Args:
         profile: the nominal device.
-        decoder: trained.
+        decoder: trained; the weights of its parts in `HALVED` are rounded to float16.
         kappa_scale: factor on p that makes its length an honest concentration.
     """
 
@@ -41,6 +45,9 @@ class DecoderGraph(nn.Module):
         self.recovery = FieldRecovery(profile, rounds=decoder.choices.field_rounds)
         self.decoder = decoder
         self.kappa_scale = kappa_scale
+        with torch.no_grad():
+            for parameter in itertools.chain(*(getattr(decoder, part).parameters() for part in HALVED)):
+                parameter.copy_(parameter.half())
         self.table_inputs = (*TABLE_INPUTS, *decoder.table_inputs)
 
     def forward(

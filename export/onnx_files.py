@@ -14,11 +14,13 @@ from onnx import numpy_helper
 from onnxscript import optimizer
 from torch import nn
 
-from export.graph import FRAME_INPUTS, Graph
+from export.graph import FRAME_INPUTS, HALVED, Graph
 from optics.registration.parameters import nominal
 from train.twin import RayTwin
 
 OPSET = 20
+_FOLDED = 20_000
+"""Largest constant, elements, that folding may leave in a file: a runtime folds the rest when it loads the graph."""
 TWIN_INPUTS = ("parameters", "points", "anchors", "camera_places")
 TWIN_OUTPUTS = ("places", "phases", "positions", "pixels")
 
@@ -38,6 +40,7 @@ def decoder_onnx(
     # torch.export takes one tensor given twice for one input, hence the clone below
     tensors = [torch.from_numpy(np.ascontiguousarray(value)) for value in defaults.values()]
     model = _export(graph, (frame, frame.clone(), *tensors), (*FRAME_INPUTS, *defaults), graph.outputs, None)
+    _halve(model, tuple(f"decoder.{name}." for name in HALVED))
     for name, value in defaults.items():
         model.graph.initializer.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
     onnx.checker.check_model(model)
@@ -80,9 +83,21 @@ def _export(
         )
         assert program is not None
         # all that pays of the exporter's optimiser, whose rewriter takes minutes over a pipe's unrolled steps
-        optimizer.fold_constants(program.model)
+        optimizer.fold_constants(program.model, output_size_limit=_FOLDED)
         optimizer.remove_unused_nodes(program.model)
     return _anonymous(program.model_proto)
+
+
+def _halve(model: onnx.ModelProto, prefixes: tuple[str, ...]) -> None:
+    """Keep the initializers with these prefixes as float16: a runtime folds the casts back when it loads the graph."""
+    casts = []
+    for held in model.graph.initializer:
+        if held.name.startswith(prefixes) and held.data_type == onnx.TensorProto.FLOAT:
+            name = held.name
+            held.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(held).astype(np.float16), f"{name}.half"))
+            casts.append(onnx.helper.make_node("Cast", [held.name], [name], to=onnx.TensorProto.FLOAT))
+    for cast in reversed(casts):
+        model.graph.node.insert(0, cast)
 
 
 def _anonymous(model: onnx.ModelProto) -> onnx.ModelProto:

@@ -38,16 +38,21 @@ class Prediction(nn.Module):
 
     Args:
         profile: the nominal device.
-        parameters: [P] fitted; `illumination` and `floor` are still those of an ideal device (`fit_prediction`).
+        parameters: [P] fitted.
+
+    Attributes:
+        illumination: real and imaginary parts of the factors of `illumination_terms`, [2, 6]; even until fitted.
+        floor: see `Measured.pull`; one until it is fitted (`fit_prediction`).
     """
 
     def __init__(self, profile: Profile, parameters: Real) -> None:
         super().__init__()
         self.waves = Waves(profile, parameters, filled=True)
-        rows, columns = (count * self.waves.samples for count in profile.page_shape)
-        even = torch.stack([torch.ones(rows, columns), torch.zeros(rows, columns)])
+        self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
         self.illumination: Tensor
         self.floor: Tensor
+        even = torch.zeros(2, len(self._terms()))
+        even[0, 0] = 1
         self.register_buffer("illumination", even)
         self.register_buffer("floor", torch.ones(()))
 
@@ -60,7 +65,11 @@ class Prediction(nn.Module):
         """Expected field on the common grid, [2, Gy, Gx], of a believed page p [2, ny, nx]; its scale is open."""
         samples = self.waves.samples
         written = expected_phasors(p).repeat_interleave(samples, dim=1).repeat_interleave(samples, dim=2)
-        return self.waves.to_camera(at, torch.stack(multiply(parts(written), parts(self.illumination))))
+        illumination = torch.tensordot(self.illumination, torch.stack(self._terms()), 1)
+        return self.waves.to_camera(at, torch.stack(multiply(parts(written), parts(illumination))))
+
+    def _terms(self) -> list[Tensor]:
+        return illumination_terms(self.waves.x_m / self._half_width, self.waves.y_m / self._half_height)
 
     def forward(
         self, recovery: FieldRecovery, measured: Measured, field: Tensor, p: Tensor, parameters: Tensor | None = None
@@ -113,7 +122,7 @@ def fit_prediction(
     """
     samples = symbol_samples(profile)
     waves = FittedWaves(profile, parameters, samples, filled=True)
-    terms = illumination_terms(waves)
+    terms = illumination_terms(waves.x, waves.y)
     coefficients, squares, lengths = [], [], []
     for pair, written in zip(pairs, phases, strict=True):
         state = extractor.state(extractor.field(pair), written, np.zeros(2))
@@ -131,7 +140,7 @@ def fit_prediction(
     # an equation's variance is that of a photon count times (|arm + e|^2 + floor)
     by_light, constant = np.polyfit(np.concatenate(lengths), np.concatenate(squares), 1)
     floor = constant / by_light if by_light > 0 else np.inf
-    prediction.illumination.copy_(stacked(np.tensordot(np.mean(coefficients, axis=0), np.stack(terms), 1)))
+    prediction.illumination.copy_(stacked(np.mean(coefficients, axis=0)))
     prediction.floor.fill_(float(np.clip(floor, *_FLOORS)))
 
 

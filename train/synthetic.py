@@ -85,7 +85,7 @@ def likeness(profile: Profile, parameters: Real, fields: Sequence[Complex], phas
     found, left = [], []
     for field, written in zip(fields, phases, strict=True):
         page = on_modulator(written, symbol_samples(profile))
-        shown = np.stack([waves.to_camera(page * term)[seen] for term in illumination_terms(waves)], axis=1)
+        shown = np.stack([waves.to_camera(page * term)[seen] for term in illumination_terms(waves.x, waves.y)], axis=1)
         light = field[seen]
         factors = np.linalg.lstsq(shown, light, rcond=None)[0]
         found.append(factors / factors[0])
@@ -127,9 +127,7 @@ class SyntheticPages:
         waves = FittedWaves(profile, parameters, symbol_samples(profile), filled=True)
         waves_back = WaveLocalizer(profile, parameters) if self._by_waves else None
         table = sampling_table(self._twin, parameters, np.pi / 2, profile)
-        light_on = sum(
-            factor * term for factor, term in zip(self._like.illumination, illumination_terms(waves), strict=True)
-        )
+        light_on = np.tensordot(self._like.illumination, np.stack(illumination_terms(waves.x, waves.y)), 1)
         for symbols in random_symbols(profile, MAX_LEVELS, PAGES_PER_STATE, rng):
             phases = symbol_phases(symbols, MAX_LEVELS)
             field = waves.to_camera(on_modulator(phases, symbol_samples(profile)) * light_on)

@@ -195,6 +195,12 @@ def _to_plane(lens: LensMatrices, field: Parts) -> Parts:
     return (real * lens.plane).sum(0), (imaginary * lens.plane).sum(0)
 
 
+def _sine_modes(numbers: Tensor, cells: int) -> Tensor:
+    """Samples of the sine modes with these numbers by parity [2, K], [2, K, cells - 1]; a mode 0 is none."""
+    places = torch.arange(1, cells, device=numbers.device)
+    return math.sqrt(2 / cells) * torch.sin(math.pi / cells * torch.remainder(numbers[..., None] * places, 2 * cells))
+
+
 class _Pipe(nn.Module):
     """`PipePropagator`."""
 
@@ -202,21 +208,22 @@ class _Pipe(nn.Module):
         super().__init__()
         y, x = pipe.bases
         self._steps, self._sheared = pipe.steps, pipe.sheared
-        self.y_modes: Tensor
-        self.x_modes: Tensor
+        self._cells = y.sine_by_parity.shape[-1] + 1, x.sine_by_parity.shape[-1] + 1
+        self.y_numbers: Tensor
+        self.x_numbers: Tensor
+        self.y_couplings: Tensor
+        self.x_couplings: Tensor
         self.y_singular: Tensor
         self.x_singular: Tensor
-        self.coupling: Tensor
         self.signs: Tensor
-        self.squares: Tensor
         for name, value in (
-            ("y_modes", y.sine_by_parity[:, None]),
-            ("x_modes", x.sine_by_parity[None]),
+            ("y_numbers", y.mode_numbers),
+            ("x_numbers", x.mode_numbers),
+            ("y_couplings", y.couplings),
+            ("x_couplings", x.couplings),
             ("y_singular", y.singular[:, None]),
             ("x_singular", x.singular[None]),
-            ("coupling", np.outer(y.couplings, x.couplings)),
             ("signs", np.array([-1.0, 1.0])[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])),
-            ("squares", y.mode_numbers[:, None, :, None] ** 2 + x.mode_numbers[None, :, None, :] ** 2),
         ):
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value)).float(), persistent=False)
 
@@ -224,8 +231,9 @@ class _Pipe(nn.Module):
         """Phasors of half a step, and cosine and sine of the turn of each pair of modes."""
         width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
         step = geometry.pipe_length_m / self._steps
-        slow = detuning(nk, self.squares * (math.pi / width) ** 2, torch.sqrt)
-        angle = step / nk * torch.sin(geometry.pipe_angle) / width**2 * self.coupling  # type: ignore[arg-type]
+        squares = self.y_numbers[:, None, :, None] ** 2 + self.x_numbers[None, :, None, :] ** 2
+        slow = detuning(nk, squares * (math.pi / width) ** 2, torch.sqrt)
+        angle = step / nk * torch.sin(geometry.pipe_angle) / width**2 * (self.y_couplings[:, None] * self.x_couplings)  # type: ignore[arg-type]
         return _phasor(0.5 * step * slow), torch.cos(angle), torch.sin(angle)
 
     def run(self, field: Parts, at: WaveMatrices, *, backwards: bool) -> Parts:
@@ -233,7 +241,9 @@ class _Pipe(nn.Module):
         made and run node by node."""
         half, sin = (conjugate(at.half_step), -at.sin) if backwards else (at.half_step, at.sin)
         full, signs = multiply(half, half), self.signs[..., None, None] * sin
-        modes = self.y_modes @ torch.stack(field)[:, None, None] @ self.x_modes.transpose(-1, -2)
+        y_cells, x_cells = self._cells
+        y_modes, x_modes = _sine_modes(self.y_numbers, y_cells)[:, None], _sine_modes(self.x_numbers, x_cells)[None]
+        modes = y_modes @ torch.stack(field)[:, None, None] @ x_modes.transpose(-1, -2)
         modes = self._times(modes, half)
         for step in range(self._steps):
             if self._sheared:
@@ -242,7 +252,7 @@ class _Pipe(nn.Module):
                 turned = at.cos * inner + signs * inner.flip(0, 1, 2)
                 modes = self.y_singular @ turned @ self.x_singular.transpose(-1, -2)
             modes = self._times(modes, full if step < self._steps - 1 else half)
-        real, imaginary = (self.y_modes.transpose(-1, -2) @ modes @ self.x_modes).sum(dim=(1, 2))
+        real, imaginary = (y_modes.transpose(-1, -2) @ modes @ x_modes).sum(dim=(1, 2))
         return real, imaginary
 
     @staticmethod

@@ -136,6 +136,13 @@ def on_modulator(phases: Real, samples: int) -> Complex:
     return np.asarray(np.exp(1j * np.kron(phases, np.ones((samples, samples)))))
 
 
-def illumination_terms(waves: FittedWaves) -> list[Real]:
-    """Terms of an illumination that is a quadratic in the page's coordinates, over the modulator."""
-    return [waves.x[None, :] ** i * waves.y[:, None] ** j for i, j in _ILLUMINATION]
+def illumination_terms(x: Any, y: Any) -> list[Any]:
+    """Terms of an illumination that is a quadratic in the page's coordinates, over the modulator.
+
+    Args:
+        x, y: places over the page's half width and half height, arrays or tensors [nx] and [ny].
+
+    Returns:
+        Six of [ny, nx], the even one first.
+    """
+    return [x[None, :] ** i * y[:, None] ** j for i, j in _ILLUMINATION]

@@ -112,7 +112,7 @@ class WaveFit:
         self._samples = symbol_samples(profile)
         page = on_modulator(np.angle(symbols), self._samples)
         waves = self._waves(np.zeros(len(PARAMETERS)))
-        self._pages = np.stack([page * term for term in illumination_terms(waves)])
+        self._pages = np.stack([page * term for term in illumination_terms(waves.x, waves.y)])
         grid = field_grid(profile)
         self._pitch_px = grid.pitch_m / profile.camera.pitch_m
         self._stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
