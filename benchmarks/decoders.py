@@ -27,10 +27,11 @@ from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils.data import Dataset
 
+from benchmarks.decoders_figure import MAP, draw
 from benchmarks.oracle import Oracle
 from optics.device import Device, Sensor
 from optics.files import write_json
-from optics.measures import measure
+from optics.measures import achievable_rate, measure
 from optics.page import pilot_mask
 from optics.profile import Profile, load_profile
 from optics.progress import percent_bar
@@ -238,7 +239,12 @@ class Bench:
         truth = [self.recording.symbols(page) for page in self.unseen]
         symbols = np.concatenate([page[~self.mask] for page in truth if page is not None])
         figures = measure(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
+        by_symbol = np.full(self.profile.page_shape, np.nan)
+        rates = achievable_rate(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
+        by_symbol[~self.mask] = rates.reshape(len(truth), -1).mean(axis=0)
+        np.save(folder / MAP, by_symbol)
         return Outcome(
+            run=str(folder.relative_to(self.out.parent)),
             arm=name,
             size=size,
             steps=steps,
@@ -264,8 +270,10 @@ def gained_at_the_end(run: Path, steps: int) -> float:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one arm reached with a network of one size. AIR in bits per data symbol, `size` as `--size` has it."""
+    """What one arm reached with a network of one size. AIR in bits per data symbol, `size` as `--size` has it; `run` is
+    its folder."""
 
+    run: str
     arm: str
     size: str
     steps: int
@@ -390,6 +398,7 @@ def main(
                     "outcomes": [asdict(outcome) for outcome in outcomes],
                 }
                 write_json(out / "figures.json", {"pages": pages, "seed": seed, "lights": [*lights, light]})
+                draw([*lights, light], out)
         lights.append(light)
         click.echo(f"\n{angle_deg:g} degree, full well {full_well:g} e-, symbols of {size_px}x{size_px} pixels")
         click.echo("\n".join([HEADER, *(outcome.line() for outcome in outcomes)]))

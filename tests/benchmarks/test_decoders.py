@@ -77,6 +77,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     (figures,) = json.loads((out / "figures.json").read_text())["lights"]
     coherent, refined, oracle, none = figures["outcomes"]
     assert (refined["arm"], refined["steps"]) == ("refined 1", 5)
+    assert (out / "figure.png").stat().st_size > 10_000
     assert (coherent["arm"], oracle["arm"], oracle["over_oracle"]) == ("coherent", "oracle", 1)
     assert coherent["over_oracle"] == pytest.approx(coherent["air"] / oracle["air"])
     assert (none["arm"], none["size"], none["steps"]) == ("none", "4/8", 12)
