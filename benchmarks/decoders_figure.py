@@ -44,12 +44,12 @@ def _bars(axis: Any, light: dict[str, Any], outcomes: list[dict[str, Any]]) -> N
     air = [outcome["air"] for outcome in outcomes]
     axis.barh(places, air, color="tab:blue", label="AIR")
     axis.plot([outcome["own_mi"] for outcome in outcomes], places, "k|", markersize=14, label="claimed (own-MI)")
+    top = max(0.1, *(outcome["own_mi"] for outcome in outcomes))
     for place, outcome in zip(places, outcomes, strict=True):
-        axis.text(
-            0.08, place, f"{outcome['air']:.2f} bit, {outcome['page_kB']:.2f} kB", va="center", color="w", fontsize=8
-        )
+        says = f"{outcome['air']:.2f} bit, {outcome['page_kB']:.2f} kB"
+        axis.text(max(outcome["air"], outcome["own_mi"], 0) + 0.03 * top, place, says, va="center", fontsize=8)
     axis.set_yticks(places, [outcome["arm"] for outcome in outcomes])
-    axis.set_xlim(0, 1.12 * max(0.1, *(outcome["own_mi"] for outcome in outcomes)))
+    axis.set_xlim(0, 1.5 * top)
     axis.set_xlabel("bit/symbol, held-out pages", fontsize=8)
     axis.legend(fontsize=7, loc="lower right")
     axis.set_title(
