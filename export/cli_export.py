@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from export.graph import (
     FRAME_INPUTS,
     DecoderGraph,
+    FieldGraph,
     Graph,
     PublishedGraph,
     published_tensors,
     table_tensors,
 )
-from export.onnx_files import decoder_onnx, twin_onnx
+from export.onnx_files import decoder_onnx, field_onnx, twin_onnx
 from export.parity import check_parity, torch_answer
 from optics.errors import BundleError
 from optics.files import NewPath, OutputFile, write_json
@@ -28,7 +29,7 @@ from optics.registration.table import sampling_table
 from runtime.bundle import Bundle, npz, write_bundle
 from runtime.decoder import Decoder
 from runtime.frames import narrow
-from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version
+from runtime.manifest import DECODER, FIELD, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version
 from runtime.ort import open_session
 from train.published.recipe import published_decoder
 from train.published.training import PublishedChoices
@@ -115,6 +116,7 @@ def export_run(
     files = {
         DECODER: decoder,
         TWIN: twin_onnx(twin),
+        **({FIELD: field_onnx(FieldGraph(profile), frame_dtype, defaults)} if isinstance(graph, DecoderGraph) else {}),
         GOLDEN: npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected["p"]),
         PILOTS: npz(**{name: kept[key] for name, key in PILOT_ARRAYS.items() if key in kept}),
     }

@@ -69,6 +69,24 @@ class DecoderGraph(nn.Module):
         return *_answers(p * self.kappa_scale), relative_power(left, field), field, left
 
 
+class FieldGraph(nn.Module):
+    """Field recovery alone, for a re-fit that asks for many fields; all of its inputs are fed.
+
+    Args:
+        profile: the nominal device.
+    """
+
+    outputs = ("field", "unexplained")
+
+    def __init__(self, profile: Profile) -> None:
+        super().__init__()
+        self.recovery = FieldRecovery(profile)
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """Frames and `TABLE_INPUTS` to field and what is left, see `FieldRecovery`."""
+        return tuple(self.recovery(*tensors))
+
+
 class PublishedGraph(nn.Module):
     """A published decoder with its sampling grid as a constant.
 

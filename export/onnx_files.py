@@ -14,7 +14,7 @@ from onnx import numpy_helper
 from onnxscript import optimizer
 from torch import nn
 
-from export.graph import FRAME_INPUTS, HALVED, Graph
+from export.graph import FRAME_INPUTS, HALVED, TABLE_INPUTS, FieldGraph, Graph
 from optics.registration.parameters import nominal
 from train.twin import RayTwin
 
@@ -43,6 +43,15 @@ def decoder_onnx(
     _halve(model, tuple(f"decoder.{name}." for name in HALVED))
     for name, value in defaults.items():
         model.graph.initializer.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString())
+
+
+def field_onnx(graph: FieldGraph, frame_dtype: str, tensors: dict[str, NDArray[np.generic]]) -> bytes:
+    """The field recovery as ONNX; `tensors` are examples of `TABLE_INPUTS`."""
+    frame = torch.from_numpy(np.zeros(tensors["reference_in_phase"].shape, dtype=frame_dtype))
+    chosen = [torch.from_numpy(np.ascontiguousarray(tensors[name])) for name in TABLE_INPUTS]
+    model = _export(graph, (frame, frame.clone(), *chosen), (*FRAME_INPUTS, *TABLE_INPUTS), graph.outputs, None)
     onnx.checker.check_model(model)
     return bytes(model.SerializeToString())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,13 @@ from optics.pilots import Pilots, estimate_piston, estimate_trust, remove_piston
 from optics.recording import FramePair
 from runtime.bundle import Bundle, Table
 from runtime.frames import check_pair
-from runtime.manifest import DECODER, GOLDEN
+from runtime.manifest import DECODER, FIELD, GOLDEN
 from runtime.ort import Node, Session, open_session
 
 OUTPUTS = ("p", "phase", "concentration")
 FIELD_OUTPUTS = ("field", "unexplained")
-"""Optional outputs, [2, Gy, Gx] each: the recovered field, and what is left of the homodyne equations."""
+"""Outputs of the field graph, or of a decoder that shows them, [2, Gy, Gx] each: the recovered field, and what is left
+of the homodyne equations."""
 GOLDEN_TOLERANCE = 1e-3
 """Largest error of p on the golden page, relative to its norm: room for another CPU's rounding, not for another net."""
 
@@ -223,10 +225,11 @@ class Decoder:
         """The field behind a frame pair (`optics.registration.twin.FieldSolver`), whatever its residual is.
 
         Raises:
-            BundleError: the graph does not show its field.
+            BundleError: no graph shows the field.
             InvalidInputError: a tensor that does not fit.
         """
-        if missing := set(FIELD_OUTPUTS) - {node.name for node in self._session.get_outputs()}:
+        session = self._field_session
+        if missing := set(FIELD_OUTPUTS) - {node.name for node in session.get_outputs()}:
             raise BundleError(f"{self._thing}: outputs", f"no {', '.join(sorted(missing))}", "a graph with its field")
         table: Table = {
             "reference_in_phase": references.in_phase,
@@ -235,9 +238,18 @@ class Decoder:
             "homodyne": homodyne,
         }
         self.check_table(table)
-        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **self._table, **table}
-        (real, imaginary), left = self._session.run(FIELD_OUTPUTS, feeds)
+        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
+        if session is self._session:
+            feeds = {**self._table, **feeds}
+        (real, imaginary), left = session.run(FIELD_OUTPUTS, feeds)
         return np.asarray(real + 1j * imaginary, np.complex64), left
+
+    @cached_property
+    def _field_session(self) -> Session:
+        """The field's own graph, which does no more than is asked for; without one, the decoder's."""
+        if FIELD not in self.bundle.files:
+            return self._session
+        return open_session(self.bundle.files[FIELD], f"{self.bundle.thing}: {FIELD}", self.threads)
 
     def decode(
         self, pair: FramePair, levels: int = 256, table: Table | None = None, pilots: Pilots | None = None

@@ -15,11 +15,12 @@ SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 DECODER = "decoder.onnx"
 TWIN = "twin.onnx"
+FIELD = "field.onnx"
 GOLDEN = "golden.npz"
 TABLE = "table.npz"
 PILOTS = "pilots.npz"
 REQUIRED_FILES = frozenset({DECODER, TWIN, GOLDEN})
-OPTIONAL_FILES = frozenset({TABLE, PILOTS})
+OPTIONAL_FILES = frozenset({FIELD, TABLE, PILOTS})
 _SELF_HASH = "manifest_sha256"
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]

@@ -20,10 +20,12 @@ from optics.errors import BundleError, InvalidInputError
 from optics.page import pilot_mask, random_symbols
 from optics.registration.calibrate import Registered
 from optics.registration.calibration import Calibration
-from optics.registration.parameters import NAMES
+from optics.registration.parameters import NAMES, nominal
+from optics.registration.table import sampling_table
 from optics.simulator import Simulator, true_parameters
-from runtime.bundle import Bundle
+from runtime.bundle import Bundle, write_bundle
 from runtime.decoder import Decoder
+from runtime.manifest import FIELD
 from runtime.ort import open_session
 from tests.optics.small import small_profile
 from train.decoder import SymbolDecoder
@@ -99,6 +101,18 @@ def test_the_bundle_does_not_tell_where_it_was_made(exported: tuple[Bundle, floa
 
 def test_the_bundle_says_what_torch_says(exported: tuple[Bundle, float, Path]) -> None:
     assert exported[1] <= 1e-3
+
+
+def test_the_fields_own_graph_shows_the_decoders_field(exported: tuple[Bundle, float, Path], tmp_path: Path) -> None:
+    bundle = exported[0]
+    files = {name: data for name, data in bundle.files.items() if name != FIELD}
+    without = Decoder.load(write_bundle(tmp_path / "without.zip", bundle.manifest, files))
+    table = sampling_table(TorchTwin(RayTwin(small_profile())), nominal(), np.pi / 2, small_profile())
+    asked = bundle.golden.pair, bundle.golden.pair, table["registration"], table["homodyne"]
+    field, left = Decoder.load(exported[2]).recover_field(*asked)
+    expected, expected_left = without.recover_field(*asked)
+    np.testing.assert_allclose(field, expected, atol=1e-4)
+    np.testing.assert_allclose(left, expected_left, atol=1e-4)
 
 
 def test_the_table_is_a_default_that_can_be_fed_instead(exported: tuple[Bundle, float, Path]) -> None:
