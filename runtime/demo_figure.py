@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from runtime.demo import LEVELS, DemoResult
 
-_LEAST_BITS, _MOST_BITS = 0.0, 6.0
+_LEAST_BITS, _MOST_BITS = 0.0, 8.0
 
 
 def write_figure(result: DemoResult, path: Path) -> None:

@@ -24,7 +24,7 @@ def test_decoders_take_turns_and_are_compared_with_the_first(tmp_path: Path) -> 
     assert ray["ratio"] == pytest.approx(ray["seconds"] / coherent["seconds"])
     assert ray["parameters"] > 200_000
     assert "ray 16/32" in output
-    with pytest.raises(click.BadParameter, match="coherent, wave"):
+    with pytest.raises(click.BadParameter, match="coherent, refined, fast, wave"):
         CliRunner().invoke(main, ["--decoder", "x"], catch_exceptions=False, standalone_mode=False)
 
 
