@@ -60,7 +60,7 @@ from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import published_choices, published_decoder
 from train.published.states import page_states
 from train.published.training import FramePages, PublishedChoices, PublishedTraining, fit_published
-from train.refinement import Prediction, RefinementPages, fit_prediction, fit_refinements
+from train.refinement import RefinementPages, fit_prediction, fit_refinements
 from train.run import begin, sole_writer
 from train.symbols import LIKENESS_PAGES
 from train.twin import RayTwin, TorchTwin
@@ -146,13 +146,9 @@ class Bench:
         if name != REFINED:
             validation, unseen = self.held_out(features)
             return self.outcome(name, size, choices.steps, folder, first, validation, unseen, preparing)
-        choices = replace(choices, refinements=choices.refinements or 1)
-        prediction = Prediction(self.profile, self.fitted.vector)
         extractor = self.extractor("coherent")
         known = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
-        written = [np.angle(page.symbols) for page in known]
-        pairs = [page.pair for page in known]
-        fit_prediction(prediction, extractor, self.profile, self.fitted.vector, pairs, written)
+        prediction = fit_prediction(extractor, self.profile, self.fitted.vector, known)
         counts = len(self.training), len(self.validation)
         material = RefinementPages(self.recording, self.pages, *counts, features)
         key = self.fitted.to_toml()

@@ -50,21 +50,11 @@ class DecoderGraph(nn.Module):
                 parameter.copy_(parameter.half())
         self.table_inputs = (*TABLE_INPUTS, *decoder.table_inputs)
 
-    def forward(
-        self,
-        in_phase: Tensor,
-        quadrature: Tensor,
-        reference_in_phase: Tensor,
-        reference_quadrature: Tensor,
-        registration: Tensor,
-        homodyne: Tensor,
-        *others: Tensor,
-    ) -> tuple[Tensor, ...]:
-        """Decode one pair; see `OUTPUTS` and, for the table, `optics.registration.table`."""
-        measured = self.recovery.measure(
-            in_phase, quadrature, reference_in_phase, reference_quadrature, registration, homodyne
-        )
-        table = dict(zip(self.decoder.table_inputs, others, strict=True))
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """Decode one pair: frames and `table_inputs` to `OUTPUTS`; see `optics.registration.table`."""
+        seen = len(FRAME_INPUTS) + len(TABLE_INPUTS)
+        measured = self.recovery.measure(*tensors[:seen])
+        table = dict(zip(self.decoder.table_inputs, tensors[seen:], strict=True))
         p, field, left = self.decoder(self.recovery, measured, table)
         return *_answers(p * self.kappa_scale), relative_power(left, field), field, left
 

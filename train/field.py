@@ -99,38 +99,14 @@ class FieldRecovery(nn.Module):
         self.v: Tensor
         self.between_x: Tensor
         self.between_y: Tensor
-        for name, axis in (("u", grid.x_m / corner), ("v", grid.y_m / corner)):
-            powers = np.stack([axis**power for power in range(_CUBIC + 1)])
-            self.register_buffer(name, torch.tensor(powers, dtype=torch.float32))
-            self.register_buffer(
-                f"between_{'x' if name == 'u' else 'y'}", torch.tensor(_interpolation(len(axis)), dtype=torch.float32)
-            )
+        for power_name, between, axis in (("u", "between_x", grid.x_m), ("v", "between_y", grid.y_m)):
+            powers = np.stack([(axis / corner) ** power for power in range(_CUBIC + 1)])
+            self.register_buffer(power_name, torch.tensor(powers, dtype=torch.float32))
+            self.register_buffer(between, torch.tensor(_interpolation(len(axis)), dtype=torch.float32))
 
-    def forward(
-        self,
-        in_phase: Tensor,
-        quadrature: Tensor,
-        reference_in_phase: Tensor,
-        reference_quadrature: Tensor,
-        registration: Tensor,
-        homodyne: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Recover the field.
-
-        Args:
-            in_phase, quadrature: raw frames [H, W], any number type.
-            reference_in_phase, reference_quadrature: reference-only frames [H, W], counts.
-            registration: [2, 2, 10], pixel (column, row) of each camera as a cubic in the grid's (x, y), each over
-                the page's corner radius.
-            homodyne: [2], cosine and sine of the turn between the two arms.
-
-        Returns:
-            field: [2, ny, nx], real and imaginary part of E over the reference amplitude's mean on the grid.
-            residual: [2, ny, nx], what is left of the two equations inside the pipe's band, over the mean reference
-                amplitude; large against the field when the frames do not belong to this calibration.
-        """
-        measured = self.measure(in_phase, quadrature, reference_in_phase, reference_quadrature, registration, homodyne)
-        return self.solve(measured)
+    def forward(self, *seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Recover the field; arguments as for `measure`, results as of `solve`."""
+        return self.solve(self.measure(*seen))
 
     def measure(
         self,
@@ -141,7 +117,15 @@ class FieldRecovery(nn.Module):
         registration: Tensor,
         homodyne: Tensor,
     ) -> Measured:
-        """Both cameras' measurements on the common grid; arguments as for `forward`."""
+        """Both cameras' measurements on the common grid.
+
+        Args:
+            in_phase, quadrature: raw frames [H, W], any number type.
+            reference_in_phase, reference_quadrature: reference-only frames [H, W], counts.
+            registration: [2, 2, 10], pixel (column, row) of each camera as a cubic in the grid's (x, y), each over
+                the page's corner radius.
+            homodyne: [2], cosine and sine of the turn between the two arms.
+        """
         frames = torch.stack([in_phase, quadrature]).to(torch.float32)
         references = torch.stack([reference_in_phase, reference_quadrature]).to(torch.float32)
         where = self._where(registration)
@@ -162,7 +146,13 @@ class FieldRecovery(nn.Module):
         return Measured(a, b, homodyne[0], homodyne[1], amplitude / amplitude.mean(), lit)
 
     def solve(self, measured: Measured) -> tuple[Tensor, Tensor]:
-        """Field and residual of what was measured, as `forward` returns them."""
+        """Solve what was measured.
+
+        Returns:
+            field: [2, ny, nx], real and imaginary part of E over the reference amplitude's mean on the grid.
+            residual: [2, ny, nx], what is left of the two equations inside the pipe's band, over the mean reference
+                amplitude; large against the field when the frames do not belong to this calibration.
+        """
         e = self._solve(measured)
         residual = self.band(torch.stack(measured.left(e)) * measured.amplitude)
         return e * measured.amplitude, residual
@@ -172,7 +162,7 @@ class FieldRecovery(nn.Module):
 
         Args:
             measured: of the frames.
-            field: predicted E [2, ny, nx], as `forward` returns it.
+            field: predicted E [2, ny, nx], as `solve` returns it.
             floor: see `Measured.pull`.
 
         Returns:

@@ -26,6 +26,7 @@ from optics.pilots import Pilots, estimate_piston
 from train.field import ROUNDS
 from train.loss import von_mises_nll
 from train.network import Refiner, SymbolUNet
+from train.parts import turned
 
 CHECKPOINTS = "checkpoints"
 """Folder of a run's checkpoints."""
@@ -163,9 +164,7 @@ class SymbolTraining(DecoderTraining[SymbolNetwork]):
 
 def _turned(parts: Tensor, by: Tensor) -> Tensor:
     """Real parts and then imaginary parts [N, 2 C, ny, nx], turned by an angle [N, 1, 1] each."""
-    real, imaginary = parts.chunk(2, dim=1)
-    cos, sin = torch.cos(by)[:, None], torch.sin(by)[:, None]
-    return torch.cat([real * cos - imaginary * sin, real * sin + imaginary * cos], dim=1)
+    return torch.cat(list(turned(torch.stack(parts.chunk(2, dim=1)), by[:, None])), dim=1)
 
 
 def air_of_nll(nll: Tensor) -> Tensor:

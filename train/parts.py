@@ -39,3 +39,9 @@ def conjugate(value: Parts) -> Parts:
 def adjoint(matrix: Parts) -> Parts:
     """The conjugate transpose of a matrix [..., m, n]."""
     return matrix[0].transpose(-1, -2), -matrix[1].transpose(-1, -2)
+
+
+def turned(stack: Tensor, by: Tensor | float) -> Tensor:
+    """Real and imaginary part [2, ...] of what is turned by an angle that broadcasts."""
+    angle = torch.as_tensor(by, dtype=stack.dtype, device=stack.device)
+    return torch.stack(multiply(parts(stack), (torch.cos(angle), torch.sin(angle))))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,8 @@ from torch import Tensor, nn
 
 from optics.grid import symbol_samples
 from optics.profile import Profile
-from optics.recording import FramePair, Recording
+from optics.recording import Recording
+from optics.registration.calibrate import KnownPage
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
 from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
@@ -26,7 +28,7 @@ from train.field import FieldRecovery, Measured
 from train.fitting import Fitted, Hyperparameters, SymbolTraining, fit_network
 from train.localizers.wave import by_symbol
 from train.network import Refiner
-from train.parts import conjugate, multiply, parts, stacked
+from train.parts import conjugate, multiply, parts, stacked, turned
 from train.waves import Real, WaveMatrices, Waves
 
 _FLOORS = (0.05, 20.0)
@@ -104,27 +106,21 @@ def expected_phasors(p: Tensor) -> Tensor:
 
 
 def fit_prediction(
-    prediction: Prediction,
-    extractor: FeatureExtractor,
-    profile: Profile,
-    parameters: Real,
-    pairs: Sequence[FramePair],
-    phases: Sequence[Real],
-) -> None:
-    """Set illumination and floor by known pages.
+    extractor: FeatureExtractor, profile: Profile, parameters: Real, known: Sequence[KnownPage]
+) -> Prediction:
+    """The prediction of a device, illumination and floor as known pages show them.
 
     Args:
-        prediction: of that device.
         extractor: of that device.
         profile, parameters: the device.
-        pairs: frames of known pages.
-        phases: what was written on them, [ny, nx] radians.
+        known: pages.
     """
-    samples = symbol_samples(profile)
+    prediction, samples = Prediction(profile, parameters), symbol_samples(profile)
     waves = FittedWaves(profile, parameters, samples, filled=True)
     terms = illumination_terms(waves.x, waves.y)
     coefficients, squares, lengths = [], [], []
-    for pair, written in zip(pairs, phases, strict=True):
+    for shown_page in known:
+        pair, written = shown_page.pair, np.angle(shown_page.symbols)
         state = extractor.state(extractor.field(pair), written, np.zeros(2))
         with torch.no_grad():
             measured, solved = extractor.look(pair, state.shift_px)
@@ -142,6 +138,7 @@ def fit_prediction(
     floor = constant / by_light if by_light > 0 else np.inf
     prediction.illumination.copy_(stacked(np.mean(coefficients, axis=0)))
     prediction.floor.fill_(float(np.clip(floor, *_FLOORS)))
+    return prediction
 
 
 @dataclass(frozen=True)
@@ -204,13 +201,10 @@ def fit_refinements(
     count, seen = len(material.pages), material.training + material.validation
     chosen = choices.of_refinement()
     for number in range(1, choices.refinements + 1):
-        earlier, module = FeatureStore(features), trained.module
+        make = partial(refined_pages, extractor, prediction, material, FeatureStore(features), trained.module)
         at = folder / f"refinement-{number}"
         features = at / "features"
         key = f"{key} {number} {trained.validation_air}"
-
-        def make(start: int, shift: tuple[float, float], earlier: FeatureStore = earlier) -> Iterator[PageFeatures]:
-            return refined_pages(extractor, prediction, material, earlier, module, start)  # noqa: B023
 
         seconds += fill(features, key, count, make, f"pages of refinement {number}")
         training, validation = (
@@ -230,7 +224,8 @@ def refined_pages(
     material: RefinementPages,
     earlier: FeatureStore,
     module: SymbolTraining,
-    start: int = 0,
+    start: int,
+    shift_px: tuple[float, float],
 ) -> Iterator[PageFeatures]:
     """Features for a refinement.
 
@@ -240,6 +235,7 @@ def refined_pages(
         earlier: their features for the look before.
         module: which was trained on such features.
         start: first page.
+        shift_px: not asked for: the look before has found each page's.
     """
     for number in range(start, len(material.pages)):
         *shown, phases = earlier[number]
@@ -254,9 +250,3 @@ def refined_pages(
             state,
             belief.numpy(),
         )
-
-
-def turned(stack: Tensor, by: float) -> Tensor:
-    """Real and imaginary part [2, ...] of what is turned by an angle."""
-    cos, sin = np.cos(by), np.sin(by)
-    return torch.stack([stack[0] * cos - stack[1] * sin, stack[0] * sin + stack[1] * cos])

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.utils.data import ConcatDataset
 
@@ -19,7 +18,7 @@ from train.feature_store import FeatureStore, fill
 from train.fitting import Fitted, Hyperparameters, Page, SymbolTraining, best_kappa_scale, fit_network
 from train.material import Material, Trained
 from train.network import SymbolUNet
-from train.refinement import Prediction, Refined, RefinementPages, fit_prediction, fit_refinements
+from train.refinement import Refined, RefinementPages, fit_prediction, fit_refinements
 from train.run import load_decoder, load_run
 from train.synthetic import MOST_NOISE, SyntheticPages, likeness
 
@@ -106,10 +105,8 @@ class SymbolRecipe:
         self, material: Material, pages: RefinementPages, first: Fitted[SymbolTraining], weights: dict[str, Tensor]
     ) -> Refined:
         """Trained refinements, which add what they have learnt to the weights."""
-        prediction = Prediction(material.profile, material.calibration.vector)
-        known, phases = self._likeness_pages(material)
-        pairs = [page.pair for page in known]
-        fit_prediction(prediction, material.extractor, material.profile, material.calibration.vector, pairs, phases)
+        device = material.profile, material.calibration.vector
+        prediction = fit_prediction(material.extractor, *device, self._likeness_pages(material))
         refined = fit_refinements(
             material.out,
             self.choices,
@@ -144,17 +141,18 @@ class SymbolRecipe:
             )
         return load_decoder(self.start, run).network
 
-    def _likeness_pages(self, material: Material) -> tuple[list[KnownPage], list[NDArray[np.float64]]]:
-        """Recorded pages that the wave model is compared with, and the phases that were written on them."""
-        known = known_pages(material.recording, material.profile, material.training[:LIKENESS_PAGES])
-        return known, [np.angle(page.symbols) for page in known]
+    @staticmethod
+    def _likeness_pages(material: Material) -> list[KnownPage]:
+        """Recorded pages that the wave model is compared with."""
+        return known_pages(material.recording, material.profile, material.training[:LIKENESS_PAGES])
 
     def _synthetic(self, material: Material) -> list[Path]:
         """Folder with the features of synthetic pages; none where the wave model is not like the device."""
         if self.synthetic_pages == 0:
             return []
         profile, vector, seed = material.profile, material.calibration.vector, self.choices.seed
-        known, phases = self._likeness_pages(material)
+        known = self._likeness_pages(material)
+        phases = [np.angle(page.symbols) for page in known]
         fields = [
             material.extractor.known_field(page.pair, written) for page, written in zip(known, phases, strict=True)
         ]

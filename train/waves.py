@@ -7,7 +7,7 @@ has drifted is decoded by feeding other parameters.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -143,7 +143,8 @@ class Waves(nn.Module):
         factors, facet_x, facet_y = couplings(geometry, torch), *facet
         per_metre = geometry.wave_number / geometry.focal_length_m
         area = (x[1] - x[0]) * (y[1] - y[0]) * (facet_x[1] - facet_x[0]) * (facet_y[1] - facet_y[0])
-        area = area / torch.cos(geometry.pipe_angle)  # type: ignore[arg-type]  # a tensor here
+        shear: Any = geometry.pipe_angle  # a tensor here, like all of it
+        area = area / torch.cos(shear)
         unitary = torch.sqrt(area) / (geometry.wavelength_m * geometry.focal_length_m)
 
         def kernel(factor: Tensor, rows: Tensor, columns: Tensor) -> Parts:
@@ -233,7 +234,8 @@ class _Pipe(nn.Module):
         step = geometry.pipe_length_m / self._steps
         squares = self.y_numbers[:, None, :, None] ** 2 + self.x_numbers[None, :, None, :] ** 2
         slow = detuning(nk, squares * (math.pi / width) ** 2, torch.sqrt)
-        angle = step / nk * torch.sin(geometry.pipe_angle) / width**2 * (self.y_couplings[:, None] * self.x_couplings)  # type: ignore[arg-type]
+        shear: Any = geometry.pipe_angle
+        angle = step / nk * torch.sin(shear) / width**2 * (self.y_couplings[:, None] * self.x_couplings)
         return _phasor(0.5 * step * slow), torch.cos(angle), torch.sin(angle)
 
     def run(self, field: Parts, at: WaveMatrices, *, backwards: bool) -> Parts:

@@ -14,13 +14,15 @@ from scipy import special
 from optics.device import Device, Drift, Sensor
 from optics.page import random_symbols, symbol_phases
 from optics.recording import FramePair
+from optics.registration.calibrate import KnownPage
 from optics.registration.fitted_waves import illumination_terms
 from optics.simulator import Simulator, true_parameters
 from tests.optics.small import small_profile
 from train.cli_train import train
 from train.features import FeatureExtractor
 from train.fitting import Hyperparameters
-from train.refinement import Prediction, expected_phasors, fit_prediction, turned
+from train.parts import turned
+from train.refinement import Prediction, expected_phasors, fit_prediction
 from train.run import load_decoder, load_run
 
 PROFILE = small_profile()
@@ -41,9 +43,8 @@ def known_page(**device: object) -> Known:
     recorded, phases = simulator.simulate(symbols), symbol_phases(symbols, 256)
     truth, turn = true_parameters(PROFILE, state), state.homodyne.turn_rad
     extractor = FeatureExtractor(PROFILE, truth, turn, simulator.references())
-    prediction = Prediction(PROFILE, truth)
-    fit_prediction(prediction, extractor, PROFILE, truth, [recorded.pair], [phases])
-    return Known(recorded.pair, phases, extractor, prediction)
+    known = KnownPage(recorded.pair, np.exp(1j * phases))
+    return Known(recorded.pair, phases, extractor, fit_prediction(extractor, PROFILE, truth, [known]))
 
 
 @pytest.fixture(scope="module")
