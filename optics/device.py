@@ -50,6 +50,8 @@ class Aberration(Table):
     defocus_rad: Phase = 1.0
     astigmatism_rad: Phase = 1.0
     coma_rad: Phase = 1.0
+    lens_path_relative_error: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] = 0.0
+    """Of the lenses' path beyond the ideal one, against the profile's: -1 is an ideal lens."""
 
 
 class Reference(Table):

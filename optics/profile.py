@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optics.errors import ProfileError
+from optics.lens_path import SeidelTerms
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -40,6 +41,17 @@ class Lens(Table):
     """The launch and the de-launch lens, both in a 2f arrangement."""
 
     focal_length_m: Positive
+
+
+class LensPath(Table):
+    """Optical path of either lens beyond an ideal one's, by its terms, for the page's corner at the pipe's wall."""
+
+    piston_rad: Finite = 0.0
+    distortion_rad: Finite = 0.0
+    astigmatism_rad: Finite = 0.0
+    field_curvature_rad: Finite = 0.0
+    coma_rad: Finite = 0.0
+    spherical_rad: Finite = 0.0
 
 
 class Pipe(Table):
@@ -86,6 +98,7 @@ class Profile(Table):
     slm: Slm
     page: PageLayout
     camera: Camera
+    lens_path: LensPath = LensPath()
 
     @model_validator(mode="after")
     def _page_fits_the_optics(self) -> Self:
@@ -126,6 +139,19 @@ class Profile(Table):
     def frame_shape(self) -> tuple[int, int]:
         """Camera pixels as (rows, columns)."""
         return self.camera.rows_px, self.camera.columns_px
+
+    def seidel_terms(self, share: Any = 1.0) -> SeidelTerms:
+        """The lenses' path beyond the ideal one, and how much of it there is, as a number or a tensor."""
+        field, aperture = self.corner_m, self.pipe.width_m / 2
+        path = self.lens_path
+        return SeidelTerms(
+            piston=share * path.piston_rad / field**4,
+            distortion=share * path.distortion_rad / (field**3 * aperture),
+            astigmatism=share * path.astigmatism_rad / (field * aperture) ** 2,
+            field_curvature=share * path.field_curvature_rad / (field * aperture) ** 2,
+            coma=share * path.coma_rad / (field * aperture**3),
+            spherical=share * path.spherical_rad / aperture**4,
+        )
 
     def with_symbols_of(self, size_px: int) -> Profile:
         """The same device with symbols of another size, SLM pixels, on as much of its page as whole symbols cover."""

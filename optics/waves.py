@@ -7,22 +7,24 @@ y' = +-w/2 with y' = x sin t + y cos t, and the field vanishes on them. The comm
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
+
+from optics.expansion import Expansion, Interpolation, Phase
+from optics.lens_path import IDEAL, SeidelTerms
 
 Complex = NDArray[np.complexfloating]
 Real = NDArray[np.floating]
 
-_RANK_TOLERANCE = 1e-7
-"""Singular values of the roll's coupling below this share of the largest are dropped (field error of the same size)."""
+_TOLERANCE = 1e-7
+"""Field error of an ideal lens's expansion."""
 
-_SPARE_DEGREES = 12
-"""Degrees beyond the largest phase of the roll's coupling, in radians, that its polynomials need for that tolerance."""
+_TOLERANCE_WITH_PATH = 1e-3
+"""The same for a real lens, where a smaller one takes more terms: 52 for this one, at the full size, 97 for 1e-5."""
 
 _MODE_MARGIN = 1.04
 """Modes beyond the one that the page's edge excites: an edge of the facet spreads it."""
@@ -41,6 +43,8 @@ class WaveGeometry:
     """Shear t of the cross-section."""
     pipe_roll: float = 0.0
     """Rotation of the pipe about the optical axis, from x towards y, against page and cameras."""
+    lens_path: SeidelTerms = IDEAL
+    """Of the first lens; the second one is its mirror image."""
 
     @property
     def wave_number(self) -> float:
@@ -131,6 +135,11 @@ def couplings(geometry: WaveGeometry, xp: Any = np) -> Couplings:
     return Couplings(cos + tan * sin, sin - tan * cos, cos / xp.cos(t), -sin / xp.cos(t))
 
 
+def on_facet(factors: Couplings, across: Any, up: Any) -> tuple[Any, Any]:
+    """A point (X, Y') of the oblique facet as Cartesian coordinates of the lens's plane."""
+    return factors.x_to_x * across + factors.x_to_y * up, factors.y_to_x * across + factors.y_to_y * up
+
+
 def entrance_window(
     geometry: WaveGeometry, facet_x_m: Any, facet_y_m: Any, envelope_m: float, blur_m: float = 0.0, xp: Any = np
 ) -> Any:
@@ -169,23 +178,28 @@ class FourierLens:
     """A 2f lens between a Cartesian plane (SLM or camera) and the oblique sample grid on a pipe facet.
 
     The kernel exp(-i k/f (x X + y Y)) is a product of four couplings of (x, y) with the facet's (X, Y'). Three of them
-    factor into matrix products; the fourth, x with Y', is there only when the pipe is rolled, varies by a few radians
-    and is expanded in its leading singular vectors.
+    factor into matrix products; the fourth, x with Y', is there only when the pipe is rolled. It and the path of a real
+    lens beyond the ideal one vary by a few radians and are expanded in few terms.
 
     Args:
         geometry: the device.
         x_m, y_m: sample positions on the plane, uniform, [nx] and [ny].
         cells: sample intervals of the pipe along (y', x).
+        second: whether this is the second lens, between cameras and exit.
 
     Attributes:
         x_to_x, y_and_x, y_to_y: the three couplings that factor, [nx, fx], [ny, fx] and [fy, ny].
-        facet_terms, plane_terms: terms of the fourth, [R, fy] and [R, nx].
+        terms: of the rest, between plane and facet.
+        on_plane: phasor of the lens's path that depends on the plane alone, [ny, nx], or one.
     """
 
-    def __init__(self, geometry: WaveGeometry, x_m: Real, y_m: Real, cells: tuple[int, int]) -> None:
+    def __init__(
+        self, geometry: WaveGeometry, x_m: Real, y_m: Real, cells: tuple[int, int], *, second: bool = False
+    ) -> None:
         w = geometry.pipe_width_m
         facet_y, facet_x = (_facet(count, w) for count in cells)
         factors = couplings(geometry)
+        path = geometry.lens_path.mirrored() if second else geometry.lens_path
 
         def kernel(factor: float, rows: Real, columns: Real) -> Complex:
             return _lens_kernel(geometry, factor * rows, columns)
@@ -195,15 +209,37 @@ class FourierLens:
         self.x_to_x = (unitary * kernel(factors.x_to_x, x_m, facet_x)).astype(np.complex64)
         self.y_and_x = kernel(factors.y_to_x, y_m, facet_x).astype(np.complex64)
         self.y_to_y = kernel(factors.y_to_y, facet_y, y_m).astype(np.complex64)
-        self.facet_terms, self.plane_terms = _separated(kernel(factors.x_to_y, facet_y, x_m), facet_y, x_m)
+        tolerance = _TOLERANCE if path == IDEAL else _TOLERANCE_WITH_PATH
+        self._geometry, self._path = geometry, path
+        self._planes = (x_m, y_m), (facet_x, facet_y)
+        self.terms = Expansion.of(self._rest(geometry), *self._planes, tolerance)
+        self.on_plane: Complex = np.ones((1, 1), np.complex64)
+        if path != IDEAL:
+            self.on_plane = np.exp(1j * path.of_field(x_m[None, :], y_m[:, None])).astype(np.complex64)
+
+    def interpolation(self, roll_margin: float, tolerance: float) -> Interpolation:
+        """Of what does not factor, for rolls up to so many radians to either side of the geometry's."""
+        rolls = (self._geometry.pipe_roll + share * roll_margin for share in (-1, 0, 1))
+        phases = [self._rest(replace(self._geometry, pipe_roll=roll)) for roll in rolls]
+        return Interpolation.of(phases, *self._planes, tolerance)
+
+    def _rest(self, geometry: WaveGeometry) -> Phase:
+        """What does not factor, of a geometry with the same lenses."""
+        factors, path = couplings(geometry), self._path
+
+        def phase(x: Real, y: Real, across: Real, up: Real) -> Real:
+            rolled = -geometry.wave_number / geometry.focal_length_m * factors.x_to_y * x * up
+            return np.asarray(rolled + path.of_both(x, y, *on_facet(factors, across, up)))
+
+        return phase
 
     def to_facet(self, field: Complex) -> Complex:
         """Field on the plane [ny, nx] to the facet's grid [cells_y - 1, cells_x - 1]."""
-        field = field.astype(np.complex64)
+        field = field.astype(np.complex64) * self.on_plane
         total: Complex | None = None
-        for on_facet, on_plane in zip(self.facet_terms, self.plane_terms, strict=True):
-            term = self.y_to_y @ (((field * on_plane) @ self.x_to_x) * self.y_and_x)
-            term *= on_facet[:, None]
+        for at_plane, at_facet in self.terms.terms():
+            term = self.y_to_y @ (((field * at_plane) @ self.x_to_x) * self.y_and_x)
+            term *= at_facet
             total = term if total is None else total + term
         assert total is not None
         return total
@@ -212,30 +248,12 @@ class FourierLens:
         """The adjoint of `to_facet`: a field on the facet's grid to the plane [ny, nx], kernel exp(+i ...)."""
         field = field.astype(np.complex64)
         total: Complex | None = None
-        for on_facet, on_plane in zip(self.facet_terms, self.plane_terms, strict=True):
-            inner = (self.y_to_y.conj().T @ (field * on_facet.conj()[:, None])) * self.y_and_x.conj()
-            term = (inner @ self.x_to_x.conj().T) * on_plane.conj()
+        for at_plane, at_facet in self.terms.terms():
+            inner = (self.y_to_y.conj().T @ (field * at_facet.conj())) * self.y_and_x.conj()
+            term = (inner @ self.x_to_x.conj().T) * at_plane.conj()
             total = term if total is None else total + term
         assert total is not None
-        return total
-
-
-def _separated(kernel: Complex, rows: Real, columns: Real) -> tuple[Complex, Complex]:
-    """Fewest terms [R, rows] and [R, columns] whose products sum to a kernel exp(i c row column).
-
-    They are its leading singular vectors, found among polynomials of the degree that its largest phase needs: the full
-    decomposition would take longer than a page.
-    """
-    largest = float(np.abs(np.angle(kernel[1:, -1] / kernel[:-1, -1])).sum()) if len(rows) > 1 else 0.0
-    degree = int(np.ceil(largest)) + _SPARE_DEGREES
-    on_rows, on_columns = (
-        np.linalg.qr(legvander(places / np.abs(places).max(), min(degree, len(places) - 1)))[0]
-        for places in (rows, columns)
-    )
-    left, weights, right = np.linalg.svd(on_rows.T @ kernel @ on_columns)
-    rank = int(np.sum(weights > _RANK_TOLERANCE * weights[0]))
-    facet = (on_rows @ (left[:, :rank] * weights[:rank])).T
-    return facet.astype(np.complex64), (right[:rank] @ on_columns.T).astype(np.complex64)
+        return np.asarray(total * self.on_plane.conj())
 
 
 class PipePropagator:
@@ -389,7 +407,7 @@ class WaveChannel:
     @cached_property
     def delaunch_lens(self) -> FourierLens:
         """Camera plane to exit facet (its `to_plane` is the de-launch)."""
-        return FourierLens(self.geometry, self.camera_x_m, self.camera_y_m, self.cells)
+        return FourierLens(self.geometry, self.camera_x_m, self.camera_y_m, self.cells, second=True)
 
     @cached_property
     def pipe(self) -> PipePropagator:

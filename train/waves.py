@@ -7,6 +7,7 @@ has drifted is decoded by feeding other parameters.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from optics.grid import field_grid, symbol_samples
+from optics.lens_path import IDEAL, SeidelTerms
 from optics.profile import Profile
 from optics.registration.fitted_waves import (
     FittedWaves,
@@ -24,29 +26,31 @@ from optics.registration.fitted_waves import (
     modulator_axes,
 )
 from optics.registration.parameters import NAMES, as_dict
-from optics.waves import PipePropagator, WaveGeometry, couplings, detuning, entrance_window
-from train.parts import Parts, adjoint, conjugate, matmul, multiply, parts
+from optics.waves import PipePropagator, WaveGeometry, couplings, detuning, entrance_window, on_facet
+from train.parts import Parts, adjoint, conjugate, matmul, multiply, parts, stacked
 
 Real = NDArray[np.float64]
 
 _ROLL_MARGIN = np.deg2rad(0.05)
-"""Roll beyond the fitted one that the terms of its coupling still serve."""
-_ROLL_TOLERANCE = 3e-4
-"""Error of that coupling."""
+"""Roll to either side of the fitted one that the terms of the lenses' expansions still serve."""
+_TOLERANCE = 3e-4
+"""Error of those expansions."""
+_TOLERANCE_WITH_PATH = 3e-3
+"""The same for lenses that are not ideal: half of the terms that the other takes, and a field error of 0.014."""
+_AT_ONCE = 12
+"""Terms that go through a product together: as many as an ideal lens has, and a memory's worth of another's."""
 _STEPS = 32
 """Splitting steps: half of the fitted waves', each of which is time in every decode; a field error of 0.02."""
-_PAGE_MARGIN = 1.05
-"""Of the extent over which it is interpolated: the page may lie off centre."""
 
 
 class LensMatrices(NamedTuple):
-    """A lens between its plane and a facet of the pipe; see `FourierLens`, whose terms are real at the plane here."""
+    """A lens between its plane and a facet of the pipe; see `FourierLens`, whose terms `plane` and `facet` are."""
 
     x: Parts
     between: Parts
     y: Parts
     facet: Parts
-    plane: Tensor
+    plane: Parts
 
 
 class WaveMatrices(NamedTuple):
@@ -87,6 +91,7 @@ class Waves(nn.Module):
         self.grid_y_m: Tensor
         self.facet_x: Tensor
         self.facet_y: Tensor
+        self._ideal = channel.geometry.lens_path == IDEAL
         self._pipe = _Pipe(channel.pipe)
         for name, value in {
             "x_m": x,
@@ -97,12 +102,15 @@ class Waves(nn.Module):
             "facet_y": np.arange(1, channel.cells[0]) / channel.cells[0] - 0.5,
         }.items():
             self.register_buffer(name, torch.from_numpy(value).to(torch.float32), persistent=False)
-        reach = _PAGE_MARGIN * max(float(np.abs(grid.x_m).max()), float(np.abs(x).max()))
-        roll = abs(as_dict(parameters)["pipe_roll_rad"]) + _ROLL_MARGIN
-        per_metre = channel.geometry.wave_number / channel.geometry.focal_length_m
-        terms = _terms(per_metre * float(roll) * reach * profile.pipe.width_m / 2)
-        self._reach = reach
-        self._nodes = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
+        self.launch_nodes: Tensor
+        self.launch_weights: Tensor
+        self.camera_nodes: Tensor
+        self.camera_weights: Tensor
+        centre = np.array([as_dict(parameters)[f"page_centre_{axis}_m"] for axis in "xy"])
+        for name, lens, middle in (("launch", channel.launch_lens, centre), ("camera", channel.delaunch_lens, 0.0)):
+            terms = lens.interpolation(_ROLL_MARGIN, _TOLERANCE if self._ideal else _TOLERANCE_WITH_PATH)
+            self.register_buffer(f"{name}_nodes", torch.from_numpy(terms.nodes - middle).float(), persistent=False)
+            self.register_buffer(f"{name}_weights", stacked(terms.weights), persistent=False)
         self.default: Tensor
         self.register_buffer("default", torch.from_numpy(parameters).to(torch.float32), persistent=False)
 
@@ -116,9 +124,14 @@ class Waves(nn.Module):
         window = entrance_window(geometry, *facet, self._envelope_m, xp=torch)
         at_launch = fitted_launch_phase(self._profile, value, geometry, self.x_m[None, :], self.y_m[:, None])
         at_camera = fitted_camera_phase(self._profile, value, geometry, grid[0][None, :], grid[1][:, None])
+        path = geometry.lens_path
+        if not self._ideal:
+            at_launch = at_launch + path.of_field(x[0][None, :], x[1][:, None])
+            at_camera = at_camera - path.mirrored().of_field(grid[0][None, :], grid[1][:, None])
+        launch_nodes = self.launch_nodes + torch.stack([value["page_centre_x_m"], value["page_centre_y_m"]])
         return WaveMatrices(
-            self._lens(geometry, *x, facet),
-            self._lens(geometry, *grid, facet),
+            self._lens(geometry, *x, facet, path, launch_nodes, self.launch_weights),
+            self._lens(geometry, *grid, facet, path.mirrored(), self.camera_nodes, self.camera_weights),
             window,
             _phasor(at_launch),
             _phasor(at_camera),
@@ -138,9 +151,18 @@ class Waves(nn.Module):
         page = _to_plane(at.launch, (real * at.window, imaginary * at.window))
         return torch.stack(multiply(page, conjugate(at.at_launch)))
 
-    def _lens(self, geometry: WaveGeometry, x: Tensor, y: Tensor, facet: tuple[Tensor, Tensor]) -> LensMatrices:
-        """`FourierLens`; the coupling of x with Y', a few radians, is interpolated in x between Chebyshev's nodes."""
-        factors, facet_x, facet_y = couplings(geometry, torch), *facet
+    def _lens(
+        self,
+        geometry: WaveGeometry,
+        x: Tensor,
+        y: Tensor,
+        facet: tuple[Tensor, Tensor],
+        path: SeidelTerms,
+        nodes: Tensor,
+        weights: Tensor,
+    ) -> LensMatrices:
+        """`FourierLens`; what does not factor is interpolated on the plane between nodes [R, 2] with weights."""
+        factors, (facet_x, facet_y) = couplings(geometry, torch), facet
         per_metre = geometry.wave_number / geometry.focal_length_m
         area = (x[1] - x[0]) * (y[1] - y[0]) * (facet_x[1] - facet_x[0]) * (facet_y[1] - facet_y[0])
         shear: Any = geometry.pipe_angle  # a tensor here, like all of it
@@ -150,32 +172,18 @@ class Waves(nn.Module):
         def kernel(factor: Tensor, rows: Tensor, columns: Tensor) -> Parts:
             return _phasor(-(factor * per_metre * rows)[:, None] * columns[None, :])
 
-        nodes = torch.from_numpy(self._nodes * self._reach).to(torch.float32)
         real, imaginary = kernel(factors.x_to_x, x, facet_x)
-        facet_terms = kernel(factors.x_to_y, nodes, facet_y)
+        node_x, node_y, up = nodes[:, :1, None], nodes[:, 1:, None], facet_y[:, None]
+        rest = -factors.x_to_y * per_metre * node_x * up
+        if not self._ideal:
+            rest = rest + path.of_both(node_x, node_y, *on_facet(factors, facet_x, up))
         return LensMatrices(
             (real * unitary, imaginary * unitary),
             kernel(factors.y_to_x, y, facet_x),
             kernel(factors.y_to_y, facet_y, y),
-            (facet_terms[0][:, :, None], facet_terms[1][:, :, None]),
-            _lagrange(self._nodes, x / self._reach)[:, None, :],
+            _phasor(rest),
+            parts(weights),
         )
-
-
-def _terms(phase: float) -> int:
-    """Terms that interpolate exp(i phase s t), |s|, |t| <= 1, to the tolerance."""
-    return next(n for n in range(1, 64) if 2 * (phase / 2) ** n / math.factorial(n) < _ROLL_TOLERANCE)
-
-
-def _lagrange(nodes: Real, at: Tensor) -> Tensor:
-    """Lagrange's polynomials of the nodes [R] at [N], [R, N]."""
-    rows = []
-    for number, node in enumerate(nodes):
-        row = torch.ones_like(at)
-        for other in np.delete(nodes, number):
-            row = row * (at - float(other)) / float(node - other)
-        rows.append(row)
-    return torch.stack(rows)
 
 
 def _phasor(phase: Tensor) -> Parts:
@@ -183,17 +191,32 @@ def _phasor(phase: Tensor) -> Parts:
 
 
 def _to_facet(lens: LensMatrices, field: Parts) -> Parts:
-    terms = field[0] * lens.plane, field[1] * lens.plane  # [R, ny, nx]
-    terms = multiply(matmul(terms, lens.x), lens.between)
-    real, imaginary = multiply(matmul(lens.y, terms), lens.facet)
-    return real.sum(0), imaginary.sum(0)
+    def of(plane: Parts, facet: Parts) -> Parts:
+        terms = multiply(matmul(multiply(plane, field), lens.x), lens.between)
+        return multiply(matmul(lens.y, terms), facet)
+
+    return _summed(of, lens.plane, lens.facet)
 
 
 def _to_plane(lens: LensMatrices, field: Parts) -> Parts:
-    terms = multiply(field, conjugate(lens.facet))  # [R, fy, fx]
-    terms = multiply(matmul(adjoint(lens.y), terms), conjugate(lens.between))
-    real, imaginary = matmul(terms, adjoint(lens.x))
-    return (real * lens.plane).sum(0), (imaginary * lens.plane).sum(0)
+    def of(plane: Parts, facet: Parts) -> Parts:
+        terms = multiply(field, conjugate(facet))  # [R, fy, fx]
+        terms = multiply(matmul(adjoint(lens.y), terms), conjugate(lens.between))
+        return multiply(matmul(terms, adjoint(lens.x)), conjugate(plane))
+
+    return _summed(of, lens.plane, lens.facet)
+
+
+def _summed(of: Callable[[Parts, Parts], Parts], plane: Parts, facet: Parts) -> Parts:
+    """The sum over all terms, some at once."""
+    total: Parts | None = None
+    for first in range(0, len(plane[0]), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        real, imaginary = of((plane[0][some], plane[1][some]), (facet[0][some], facet[1][some]))
+        more = real.sum(0), imaginary.sum(0)
+        total = more if total is None else (total[0] + more[0], total[1] + more[1])
+    assert total is not None
+    return total
 
 
 def _sine_modes(numbers: Tensor, cells: int) -> Tensor:

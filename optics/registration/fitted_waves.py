@@ -33,6 +33,7 @@ def fitted_geometry(profile: Profile, value: Mapping[str, Any]) -> WaveGeometry:
         refractive_index=profile.pipe.refractive_index,
         pipe_angle=np.deg2rad(profile.pipe.angle_deg) + value["pipe_angle_rad"],
         pipe_roll=value["pipe_roll_rad"],
+        lens_path=profile.seidel_terms(1 + value["lens_path_relative"]),
     )
 
 

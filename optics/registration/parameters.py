@@ -41,6 +41,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("launch_astigmatism_45_rad", 1.0, "launch"),
     Parameter("launch_coma_x_rad", 1.5, "launch"),
     Parameter("launch_coma_y_rad", 1.0, "launch"),
+    # of the lenses' path beyond the ideal one, which the profile states; a device whose lenses are ideal lies at -1
+    Parameter("lens_path_relative", 0.5, "launch"),
     # phase of the signal against the reference over the camera plane; tilts at the edges, the rest at the corner
     Parameter("camera_tilt_x_rad", 3.0, "camera_phase"),
     Parameter("camera_tilt_y_rad", 3.0, "camera_phase"),

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from optics.grid import field_grid, symbol_samples
+from optics.lens_path import IDEAL
 from optics.profile import Profile
 from optics.recording import FramePair
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
-from optics.registration.parameters import PARAMETERS, PRIORS, indices
+from optics.registration.parameters import NAMES, PARAMETERS, PRIORS, indices
 from optics.registration.samplers import smooth_reference
 from optics.registration.twin import Twin
 
@@ -47,6 +48,8 @@ _DIFFERENCE = 1e-3
 _CAMERAS = ("in_phase", "quadrature")
 _AT_CAMERA = frozenset(indices("camera_phase"))
 """Parameters whose change of the light needs no propagation."""
+_OF_REAL_LENSES = (NAMES.index("lens_path_relative"),)
+"""Parameters that do nothing where the profile's lenses are ideal."""
 _SEEN = frozenset(indices(*_CAMERAS, "distortion"))
 """Parameters that say where the cameras see a place; all others change the light itself."""
 
@@ -144,7 +147,8 @@ class WaveFit:
             centre: [P] centre of the priors, nominal (zero) if None.
             prior_scale: factor on the priors' standard deviations, one for all or [P].
         """
-        of_light = [index for index in indices(*groups) if index not in _SEEN]
+        without_effect = () if self._profile.seidel_terms() != IDEAL else _OF_REAL_LENSES
+        of_light = [index for index in indices(*groups) if index not in (*_SEEN, *without_effect)]
         of_cameras = [index for index in indices(*groups) if index in _SEEN]
         free = of_light + of_cameras
         precision = 1 / (PRIORS * prior_scale)[free] ** 2

@@ -5,9 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from optics.device import CameraPose, Device, ideal_device
-from optics.profile import Camera, Lens, PageLayout, Pipe, Profile, load_profile
+from optics.profile import Camera, Lens, LensPath, PageLayout, Pipe, Profile, load_profile
 
 PLAIN_POSE = CameraPose()
+THICK = LensPath(
+    piston_rad=-5,
+    distortion_rad=-4.4,
+    astigmatism_rad=-2.8,
+    field_curvature_rad=-2.1,
+    coma_rad=-1.4,
+    spherical_rad=-0.1,
+)
+"""About what a real lens does at the full size."""
 
 
 def small_profile() -> Profile:

@@ -14,7 +14,7 @@ from optics.profile import PageLayout, Profile, load_profile
 from optics.registration.parameters import NAMES
 from optics.registration.twin import BRANCHES
 from optics.simulator import Simulator, TrueOptics, true_parameters
-from tests.optics.small import on_slm, perfect_device, random_phases, small_profile
+from tests.optics.small import THICK, on_slm, perfect_device, random_phases, small_profile
 from train.twin import RayTwin, TorchTwin
 
 FINE_SENSOR = Sensor(full_well_e=1e9, read_noise_e=0, bit_depth=16)
@@ -332,22 +332,24 @@ class TestTruth:
             frame = resample(np.abs(field) ** 2, *optics.camera_axes_m, *optics.view(pose))
             assert _centre_of_spot(frame) == pytest.approx(predicted[camera], abs=0.2)
 
-    @pytest.mark.parametrize("name", ["square", "sheared", "mishandled"])
+    @pytest.mark.parametrize("name", ["square", "sheared", "mishandled", "real lenses"])
     def test_light_arrives_where_the_rays_say_and_with_the_phase_that_they_say(self, name: str) -> None:
+        profile = TALL.model_copy(update={"lens_path": THICK}) if name == "real lenses" else TALL
         device = {
+            "real lenses": mishandled(),
             "square": perfect_device(),
             "sheared": perfect_device(
                 geometry=Geometry(pipe_angle_deg=-0.6, page_shift_x_px=0, page_shift_y_px=0, pipe_roll_deg=0)
             ),
             "mishandled": mishandled(),
         }[name]
-        optics, twin = TrueOptics(TALL, device), TorchTwin(RayTwin(TALL))
+        optics, twin = TrueOptics(profile, device), TorchTwin(RayTwin(profile))
         page_x, page_y = optics.page_axes_m
         points = np.stack(np.meshgrid(page_x - page_x.mean(), page_y - page_y.mean()), axis=-1).reshape(-1, 2)
-        rays = twin.trace(true_parameters(TALL, device), points)
+        rays = twin.trace(true_parameters(profile, device), points)
         reference = optics.reference()
         away = np.abs(rays.positions)
-        pages = [on_slm(random_phases(TALL, seed), TALL) for seed in range(3)]
+        pages = [on_slm(random_phases(profile, seed), profile) for seed in range(3)]
         # the field is known against the reference
         fields = [optics.camera_field(optics.exit_field(page)) * np.exp(-1j * np.angle(reference)) for page in pages]
         for branch, cell in (("direct", (0, 0)), ("x", (1, 0)), ("y", (0, 1))):
@@ -361,8 +363,9 @@ class TestTruth:
                 arrived = np.array([1, 1j]) @ np.stack(list(parts))
                 light.append(arrived * np.exp(-1j * (rays.phases[b, clean] + page.ravel()[clean])))
             mean = np.mean(light)
-            assert abs(mean) / np.sqrt(np.mean(np.abs(light) ** 2)) > 0.9, branch
-            assert abs(np.angle(mean)) < 0.05, branch
+            # no single ray undoes a wavefront that a real lens has bent
+            assert abs(mean) / np.sqrt(np.mean(np.abs(light) ** 2)) > (0.8 if name == "real lenses" else 0.9), branch
+            assert abs(np.angle(mean)) < (0.1 if name == "real lenses" else 0.05), branch
 
     def test_in_a_sheared_pipe_either_order_of_two_reflections_has_its_share_of_the_corner_light(self) -> None:
         straight = Geometry(pipe_angle_deg=-0.6, page_shift_x_px=0, page_shift_y_px=0, pipe_roll_deg=0)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import fft, integrate, linalg, ndimage
 
+from optics.lens_path import SeidelTerms
 from optics.waves import FourierLens, PipePropagator, WaveChannel, WaveGeometry, cells_for, modes_for, sine_matrix
 
 DEVICE = WaveGeometry(
@@ -170,6 +171,37 @@ class TestLens:
             sample = (x[1] - x[0]) * (y[1] - y[0])
             expected = np.sum(plane * wave) * np.sqrt(cell * sample) / geometry.wavelength_m / geometry.focal_length_m
             assert abs(got[row, column] - expected) < 2e-5 * np.abs(got).max()
+
+    @pytest.mark.parametrize("second", [False, True])
+    def test_a_real_lens_adds_its_path_to_every_ray_between_plane_and_facet(self, second: bool) -> None:
+        page, wall = 0.95e-3, DEVICE.pipe_width_m / 2
+        radians = {(4, 0): -5, (3, 1): -4, (2, 2): -3, (1, 3): -1.5, (0, 4): -1}
+        of = {powers: value / page ** powers[0] / wall ** powers[1] for powers, value in radians.items()}
+        terms = SeidelTerms(of[4, 0], of[3, 1], of[2, 2], -of[2, 2], of[1, 3], of[0, 4])
+        geometry = replace(device(-0.6, 0.2), lens_path=terms)
+        x, y = axis(60, 27e-6) + 18e-6, axis(44, 23e-6) - 30e-6
+        plane, rng = noise(44, 60), np.random.default_rng(4)
+        lens, ideal = (FourierLens(g, x, y, CELLS, second=second) for g in (geometry, device(-0.6, 0.2)))
+        got = lens.to_facet(plane)
+        assert off(ideal.to_facet(plane), got) > 0.5
+        t, r = geometry.pipe_angle, geometry.pipe_roll
+        for _ in range(20):
+            row, column = int(rng.integers(CELLS[0] - 1)), int(rng.integers(CELLS[1] - 1))
+            across = ((column + 1) / CELLS[1] - 0.5) * geometry.pipe_width_m
+            up = (((row + 1) / CELLS[0] - 0.5) * geometry.pipe_width_m - across * np.sin(t)) / np.cos(t)
+            at_x, at_y = across * np.cos(r) - up * np.sin(r), across * np.sin(r) + up * np.cos(r)
+            # the mirror image of a lens sends the same path the other way: through the facet's point to -x, -y
+            sign = -1 if second else 1
+            r2, aperture2 = x[None] ** 2 + y[:, None] ** 2, at_x**2 + at_y**2
+            product = sign * (x[None] * at_x + y[:, None] * at_y)
+            powers = r2**2, r2 * product, product**2, r2 * aperture2, aperture2 * product, aperture2**2
+            path = sum(term * power for term, power in zip(terms, powers, strict=True))
+            wave = np.exp(-1j * geometry.wave_number / geometry.focal_length_m * (x[None] * at_x + y[:, None] * at_y))
+            cell = geometry.pipe_width_m**2 / CELLS[0] / CELLS[1] / np.cos(t)
+            sample = (x[1] - x[0]) * (y[1] - y[0])
+            unit = np.sqrt(cell * sample) / geometry.wavelength_m / geometry.focal_length_m
+            expected = np.sum(plane * wave * np.exp(1j * sign * path)) * unit
+            assert abs(got[row, column] - expected) < 4e-3 * np.abs(got).max()
 
     def test_the_modes_counted_for_an_edge_reach_the_light_of_that_edge(self) -> None:
         edge = 0.6e-3

@@ -11,7 +11,7 @@ import torch
 from optics.profile import Profile, load_profile
 from optics.registration.parameters import NAMES, PRIORS, nominal
 from optics.registration.twin import BRANCHES
-from tests.optics.small import small_profile
+from tests.optics.small import THICK, small_profile
 from train.twin import RayTwin, TorchTwin
 
 
@@ -231,7 +231,7 @@ class TestPaths:
             np.testing.assert_allclose(pixels[index], twin.pixels(parameters, points), rtol=1e-13)
 
     def test_no_parameter_is_dead(self) -> None:
-        profile = small_profile()
+        profile = small_profile().model_copy(update={"lens_path": THICK})
         twin, points = TorchTwin(RayTwin(profile)), page_points(profile, 50)
         base = some_device(5)
         before, pixels_before = twin.trace(base, points), twin.pixels(base, points)

@@ -211,6 +211,30 @@ def _check(points: Tensor, angle: Tensor) -> None:
         raise InvalidInputError("pipe angle", f"{radians:g} rad", f"at most {_WIDEST_ANGLE:.4f} rad either way")
 
 
+def launched_path(lens: LensPrescription, points: Tensor, sines: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays from a lens's front focal plane reach its back focal plane, and over what optical path.
+
+    Args:
+        lens: the lens.
+        points: [N, 2] metres.
+        sines: direction sines there, [N, 2].
+
+    Returns:
+        Places [N, 2] and optical path beyond that along the axis, [N], metres; not finite where a ray is lost.
+    """
+    along = torch.sqrt(1 - (sines**2).sum(-1, keepdim=True))
+    start = torch.cat([points, torch.zeros_like(points[:, :1])], dim=-1)
+    rays = _Rays(start, torch.cat([sines, along], dim=-1), torch.ones_like(points[:, 0], dtype=torch.bool))
+    stops, indices = _through(lens, rays), [1.0, *(surface.index for surface in lens.surfaces)]
+    path = torch.zeros_like(points[:, 0])
+    for stop, index in zip(stops, indices, strict=True):
+        path = path + index * (stop.position - rays.position).norm(dim=-1)
+        rays = stop
+    glass = sum(surface.index * surface.thickness_m for surface in lens.surfaces)
+    beyond = path - (lens.front_focal_m + glass + lens.back_focal_m)
+    return rays.position[:, :2], torch.where(rays.valid, beyond, torch.nan)
+
+
 def _through(lens: LensPrescription, rays: _Rays) -> list[_Rays]:
     """From the lens's front focal plane, where the rays are, to its back focal plane."""
     vertex, before, stops = rays.position[:, 2] + lens.front_focal_m, 1.0, []

@@ -10,7 +10,7 @@ import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from optics.lenses import LENSES
+from optics.lenses import LENSES, LensPrescription
 from optics.profile import Profile
 from optics.progress import Progress
 from train.published.localizers import page_places
@@ -26,11 +26,16 @@ _THICK_WITHIN = 0.05
 """A prescription stands for the profile's lenses if its focal length is that close to theirs."""
 
 
-def tracer_for(profile: Profile) -> RayTracer:
-    """A tracer through the prescription that the profile's focal length suggests, else through ideal lenses."""
+def lens_for(profile: Profile) -> LensPrescription | None:
+    """The prescription that the profile's focal length suggests; None for ideal lenses."""
     focal = profile.lens.focal_length_m
     suited = [lens for lens in LENSES.values() if abs(lens.effective_focal_m / focal - 1) < _THICK_WITHIN]
-    return RayTracer(profile, suited[0] if suited else None)
+    return suited[0] if suited else None
+
+
+def tracer_for(profile: Profile) -> RayTracer:
+    """A tracer through that prescription, or through ideal lenses."""
+    return RayTracer(profile, lens_for(profile))
 
 
 def _cases(settings: Settings) -> list[Case]:

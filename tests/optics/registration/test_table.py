@@ -68,7 +68,7 @@ def test_its_maps_have_the_names_and_shapes_that_a_decoder_takes() -> None:
     assert {name: array.shape for name, array in table.items()} == {
         "registration": (2, 2, 10),
         "homodyne": (2,),
-        "parameters": (32,),
+        "parameters": (len(NAMES),),
         "places": (branches, 2, *page),
         "place_gradients": (branches, 4, *page),
         "phases": (branches, 6, *page),

@@ -12,6 +12,7 @@ from PIL import Image
 
 from optics.device import Device
 from optics.errors import InvalidInputError
+from optics.lenses import LENSES
 from optics.profile import load_profile
 from optics.simulator import TrueOptics
 from tests.optics.small import small_profile
@@ -21,6 +22,7 @@ from train.studies import (
     drift,
     folding,
     imaging_condition,
+    lens_path,
     pipe_length,
     rays,
     receptive_field,
@@ -86,6 +88,15 @@ def test_single_pixels_are_too_fine_for_the_full_size_pipe_and_pairs_are_not() -
     paper = load_profile("paper")
     assert imaging_condition.needed_width_m(paper, 1) * 1e3 == pytest.approx(4.63, abs=0.01)
     assert imaging_condition.needed_width_m(paper, 2) < paper.pipe.width_m < imaging_condition.needed_width_m(paper, 1)
+
+
+def test_the_full_size_profile_states_the_path_that_is_traced_through_its_lens() -> None:
+    paper = load_profile("paper")
+    found = lens_path.fitted_path(paper, LENSES["AC508-080-A"], seed=1)
+    assert found.spread_rad > 1.5
+    assert found.left_rad < 0.02
+    for name, value in found.path.model_dump().items():
+        assert getattr(paper.lens_path, name) == pytest.approx(value, abs=0.02), name
 
 
 def test_a_square_pipe_makes_one_two_or_four_spots_and_a_round_one_smears() -> None:

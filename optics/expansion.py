@@ -1,0 +1,170 @@
+"""A smooth phase between two planes as a short sum of products, each of one factor for either plane."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss, legvander
+from numpy.typing import NDArray
+from scipy.linalg import qr
+
+Complex = NDArray[np.complexfloating]
+Real = NDArray[np.floating]
+Plane = tuple[Real, Real]
+"""Sample places (x, y)."""
+Phase = Callable[[Real, Real, Real, Real], Real]
+"""(x, y) of one plane and (X, Y) of the other, arrays that broadcast, to radians."""
+
+_SPARE_DEGREES = 12
+"""Degrees beyond the steepest phase along an axis, in radians over half of the axis, that its polynomials need."""
+_PROBES = 9
+"""Places along an axis that are asked how steep the phase is."""
+_FLAT = 1e-9
+"""Radians over half an axis below which a phase does not depend on it."""
+_POINT = 1e-300
+"""Half length of an axis with one sample, metres."""
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """exp(i phase) on the samples of two planes, as terms whose products sum to it.
+
+    The terms are the leading singular vectors among polynomials of the degrees that the phase needs.
+
+    Attributes:
+        first, second: polynomial coefficients of the terms, [R, y, x].
+        first_axes, second_axes: the polynomials at the samples (y, x), [samples, degrees] each.
+    """
+
+    first: Complex
+    second: Complex
+    first_axes: tuple[Real, Real]
+    second_axes: tuple[Real, Real]
+
+    @classmethod
+    def of(cls, phase: Phase, first: Plane, second: Plane, tolerance: float) -> Expansion:
+        """Expand a phase.
+
+        Args:
+            phase: the phase.
+            first, second: sample places (x, y) of both planes.
+            tolerance: singular values below this share of the largest are dropped; the error is about as large.
+        """
+        axes, kernel = _sampled(phase, first, second)
+        left, values, right = np.linalg.svd(kernel, full_matrices=False)
+        rank = int(np.sum(values > tolerance * values[0]))
+        return cls(
+            first=_coefficients((left[:, :rank] * values[:rank]).T, *axes[:2]),
+            second=_coefficients(right[:rank], *axes[2:]),
+            first_axes=(axes[1].at_samples, axes[0].at_samples),
+            second_axes=(axes[3].at_samples, axes[2].at_samples),
+        )
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def terms(self) -> Iterator[tuple[Complex, Complex]]:
+        """Pairs of factors on the planes' samples, [y, x] each; an axis on which nothing depends has one sample."""
+        for first, second in zip(self.first, self.second, strict=True):
+            yield _values(first, self.first_axes), _values(second, self.second_axes)
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """exp(i phase) on the samples of a plane from its values at few nodes, whatever the place on the other plane.
+
+    Attributes:
+        nodes: places (x, y) on the first plane, [R, 2].
+        weights: of each node on the plane's samples, [R, y, x]; an axis on which nothing depends has one sample.
+    """
+
+    nodes: Real
+    weights: Complex
+
+    @classmethod
+    def of(cls, phases: Sequence[Phase], first: Plane, second: Plane, tolerance: float) -> Interpolation:
+        """For any of the phases and what lies between them; arguments as for `Expansion.of`."""
+        sampled = [_sampled(phase, first, second) for phase in phases]
+        finest = [max((axes[number] for axes, _ in sampled), key=lambda axis: len(axis.nodes)) for number in range(4)]
+        kernels = [_kernel(phase, finest) for phase in phases]
+        left, values, _ = np.linalg.svd(np.concatenate(kernels, axis=1), full_matrices=False)
+        basis = left[:, : int(np.sum(values > tolerance * values[0]))]
+        x, y = finest[:2]
+        root = np.sqrt(np.outer(x.weights, y.weights)).reshape(-1, 1)
+        _, _, pivots = qr(basis.T, pivoting=True, mode="economic")
+        chosen = pivots[: basis.shape[1]]
+        weights = (basis @ np.linalg.inv(basis[chosen] / root[chosen])).T
+        places = np.stack(np.meshgrid(x.places, y.places, indexing="ij"), axis=-1).reshape(-1, 2)
+        samples = y.at_samples, x.at_samples
+        return cls(places[chosen], np.stack([_values(one, samples) for one in _coefficients(weights, x, y)]))
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Gauss's nodes on one axis, and Legendre's polynomials at its samples.
+
+    Attributes:
+        nodes, weights: of Gauss's quadrature from -1 to 1, [D].
+        places: the nodes on the axis, [D].
+        at_samples: polynomials there, [samples, D].
+    """
+
+    nodes: Real
+    weights: Real
+    places: Real
+    at_samples: Real
+
+    @classmethod
+    def of(cls, samples: Real, steepest: float) -> _Axis:
+        degree = 0 if steepest < _FLAT else min(int(np.ceil(steepest)) + _SPARE_DEGREES, len(samples) - 1)
+        nodes, weights = leggauss(degree + 1)
+        centre, half = _extent(samples)
+        return cls(
+            nodes, weights, centre + half * nodes, legvander((samples - centre) / half, degree).astype(np.float32)
+        )
+
+    @property
+    def to_coefficients(self) -> Real:
+        """Values at the nodes, times the roots of their weights, to coefficients of the polynomials, [D, D]."""
+        count = len(self.nodes)
+        return np.asarray((legvander(self.nodes, count - 1) * (np.arange(count) + 0.5)).T * np.sqrt(self.weights))
+
+
+def _extent(samples: Real) -> tuple[float, float]:
+    """Middle of an axis and half of its length."""
+    return float(samples[0] + samples[-1]) / 2, max(float(np.ptp(samples)) / 2, _POINT)
+
+
+def _sampled(phase: Phase, first: Plane, second: Plane) -> tuple[list[_Axis], Complex]:
+    """Axes (x, y, X, Y) with as many nodes as the phase needs, and the kernel at them."""
+    samples = [*first, *second]
+    probes = np.linspace(-1, 1, _PROBES)
+    places = [centre + half * probes for centre, half in map(_extent, samples)]
+    seen = np.broadcast_to(phase(*np.meshgrid(*places, indexing="ij", sparse=True)), [_PROBES] * 4)
+    slopes = np.gradient(seen, probes[1] - probes[0])
+    axes = [_Axis.of(axis, float(np.abs(slope).max())) for axis, slope in zip(samples, slopes, strict=True)]
+    return axes, _kernel(phase, axes)
+
+
+def _kernel(phase: Phase, axes: list[_Axis]) -> Complex:
+    """exp(i phase) at the nodes, times the roots of their weights, [nodes of the first plane, of the second]."""
+    shape = [len(axis.nodes) for axis in axes]
+    kernel = np.exp(
+        1j * np.broadcast_to(phase(*np.meshgrid(*(a.places for a in axes), indexing="ij", sparse=True)), shape)
+    )
+    for number, axis in enumerate(axes):
+        kernel = kernel * np.sqrt(axis.weights).reshape([-1 if other == number else 1 for other in range(4)])
+    return np.asarray(kernel.reshape(shape[0] * shape[1], -1))
+
+
+def _coefficients(values: Complex, x: _Axis, y: _Axis) -> Complex:
+    """Values [R, x y] at the nodes of a plane, times the roots of weights, to coefficients [R, y, x]."""
+    on_nodes = values.reshape(len(values), len(x.nodes), len(y.nodes)).swapaxes(1, 2)
+    return np.asarray(y.to_coefficients @ on_nodes @ x.to_coefficients.T, dtype=np.complex64)
+
+
+def _values(coefficients: Complex, axes: tuple[Real, Real]) -> Complex:
+    y, x = (axis if axis.shape[1] > 1 else axis[:1] for axis in axes)
+    return np.asarray(y @ coefficients @ x.T)
