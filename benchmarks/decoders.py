@@ -56,6 +56,7 @@ from train.fitting import (
     seed_stretch,
     without_piston,
 )
+from train.patches import training_pages
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import published_choices, published_decoder
 from train.published.states import page_states
@@ -178,11 +179,12 @@ class Bench:
 
         preparing = fill(features, key, len(self.pages), make, f"features of {name}")
         training, (validation, _) = FeatureStore(features, range(len(self.training))), self.held_out(features)
+        patches = training_pages([training], self.mask, choices.patch)
         folder = self.begun(self.out / name / f"{size}-{choices.steps}", asdict(replace(choices, refinements=0)))
         return (
             folder,
             features,
-            fit_network(folder, choices, self.mask, LEVELS, training, validation, devices=1),
+            fit_network(folder, choices, self.mask, LEVELS, patches, validation, devices=1),
             preparing,
         )
 

@@ -47,7 +47,7 @@ from train.run import (
     save_weights,
     sole_writer,
 )
-from train.symbols import DEFAULT_SYNTHETIC_PAGES, LIKENESS_PAGES, SymbolRecipe
+from train.symbols import LIKENESS_PAGES, SymbolRecipe, default_synthetic_pages
 
 _FEWEST_PAGES = 6
 
@@ -78,6 +78,12 @@ def _default(name: str) -> str:
     f"{_default('steps')}; published: 50 passes over the pages, fewer for symbols larger than 4x4.",
 )
 @click.option("--batch", type=click.IntRange(min=1), help=f"Pages a step. {_default('batch')}; published: 2.")
+@click.option(
+    "--patch",
+    type=click.IntRange(min=16),
+    help="Larger pages are trained on in patches with so many symbols along an edge. "
+    f"{_default('patch')}; published: whole pages.",
+)
 @click.option(
     "--channels",
     type=click.IntRange(min=4),
@@ -136,7 +142,7 @@ def _default(name: str) -> str:
     "--synthetic-pages",
     type=click.IntRange(min=0),
     help="Pages that the fitted device would show after drifts, trained on beside the recorded ones. "
-    f"[default: {DEFAULT_SYNTHETIC_PAGES}; published: none]",
+    f"[default: {default_synthetic_pages(load_profile('bench'))}, of larger ones fewer; published: none]",
 )
 @click.option("--start", type=click.Path(path_type=Path), help="Finished run whose weights this one begins with.")
 @click.option(
@@ -165,6 +171,7 @@ def train(
     levels: int | None,
     refinements: int | None,
     field_rounds: int | None,
+    patch: int | None,
     learning_rate: float | None,
     lenses: str | None,
     precision: str,
@@ -201,14 +208,15 @@ def train(
                     "--levels": levels,
                     "--refinements": refinements,
                     "--field-rounds": field_rounds,
+                    "--patch": patch,
                     "--synthetic-pages": synthetic_pages,
                     "--start": start,
                 },
             )
         else:
             sizes = {"channels": channels, "blocks": blocks, "levels": levels, "refinements": refinements}
-            wanted = {**chosen, **sizes, "field_rounds": field_rounds, "learning_rate": learning_rate}
-            recipe = _symbols(localizer, wanted, synthetic_pages, start, {"--lenses": lenses})
+            wanted = {**chosen, **sizes, "field_rounds": field_rounds, "patch": patch, "learning_rate": learning_rate}
+            recipe = _symbols(profile, localizer, wanted, synthetic_pages, start, {"--lenses": lenses})
             recipe.check_start(profile)
         references = recording.references()
         options = {
@@ -277,6 +285,7 @@ def train(
 
 
 def _symbols(
+    profile: Profile,
     localizer: str,
     chosen: dict[str, Any],
     synthetic_pages: int | None,
@@ -286,7 +295,7 @@ def _symbols(
     """The way of training at symbol pitch; what was not chosen stays as it is by default."""
     _check_absent(localizer, refused)
     choices = replace(Hyperparameters(), **_given(chosen))
-    count = DEFAULT_SYNTHETIC_PAGES if synthetic_pages is None else synthetic_pages
+    count = default_synthetic_pages(profile) if synthetic_pages is None else synthetic_pages
     return SymbolRecipe(localizer, choices, count, start)
 
 

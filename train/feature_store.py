@@ -50,7 +50,12 @@ class FeatureStore(Dataset[Page]):
 
     def __getitem__(self, index: int) -> Page:
         """One page."""
-        light, *others = (torch.from_numpy(np.array(array[self._pages[index]])) for array in self._arrays)
+        return self.part(index, slice(None), slice(None))
+
+    def part(self, index: int, rows: slice, columns: slice) -> Page:
+        """Some rows and columns of a page; no more is read."""
+        number = self._pages[index]
+        light, *others = (torch.from_numpy(np.array(array[number][..., rows, columns])) for array in self._arrays)
         return light.flatten(0, -3), *others
 
     def state(self, index: int) -> PageState:

@@ -48,7 +48,8 @@ class Hyperparameters:
         refinements: how often the decoder looks again, see `train.refinement`.
         field_rounds: of the field's recovery, see `train.field.FieldRecovery`.
         steps: optimiser steps.
-        batch: pages a step.
+        batch: pages a step, or patches of large ones.
+        patch: symbols along a patch's edge; smaller pages are trained on whole.
         learning_rate: peak of the one-cycle schedule.
         weight_decay: of AdamW.
         seed: of initial weights, batches and rotations.
@@ -62,6 +63,7 @@ class Hyperparameters:
     field_rounds: int = ROUNDS
     steps: int = 6000
     batch: int = 4
+    patch: int = 96
     learning_rate: float = 4e-3
     weight_decay: float = 1e-3
     seed: int = 0
@@ -101,8 +103,11 @@ class DecoderTraining(L.LightningModule, Generic[N]):
         return torch.as_tensor(self.network(*page))
 
     def loss(self, p: Tensor, phases: Tensor) -> Tensor:
-        """Mean over the data symbols, logged."""
-        loss = von_mises_nll(p, phases)[:, self.data].mean()
+        """Mean over the data symbols, logged; those of a part of a page are the ones whose phases are finite."""
+        asked = torch.isfinite(phases)
+        if phases.shape[-2:] == self.data.shape:
+            asked = asked & self.data
+        loss = von_mises_nll(p, torch.where(asked, phases, 0.0))[asked].mean()
         self.log("train_nll", loss, prog_bar=True)
         self.log("train_air", air_of_nll(loss), prog_bar=True)
         return loss

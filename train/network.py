@@ -17,6 +17,21 @@ _KAPPA_UNIT = 20.0
 """What an output of one adds to p: with concentrations in the hundreds, the net need not learn large numbers."""
 
 
+def with_page_coordinates(positions: Tensor, shape: tuple[int, ...], part: tuple[slice, slice]) -> Tensor:
+    """Exit centroids [..., 2, ny, nx] of a part of a page, and its columns and rows from -1 to 1 behind them.
+
+    Args:
+        positions: exit centroids.
+        shape: of the page, rows and columns of symbols.
+        part: which rows and columns of it.
+    """
+    rows, columns = (
+        torch.linspace(-1, 1, count, device=positions.device)[some] for count, some in zip(shape, part, strict=True)
+    )
+    page = torch.stack([columns.expand(len(rows), -1), rows[:, None].expand(-1, len(columns))])
+    return torch.cat([positions, page.expand(*positions.shape[:-3], 2, -1, -1)], dim=-3)
+
+
 class PositionModulation(nn.Module):
     """Scales and shifts each channel by where a symbol lies: feature-wise linear modulation (FiLM).
 
@@ -35,20 +50,23 @@ class PositionModulation(nn.Module):
             nn.init.zeros_(value)
 
     def forward(self, x: Tensor, positions: Tensor) -> Tensor:
-        """Features [N, C, ny, nx] and exit centroids q, [N, 2, ny, nx] over the pipe's width, to features."""
+        """Features [N, C, ny, nx] and exit centroids q, [N, 2, ny, nx] over the pipe's width, to features.
+
+        Of a part of a page, the centroids come `with_page_coordinates`.
+        """
+        if positions.shape[1] == 2:
+            whole = tuple(positions.shape[-2:])
+            positions = with_page_coordinates(positions, whole, (slice(None), slice(None)))
         scale, shift = self.outer(functional.gelu(self.inner(self._conditions(positions)))).chunk(2, dim=1)
         return torch.as_tensor(x * (1 + scale) + shift)
 
     @staticmethod
     def _conditions(positions: Tensor) -> Tensor:
         """Column and row on the page from -1 to 1, q, q - round(q) and harmonics of q."""
-        ny, nx = positions.shape[-2:]
-        rows = torch.linspace(-1, 1, ny, device=positions.device)[:, None].expand(ny, nx)
-        columns = torch.linspace(-1, 1, nx, device=positions.device)[None, :].expand(ny, nx)
-        page = torch.stack([columns, rows]).expand(positions.shape[0], 2, ny, nx)
-        angles = [2 * math.pi * harmonic * positions for harmonic in _HARMONICS]
+        centroids, page = positions.chunk(2, dim=1)
+        angles = [2 * math.pi * harmonic * centroids for harmonic in _HARMONICS]
         waves = [wave(angle) for angle in angles for wave in (torch.cos, torch.sin)]
-        return torch.cat([page, positions, positions - torch.round(positions), *waves], dim=1)
+        return torch.cat([page, centroids, centroids - torch.round(centroids), *waves], dim=1)
 
 
 class Residual(nn.Module):
@@ -101,7 +119,7 @@ class SymbolUNet(nn.Module):
 
         Args:
             light: [N, light_channels, ny, nx].
-            positions: exit centroids over the pipe's width, [N, 2, ny, nx].
+            positions: exit centroids over the pipe's width, [N, 2, ny, nx]; of a part of a page, with coordinates.
 
         Returns:
             p = (px, py), [N, 2, ny, nx].

@@ -29,6 +29,7 @@ from train.fitting import Fitted, Hyperparameters, SymbolTraining, fit_network
 from train.localizers.wave import by_symbol
 from train.network import Refiner
 from train.parts import conjugate, multiply, parts, stacked, turned
+from train.patches import training_pages
 from train.waves import Real, WaveMatrices, Waves
 
 _FLOORS = (0.05, 20.0)
@@ -211,7 +212,8 @@ def fit_refinements(
             FeatureStore(features, part) for part in (range(material.training), range(material.training, seen))
         )
         mask, levels = first.module.pilot_mask, first.module.levels
-        trained = fit_network(at, chosen, mask, levels, training, validation, kind=Refiner, devices=devices)
+        patches = training_pages([training], mask, chosen.patch)
+        trained = fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, devices=devices)
         assert isinstance(trained.module.network, Refiner)
         refiners.append(trained.module.network)
         seconds += trained.seconds

@@ -8,23 +8,29 @@ from pathlib import Path
 import click
 import numpy as np
 from torch import Tensor, nn
-from torch.utils.data import ConcatDataset
 
 from optics.errors import InvalidInputError
 from optics.profile import Profile
 from optics.registration.calibrate import KnownPage
 from optics.registration.known import known_pages
 from train.feature_store import FeatureStore, fill
-from train.fitting import Fitted, Hyperparameters, Page, SymbolTraining, best_kappa_scale, fit_network
+from train.fitting import Fitted, Hyperparameters, SymbolTraining, best_kappa_scale, fit_network
 from train.material import Material, Trained
 from train.network import SymbolUNet
+from train.patches import training_pages
 from train.refinement import Refined, RefinementPages, fit_prediction, fit_refinements
 from train.run import load_decoder, load_run
 from train.synthetic import MOST_NOISE, SyntheticPages, likeness
 
-DEFAULT_SYNTHETIC_PAGES = 96
+_SYNTHETIC_SYMBOLS = 470_000
+"""Of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""
 LIKENESS_PAGES = 2
 """Recorded pages that the wave model is compared with: each has thousands of symbols."""
+
+
+def default_synthetic_pages(profile: Profile) -> int:
+    """Synthetic pages that are made unless told otherwise."""
+    return max(4, round(_SYNTHETIC_SYMBOLS / np.prod(profile.page_shape)))
 
 
 @dataclass(frozen=True)
@@ -69,9 +75,8 @@ class SymbolRecipe:
             "recorded pages",
         )
         count = len(material.training)
-        training: ConcatDataset[Page] = ConcatDataset(
-            [FeatureStore(features, range(count)), *map(FeatureStore, self._synthetic(material))]
-        )
+        stores = [FeatureStore(features, range(count)), *map(FeatureStore, self._synthetic(material))]
+        training = training_pages(stores, material.pilot_mask, self.choices.patch)
         validation = FeatureStore(features, range(count, len(known)))
         fitted = fit_network(
             material.out,
@@ -98,7 +103,7 @@ class SymbolRecipe:
             validation_air=last.validation_air,
             kappa_scale=best_kappa_scale(last.module, validation, material.pilot_mask),
             seconds=seconds,
-            synthetic_pages=len(training) - count,
+            synthetic_pages=sum(map(len, stores)) - count,
         )
 
     def _refined(
