@@ -147,16 +147,19 @@ class Refined:
     """Trained refinements.
 
     Attributes:
-        refiners: their networks, in order.
-        last: the last one's training.
+        trained: their trainings, in order.
         validation: its features of the validation pages.
         seconds: of all of it, features and training, all stretches together.
     """
 
-    refiners: list[Refiner]
-    last: Fitted[SymbolTraining]
+    trained: list[Fitted[SymbolTraining]]
     validation: FeatureStore
     seconds: float
+
+    @property
+    def last(self) -> Fitted[SymbolTraining]:
+        """The last one's training."""
+        return self.trained[-1]
 
 
 @dataclass(frozen=True)
@@ -198,14 +201,14 @@ def fit_refinements(
         key: everything that the first look's features depend on.
         devices: see `fit_network`.
     """
-    refiners, trained, features, seconds = list[Refiner](), first, material.features, 0.0
+    looks, features, seconds = [first], material.features, 0.0
     count, seen = len(material.pages), material.training + material.validation
     chosen = choices.of_refinement()
     for number in range(1, choices.refinements + 1):
-        make = partial(refined_pages, extractor, prediction, material, FeatureStore(features), trained.module)
+        make = partial(refined_pages, extractor, prediction, material, FeatureStore(features), looks[-1].module)
         at = folder / f"refinement-{number}"
         features = at / "features"
-        key = f"{key} {number} {trained.validation_air}"
+        key = f"{key} {number} {looks[-1].validation_air}"
 
         seconds += fill(features, key, count, make, f"pages of refinement {number}")
         training, validation = (
@@ -213,11 +216,9 @@ def fit_refinements(
         )
         mask, levels = first.module.pilot_mask, first.module.levels
         patches = training_pages([training], mask, chosen.patch)
-        trained = fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, devices=devices)
-        assert isinstance(trained.module.network, Refiner)
-        refiners.append(trained.module.network)
-        seconds += trained.seconds
-    return Refined(refiners, trained, validation, seconds)
+        looks.append(fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, devices=devices))
+        seconds += looks[-1].seconds
+    return Refined(looks[1:], validation, seconds)
 
 
 def refined_pages(

@@ -122,7 +122,10 @@ class SymbolRecipe:
             f"{material.key} {self.localizer} {self.choices.field_rounds}",
             material.devices,
         )
-        for name, module in {"prediction": prediction, "refiners": nn.ModuleList(refined.refiners)}.items():
+        for name, module in {
+            "prediction": prediction,
+            "refiners": nn.ModuleList(one.module.network for one in refined.trained),
+        }.items():
             weights |= {f"{name}.{key}": value for key, value in module.state_dict().items()}
         return refined
 

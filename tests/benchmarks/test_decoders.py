@@ -11,7 +11,8 @@ import pytest
 from click.testing import CliRunner
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from benchmarks.decoders import gained_at_the_end, main
+from benchmarks.comparison import gained_at_the_end
+from benchmarks.decoders import main
 from benchmarks.oracle import Oracle
 from optics.device import Device, Reference, Sensor
 from optics.recording import Recording
@@ -70,13 +71,20 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     arguments = (
         f"--profile {profile} --pages 12 --steps 20 --size 8x1x0 --arm coherent --arm refined --arm oracle --arm none"
     )
-    arguments += f" --published-channels 4 --published-steps 12 --out {out}"
+    arguments += f" --published-channels 4 --published-steps 12 --levels 4 --out {out}"
     first = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert first.exit_code == 0, first.output
     assert "-0.6 degree, full well 32 e-, symbols of 4x4 pixels" in first.output
     (figures,) = json.loads((out / "figures.json").read_text())["lights"]
     coherent, refined, oracle, none = figures["outcomes"]
     assert (refined["arm"], refined["steps"]) == ("refined 1", 5)
+    assert [[figures["levels"] for figures in arm["by_levels"]] for arm in (coherent, refined, oracle, none)] == [
+        [4],
+        [4],
+        [4],
+        [],
+    ]
+    assert all(0 < arm["by_levels"][0]["symbol_error_rate"] < 1 for arm in (coherent, refined, oracle))
     assert (out / "figure.png").stat().st_size > 10_000
     assert (coherent["arm"], oracle["arm"], oracle["over_oracle"]) == ("coherent", "oracle", 1)
     assert coherent["over_oracle"] == pytest.approx(coherent["air"] / oracle["air"])

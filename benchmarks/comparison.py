@@ -1,0 +1,363 @@
+"""One light, and every decoder on it: the same recording, the same held-out pages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.utils.data import Dataset
+
+from benchmarks.decoders_figure import MAP
+from benchmarks.levels import LevelFigures, level_figures
+from benchmarks.oracle import Oracle
+from optics.device import Device
+from optics.measures import achievable_rate, measure
+from optics.page import pilot_mask
+from optics.profile import Profile
+from optics.progress import percent_bar
+from optics.recording import Recording, hash_frames
+from optics.recording_job import RecordingJob
+from optics.registration.calibrate import calibrate
+from optics.registration.calibration import Calibration, load_calibration
+from optics.registration.known import known_pages
+from train.decoder import LOCALIZERS
+from train.feature_store import FeatureStore, fill
+from train.features import FeatureExtractor, PageFeatures
+from train.field import FieldRecovery, TorchFieldSolver
+from train.fitting import (
+    DecoderTraining,
+    Fitted,
+    Hyperparameters,
+    Page,
+    SymbolTraining,
+    best_kappa_scale,
+    decode_pages,
+    fit_network,
+    seed_stretch,
+    without_piston,
+)
+from train.patches import training_pages
+from train.published.localizers import NAMES as PUBLISHED
+from train.published.recipe import published_decoder
+from train.published.states import page_states
+from train.published.training import FramePages, PublishedChoices, PublishedTraining, fit_published
+from train.refinement import Prediction, RefinementPages, fit_prediction, fit_refinements, refined_pages
+from train.run import begin
+from train.symbols import LIKENESS_PAGES
+from train.twin import RayTwin, TorchTwin
+
+LEVELS = 256
+ORACLE = "oracle"
+REFINED = "refined"
+ARMS = (*PUBLISHED, *LOCALIZERS, REFINED, ORACLE)
+CALIBRATED = 2
+HELD_OUT_SHARE = 0.05
+LAST_SHARE = 0.2
+LEVEL_PAGES = 4
+"""Of each number of levels, and as many as are calibrated on: thirty thousand symbols on the bench device."""
+
+
+def calibrated(profile: Profile, recording: Recording, path: Path) -> Calibration:
+    """The calibration from nominal on the recording's first pages, kept in `path`."""
+    if not path.exists():
+        pages = known_pages(recording, profile, range(CALIBRATED))
+        twin, solver = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
+        with percent_bar() as progress:
+            fitted = calibrate(twin, solver, profile, recording.references(), pages, progress)
+        hashes = [hash_frames(page.pair) for page in pages]
+        Calibration.from_registered(fitted, profile, hashes).save(path)
+    return load_calibration(path)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What all arms share.
+
+    Attributes:
+        recording: open.
+        profile, device: nominal and true.
+        fitted: the calibration.
+        out: folder of everything.
+        training, validation, unseen: page numbers.
+        levels: numbers of levels of further recordings, on which confidences are judged.
+        seed: of the recording; theirs follow.
+    """
+
+    recording: Recording
+    profile: Profile
+    device: Device
+    fitted: Calibration
+    out: Path
+    training: range
+    validation: range
+    unseen: range
+    levels: tuple[int, ...]
+    seed: int
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        profile: Profile,
+        device: Device,
+        out: Path,
+        levels: tuple[int, ...],
+        seed: int,
+    ) -> Bench:
+        """Calibrated, and split into pages for training, for validation and for the figures."""
+        pages = recording.pages - CALIBRATED
+        held, last = max(2, round(HELD_OUT_SHARE * pages)), recording.pages
+        return cls(
+            recording=recording,
+            profile=profile,
+            device=device,
+            fitted=calibrated(profile, recording, out / "calibration.toml"),
+            out=out,
+            training=range(CALIBRATED, last - 2 * held),
+            validation=range(last - 2 * held, last - held),
+            unseen=range(last - held, last),
+            levels=levels,
+            seed=seed,
+        )
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """Pilots, bool [ny, nx]."""
+        return pilot_mask(self.profile)
+
+    @property
+    def pages(self) -> list[int]:
+        """All that is not calibrated on, in order."""
+        return [*self.training, *self.validation, *self.unseen]
+
+    def extractor(self, localizer: str) -> FeatureExtractor:
+        """Of the calibrated device."""
+        references = self.recording.references()
+        return FeatureExtractor(self.profile, self.fitted.vector, self.fitted.turn_rad, references, localizer)
+
+    def symbol_arm(self, name: str, size: str, choices: Hyperparameters) -> Outcome:
+        """Features, then the network at symbol pitch."""
+        channels, blocks, levels = map(int, size.split("x"))
+        choices = replace(choices, channels=channels, blocks=blocks, levels=levels)
+        folder, features, first, preparing = self.first_look("coherent" if name == REFINED else name, size, choices)
+        if name != REFINED:
+            outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing)
+            return replace(outcome, by_levels=self.at_levels(name, folder, [first.module], outcome.kappa_scale))
+        extractor = self.extractor("coherent")
+        known = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
+        prediction = fit_prediction(extractor, self.profile, self.fitted.vector, known)
+        counts = len(self.training), len(self.validation)
+        material = RefinementPages(self.recording, self.pages, *counts, features)
+        key = self.fitted.to_toml()
+        refined = fit_refinements(folder, choices, material, extractor, prediction, first, key, devices=1)
+        at = folder / f"refinement-{choices.refinements}"
+        held_out, preparing = self.held_out(at / "features"), refined.seconds - refined.last.seconds
+        steps = choices.of_refinement().steps
+        outcome = self.outcome(f"{name} {choices.refinements}", size, steps, at, refined.last, *held_out, preparing)
+        modules = [first.module, *(one.module for one in refined.trained)]
+        return replace(outcome, by_levels=self.at_levels("coherent", at, modules, outcome.kappa_scale, prediction))
+
+    def at_levels(
+        self,
+        name: str,
+        folder: Path,
+        modules: list[SymbolTraining],
+        scale: float,
+        prediction: Prediction | None = None,
+    ) -> list[LevelFigures]:
+        """What a decoder is worth among fewer levels, on recordings of their own."""
+        found = []
+        for levels in self.levels:
+            at = folder / f"levels-{levels}"
+            with recorded(
+                self.profile, self.device, LEVEL_PAGES, self.seed + levels, self.out / at.name, levels
+            ) as pages:
+                numbers = list(range(pages.pages))
+                looked = partial(self.features_of, name, pages, numbers)
+                fill(at / "look-0", self.key(name), len(numbers), looked, f"pages of {levels} levels")
+                for number in range(1, len(modules)):
+                    assert prediction is not None
+                    earlier = at / f"look-{number - 1}"
+                    material = RefinementPages(pages, numbers, len(numbers), 0, earlier)
+                    make = partial(
+                        refined_pages,
+                        self.extractor(name),
+                        prediction,
+                        material,
+                        FeatureStore(earlier),
+                        modules[number - 1],
+                    )
+                    fill(at / f"look-{number}", self.key(name), len(numbers), make, f"look {number} at them")
+                last = FeatureStore(at / f"look-{len(modules) - 1}")
+                found.append(level_figures(self.decoded(modules[-1], last, scale), pages, numbers, self.mask))
+        return found
+
+    def key(self, name: str) -> str:
+        """What the features of an arm depend on, beside the recording."""
+        return "" if name == ORACLE else self.fitted.to_toml()
+
+    def features_of(
+        self, name: str, recording: Recording, pages: Sequence[int], start: int, shift: tuple[float, float]
+    ) -> Iterator[PageFeatures]:
+        """First looks of an arm at pages from a place in their order on, the image having moved by `shift` before."""
+        if name == ORACLE:
+            return Oracle(recording, self.profile, self.device).pages(pages[start:], shift)
+        return self.extractor(name).pages(recording, pages[start:], shift)
+
+    def first_look(
+        self, name: str, size: str, choices: Hyperparameters
+    ) -> tuple[Path, Path, Fitted[SymbolTraining], float]:
+        """Run, features, trained network, and seconds that the features took."""
+        features = self.out / name / "features"
+        make = partial(self.features_of, name, self.recording, self.pages)
+        preparing = fill(features, self.key(name), len(self.pages), make, f"features of {name}")
+        training, (validation, _) = FeatureStore(features, range(len(self.training))), self.held_out(features)
+        patches = training_pages([training], self.mask, choices.patch)
+        folder = self.begun(self.out / name / f"{size}-{choices.steps}", asdict(replace(choices, refinements=0)))
+        return (
+            folder,
+            features,
+            fit_network(folder, choices, self.mask, LEVELS, patches, validation, devices=1),
+            preparing,
+        )
+
+    def held_out(self, features: Path) -> tuple[FeatureStore, FeatureStore]:
+        """Features of the validation pages, and of those for the figures."""
+        first, last, end = len(self.training), len(self.training) + len(self.validation), len(self.pages)
+        return FeatureStore(features, range(first, last)), FeatureStore(features, range(last, end))
+
+    def published_arm(self, name: str, choices: PublishedChoices) -> Outcome:
+        """States of the pages, then a published decoder on raw frames."""
+        states, preparing = page_states(
+            self.out / "states.json", self.fitted.to_toml(), self.recording, self.extractor("coherent"), self.pages
+        )
+        by_page = dict(zip(self.pages, states, strict=True))
+        training, validation, unseen = (
+            FramePages(self.recording, part, [by_page[page] for page in part])
+            for part in (self.training, self.validation, self.unseen)
+        )
+        size = "/".join(map(str, choices.channels))
+        chosen = asdict(choices) | {"channels": list(choices.channels)}
+        folder = self.begun(self.out / name / f"{size.replace('/', '-')}-{choices.steps}", chosen)
+        seed_stretch(folder, choices.seed)
+        decoder = published_decoder(name, choices, self.profile, self.recording.references(), self.fitted.turn_rad)
+        module = PublishedTraining(decoder, choices, self.mask, LEVELS)
+        trained = fit_published(folder, module, training, validation, devices=1)
+        return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing)
+
+    def begun(self, folder: Path, options: dict[str, Any]) -> Path:
+        """The folder of a run that was begun with these options."""
+        folder.mkdir(parents=True, exist_ok=True)
+        begin(folder, options)
+        return folder
+
+    def decoded(self, module: DecoderTraining[Any], pages: Dataset[Page], scale: float) -> NDArray[np.float32]:
+        """p of all data symbols of pages, piston off and made honest, [2, symbols]."""
+        found = zip(*decode_pages(module, pages), strict=True)
+        return np.concatenate([without_piston(p * scale, t, self.mask)[:, ~self.mask] for p, t in found], axis=1)
+
+    def outcome(
+        self,
+        name: str,
+        size: str,
+        steps: int,
+        folder: Path,
+        trained: Fitted[Any],
+        validation: Dataset[Page],
+        unseen: Dataset[Page],
+        preparing: float,
+    ) -> Outcome:
+        """Figures of the held-out pages, kappa made honest on the validation pages."""
+        module: DecoderTraining[Any] = trained.module
+        scale = best_kappa_scale(module, validation, self.mask)
+        px, py = self.decoded(module, unseen, scale)
+        truth = [self.recording.symbols(page) for page in self.unseen]
+        symbols = np.concatenate([page[~self.mask] for page in truth if page is not None])
+        figures = measure(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
+        by_symbol = np.full(self.profile.page_shape, np.nan)
+        rates = achievable_rate(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
+        by_symbol[~self.mask] = rates.reshape(len(truth), -1).mean(axis=0)
+        np.save(folder / MAP, by_symbol)
+        return Outcome(
+            kappa_scale=scale,
+            run=str(folder.relative_to(self.out.parent)),
+            arm=name,
+            size=size,
+            steps=steps,
+            air=figures.air_bits_per_symbol,
+            own_mi=figures.own_mi_bits_per_symbol,
+            page_kB=figures.air_bits_per_symbol * int((~self.mask).sum()) / 8000,
+            validation_air=trained.validation_air,
+            gained_in_last_fifth=gained_at_the_end(folder, steps),
+            preparing_seconds=preparing,
+            training_seconds=trained.seconds,
+        )
+
+
+def gained_at_the_end(run: Path, steps: int) -> float:
+    """Validation AIR that the best of the last fifth of a run's steps has over the best before, bits."""
+    events = EventAccumulator(str(run / "tensorboard"))
+    events.Reload()
+    seen = [(event.step, event.value) for event in events.Scalars("val_air")]
+    late = [value for step, value in seen if step > (1 - LAST_SHARE) * steps]
+    early = [value for step, value in seen if step <= (1 - LAST_SHARE) * steps]
+    return max(late) - max(early) if late and early else float("nan")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one arm reached with a network of one size. AIR in bits per data symbol, `size` as `--size` has it; `run` is
+    its folder."""
+
+    run: str
+    arm: str
+    size: str
+    steps: int
+    air: float
+    own_mi: float
+    page_kB: float
+    validation_air: float
+    gained_in_last_fifth: float
+    preparing_seconds: float
+    training_seconds: float
+    kappa_scale: float
+    over_oracle: float | None = None
+    by_levels: list[LevelFigures] = field(default_factory=list)
+
+    def line(self) -> str:
+        over = "" if self.over_oracle is None else f"{self.over_oracle:.3f}"
+        return (
+            f"{self.arm:<10} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} {self.page_kB:>6.2f} "
+            f"{over:>10} {self.gained_in_last_fifth:>8.3f} {self.preparing_seconds / 60:>9.1f} "
+            f"{self.training_seconds / 60:>8.1f}"
+        )
+
+
+HEADER = (
+    f"{'arm':<10} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'kB':>6} {'of oracle':>10} {'gained':>8} "
+    f"{'features':>9} {'training':>8}"
+)
+"""Held-out pages, bits a symbol and kB a page; what validation AIR gained in the last fifth of the steps; minutes."""
+
+
+@contextmanager
+def recorded(
+    profile: Profile, device: Device, pages: int, seed: int, folder: Path, levels: int = LEVELS
+) -> Iterator[Recording]:
+    """The recording of a light, of so many pages and some to calibrate on before them; made if it is not there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    begin(folder, {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed})
+    path = folder / "recording.h5"
+    if not path.exists():
+        job = RecordingJob(profile, device, levels, seed, truth=True, out=path)
+        job.claim(force=False)
+        job.run(CALIBRATED + pages)
+    with Recording.open(path) as recording:
+        yield recording
