@@ -42,7 +42,7 @@ class DecoderGraph(nn.Module):
 
     def __init__(self, profile: Profile, decoder: SymbolDecoder, kappa_scale: float) -> None:
         super().__init__()
-        self.recovery = FieldRecovery(profile, rounds=decoder.choices.field_rounds)
+        self.recovery = FieldRecovery(profile, rounds=decoder.choices.field_rounds, binning=decoder.choices.binning)
         self.decoder = decoder
         self.kappa_scale = kappa_scale
         with torch.no_grad():

@@ -27,8 +27,8 @@ from optics.registration.known import known_pages
 from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording
 from train.decoder import LOCALIZERS
 from train.features import FeatureExtractor
-from train.field import ROUNDS
 from train.fitting import Hyperparameters
+from train.localizers.coherent import BICUBIC, BILINEAR
 from train.material import Material
 from train.published.decoder import LENS_CHOICES
 from train.published.localizers import NAMES as PUBLISHED
@@ -54,7 +54,8 @@ _FEWEST_PAGES = 6
 
 def _default(name: str) -> str:
     """How the help text of an option tells its default."""
-    return f"[default: {getattr(Hyperparameters, name):g}]"
+    value = getattr(Hyperparameters, name)
+    return f"[default: {value if isinstance(value, str) else format(value, 'g')}]"
 
 
 @click.command()
@@ -78,6 +79,24 @@ def _default(name: str) -> str:
     f"{_default('steps')}; published: 50 passes over the pages, fewer for symbols larger than 4x4.",
 )
 @click.option("--batch", type=click.IntRange(min=1), help=f"Pages a step. {_default('batch')}; published: 2.")
+@click.option(
+    "--binning",
+    type=click.IntRange(min=1, max=2),
+    help="Camera pixels along each axis whose mean is sampled, instead of filtering frames first: 2 is quicker and "
+    f"less exact. {_default('binning')}; published: none to choose.",
+)
+@click.option(
+    "--samples",
+    type=click.IntRange(min=0, max=16),
+    help="Samples per symbol and axis that the coherent localizer reads; 0 takes as many as the field has. "
+    f"{_default('samples')}; published: none to choose.",
+)
+@click.option(
+    "--interpolation",
+    type=click.Choice([BICUBIC, BILINEAR]),
+    help=f"How it reads them off its grid: bilinear is quicker and less exact. {_default('interpolation')}; "
+    "published: none to choose.",
+)
 @click.option(
     "--patch",
     type=click.IntRange(min=16),
@@ -172,6 +191,9 @@ def train(
     refinements: int | None,
     field_rounds: int | None,
     patch: int | None,
+    binning: int | None,
+    samples: int | None,
+    interpolation: str | None,
     learning_rate: float | None,
     lenses: str | None,
     precision: str,
@@ -209,13 +231,22 @@ def train(
                     "--refinements": refinements,
                     "--field-rounds": field_rounds,
                     "--patch": patch,
+                    "--binning": binning,
+                    "--samples": samples,
+                    "--interpolation": interpolation,
                     "--synthetic-pages": synthetic_pages,
                     "--start": start,
                 },
             )
         else:
             sizes = {"channels": channels, "blocks": blocks, "levels": levels, "refinements": refinements}
-            wanted = {**chosen, **sizes, "field_rounds": field_rounds, "patch": patch, "learning_rate": learning_rate}
+            light = {
+                "field_rounds": field_rounds,
+                "binning": binning,
+                "samples": samples,
+                "interpolation": interpolation,
+            }
+            wanted = {**chosen, **sizes, **light, "patch": patch, "learning_rate": learning_rate}
             recipe = _symbols(profile, localizer, wanted, synthetic_pages, start, {"--lenses": lenses})
             recipe.check_start(profile)
         references = recording.references()
@@ -231,9 +262,16 @@ def train(
         calibration.check_profile(profile)
         options["calibration"] = calibration.to_toml()
         features = localizer if localizer in LOCALIZERS else LOCALIZERS[0]
-        rounds = recipe.choices.field_rounds if isinstance(recipe, SymbolRecipe) else ROUNDS
+        choices = recipe.choices if isinstance(recipe, SymbolRecipe) else Hyperparameters()
         extractor = FeatureExtractor(
-            profile, calibration.vector, calibration.turn_rad, references, features, rounds=rounds
+            profile,
+            calibration.vector,
+            calibration.turn_rad,
+            references,
+            features,
+            rounds=choices.field_rounds,
+            binning=choices.binning,
+            coherent=choices.coherent_localizer(profile),
         )
         extractor.check(known_pages(recording, profile, groups[0][:1])[0], calibration.coherence_after)
         begin(out, options)

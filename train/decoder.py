@@ -34,7 +34,7 @@ class SymbolDecoder(nn.Module):
     def __init__(self, profile: Profile, parameters: Real, localizer: str, choices: Hyperparameters) -> None:
         super().__init__()
         self.choices = choices
-        chosen = CoherentLocalizer(profile) if localizer == COHERENT else WaveLocalizer(profile, parameters)
+        chosen = choices.coherent_localizer(profile) if localizer == COHERENT else WaveLocalizer(profile, parameters)
         self.localizer: CoherentLocalizer | WaveLocalizer = chosen
         self.network = SymbolUNet(chosen.light_channels, choices.channels, choices.blocks, choices.levels)
         small = choices.of_refinement()

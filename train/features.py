@@ -74,7 +74,8 @@ class FeatureExtractor:
         turn: angle between the homodyne arms, radians.
         references: reference-only frames.
         localizer: `coherent` or `wave`.
-        with_signal_power, rounds: see `FieldRecovery`.
+        with_signal_power, rounds, binning: see `FieldRecovery`.
+        coherent: the coherent localizer, where it is not the usual one.
     """
 
     def __init__(
@@ -87,12 +88,14 @@ class FeatureExtractor:
         *,
         with_signal_power: bool = True,
         rounds: int = ROUNDS,
+        binning: int = 1,
+        coherent: CoherentLocalizer | None = None,
     ) -> None:
         self._profile, self._parameters, self._twin = profile, parameters, TorchTwin(RayTwin(profile))
         self.table: Table = sampling_table(self._twin, parameters, turn, profile)
-        self.recovery = FieldRecovery(profile, with_signal_power=with_signal_power, rounds=rounds)
+        self.recovery = FieldRecovery(profile, with_signal_power=with_signal_power, rounds=rounds, binning=binning)
         self._solve = TorchFieldSolver(self.recovery)
-        self._coherent = CoherentLocalizer(profile)
+        self._coherent = coherent or CoherentLocalizer(profile)
         self._wave = WaveLocalizer(profile, parameters) if localizer == "wave" else None
         self._references = references
         shares = branch_shares(self.table["positions"].reshape(2, -1).T.astype(float))

@@ -84,11 +84,15 @@ class FieldRecovery(nn.Module):
         with_signal_power: whether the frames hold |E|^2; an oracle takes it off beforehand, and the equations are then
             linear.
         rounds: of descent.
+        binning: camera pixels along each axis whose mean is sampled; one filters the frames first instead, which takes
+            longer and loses less.
     """
 
-    def __init__(self, profile: Profile, *, with_signal_power: bool = True, rounds: int = ROUNDS) -> None:
+    def __init__(
+        self, profile: Profile, *, with_signal_power: bool = True, rounds: int = ROUNDS, binning: int = 1
+    ) -> None:
         super().__init__()
-        self.with_signal_power, self.rounds = with_signal_power, rounds
+        self.with_signal_power, self.rounds, self.binning = with_signal_power, rounds, binning
         grid = field_grid(profile)
         self.grid: FieldGrid = grid
         self.rows_px, self.columns_px = profile.frame_shape
@@ -128,18 +132,15 @@ class FieldRecovery(nn.Module):
         """
         frames = torch.stack([in_phase, quadrature]).to(torch.float32)
         references = torch.stack([reference_in_phase, reference_quadrature]).to(torch.float32)
-        where = self._where(registration)
-        gained = functional.grid_sample(
-            self.prefilter(frames - references)[:, None],
-            where,
-            mode="bilinear",
-            padding_mode="zeros",
-            align_corners=True,
-        )[:, 0]
-        reference = self._reference(references, where)
+        where = self._where(registration, self.binning)
+        beyond = frames - references
+        if self.binning == 1:
+            beyond = self.prefilter(beyond)
+        gained = self._block_means(beyond, where, self.binning)
+        reference = self._reference(references, registration)
         floor = _FLOOR * references.mean(dim=(1, 2))[:, None, None]
-        seen = (where.abs() <= 1).all(dim=-1) & (reference > floor)
-        lit = seen.to(torch.float32).prod(dim=0)
+        seen = (where.abs().amax(dim=-1) <= 1) & (reference > floor)
+        lit = (seen[0] & seen[1]).to(torch.float32)
         reference = torch.maximum(reference, floor)
         a, b = lit * gained / (2 * reference)
         amplitude = torch.sqrt(reference[0])
@@ -196,30 +197,35 @@ class FieldRecovery(nn.Module):
             before, estimate = estimate, self.band((ahead + step) * amplitude) / amplitude
         return torch.as_tensor(estimate)
 
-    def _where(self, registration: Tensor) -> Tensor:
-        """Sampling grid [2, ny, nx, 2] in grid_sample's coordinates."""
-        size = registration.new_tensor([self.columns_px - 1, self.rows_px - 1])
+    def _where(self, registration: Tensor, side: int, step: int = 1) -> Tensor:
+        """Where every `step`-th grid sample lies in frames of blocks of pixels, [2, ny, nx, 2] for grid_sample.
+
+        From -1 to 1 between the outer edges of the blocks.
+        """
+        size = registration.new_tensor([-(-count // side) * side for count in (self.columns_px, self.rows_px)])
         cubic = 2 * registration / size[:, None]
-        cubic = torch.cat([cubic[..., :1] - 1, cubic[..., 1:], torch.zeros_like(cubic[..., :1])], dim=-1)
+        centre = (1 / size - 1)[:, None].expand(2, 2, 1)
+        cubic = torch.cat([cubic[..., :1] + centre, cubic[..., 1:], torch.zeros_like(cubic[..., :1])], dim=-1)
         powers = monomial_powers()
         absent = len(powers)
         table = [
             [powers.index((i, j)) if (i, j) in powers else absent for i in range(_CUBIC + 1)] for j in range(_CUBIC + 1)
         ]
         by_power = cubic[..., torch.tensor(table, device=cubic.device)]  # [2, 2, powers of y, powers of x]
-        return (self.v.T @ by_power @ self.u).permute(0, 2, 3, 1)
+        return (self.v[:, ::step].T @ by_power @ self.u[:, ::step]).permute(0, 2, 3, 1)
 
-    def _reference(self, references: Tensor, where: Tensor) -> Tensor:
-        """The references on the grid, [2, ny, nx]: beams are smooth, so block means are interpolated."""
-        side = _REFERENCE_BLOCK_PX
-        blocks = functional.avg_pool2d(references[:, None], side, ceil_mode=True, count_include_pad=False)
-        size = where.new_tensor([self.columns_px, self.rows_px])
-        counts = where.new_tensor([blocks.shape[-1], blocks.shape[-2]])
-        # pixels' centres from -1 to 1 there, blocks' edges here
-        coarse = where[:, ::_REFERENCE_STEP, ::_REFERENCE_STEP] * ((size - 1) / size)
-        coarse = (coarse + 1) * (size / (counts * side)) - 1
-        sampled = functional.grid_sample(blocks, coarse, mode="bilinear", padding_mode="border", align_corners=False)
-        return torch.as_tensor((self.between_y @ sampled @ self.between_x.T)[:, 0])
+    def _reference(self, references: Tensor, registration: Tensor) -> Tensor:
+        """The references on the grid, [2, ny, nx]: beams are smooth, so few places are looked at."""
+        coarse = self._where(registration, _REFERENCE_BLOCK_PX, _REFERENCE_STEP)
+        return self.between_y @ self._block_means(references, coarse, _REFERENCE_BLOCK_PX) @ self.between_x.T
+
+    @staticmethod
+    def _block_means(images: Tensor, where: Tensor, side: int) -> Tensor:
+        """Means of blocks of pixels of images [2, H, W], interpolated where `_where` says, [2, ny, nx]."""
+        blocks = images[:, None]
+        if side > 1:
+            blocks = functional.avg_pool2d(blocks, side, ceil_mode=True, count_include_pad=False)
+        return functional.grid_sample(blocks, where, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
 
 
 def _interpolation(count: int) -> NDArray[np.float64]:

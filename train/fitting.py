@@ -23,7 +23,9 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 
 from optics.measures import achievable_rate
 from optics.pilots import Pilots, estimate_piston
+from optics.profile import Profile
 from train.field import ROUNDS
+from train.localizers.coherent import BICUBIC, CoherentLocalizer
 from train.loss import von_mises_nll
 from train.network import Refiner, SymbolUNet
 from train.parts import turned
@@ -46,7 +48,8 @@ class Hyperparameters:
     Attributes:
         channels, blocks, levels: size of the network, see `SymbolUNet`.
         refinements: how often the decoder looks again, see `train.refinement`.
-        field_rounds: of the field's recovery, see `train.field.FieldRecovery`.
+        field_rounds, binning: of the field's recovery, see `train.field.FieldRecovery`.
+        samples, interpolation: see `CoherentLocalizer`.
         steps: optimiser steps.
         batch: pages a step, or patches of large ones.
         patch: symbols along a patch's edge; smaller pages are trained on whole.
@@ -61,6 +64,9 @@ class Hyperparameters:
     levels: int = 0
     refinements: int = 0
     field_rounds: int = ROUNDS
+    binning: int = 1
+    samples: int = 0
+    interpolation: str = BICUBIC
     steps: int = 6000
     batch: int = 4
     patch: int = 96
@@ -68,6 +74,15 @@ class Hyperparameters:
     weight_decay: float = 1e-3
     seed: int = 0
     precision: str = "bf16-mixed"
+
+    @property
+    def first_look(self) -> str:
+        """What the features of the first look depend on."""
+        return f"{self.field_rounds} {self.binning} {self.samples} {self.interpolation}"
+
+    def coherent_localizer(self, profile: Profile) -> CoherentLocalizer:
+        """The localizer of these choices."""
+        return CoherentLocalizer(profile, self.samples, self.interpolation)
 
     def of_refinement(self) -> Hyperparameters:
         """The choices for a refinement's network, which starts from a good belief and sees little light."""

@@ -13,6 +13,7 @@ from optics.errors import InvalidInputError
 from optics.profile import Profile
 from optics.registration.calibrate import KnownPage
 from optics.registration.known import known_pages
+from train.decoder import WAVE
 from train.feature_store import FeatureStore, fill
 from train.fitting import Fitted, Hyperparameters, SymbolTraining, best_kappa_scale, fit_network
 from train.material import Material, Trained
@@ -69,7 +70,7 @@ class SymbolRecipe:
         features = material.out / "features"
         preparing = fill(
             features,
-            f"{material.key} {self.localizer} {self.choices.field_rounds}",
+            f"{material.key} {self.localizer} {self.choices.first_look}",
             len(known),
             lambda first, shift: material.extractor.pages(material.recording, known[first:], shift),
             "recorded pages",
@@ -119,7 +120,7 @@ class SymbolRecipe:
             material.extractor,
             prediction,
             first,
-            f"{material.key} {self.localizer} {self.choices.field_rounds}",
+            f"{material.key} {self.localizer} {self.choices.first_look}",
             material.devices,
         )
         for name, module in {
@@ -170,8 +171,10 @@ class SymbolRecipe:
             return []
         click.echo(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
         folder = material.out / "synthetic"
-        pages = SyntheticPages(profile, vector, like, self.localizer, seed)
-        key = f"{self.localizer} {seed} {profile.to_toml()} {material.calibration.to_toml()} {like.noise:.6f} "
+        reader = self.choices.coherent_localizer(profile)
+        pages = SyntheticPages(profile, vector, like, None if self.localizer == WAVE else reader, seed)
+        key = f"{self.localizer} {self.choices.first_look} {seed} "
+        key += f"{profile.to_toml()} {material.calibration.to_toml()} {like.noise:.6f} "
         key += f"{np.round(like.illumination, 6).tolist()}"
         fill(folder, key, self.synthetic_pages, lambda first, shift: pages.pages(first), "synthetic pages")
         return [folder]

@@ -100,15 +100,16 @@ class SyntheticPages:
         profile: the nominal device.
         parameters: [P] fitted.
         like: what recorded pages show over that geometry.
-        localizer: `coherent` or `wave`.
+        localizer: the coherent one; None for that by waves.
         seed: of drifts, symbols and noise.
     """
 
-    def __init__(self, profile: Profile, parameters: Real, like: Likeness, localizer: str, seed: int) -> None:
+    def __init__(
+        self, profile: Profile, parameters: Real, like: Likeness, localizer: CoherentLocalizer | None, seed: int
+    ) -> None:
         self._profile, self._parameters, self._like, self._seed = profile, parameters, like, seed
         self._twin = TorchTwin(RayTwin(profile))
-        self._coherent = CoherentLocalizer(profile)
-        self._by_waves = localizer == "wave"
+        self._coherent = localizer
 
     def pages(self, first: int = 0) -> Iterator[PageFeatures]:
         """Features of page `first` and all after it, without end; the same pages from wherever it starts."""
@@ -125,14 +126,18 @@ class SyntheticPages:
         drift = np.array([_DRIFT.get(name, 0.0) for name in NAMES]) * rng.uniform(-1, 1, len(NAMES))
         parameters = self._parameters + drift
         waves = FittedWaves(profile, parameters, symbol_samples(profile), filled=True)
-        waves_back = WaveLocalizer(profile, parameters) if self._by_waves else None
+        waves_back = WaveLocalizer(profile, parameters) if self._coherent is None else None
         table = sampling_table(self._twin, parameters, np.pi / 2, profile)
         light_on = np.tensordot(self._like.illumination, np.stack(illumination_terms(waves.x, waves.y)), 1)
         for symbols in random_symbols(profile, MAX_LEVELS, PAGES_PER_STATE, rng):
             phases = symbol_phases(symbols, MAX_LEVELS)
             field = waves.to_camera(on_modulator(phases, symbol_samples(profile)) * light_on)
             field = (self._like.seen * (field + self._noise(field, rng))).astype(np.complex64)
-            light = demodulate(self._coherent, field, table) if waves_back is None else localized(waves_back, field)
+            if waves_back is not None:
+                light = localized(waves_back, field)
+            else:
+                assert self._coherent is not None
+                light = demodulate(self._coherent, field, table)
             written, still = phases.astype(np.float32), PageState((0.0, 0.0), 0.0)
             yield PageFeatures(light.astype(np.float16), table["positions"], written, still)
 

@@ -13,6 +13,7 @@ from optics.registration.parameters import NAMES
 from optics.simulator import Simulator, true_parameters
 from tests.optics.small import small_profile
 from train.features import FeatureExtractor, PageFeatures
+from train.localizers.coherent import CoherentLocalizer
 from train.synthetic import MOST_NOISE, PAGES_PER_STATE, Likeness, SyntheticPages, likeness
 
 SEED = 5
@@ -68,7 +69,7 @@ def test_other_symbols_explain_nothing_and_another_angle_less(
 def test_synthetic_light_shows_its_symbols_as_the_recorded_light_does(
     like: Likeness, recorded: tuple[PageFeatures, np.ndarray, np.ndarray]
 ) -> None:
-    pages = list(islice(SyntheticPages(PROFILE, TRUTH, like, "coherent", SEED).pages(), 4))
+    pages = list(islice(SyntheticPages(PROFILE, TRUTH, like, CoherentLocalizer(PROFILE), SEED).pages(), 4))
     found = np.array([agreement(page) for page in pages])
     # pages of this size differ by their symbols' chance neighbours
     assert found.mean() == pytest.approx(agreement(recorded[0]), rel=0.06)
@@ -76,7 +77,7 @@ def test_synthetic_light_shows_its_symbols_as_the_recorded_light_does(
 
 
 def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: Likeness) -> None:
-    made = SyntheticPages(PROFILE, TRUTH, like, "coherent", SEED)
+    made = SyntheticPages(PROFILE, TRUTH, like, CoherentLocalizer(PROFILE), SEED)
     count = PAGES_PER_STATE + 2
     all_pages = list(islice(made.pages(), count))
     again = next(islice(made.pages(PAGES_PER_STATE + 1), 1))
@@ -87,5 +88,5 @@ def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: Lik
 
 
 def test_the_wave_localizer_has_synthetic_pages_too(like: Likeness) -> None:
-    page = next(SyntheticPages(PROFILE, TRUTH, like, "wave", SEED).pages())
+    page = next(SyntheticPages(PROFILE, TRUTH, like, None, SEED).pages())
     assert agreement(page) > 0.85

@@ -10,19 +10,24 @@ from optics.grid import field_grid, symbol_samples
 from optics.profile import Profile
 from optics.registration.twin import BRANCHES
 
+BICUBIC, BILINEAR = "bicubic", "bilinear"
+
 
 class CoherentLocalizer(nn.Module):
     """Field and sampling table to features at symbol pitch.
 
     Args:
         profile: the nominal device.
+        samples: per symbol and axis; 0 takes as many as the field has, see `symbol_samples`.
+        interpolation: of the field between the grid's samples, `bicubic` or `bilinear`: an error of -32 or -23 dB.
     """
 
-    def __init__(self, profile: Profile) -> None:
+    def __init__(self, profile: Profile, samples: int = 0, interpolation: str = BICUBIC) -> None:
         super().__init__()
+        self.interpolation = interpolation
         self.grid_shape = field_grid(profile).shape
         self.page_shape = profile.page_shape
-        self.samples = symbol_samples(profile)
+        self.samples = samples or symbol_samples(profile)
         steps = (torch.arange(self.samples, dtype=torch.float32) + 0.5) / self.samples - 0.5
         self.offset_x: Tensor
         self.offset_y: Tensor
@@ -54,7 +59,7 @@ class CoherentLocalizer(nn.Module):
         where = torch.stack([2 * column / (width - 1) - 1, 2 * row / (height - 1) - 1], dim=-1)
         ny, nx = self.page_shape
         sampled = functional.grid_sample(
-            field[None], where.reshape(1, -1, nx, 2), mode="bicubic", padding_mode="zeros", align_corners=True
+            field[None], where.reshape(1, -1, nx, 2), mode=self.interpolation, padding_mode="zeros", align_corners=True
         ).reshape(2, len(BRANCHES), self.samples**2, ny, nx)
         cos, sin = torch.cos(phase), torch.sin(phase)
         scale = torch.rsqrt((field * field).mean() * 2 + 1e-12)

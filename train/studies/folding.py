@@ -70,7 +70,7 @@ def folded_by_waves(profile: Profile, picture: Real, angle_deg: float, looks: in
         phases = rng.uniform(0, 2 * np.pi, profile.page_shape)
         size = profile.page.symbol_size_px
         field = amplitude * np.exp(1j * np.kron(phases, np.ones((size, size))))
-        total += np.abs(optics.channel.forward(optics.slm_factor * field)) ** 2
+        total += np.abs(optics.camera_field(optics.channel.exit_field(optics.slm_factor * field))) ** 2
     return total / looks
 
 
