@@ -100,6 +100,12 @@ def session_of(profile: Profile, graph: Graph, tensors: Tensors, threads: int) -
     return open_session(decoder_onnx(graph.eval(), "uint8", profile.frame_shape, tensors), "speed", threads)
 
 
+def frames_of(profile: Profile) -> dict[str, np.ndarray]:
+    """A frame pair of noise: times do not depend on what is seen."""
+    rng = np.random.default_rng(0)
+    return {name: rng.integers(60, 140, profile.frame_shape, dtype=np.uint8) for name in FRAME_INPUTS}
+
+
 def weights(graph: nn.Module) -> int:
     return sum(parameter.numel() for parameter in graph.parameters())
 
@@ -123,9 +129,7 @@ def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int |
         if not names or name in names:
             graph, tensors = make()
             sessions[name], sizes[name] = session_of(profile, graph, tensors, threads), weights(graph)
-    rng = np.random.default_rng(0)
-    frames = [rng.integers(60, 140, profile.frame_shape, dtype=np.uint8) for _ in FRAME_INPUTS]
-    feeds = dict(zip(FRAME_INPUTS, frames, strict=True))
+    feeds = frames_of(profile)
     taken: dict[str, list[float]] = {name: [] for name in sessions}
     for repeat in range(repeats + 1):
         for name, session in sessions.items():  # taking turns: a slow moment meets all of them
