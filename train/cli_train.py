@@ -47,7 +47,7 @@ from train.run import (
     save_weights,
     sole_writer,
 )
-from train.symbols import LIKENESS_PAGES, SymbolRecipe, default_synthetic_pages
+from train.symbols import LIKENESS_PAGES, USUAL_REFINEMENTS, SymbolRecipe, default_synthetic_pages
 
 _FEWEST_PAGES = 6
 
@@ -123,7 +123,7 @@ def _default(name: str) -> str:
     "--refinements",
     type=click.IntRange(min=0, max=4),
     help="How often the decoder looks again, for what the symbols decoded so far do not explain. "
-    f"{_default('refinements')}; published: none to choose.",
+    f"[default: {USUAL_REFINEMENTS}]; published: none to choose.",
 )
 @click.option(
     "--field-rounds",
@@ -332,7 +332,7 @@ def _symbols(
 ) -> SymbolRecipe:
     """The way of training at symbol pitch; what was not chosen stays as it is by default."""
     _check_absent(localizer, refused)
-    choices = replace(Hyperparameters(), **_given(chosen))
+    choices = replace(Hyperparameters(refinements=USUAL_REFINEMENTS), **_given(chosen))
     count = default_synthetic_pages(profile) if synthetic_pages is None else synthetic_pages
     return SymbolRecipe(localizer, choices, count, start)
 

@@ -23,6 +23,8 @@ from train.refinement import Refined, RefinementPages, fit_prediction, fit_refin
 from train.run import load_decoder, load_run
 from train.synthetic import MOST_NOISE, SyntheticPages, likeness
 
+USUAL_REFINEMENTS = 1
+"""Of a decoder, unless told otherwise: it adds more than anything else does, for twice the time a page."""
 _SYNTHETIC_SYMBOLS = 470_000
 """Of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""
 LIKENESS_PAGES = 2

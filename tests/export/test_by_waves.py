@@ -30,7 +30,7 @@ from train.twin import RayTwin, TorchTwin
 DEVICE = Device()
 
 
-@pytest.fixture(scope="module", params=["--localizer wave", "--refinements 1"])
+@pytest.fixture(scope="module", params=["--localizer wave --refinements 0", "--refinements 1"])
 def made(
     request: pytest.FixtureRequest, small_device: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path, float]:

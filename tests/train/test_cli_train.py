@@ -32,7 +32,7 @@ SECONDS = 120
 @pytest.fixture(scope="module")
 def device(small_device: list[str]) -> list[str]:
     """Options of a run on the small device with a small network."""
-    return [*small_device, "--channels", "8", "--blocks", "1"]
+    return [*small_device, "--channels", "8", "--blocks", "1", "--refinements", "0"]
 
 
 def run(arguments: list[str]) -> str:

@@ -92,15 +92,13 @@ def test_illumination_and_floor_are_those_of_the_device(dim: Known) -> None:
 def test_a_run_with_refinements_decodes_better_than_its_first_look(small_device: list[str], tmp_path: Path) -> None:
     size = ["--channels", "24", "--blocks", "1", "--steps", "160", "--synthetic-pages", "0"]
 
-    def trained(*more: str) -> float:
-        out = tmp_path / f"run{len(more)}"
-        CliRunner().invoke(
-            train, [*small_device, *size, *more, "--out", str(out)], standalone_mode=False, catch_exceptions=False
-        )
+    def trained(refinements: int) -> float:
+        out = tmp_path / f"run{refinements}"
+        options = [*small_device, *size, "--refinements", str(refinements), "--out", str(out)]
+        CliRunner().invoke(train, options, standalone_mode=False, catch_exceptions=False)
         return load_run(out).validation_air
 
-    refined = trained("--refinements", "2")
-    assert refined > trained() + 0.2
+    assert trained(2) > trained(0) + 0.2
     run = load_run(tmp_path / "run2")
     assert run.hyperparameters == Hyperparameters(channels=24, blocks=1, steps=160, refinements=2)
     assert len(load_decoder(tmp_path / "run2", run).refiners) == 2

@@ -32,6 +32,7 @@ _REPEATS = 3
 METHODS = ("matrix", "modes", "coherent")
 _EXPECTED = {"matrix": 2.0, "modes": 1.5, "coherent": 1.0}
 """Powers of the number of symbols."""
+_TIMED = {"matrix": "its product alone", "modes": "its localizer alone", "coherent": "frames to beliefs"}
 
 
 def enlarged(profile: Profile, factor: int) -> Profile:
@@ -153,7 +154,8 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     for method, colour in zip(METHODS, ("tab:red", "tab:orange", "tab:blue"), strict=True):
         chosen, seconds, measured = _series(cases, results, method)
         symbols = [result["symbols"] for result in chosen]
-        time_axis.loglog(symbols, seconds, color=colour, label=f"{method}, power {_EXPECTED[method]:g} expected")
+        label = f"{method}: {_TIMED[method]}; power {_EXPECTED[method]:g} expected"
+        time_axis.loglog(symbols, seconds, color=colour, label=label)
         for axis, values in ((time_axis, seconds), (memory_axis, [result["bytes"] / 1e6 for result in chosen])):
             for x, y, real in zip(symbols, values, measured, strict=True):
                 axis.plot(x, y, "o", color=colour, fillstyle="full" if real else "none")
@@ -164,7 +166,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
         axis.set_xlabel("symbols on a page")
         axis.grid(alpha=0.3)
         axis.legend()
-    time_axis.set_title("open: extrapolated")
+    time_axis.set_title("in torch; open: extrapolated")
     return figure
 
 
