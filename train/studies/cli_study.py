@@ -27,10 +27,24 @@ _RESULTS = "results"
 @click.option("--profile", "profile_name", help="Shipped profile or TOML file.  [default: bench]")
 @click.option("--quick", is_flag=True, help="Few and small cases, to see that it works.")
 @click.option("--full", is_flag=True, help=f"At full scale, profile {_FULL}; what trains needs a GPU there.")
+@click.option(
+    "--share",
+    type=click.FloatRange(min=0, max=1, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Of the steps that the authors trained for, where a study trains: the whole takes hours for each case.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--json", "json_path", type=OutputFile(), help="Write settings and table to this file too.")
 def study(
-    name: str, out: Path, profile_name: str | None, quick: bool, full: bool, seed: int, json_path: Path | None
+    name: str,
+    out: Path,
+    profile_name: str | None,
+    quick: bool,
+    full: bool,
+    share: float,
+    seed: int,
+    json_path: Path | None,
 ) -> None:
     """Measure the cases of study NAME, write OUT/table.txt, OUT/figure.png and OUT/study.json, and print the table."""
     if full and profile_name is not None:
@@ -38,9 +52,11 @@ def study(
     chosen = STUDIES[name]
     if full and chosen.trains and not torch.cuda.is_available():
         raise InvalidInputError(f"study {name} --full", "no CUDA device", "one: it trains networks at full scale")
+    if share < 1 and not chosen.trains:
+        raise InvalidInputError(f"study {name} --share", f"{share:g} of a study that trains nothing", "no --share")
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
-    settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed)
+    settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed, share)
     context.with_resource(sole_writer(out))
     begin(out, {"study": name, **settings.key()})
     results_folder = out / _RESULTS
@@ -61,7 +77,8 @@ def study(
     table = aligned(chosen.header, rows)
     figure = chosen.plot(settings, cases, results)
     replace_file(out / "figure.png", lambda file: figure.savefig(file, format="png", dpi=110), "picture of the study")
-    replace_text(out / "table.txt", f"{chosen.title} ({chosen.source})\n\n{table}\n", "table of the study")
+    how = "" if share == 1 else f"; {share:.0%} of the authors' steps"
+    replace_text(out / "table.txt", f"{chosen.title} ({chosen.source}){how}\n\n{table}\n", "table of the study")
     figures = {
         "study": name,
         **settings.key(),

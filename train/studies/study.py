@@ -30,11 +30,13 @@ class Settings:
         profile: the nominal device.
         quick: as few and as small cases as show that it works; their figures say little.
         seed: of everything random.
+        share: of the authors' steps that networks are trained for.
     """
 
     profile: Profile
     quick: bool = False
     seed: int = 0
+    share: float = 1.0
 
     def key(self) -> dict[str, Any]:
         """The settings as JSON keeps them."""

@@ -94,6 +94,7 @@ def trained(
     choices = replace(published_choices(profile, first), seed=settings.seed, classes=classes)
     if settings.quick:
         choices = replace(choices, **_QUICK)  # type: ignore[arg-type]
+    choices = replace(choices, steps=max(1, round(settings.share * choices.steps)))
     mask = pilot_mask(profile)
     begin(work, asdict(choices) | {"channels": list(choices.channels), "localizer": localizer})
     with Recording.open(path) as recording:

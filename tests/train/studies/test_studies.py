@@ -64,6 +64,8 @@ def test_each_makes_a_table_and_a_picture_and_is_gone_on_with(name: str, tmp_pat
 def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"--full.*--profile"):
         run("rays", "--full", "--profile", "bench", "--out", str(tmp_path / "out"))
+    with pytest.raises(InvalidInputError, match=r"--share.*trains nothing"):
+        run("rays", "--share", "0.5", "--out", str(tmp_path / "out"))
 
 
 def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) -> None:
@@ -211,6 +213,14 @@ def test_each_that_trains_makes_maps_of_every_case_and_shares_its_light(name: st
             assert np.isnan(maps["own_mi_map"]).any()  # pilots carry nothing
             assert len(maps["validation_curve"]) > 1
             assert (len(maps["angles"]) > 0) == (case.get("localizer") == "ray")
+
+
+def test_a_share_of_the_steps_is_said_in_the_table(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL.to_toml())
+    out = tmp_path / "out"
+    run("symbol-size", "--quick", "--share", "0.5", "--profile", str(tmp_path / "small.toml"), "--out", str(out))
+    assert "; 50% of the authors' steps" in (out / "table.txt").read_text()
+    assert [row[-1] for row in json.loads((out / "study.json").read_text())["rows"]] == [6] * 4
 
 
 def test_what_trains_at_full_scale_asks_for_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
