@@ -16,6 +16,7 @@ import click
 import numpy as np
 from torch import nn
 
+from benchmarks.comparison import FAST, HURRIED
 from export.graph import (
     FRAME_INPUTS,
     DecoderGraph,
@@ -34,7 +35,6 @@ from runtime.cpus import available_cpus
 from runtime.ort import Session, open_session
 from train.decoder import SymbolDecoder
 from train.fitting import Hyperparameters
-from train.localizers.coherent import BILINEAR
 from train.published.recipe import published_decoder
 from train.published.training import PublishedChoices
 from train.twin import RayTwin, TorchTwin
@@ -43,8 +43,6 @@ Tensors = dict[str, np.ndarray]
 SETTLE_S = 0.2
 """Pause before a decode: the threads of the one before spin for a while, and would be in its way."""
 USUAL = Hyperparameters()
-FAST = Hyperparameters(channels=48, field_rounds=0, binning=2, samples=3, interpolation=BILINEAR)
-"""Of the coherent decoder when time counts more than the last tenth of a bit."""
 WIDTHS = {"ray 16/32": (16, 32), "ray 32/64": (32, 64), "ray 64/128": (64, 128)}
 """The published decoder with its ray grid, by the channels of its U-Net."""
 
@@ -78,7 +76,7 @@ def makers(profile: Profile) -> dict[str, Callable[[], tuple[Graph, Tensors]]]:
     return {
         "coherent": lambda: at_symbol_pitch(profile, "coherent"),
         "refined": lambda: at_symbol_pitch(profile, "coherent", Hyperparameters(refinements=1)),
-        "fast": lambda: at_symbol_pitch(profile, "coherent", FAST),
+        FAST: lambda: at_symbol_pitch(profile, "coherent", HURRIED),
         "wave": lambda: at_symbol_pitch(profile, "wave"),
         **rays,
         "mode 32/64": lambda: published(profile, "mode", (32, 64)),

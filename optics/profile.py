@@ -161,15 +161,15 @@ class Profile(Table):
         return self.model_copy(update={"page": page.model_copy(update=update)})
 
     def to_toml(self) -> str:
-        """The profile as TOML text; `parse_profile` reads it back to an equal profile."""
-        return to_toml(self)
+        """The profile as TOML text, which `parse_profile` reads back to an equal one; ideal lenses are left out."""
+        return to_toml(self, without=("lens_path",) if self.lens_path == LensPath() else ())
 
 
-def to_toml(table: Table) -> str:
-    """Write a checked table (scalars first, then its sub-tables one level down) as TOML text."""
+def to_toml(table: Table, without: tuple[str, ...] = ()) -> str:
+    """Write a checked table (scalars first, then its sub-tables one level down) as TOML text, some keys left out."""
     scalars: list[str] = []
     tables: list[str] = []
-    for key, value in table.model_dump().items():
+    for key, value in table.model_dump(exclude=set(without)).items():
         if isinstance(value, dict):
             tables += ["", f"[{key}]", *(f"{k} = {_toml_value(v)}" for k, v in value.items())]
         else:

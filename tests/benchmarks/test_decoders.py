@@ -68,17 +68,17 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     light = out / "-0.6deg-32e-4px"
     light.mkdir(parents=True)
     calibration_of(Device()).save(light / "calibration.toml")
-    arguments = (
-        f"--profile {profile} --pages 12 --steps 20 --size 8x1x0 --arm coherent --arm refined --arm oracle --arm none"
-    )
+    arguments = f"--profile {profile} --pages 12 --steps 20 --size 8x1x0"
+    arguments += "".join(f" --arm {name}" for name in ("coherent", "refined", "oracle", "fast", "none"))
     arguments += f" --published-channels 4 --published-steps 12 --levels 4 --out {out}"
     first = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert first.exit_code == 0, first.output
     assert "-0.6 degree, full well 32 e-, symbols of 4x4 pixels" in first.output
     (figures,) = json.loads((out / "figures.json").read_text())["lights"]
-    coherent, refined, oracle, none = figures["outcomes"]
+    coherent, refined, oracle, fast, none = figures["outcomes"]
     assert (refined["arm"], refined["steps"]) == ("refined 1", 5)
-    assert [[figures["levels"] for figures in arm["by_levels"]] for arm in (coherent, refined, oracle, none)] == [
+    assert [[figures["levels"] for figures in arm["by_levels"]] for arm in (coherent, refined, oracle, fast, none)] == [
+        [4],
         [4],
         [4],
         [4],
@@ -88,6 +88,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     assert (out / "figure.png").stat().st_size > 10_000
     assert (coherent["arm"], oracle["arm"], oracle["over_oracle"]) == ("coherent", "oracle", 1)
     assert coherent["over_oracle"] == pytest.approx(coherent["air"] / oracle["air"])
+    assert (fast["arm"], fast["size"], fast["steps"]) == ("fast", "48x2x0", 20)
     assert (none["arm"], none["size"], none["steps"]) == ("none", "4/8", 12)
     assert none["over_oracle"] == pytest.approx(none["air"] / oracle["air"])
     assert figures["angle_error_deg"] == pytest.approx(0, abs=1e-9)
