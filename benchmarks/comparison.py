@@ -166,7 +166,7 @@ class Bench:
         folder, features, first, preparing = self.first_look("coherent" if name == REFINED else name, size, choices)
         if name != REFINED:
             outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing)
-            return replace(outcome, by_levels=self.at_levels(name, folder, [first.module], outcome.kappa_scale))
+            return replace(outcome, by_levels=self.at_levels(name, folder, [first], outcome.kappa_scale))
         extractor = self.extractor("coherent")
         known = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
         prediction = fit_prediction(extractor, self.profile, self.fitted.vector, known)
@@ -178,14 +178,14 @@ class Bench:
         held_out, preparing = self.held_out(at / "features"), refined.seconds - refined.last.seconds
         steps = choices.of_refinement().steps
         outcome = self.outcome(f"{name} {choices.refinements}", size, steps, at, refined.last, *held_out, preparing)
-        modules = [first.module, *(one.module for one in refined.trained)]
-        return replace(outcome, by_levels=self.at_levels("coherent", at, modules, outcome.kappa_scale, prediction))
+        looks = [first, *refined.trained]
+        return replace(outcome, by_levels=self.at_levels("coherent", at, looks, outcome.kappa_scale, prediction))
 
     def at_levels(
         self,
         name: str,
         folder: Path,
-        modules: list[SymbolTraining],
+        looks: list[Fitted[SymbolTraining]],
         scale: float,
         prediction: Prediction | None = None,
     ) -> list[LevelFigures]:
@@ -199,7 +199,7 @@ class Bench:
                 numbers = list(range(pages.pages))
                 looked = partial(self.features_of, name, pages, numbers)
                 fill(at / "look-0", self.key(name), len(numbers), looked, f"pages of {levels} levels")
-                for number in range(1, len(modules)):
+                for number in range(1, len(looks)):
                     assert prediction is not None
                     earlier = at / f"look-{number - 1}"
                     material = RefinementPages(pages, numbers, len(numbers), 0, earlier)
@@ -209,11 +209,12 @@ class Bench:
                         prediction,
                         material,
                         FeatureStore(earlier),
-                        modules[number - 1],
+                        looks[number - 1].module,
                     )
-                    fill(at / f"look-{number}", self.key(name), len(numbers), make, f"look {number} at them")
-                last = FeatureStore(at / f"look-{len(modules) - 1}")
-                found.append(level_figures(self.decoded(modules[-1], last, scale), pages, numbers, self.mask))
+                    key = f"{self.key(name)} {looks[number - 1].validation_air}"
+                    fill(at / f"look-{number}", key, len(numbers), make, f"look {number} at them")
+                last = FeatureStore(at / f"look-{len(looks) - 1}")
+                found.append(level_figures(self.decoded(looks[-1].module, last, scale), pages, numbers, self.mask))
         return found
 
     def key(self, name: str) -> str:
@@ -238,7 +239,7 @@ class Bench:
         make = partial(self.features_of, name, self.recording, self.pages)
         preparing = fill(features, self.key(name), len(self.pages), make, f"features of {name}")
         training, (validation, _) = FeatureStore(features, range(len(self.training))), self.held_out(features)
-        patches = training_pages([training], self.mask, choices.patch)
+        patches = training_pages([training], self.mask, choices)
         folder = self.begun(self.out / name / f"{size}-{choices.steps}", asdict(replace(choices, refinements=0)))
         return (
             folder,
@@ -332,8 +333,11 @@ def gained_at_the_end(run: Path, steps: int) -> float:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one arm reached with a network of one size. AIR in bits per data symbol, `size` as `--size` has it; `run` is
-    its folder."""
+    """What one arm reached with a network of one size.
+
+    Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor that made
+    its claims honest, `by_levels` what it is worth among fewer levels.
+    """
 
     run: str
     arm: str

@@ -15,7 +15,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from benchmarks.speed import at_symbol_pitch, frames_of, session_of
+from benchmarks.speed import SETTLE_S, at_symbol_pitch, frames_of, session_of
 from optics.files import OutputFile, write_json
 from optics.profile import load_profile
 from runtime.cpus import available_cpus
@@ -48,12 +48,13 @@ def main(
     smallest, threads = load_profile(profile_name), threads or available_cpus()
     results = []
     click.echo(f"{'symbols':>8} {'ms a page':>10} {'us a symbol':>12} {'over the smallest':>18}")
-    for factor in factors:
+    for factor in sorted(set(factors)):
         profile = enlarged(smallest, factor)
         session, feeds = session_of(profile, *at_symbol_pitch(profile, "coherent"), threads), frames_of(profile)
         session.run(["p"], feeds)
         seconds = []
         for _ in range(repeats):
+            time.sleep(SETTLE_S)
             start = time.perf_counter()
             session.run(["p"], feeds)
             seconds.append(time.perf_counter() - start)

@@ -42,7 +42,7 @@ from train.twin import RayTwin, TorchTwin
 Tensors = dict[str, np.ndarray]
 SETTLE_S = 0.2
 """Pause before a decode: the threads of the one before spin for a while, and would be in its way."""
-USUAL = Hyperparameters()
+FIRST_LOOK = Hyperparameters()
 WIDTHS = {"ray 16/32": (16, 32), "ray 32/64": (32, 64), "ray 64/128": (64, 128)}
 """The published decoder with its ray grid, by the channels of its U-Net."""
 
@@ -53,7 +53,7 @@ def reference(profile: Profile) -> FramePair:
     return FramePair(frame, frame)
 
 
-def at_symbol_pitch(profile: Profile, localizer: str, choices: Hyperparameters = USUAL) -> tuple[Graph, Tensors]:
+def at_symbol_pitch(profile: Profile, localizer: str, choices: Hyperparameters = FIRST_LOOK) -> tuple[Graph, Tensors]:
     """A decoder of ours, at an angle of -0.6 degree: a square pipe would need no splitting steps."""
     parameters = nominal()
     parameters[0] = np.deg2rad(-0.6)

@@ -50,7 +50,7 @@ class Aberration(Table):
     defocus_rad: Phase = 1.0
     astigmatism_rad: Phase = 1.0
     coma_rad: Phase = 1.0
-    lens_path_relative_error: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] = 0.0
+    lens_path_relative_error: Annotated[float, Field(ge=-3, le=3, allow_inf_nan=False)] = 0.0
     """Of the lenses' path beyond the ideal one, against the profile's: -1 is an ideal lens."""
 
 
@@ -220,4 +220,5 @@ def draw_device(rng: np.random.Generator) -> Device:
         drift=Drift(piston_rad=float(rng.uniform(0, 0.5)), shift_px=float(rng.uniform(0, 0.2))),
     )
     ripple = device.reference.model_copy(update={"ripple_seed": int(rng.integers(2**31))})
-    return device.model_copy(update={"reference": ripple})
+    lenses = device.aberration.model_copy(update={"lens_path_relative_error": within(0.3)})
+    return device.model_copy(update={"reference": ripple, "aberration": lenses})

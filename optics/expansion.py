@@ -77,11 +77,13 @@ class Interpolation:
 
     Attributes:
         nodes: places (x, y) on the first plane, [R, 2].
-        weights: of each node on the plane's samples, [R, y, x]; an axis on which nothing depends has one sample.
+        weights: polynomial coefficients of each node's weight, [R, y, x].
+        axes: the polynomials at the plane's samples (y, x); an axis on which nothing depends has one sample.
     """
 
     nodes: Real
     weights: Complex
+    axes: tuple[Real, Real]
 
     @classmethod
     def of(cls, phases: Sequence[Phase], first: Plane, second: Plane, tolerance: float) -> Interpolation:
@@ -97,8 +99,7 @@ class Interpolation:
         chosen = pivots[: basis.shape[1]]
         weights = (basis @ np.linalg.inv(basis[chosen] / root[chosen])).T
         places = np.stack(np.meshgrid(x.places, y.places, indexing="ij"), axis=-1).reshape(-1, 2)
-        samples = y.at_samples, x.at_samples
-        return cls(places[chosen], np.stack([_values(one, samples) for one in _coefficients(weights, x, y)]))
+        return cls(places[chosen], _coefficients(weights, x, y), (_varying(y.at_samples), _varying(x.at_samples)))
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class _Axis:
 
     @classmethod
     def of(cls, samples: Real, steepest: float) -> _Axis:
-        degree = 0 if steepest < _FLAT else min(int(np.ceil(steepest)) + _SPARE_DEGREES, len(samples) - 1)
+        degree = 0 if steepest < _FLAT else int(np.ceil(steepest)) + _SPARE_DEGREES
         nodes, weights = leggauss(degree + 1)
         centre, half = _extent(samples)
         return cls(
@@ -166,5 +167,10 @@ def _coefficients(values: Complex, x: _Axis, y: _Axis) -> Complex:
 
 
 def _values(coefficients: Complex, axes: tuple[Real, Real]) -> Complex:
-    y, x = (axis if axis.shape[1] > 1 else axis[:1] for axis in axes)
+    y, x = map(_varying, axes)
     return np.asarray(y @ coefficients @ x.T)
+
+
+def _varying(at_samples: Real) -> Real:
+    """Polynomials at samples [samples, D]; at one of them if there is only the constant."""
+    return at_samples if at_samples.shape[1] > 1 else at_samples[:1]

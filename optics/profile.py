@@ -15,6 +15,8 @@ from optics.lens_path import SeidelTerms
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Radians = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]
+"""Of a term of a lens's path: more would take more memory to compute with than there is."""
 Count = Annotated[int, Field(gt=0)]
 Side = Annotated[int, Field(gt=0, le=30_000)]
 """Pixels along one side of a sensor: the largest that are made have some twenty thousand."""
@@ -46,12 +48,23 @@ class Lens(Table):
 class LensPath(Table):
     """Optical path of either lens beyond an ideal one's, by its terms, for the page's corner at the pipe's wall."""
 
-    piston_rad: Finite = 0.0
-    distortion_rad: Finite = 0.0
-    astigmatism_rad: Finite = 0.0
-    field_curvature_rad: Finite = 0.0
-    coma_rad: Finite = 0.0
-    spherical_rad: Finite = 0.0
+    piston_rad: Radians = 0.0
+    distortion_rad: Radians = 0.0
+    astigmatism_rad: Radians = 0.0
+    field_curvature_rad: Radians = 0.0
+    coma_rad: Radians = 0.0
+    spherical_rad: Radians = 0.0
+
+    def at(self, share: float) -> LensPath:
+        """The same lenses, stated for a page whose corner lies at that share of this one's distance."""
+        powers = {"piston": 4, "distortion": 3, "astigmatism": 2, "field_curvature": 2, "coma": 1, "spherical": 0}
+        return LensPath(
+            **{f"{name}_rad": getattr(self, f"{name}_rad") * share**power for name, power in powers.items()}
+        )
+
+    def times(self, factor: float) -> LensPath:
+        """Of lenses so many times as large."""
+        return LensPath(**{name: factor * value for name, value in self.model_dump().items()})
 
 
 class Pipe(Table):
@@ -140,6 +153,11 @@ class Profile(Table):
         """Camera pixels as (rows, columns)."""
         return self.camera.rows_px, self.camera.columns_px
 
+    @property
+    def ideal_lenses(self) -> bool:
+        """Whether the lenses have no path beyond the ideal one."""
+        return self.lens_path == LensPath()
+
     def seidel_terms(self, share: Any = 1.0) -> SeidelTerms:
         """The lenses' path beyond the ideal one, and how much of it there is, as a number or a tensor."""
         field, aperture = self.corner_m, self.pipe.width_m / 2
@@ -158,11 +176,12 @@ class Profile(Table):
         page = self.page
         columns, rows = (count * page.symbol_size_px // size_px for count in (page.columns, page.rows))
         update = {"columns": columns, "rows": rows, "symbol_size_px": size_px}
-        return self.model_copy(update={"page": page.model_copy(update=update)})
+        cut = self.model_copy(update={"page": page.model_copy(update=update)})
+        return cut.model_copy(update={"lens_path": self.lens_path.at(cut.corner_m / self.corner_m)})
 
     def to_toml(self) -> str:
         """The profile as TOML text, which `parse_profile` reads back to an equal one; ideal lenses are left out."""
-        return to_toml(self, without=("lens_path",) if self.lens_path == LensPath() else ())
+        return to_toml(self, without=("lens_path",) if self.ideal_lenses else ())
 
 
 def to_toml(table: Table, without: tuple[str, ...] = ()) -> str:

@@ -25,7 +25,7 @@ from optics.recording import Recording, hash_frames
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.known import known_pages
 from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording
-from train.decoder import LOCALIZERS
+from train.decoder import LOCALIZERS, WAVE
 from train.features import FeatureExtractor
 from train.fitting import Hyperparameters
 from train.localizers.coherent import BICUBIC, BILINEAR
@@ -78,7 +78,11 @@ def _default(name: str) -> str:
     help="Optimiser steps: 300 for a first try, thousands for all that a device gives. "
     f"{_default('steps')}; published: 50 passes over the pages, fewer for symbols larger than 4x4.",
 )
-@click.option("--batch", type=click.IntRange(min=1), help=f"Pages a step. {_default('batch')}; published: 2.")
+@click.option(
+    "--batch",
+    type=click.IntRange(min=1),
+    help=f"Pages, or patches of large ones, a step. {_default('batch')}; published: 2.",
+)
 @click.option(
     "--binning",
     type=click.IntRange(min=1, max=2),
@@ -247,7 +251,10 @@ def train(
                 "interpolation": interpolation,
             }
             wanted = {**chosen, **sizes, **light, "patch": patch, "learning_rate": learning_rate}
-            recipe = _symbols(profile, localizer, wanted, synthetic_pages, start, {"--lenses": lenses})
+            refused: dict[str, object] = {"--lenses": lenses}
+            if localizer == WAVE:
+                refused |= {"--samples": samples, "--interpolation": interpolation}
+            recipe = _symbols(profile, localizer, wanted, synthetic_pages, start, refused)
             recipe.check_start(profile)
         references = recording.references()
         options = {

@@ -96,6 +96,9 @@ class FieldRecovery(nn.Module):
         grid = field_grid(profile)
         self.grid: FieldGrid = grid
         self.rows_px, self.columns_px = profile.frame_shape
+        # the outer pixels' centres, where blocks' outer edges lie at -1 and 1
+        blocked = [(count, -(-count // binning) * binning) for count in profile.frame_shape]
+        self._edge = min(min(1 - 1 / extent, (2 * count - 1) / extent - 1) for count, extent in blocked)
         corner = profile.corner_m
         self.prefilter = SeparableFilter(grid.prefilter)
         self.band = SeparableFilter(grid.band)
@@ -139,7 +142,7 @@ class FieldRecovery(nn.Module):
         gained = self._block_means(beyond, where, self.binning)
         reference = self._reference(references, registration)
         floor = _FLOOR * references.mean(dim=(1, 2))[:, None, None]
-        seen = (where.abs().amax(dim=-1) <= 1) & (reference > floor)
+        seen = (where.abs().amax(dim=-1) <= self._edge) & (reference > floor)
         lit = (seen[0] & seen[1]).to(torch.float32)
         reference = torch.maximum(reference, floor)
         a, b = lit * gained / (2 * reference)

@@ -84,6 +84,13 @@ class Residual(nn.Module):
         return torch.as_tensor(x + inner)
 
 
+def reach(blocks: int, levels: int) -> int:
+    """Rings of neighbours that a `SymbolUNet` of that size sees of a symbol, at most."""
+    convolutions = 2 * blocks
+    inner = sum((2 * convolutions + 1) << level for level in range(levels))
+    return 1 + inner + (convolutions << levels)
+
+
 class SymbolUNet(nn.Module):
     """Light at symbol pitch to the vector p of each symbol.
 

@@ -1,4 +1,4 @@
-"""Parts of large pages to train on: a step then sees as many symbols as on a small page, from more places and pages."""
+"""Parts of large pages to train on: a step then sees symbols from more places and pages."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset
 
+from optics.errors import InvalidInputError
 from train.feature_store import FeatureStore
-from train.fitting import Page
-from train.network import with_page_coordinates
-
-_RIM = 4
-"""Symbols along a patch's edge that are shown and not asked for: the network would miss their neighbours."""
+from train.fitting import Hyperparameters, Page
+from train.network import reach, with_page_coordinates
 
 
-def training_pages(stores: Sequence[FeatureStore], mask: NDArray[np.bool_], side: int) -> Dataset[Page]:
+def training_pages(stores: Sequence[FeatureStore], mask: NDArray[np.bool_], choices: Hyperparameters) -> Dataset[Page]:
     """What a network at symbol pitch trains on: whole pages, or patches where they are larger than those.
 
     Args:
         stores: pages of one shape.
         mask: pilots, bool [ny, nx].
-        side: symbols along a patch's edge.
+        choices: say how large patches are, and the network.
+
+    Raises:
+        InvalidInputError: patches in which the network would not see the neighbours of a single symbol.
     """
-    if max(mask.shape) <= side:
+    if max(mask.shape) <= choices.patch:
         return ConcatDataset(stores)
-    return Patches(stores, mask, side)
+    return Patches(stores, mask, choices.patch, reach(choices.blocks, choices.levels), 2**choices.levels)
 
 
 class Patches(Dataset[Page]):
@@ -36,12 +37,27 @@ class Patches(Dataset[Page]):
 
     An item is a page's as of `FeatureStore`, cut; its positions also hold column and row on the page (see
     `with_page_coordinates`), and phases that are not to be learnt from are NaN: pilots, and a rim.
+
+    Args:
+        stores, mask: as for `training_pages`.
+        side: symbols along an edge.
+        rim: symbols along a patch's edge that are shown and not asked for: the network misses their neighbours.
+        step: places lie on multiples of it, as the network's lower levels do.
+
+    Raises:
+        InvalidInputError: patches that are all rim.
     """
 
-    def __init__(self, stores: Sequence[FeatureStore], mask: NDArray[np.bool_], side: int) -> None:
+    def __init__(
+        self, stores: Sequence[FeatureStore], mask: NDArray[np.bool_], side: int, rim: int, step: int = 1
+    ) -> None:
+        if side <= 2 * rim:
+            raise InvalidInputError("patch", f"{side} symbols", f"more than {2 * rim}, twice what the network sees")
+        self._rim, self._step = rim, step
         self._places = [(store, index) for store in stores for index in range(len(store))]
         self._shape = mask.shape
-        self._sides = tuple(min(side, count) for count in mask.shape)
+        # the last place lies on the step too
+        self._sides = tuple(min(count, side - (side - count) % step) for count in mask.shape)
         self._mask = torch.from_numpy(mask)
         self._each = int(np.prod([np.ceil(count / side) for count in mask.shape]))
 
@@ -52,15 +68,17 @@ class Patches(Dataset[Page]):
     def __getitem__(self, index: int) -> Page:
         """A patch of page `index // patches of a page`."""
         store, page = self._places[index // self._each]
-        # about a symbol that may be any, as far as the page reaches: its edge is seen as often as its middle
-        starts = [
-            min(max(int(torch.randint(count, ())) - side // 2, 0), count - side)
-            for count, side in zip(self._shape, self._sides, strict=True)
-        ]
+        starts = [self._start(count, side) for count, side in zip(self._shape, self._sides, strict=True)]
         rows, columns = (slice(start, start + side) for start, side in zip(starts, self._sides, strict=True))
         light, positions, *belief, phases = store.part(page, rows, columns)
         where = with_page_coordinates(positions, self._shape, (rows, columns))
         return light, where, *belief, torch.where(self._asked(rows, columns), phases, torch.nan)
+
+    def _start(self, count: int, side: int) -> int:
+        """Where a patch begins on an axis: drawn from beyond the page too, so that its edge is asked for as often."""
+        beyond = side - 2 * self._rim - 1
+        drawn = int(torch.randint(-beyond, count - side + beyond + 1, ()))
+        return min(max(drawn, 0), count - side) // self._step * self._step
 
     def _asked(self, rows: slice, columns: slice) -> Tensor:
         """Symbols of a patch that are data and have their neighbours, or the page's edge, around them."""
@@ -68,7 +86,7 @@ class Patches(Dataset[Page]):
         for axis, (part, count) in enumerate(zip((rows, columns), self._shape, strict=True)):
             along = asked if axis == 0 else asked.T
             if part.start > 0:
-                along[:_RIM] = False
+                along[: self._rim] = False
             if part.stop < count:
-                along[-_RIM:] = False
+                along[-self._rim :] = False
         return asked

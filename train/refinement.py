@@ -215,7 +215,7 @@ def fit_refinements(
             FeatureStore(features, part) for part in (range(material.training), range(material.training, seen))
         )
         mask, levels = first.module.pilot_mask, first.module.levels
-        patches = training_pages([training], mask, chosen.patch)
+        patches = training_pages([training], mask, chosen)
         looks.append(fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, devices=devices))
         seconds += looks[-1].seconds
     return Refined(looks[1:], validation, seconds)

@@ -10,6 +10,7 @@ import numpy as np
 from torch import Tensor, nn
 
 from optics.errors import InvalidInputError
+from optics.grid import symbol_samples
 from optics.profile import Profile
 from optics.registration.calibrate import KnownPage
 from optics.registration.known import known_pages
@@ -24,16 +25,19 @@ from train.run import load_decoder, load_run
 from train.synthetic import MOST_NOISE, SyntheticPages, likeness
 
 USUAL_REFINEMENTS = 1
-"""Of a decoder, unless told otherwise: it adds more than anything else does, for twice the time a page."""
+"""Of a decoder, unless told otherwise: it adds more than anything else does. With ideal lenses it takes twice the time
+a page; with real ones its waves pass each of them in fifty terms, which takes much longer at the full size."""
 _SYNTHETIC_SYMBOLS = 470_000
 """Of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""
+_SYNTHETIC_PAGES = 12, 96
+"""Fewest and most: few large ones would show few drifted states, and more small ones teach no more."""
 LIKENESS_PAGES = 2
 """Recorded pages that the wave model is compared with: each has thousands of symbols."""
 
 
 def default_synthetic_pages(profile: Profile) -> int:
     """Synthetic pages that are made unless told otherwise."""
-    return max(4, round(_SYNTHETIC_SYMBOLS / np.prod(profile.page_shape)))
+    return int(np.clip(round(_SYNTHETIC_SYMBOLS / np.prod(profile.page_shape)), *_SYNTHETIC_PAGES))
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ class SymbolRecipe:
         )
         count = len(material.training)
         stores = [FeatureStore(features, range(count)), *map(FeatureStore, self._synthetic(material))]
-        training = training_pages(stores, material.pilot_mask, self.choices.patch)
+        training = training_pages(stores, material.pilot_mask, self.choices)
         validation = FeatureStore(features, range(count, len(known)))
         fitted = fit_network(
             material.out,
@@ -144,11 +148,11 @@ class SymbolRecipe:
     def _first_network(self, profile: Profile) -> SymbolUNet:
         assert self.start is not None
         run = load_run(self.start)
-        size = (run.localizer, run.profile.page_shape, *_size(run.hyperparameters))
-        wanted = (self.localizer, profile.page_shape, *_size(self.choices))
+        size = (run.localizer, run.profile.page_shape, *_size(run.hyperparameters, run.profile))
+        wanted = (self.localizer, profile.page_shape, *_size(self.choices, profile))
         if size != wanted:
             raise InvalidInputError(
-                f"--start {self.start}: localizer, page, channels, blocks, levels", size, f"{wanted}"
+                f"--start {self.start}: localizer, page, channels, blocks, levels, samples", size, f"{wanted}"
             )
         return load_decoder(self.start, run).network
 
@@ -182,5 +186,6 @@ class SymbolRecipe:
         return [folder]
 
 
-def _size(choices: object) -> tuple[object, ...]:
-    return tuple(getattr(choices, name, None) for name in ("channels", "blocks", "levels"))
+def _size(choices: object, profile: Profile) -> tuple[object, ...]:
+    samples = getattr(choices, "samples", 0) or symbol_samples(profile)
+    return (*(getattr(choices, name, None) for name in ("channels", "blocks", "levels")), samples)

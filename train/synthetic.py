@@ -30,6 +30,8 @@ Complex = NDArray[np.complexfloating]
 
 PAGES_PER_STATE = 4
 """Pages of each drifted state: the waves and the sampling table are set up once a state."""
+_LARGE = 20_000
+"""Symbols of a page from which each page has a state of its own."""
 MOST_NOISE = 0.3
 """Unexplained power over the light's above which synthetic light teaches nothing of the device."""
 _DRIFT = {
@@ -109,12 +111,13 @@ class SyntheticPages:
     ) -> None:
         self._profile, self._parameters, self._like, self._seed = profile, parameters, like, seed
         self._twin = TorchTwin(RayTwin(profile))
+        self._per_state = PAGES_PER_STATE if np.prod(profile.page_shape) < _LARGE else 1
         self._coherent = localizer
 
     def pages(self, first: int = 0) -> Iterator[PageFeatures]:
         """Features of page `first` and all after it, without end; the same pages from wherever it starts."""
-        state = first // PAGES_PER_STATE
-        skipped = first % PAGES_PER_STATE
+        state = first // self._per_state
+        skipped = first % self._per_state
         while True:
             yield from itertools.islice(self._state(state), skipped, None)
             state, skipped = state + 1, 0
@@ -129,7 +132,7 @@ class SyntheticPages:
         waves_back = WaveLocalizer(profile, parameters) if self._coherent is None else None
         table = sampling_table(self._twin, parameters, np.pi / 2, profile)
         light_on = np.tensordot(self._like.illumination, np.stack(illumination_terms(waves.x, waves.y)), 1)
-        for symbols in random_symbols(profile, MAX_LEVELS, PAGES_PER_STATE, rng):
+        for symbols in random_symbols(profile, MAX_LEVELS, self._per_state, rng):
             phases = symbol_phases(symbols, MAX_LEVELS)
             field = waves.to_camera(on_modulator(phases, symbol_samples(profile)) * light_on)
             field = (self._like.seen * (field + self._noise(field, rng))).astype(np.complex64)

@@ -15,7 +15,7 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from optics.lens_path import IDEAL, SeidelTerms
+from optics.lens_path import SeidelTerms
 from optics.profile import Profile
 from optics.registration.parameters import NAMES
 from optics.registration.phases import camera_phase, launch_phase
@@ -54,7 +54,7 @@ class RayTwin(nn.Module):
         self.half_height = profile.page_height_m / 2
         self.corner = profile.corner_m
         self.seidel_terms = profile.seidel_terms
-        self.ideal_lenses = profile.seidel_terms() == IDEAL
+        self.ideal_lenses = profile.ideal_lenses
         self.symbol_pitch = profile.symbol_pitch_m
         self.camera_pitch = profile.camera.pitch_m
         self.camera_centre = ((profile.camera.columns_px - 1) / 2, (profile.camera.rows_px - 1) / 2)
@@ -126,7 +126,7 @@ class RayTwin(nn.Module):
             k, phase = straight, at_launch
             met = torch.stack([crossed["x"], crossed["y"]], dim=-1)
             if not self.ideal_lenses:
-                entrance, spread = self._filled(met - positions, width, focal)
+                entrance, leaves, spread = self._filled(met, positions, width, focal)
                 tilt, more = bent_by(path, starts, entrance, spread)
                 k, phase = k + tilt, phase + more
             squared = (k * k).sum(-1)
@@ -135,7 +135,6 @@ class RayTwin(nn.Module):
                 k, phase = self._reflect(k, phase, normals[name], crossed[name], width, wall_offset["xy".index(name)])
             landing = -k / per_metre
             if not self.ideal_lenses:
-                leaves = torch.where(torch.remainder(met, 2) == 0, -entrance, entrance)
                 for _ in range(_LANDINGS):
                     tilt, more = bent_by(path.mirrored(), landing, leaves, spread)
                     landing = (tilt - k) / per_metre
@@ -147,20 +146,21 @@ class RayTwin(nn.Module):
             phases.append(phase + camera_phase(value, x, y, *edges))
         return torch.stack(landings), torch.stack(phases), positions
 
-    def _filled(self, beyond: Tensor, width: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
-        """The part of the entrance whose light leaves through cells so far beyond the beam's middle, [N, 2] widths.
+    def _filled(self, met: Tensor, positions: Tensor, width: Tensor, focal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Where light that leaves through the cells `met` enters and leaves, for exit centroids `positions`, [N, 2].
 
         Returns:
-            Mean place and variance along either axis, [N, 2]; weighted by a symbol's light.
+            Mean places at entrance and exit, and variance along either axis, [N, 2]; weighted by a symbol's light.
         """
-        shifted = torch.clamp(beyond, -1, 1)
+        shifted = torch.clamp(met - positions, -1, 1)
         low, high = torch.clamp(shifted - 0.5, min=-0.5), torch.clamp(shifted + 0.5, max=0.5)
-        u, weight = (torch.from_numpy(array).to(beyond.device) for array in leggauss(_NODES))
+        u, weight = (torch.from_numpy(array).to(met.device) for array in leggauss(_NODES))
         places = width * ((low + high)[..., None] / 2 + (high - low)[..., None] / 2 * u)
         light = weight * torch.sinc(places * self.symbol_pitch * self.wave_number / (2 * math.pi * focal)) ** 2
         total = light.sum(-1) + _DARK
         mean = (light * places).sum(-1) / total
-        return mean, (light * places**2).sum(-1) / total - mean**2
+        leaves = torch.where(torch.remainder(met, 2) == 0, 1, -1) * (mean - width * shifted)
+        return mean, leaves, (light * places**2).sum(-1) / total - mean**2
 
     def _reflect(
         self, k: Tensor, phase: Tensor, normal: Tensor, cells: Tensor, width: Tensor, offset: Tensor

@@ -15,8 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from optics.expansion import Interpolation
 from optics.grid import field_grid, symbol_samples
-from optics.lens_path import IDEAL, SeidelTerms
+from optics.lens_path import SeidelTerms
 from optics.profile import Profile
 from optics.registration.fitted_waves import (
     FittedWaves,
@@ -44,13 +45,18 @@ _STEPS = 32
 
 
 class LensMatrices(NamedTuple):
-    """A lens between its plane and a facet of the pipe; see `FourierLens`, whose terms `plane` and `facet` are."""
+    """A lens between its plane and a facet of the pipe; see `FourierLens`.
+
+    Its terms are `facet` on the facet, and on the plane weights [R, degrees, degrees] of polynomials at its samples.
+    """
 
     x: Parts
     between: Parts
     y: Parts
     facet: Parts
-    plane: Parts
+    weights: Parts
+    on_y: Tensor
+    on_x: Tensor
 
 
 class WaveMatrices(NamedTuple):
@@ -91,7 +97,7 @@ class Waves(nn.Module):
         self.grid_y_m: Tensor
         self.facet_x: Tensor
         self.facet_y: Tensor
-        self._ideal = channel.geometry.lens_path == IDEAL
+        self._ideal = profile.ideal_lenses
         self._pipe = _Pipe(channel.pipe)
         for name, value in {
             "x_m": x,
@@ -102,15 +108,10 @@ class Waves(nn.Module):
             "facet_y": np.arange(1, channel.cells[0]) / channel.cells[0] - 0.5,
         }.items():
             self.register_buffer(name, torch.from_numpy(value).to(torch.float32), persistent=False)
-        self.launch_nodes: Tensor
-        self.launch_weights: Tensor
-        self.camera_nodes: Tensor
-        self.camera_weights: Tensor
         centre = np.array([as_dict(parameters)[f"page_centre_{axis}_m"] for axis in "xy"])
-        for name, lens, middle in (("launch", channel.launch_lens, centre), ("camera", channel.delaunch_lens, 0.0)):
-            terms = lens.interpolation(_ROLL_MARGIN, _TOLERANCE if self._ideal else _TOLERANCE_WITH_PATH)
-            self.register_buffer(f"{name}_nodes", torch.from_numpy(terms.nodes - middle).float(), persistent=False)
-            self.register_buffer(f"{name}_weights", stacked(terms.weights), persistent=False)
+        tolerance = _TOLERANCE if self._ideal else _TOLERANCE_WITH_PATH
+        self._on_page = _Terms(channel.launch_lens.interpolation(_ROLL_MARGIN, tolerance), centre)
+        self._on_camera = _Terms(channel.delaunch_lens.interpolation(_ROLL_MARGIN, tolerance), 0 * centre)
         self.default: Tensor
         self.register_buffer("default", torch.from_numpy(parameters).to(torch.float32), persistent=False)
 
@@ -128,10 +129,10 @@ class Waves(nn.Module):
         if not self._ideal:
             at_launch = at_launch + path.of_field(x[0][None, :], x[1][:, None])
             at_camera = at_camera - path.mirrored().of_field(grid[0][None, :], grid[1][:, None])
-        launch_nodes = self.launch_nodes + torch.stack([value["page_centre_x_m"], value["page_centre_y_m"]])
+        centre = torch.stack([value["page_centre_x_m"], value["page_centre_y_m"]])
         return WaveMatrices(
-            self._lens(geometry, *x, facet, path, launch_nodes, self.launch_weights),
-            self._lens(geometry, *grid, facet, path.mirrored(), self.camera_nodes, self.camera_weights),
+            self._lens(geometry, *x, facet, path, self._on_page, centre),
+            self._lens(geometry, *grid, facet, path.mirrored(), self._on_camera, 0 * centre),
             window,
             _phasor(at_launch),
             _phasor(at_camera),
@@ -158,10 +159,10 @@ class Waves(nn.Module):
         y: Tensor,
         facet: tuple[Tensor, Tensor],
         path: SeidelTerms,
-        nodes: Tensor,
-        weights: Tensor,
+        terms: _Terms,
+        centre: Tensor,
     ) -> LensMatrices:
-        """`FourierLens`; what does not factor is interpolated on the plane between nodes [R, 2] with weights."""
+        """`FourierLens`; what does not factor is interpolated on the plane between nodes, told from its `centre`."""
         factors, (facet_x, facet_y) = couplings(geometry, torch), facet
         per_metre = geometry.wave_number / geometry.focal_length_m
         area = (x[1] - x[0]) * (y[1] - y[0]) * (facet_x[1] - facet_x[0]) * (facet_y[1] - facet_y[0])
@@ -173,7 +174,8 @@ class Waves(nn.Module):
             return _phasor(-(factor * per_metre * rows)[:, None] * columns[None, :])
 
         real, imaginary = kernel(factors.x_to_x, x, facet_x)
-        node_x, node_y, up = nodes[:, :1, None], nodes[:, 1:, None], facet_y[:, None]
+        nodes, up = terms.nodes + centre, facet_y[:, None]
+        node_x, node_y = nodes[:, :1, None], nodes[:, 1:, None]
         rest = -factors.x_to_y * per_metre * node_x * up
         if not self._ideal:
             rest = rest + path.of_both(node_x, node_y, *on_facet(factors, facet_x, up))
@@ -182,7 +184,9 @@ class Waves(nn.Module):
             kernel(factors.y_to_x, y, facet_x),
             kernel(factors.y_to_y, facet_y, y),
             _phasor(rest),
-            parts(weights),
+            parts(terms.weights),
+            terms.on_y,
+            terms.on_x,
         )
 
 
@@ -195,7 +199,7 @@ def _to_facet(lens: LensMatrices, field: Parts) -> Parts:
         terms = multiply(matmul(multiply(plane, field), lens.x), lens.between)
         return multiply(matmul(lens.y, terms), facet)
 
-    return _summed(of, lens.plane, lens.facet)
+    return _summed(of, lens)
 
 
 def _to_plane(lens: LensMatrices, field: Parts) -> Parts:
@@ -204,19 +208,39 @@ def _to_plane(lens: LensMatrices, field: Parts) -> Parts:
         terms = multiply(matmul(adjoint(lens.y), terms), conjugate(lens.between))
         return multiply(matmul(terms, adjoint(lens.x)), conjugate(plane))
 
-    return _summed(of, lens.plane, lens.facet)
+    return _summed(of, lens)
 
 
-def _summed(of: Callable[[Parts, Parts], Parts], plane: Parts, facet: Parts) -> Parts:
-    """The sum over all terms, some at once."""
+def _summed(of: Callable[[Parts, Parts], Parts], lens: LensMatrices) -> Parts:
+    """The sum over all terms, some at once; on the plane they are made as they are needed, for they are large."""
     total: Parts | None = None
-    for first in range(0, len(plane[0]), _AT_ONCE):
+    for first in range(0, len(lens.facet[0]), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        real, imaginary = of((plane[0][some], plane[1][some]), (facet[0][some], facet[1][some]))
+        on_x = lens.on_x.transpose(0, 1)
+        plane = lens.on_y @ lens.weights[0][some] @ on_x, lens.on_y @ lens.weights[1][some] @ on_x
+        real, imaginary = of(plane, (lens.facet[0][some], lens.facet[1][some]))
         more = real.sum(0), imaginary.sum(0)
         total = more if total is None else (total[0] + more[0], total[1] + more[1])
     assert total is not None
     return total
+
+
+class _Terms(nn.Module):
+    """`Interpolation` as tensors, its nodes told from a centre."""
+
+    def __init__(self, terms: Interpolation, centre: Real) -> None:
+        super().__init__()
+        self.nodes: Tensor
+        self.weights: Tensor
+        self.on_y: Tensor
+        self.on_x: Tensor
+        for name, value in {
+            "nodes": torch.from_numpy(terms.nodes - centre).float(),
+            "weights": stacked(terms.weights),
+            "on_y": torch.from_numpy(terms.axes[0]),
+            "on_x": torch.from_numpy(terms.axes[1]),
+        }.items():
+            self.register_buffer(name, value, persistent=False)
 
 
 def _sine_modes(numbers: Tensor, cells: int) -> Tensor:

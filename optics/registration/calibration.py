@@ -21,8 +21,8 @@ Real = NDArray[np.float64]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 PageHash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-_ADDED = ("lens_path_relative",)
-"""Parameters that documents written before them lack: their decoders took lenses for ideal."""
+_ADDED = {"parameters": {"lens_path_relative": -1.0}, "deviations": {"lens_path_relative": 0.0}}
+"""What documents lack that were written before it: they took lenses for ideal."""
 
 
 def _names_problem(values: dict[str, Any]) -> str:
@@ -140,7 +140,7 @@ def parse_calibration(text: str, source: str = "calibration") -> Calibration:
     for table in ("parameters", "deviations"):
         values = data.get(table)
         if isinstance(values, dict):
-            data[table] = values = dict.fromkeys(_ADDED, 0.0) | values
+            data[table] = values = _ADDED[table] | values
         problem = _names_problem(values) if isinstance(values, dict) else ""
         if problem:
             raise ProfileError(f"{source}: [{table}]", problem, "every parameter of the ray twin and no other")

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from optics.grid import field_grid, symbol_samples
-from optics.lens_path import IDEAL
 from optics.profile import Profile
 from optics.recording import FramePair
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
@@ -147,7 +146,7 @@ class WaveFit:
             centre: [P] centre of the priors, nominal (zero) if None.
             prior_scale: factor on the priors' standard deviations, one for all or [P].
         """
-        without_effect = () if self._profile.seidel_terms() != IDEAL else _OF_REAL_LENSES
+        without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*_SEEN, *without_effect)]
         of_cameras = [index for index in indices(*groups) if index in _SEEN]
         free = of_light + of_cameras

@@ -84,7 +84,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
         [4],
         [],
     ]
-    assert all(0 < arm["by_levels"][0]["symbol_error_rate"] < 1 for arm in (coherent, refined, oracle))
+    assert all(0 < arm["by_levels"][0]["symbol_error_rate"] <= 0.8 for arm in (coherent, refined, oracle))
     assert (out / "figure.png").stat().st_size > 10_000
     assert (coherent["arm"], oracle["arm"], oracle["over_oracle"]) == ("coherent", "oracle", 1)
     assert coherent["over_oracle"] == pytest.approx(coherent["air"] / oracle["air"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -352,20 +353,23 @@ class TestTruth:
         pages = [on_slm(random_phases(profile, seed), profile) for seed in range(3)]
         # the field is known against the reference
         fields = [optics.camera_field(optics.exit_field(page)) * np.exp(-1j * np.angle(reference)) for page in pages]
-        for branch, cell in (("direct", (0, 0)), ("x", (1, 0)), ("y", (0, 1))):
-            clean = (np.abs(away - cell) < 0.2).all(axis=1)
-            assert clean.sum() > 500
+        # a wavefront that real lenses have bent is no single ray's any more
+        lost, turned = (0.1, 0.08) if name == "real lenses" else (0.0, 0.05)
+        rings = ((0.0, 0.2, 0.9), (0.2, 0.4, 0.83))
+        for (branch, cell), (low, high, whole) in product((("direct", (0, 0)), ("x", (1, 0)), ("y", (0, 1))), rings):
+            off_centre = np.abs(away - cell).max(axis=1)
+            chosen = (low <= off_centre) & (off_centre < high)
+            assert chosen.sum() > 500
             b = BRANCHES.index(branch)
-            x, y = rays.places[b, clean].T
+            x, y = rays.places[b, chosen].T
             light = []
             for page, field in zip(pages, fields, strict=True):
                 parts = (resample(part, *optics.camera_axes_m, x, y) for part in (field.real, field.imag))
                 arrived = np.array([1, 1j]) @ np.stack(list(parts))
-                light.append(arrived * np.exp(-1j * (rays.phases[b, clean] + page.ravel()[clean])))
+                light.append(arrived * np.exp(-1j * (rays.phases[b, chosen] + page.ravel()[chosen])))
             mean = np.mean(light)
-            # no single ray undoes a wavefront that a real lens has bent
-            assert abs(mean) / np.sqrt(np.mean(np.abs(light) ** 2)) > (0.8 if name == "real lenses" else 0.9), branch
-            assert abs(np.angle(mean)) < (0.1 if name == "real lenses" else 0.05), branch
+            assert abs(mean) / np.sqrt(np.mean(np.abs(light) ** 2)) > whole - lost, (branch, low)
+            assert abs(np.angle(mean)) < turned, (branch, low)
 
     def test_in_a_sheared_pipe_either_order_of_two_reflections_has_its_share_of_the_corner_light(self) -> None:
         straight = Geometry(pipe_angle_deg=-0.6, page_shift_x_px=0, page_shift_y_px=0, pipe_roll_deg=0)

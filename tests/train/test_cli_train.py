@@ -65,6 +65,39 @@ def test_recorded_and_synthetic_pages_are_trained_on_and_the_last_are_left(devic
         run([*again, "--channels", "16", "--out", str(tmp_path / "other")])
 
 
+def test_options_of_the_first_look_are_kept_and_those_that_do_nothing_refused(
+    small_device: list[str], tmp_path: Path
+) -> None:
+    small = [*small_device, "--channels", "8", "--blocks", "1", "--steps", "12", "--synthetic-pages", "0"]
+    hurried = [
+        "--binning",
+        "2",
+        "--samples",
+        "3",
+        "--interpolation",
+        "bilinear",
+        "--field-rounds",
+        "0",
+        "--patch",
+        "20",
+    ]
+    run([*small, *hurried, "--out", str(tmp_path / "run")])
+    kept = json.loads((tmp_path / "run" / "run.json").read_text())["hyperparameters"]
+    assert {name: kept[name] for name in ("binning", "samples", "interpolation", "field_rounds", "patch")} == {
+        "binning": 2,
+        "samples": 3,
+        "interpolation": "bilinear",
+        "field_rounds": 0,
+        "patch": 20,
+    }
+    assert kept["refinements"] == 1  # unless told otherwise
+    with pytest.raises(InvalidInputError, match=r"--samples"):
+        run([*small, "--localizer", "wave", "--samples", "3", "--out", str(tmp_path / "wave")])
+    start = ["--start", str(tmp_path / "run"), "--out", str(tmp_path / "other")]
+    with pytest.raises(InvalidInputError, match=r"samples: got .*3\), wanted .*4\)"):
+        run([*small, *start])
+
+
 def test_ctrl_c_in_training_loses_nothing_and_the_same_command_goes_on(device: list[str], tmp_path: Path) -> None:
     out, steps = (
         tmp_path / "run",

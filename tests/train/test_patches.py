@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch.utils.data import ConcatDataset
 
+from optics.errors import InvalidInputError
 from train.feature_store import FeatureStore, fill
 from train.features import PageFeatures, PageState
 from train.fitting import Hyperparameters, SymbolTraining
@@ -17,7 +18,7 @@ from train.network import SymbolUNet
 from train.patches import Patches, training_pages
 
 SHAPE = (30, 41)
-SIDE = 20
+SIDE = 24
 
 
 @pytest.fixture
@@ -45,42 +46,64 @@ def mask() -> np.ndarray:
 
 
 def test_small_pages_are_trained_on_whole(store: FeatureStore, mask: np.ndarray) -> None:
-    assert isinstance(training_pages([store], mask, 41), ConcatDataset)
-    assert isinstance(training_pages([store], mask, 40), Patches)
+    assert isinstance(training_pages([store], mask, Hyperparameters(patch=41)), ConcatDataset)
+    wide = training_pages([store], mask, Hyperparameters(patch=40))
+    assert isinstance(wide, Patches)
+    assert wide[0][-1].shape == (30, 40)  # the shorter side is taken whole
 
 
-def test_a_network_says_of_a_patch_what_it_says_of_the_page(store: FeatureStore, mask: np.ndarray) -> None:
+def test_patches_in_which_the_network_sees_no_symbol_whole_are_refused(store: FeatureStore, mask: np.ndarray) -> None:
+    with pytest.raises(InvalidInputError, match="patch: got 10 symbols, wanted more than 10"):
+        training_pages([store], mask, Hyperparameters(blocks=2, patch=10))
+
+
+@pytest.mark.parametrize(("blocks", "levels"), [(1, 0), (2, 0), (1, 1)])
+def test_a_network_says_of_a_patch_what_it_says_of_the_page(
+    store: FeatureStore, mask: np.ndarray, blocks: int, levels: int
+) -> None:
     torch.manual_seed(0)
-    network = SymbolUNet(8, channels=8, blocks=1)
+    network = SymbolUNet(8, channels=8, blocks=blocks, levels=levels)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
-    patches = training_pages([store], mask, SIDE)
-    assert len(patches) == 3 * 2 * 3  # type: ignore[arg-type]
+    patches = training_pages([store], mask, Hyperparameters(blocks=blocks, levels=levels, patch=SIDE))
+    assert len(patches) == 3 * 2 * 2  # type: ignore[arg-type]
     asked_at = set()
-    for index in range(len(patches)):  # type: ignore[arg-type]
+    for index in [*range(len(patches))] * 4:  # type: ignore[arg-type]
         light, where, phases = patches[index]
-        assert phases.shape == (SIDE, SIDE)
-        whole_light, whole_where, whole_phases = store[index // 6]
+        assert SIDE - 1 <= min(phases.shape) <= max(phases.shape) <= SIDE
+        whole_light, whole_where, whole_phases = store[index // 4]
         row, column = _found(phases, whole_phases)
         asked = torch.isfinite(phases)
-        at = slice(row, row + SIDE), slice(column, column + SIDE)
+        at = slice(row, row + phases.shape[0]), slice(column, column + phases.shape[1])
         assert not (asked & torch.from_numpy(mask)[at]).any()
         torch.testing.assert_close(phases[asked], whole_phases[at][asked])
         with torch.no_grad():
             part = network(light[None].float(), where[None])[0]
             page = network(whole_light[None].float(), whole_where[None])[0]
-        # three convolutions of 3x3: three rings of neighbours
         torch.testing.assert_close(part[:, asked], page[:, *at][:, asked])
         asked_at |= {(row + int(r), column + int(c)) for r, c in asked.nonzero()}
-    assert len(asked_at) > 0.7 * (~mask).sum()
-    assert {0, SHAPE[0] - 1} & {row for row, _ in asked_at}  # the page's own edge is learnt from
+    rows, columns = ({place[axis] for place in asked_at} for axis in (0, 1))
+    assert {0, SHAPE[0] - 1} <= rows  # the page's own edges are learnt from
+    assert {0, SHAPE[1] - 1} <= columns
+
+
+def test_symbols_at_the_edge_are_asked_for_as_often_as_those_in_the_middle(store: FeatureStore) -> None:
+    torch.manual_seed(0)
+    patches = Patches([store], np.zeros(SHAPE, bool), SIDE, rim=3)
+    count, side, often = 225, 96, np.zeros(225)
+    for _ in range(4000):
+        start = patches._start(count, side)
+        often[start + 3 * (start > 0) : start + side - 3 * (start + side < count)] += 1
+    assert often[[0, -1]] == pytest.approx(often[count // 2], rel=0.15)
+    assert often.min() > 0.85 * often[count // 2]
 
 
 def _found(phases: torch.Tensor, page: torch.Tensor) -> tuple[int, int]:
     """Where a patch was cut."""
-    for row in range(SHAPE[0] - SIDE + 1):
-        for column in range(SHAPE[1] - SIDE + 1):
-            part = page[row : row + SIDE, column : column + SIDE]
+    height, width = phases.shape
+    for row in range(SHAPE[0] - height + 1):
+        for column in range(SHAPE[1] - width + 1):
+            part = page[row : row + height, column : column + width]
             if torch.equal(part[torch.isfinite(phases)], phases[torch.isfinite(phases)]):
                 return row, column
     raise AssertionError("no part of the page")
@@ -89,7 +112,7 @@ def _found(phases: torch.Tensor, page: torch.Tensor) -> tuple[int, int]:
 def test_the_loss_counts_what_is_asked(store: FeatureStore, mask: np.ndarray) -> None:
     module = SymbolTraining(SymbolUNet(8, channels=4, blocks=1), Hyperparameters(), mask, 256)
     module.log = lambda *_, **__: None  # type: ignore[method-assign]
-    phases = Patches([store], mask, SIDE)[0][-1]
+    phases = Patches([store], mask, SIDE, rim=3)[0][-1]
     p = torch.randn(1, 2, SIDE, SIDE, requires_grad=True)
     module.loss(p, phases[None]).backward()
     assert p.grad is not None

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from optics.device import Device
+from optics.profile import load_profile
 from optics.registration.fitted_waves import FittedWaves
-from optics.registration.parameters import NAMES, PRIORS
+from optics.registration.parameters import NAMES, PRIORS, nominal
 from optics.simulator import true_parameters
 from tests.optics.small import THICK, small_profile
 from train.parts import stacked
@@ -50,6 +51,12 @@ def test_a_page_lights_the_camera_as_in_the_fitted_waves(models: tuple[FittedWav
 def test_a_field_comes_back_to_the_page_as_in_the_fitted_waves(models: tuple[FittedWaves, Waves, float]) -> None:
     field = noise(models[0].against_reference.shape)
     check(models[1].to_page(models[1].matrices(), stacked(field)), models[0].to_page(field), models[2])
+
+
+def test_the_full_size_device_is_small_enough_to_be_exported() -> None:
+    profile = load_profile("paper")
+    waves = Waves(profile, nominal(), filled=True)
+    assert sum(buffer.nbytes for buffer in waves.buffers()) < 30e6
 
 
 def test_other_parameters_make_the_waves_of_the_device_that_has_drifted() -> None:

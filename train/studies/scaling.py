@@ -47,6 +47,7 @@ def enlarged(profile: Profile, factor: int) -> Profile:
             "page": profile.page.model_copy(
                 update={"columns": factor * profile.page.columns, "rows": factor * profile.page.rows}
             ),
+            "lens_path": profile.lens_path.times(factor),
             "camera": profile.camera.model_copy(
                 update={
                     "columns_px": factor * profile.camera.columns_px,

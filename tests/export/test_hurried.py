@@ -1,0 +1,46 @@
+"""A decoder that reads coarsely, of a camera whose pixels do not come in pairs: the file says what torch says."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from export.graph import FRAME_INPUTS, DecoderGraph, table_tensors
+from export.onnx_files import decoder_onnx
+from export.parity import check_parity, torch_answer
+from optics.device import Device
+from optics.page import random_symbols
+from optics.profile import Camera
+from optics.registration.table import sampling_table
+from optics.simulator import Simulator, true_parameters
+from runtime.ort import open_session
+from tests.optics.small import small_profile
+from train.decoder import SymbolDecoder
+from train.fitting import Hyperparameters
+from train.localizers.coherent import BILINEAR
+from train.twin import RayTwin, TorchTwin
+
+PROFILE = small_profile().model_copy(update={"camera": Camera(columns_px=685, rows_px=457, pitch_m=2.4e-6)})
+HURRIED = Hyperparameters(channels=8, blocks=1, field_rounds=0, binning=2, samples=3, interpolation=BILINEAR)
+
+
+def test_it_agrees_with_torch_and_sees_nearly_what_a_patient_one_sees() -> None:
+    device = Device()
+    simulator = Simulator(PROFILE, device, seed=1)
+    pair = simulator.page(random_symbols(PROFILE, 256, 1, np.random.default_rng(1))[0])
+    parameters = true_parameters(PROFILE, device)
+    table = sampling_table(TorchTwin(RayTwin(PROFILE)), parameters, device.homodyne.turn_rad, PROFILE)
+    fields = []
+    for choices in (HURRIED, Hyperparameters(channels=8, blocks=1)):
+        torch.manual_seed(0)
+        graph = DecoderGraph(PROFILE, SymbolDecoder(PROFILE, parameters, "coherent", choices), 1.0).eval()
+        tensors = table_tensors(graph, table, simulator.references())
+        session = open_session(decoder_onnx(graph, "uint8", PROFILE.frame_shape, tensors), "hurried", 1)
+        frames = dict(zip(FRAME_INPUTS, (pair.in_phase, pair.quadrature), strict=True))
+        expected = torch_answer(graph, pair, {name: tensors[name] for name in graph.table_inputs})
+        p, field = session.run(["p", "field"], frames)
+        check_parity(expected["p"], p, "p")
+        fields.append(field[0] + 1j * field[1])
+    hurried, patient = fields
+    off = np.linalg.norm(hurried - patient) / np.linalg.norm(patient)
+    assert 0.01 < off < 0.35
