@@ -64,6 +64,7 @@ ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, ORACLE)
 CALIBRATED = 2
 HELD_OUT_SHARE = 0.05
 LAST_SHARE = 0.2
+CURVE_POINTS = 60
 LEVEL_PAGES = 4
 """Of each number of levels, and as many as are calibrated on: thirty thousand symbols on the bench device."""
 
@@ -305,8 +306,11 @@ class Bench:
         rates = achievable_rate(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
         by_symbol[~self.mask] = rates.reshape(len(truth), -1).mean(axis=0)
         np.save(folder / MAP, by_symbol)
+        validated = logged(folder, "val_air")
         return Outcome(
             kappa_scale=scale,
+            validation_curve=validated,
+            training_curve=logged(folder, "train_air"),
             run=str(folder.relative_to(self.out.parent)),
             arm=name,
             size=size,
@@ -315,19 +319,28 @@ class Bench:
             own_mi=figures.own_mi_bits_per_symbol,
             page_kB=figures.air_bits_per_symbol * int((~self.mask).sum()) / 8000,
             validation_air=trained.validation_air,
-            gained_in_last_fifth=gained_at_the_end(folder, steps),
+            gained_in_last_fifth=gained_at_the_end(validated, steps),
             preparing_seconds=preparing,
             training_seconds=trained.seconds,
         )
 
 
-def gained_at_the_end(run: Path, steps: int) -> float:
-    """Validation AIR that the best of the last fifth of a run's steps has over the best before, bits."""
+def logged(run: Path, name: str) -> list[tuple[int, float]]:
+    """A curve of a run as (step, value), the mean over every sixtieth of its steps; none of a run too short for it."""
     events = EventAccumulator(str(run / "tensorboard"))
     events.Reload()
-    seen = [(event.step, event.value) for event in events.Scalars("val_air")]
-    late = [value for step, value in seen if step > (1 - LAST_SHARE) * steps]
-    early = [value for step, value in seen if step <= (1 - LAST_SHARE) * steps]
+    known = name in events.Tags()["scalars"]
+    seen = [(event.step, event.value) for event in events.Scalars(name)] if known else []
+    if not seen:
+        return []
+    parts = np.array_split(np.array(sorted(seen)), min(len(seen), CURVE_POINTS))
+    return [(round(float(part[-1, 0])), float(part[:, 1].mean())) for part in parts]
+
+
+def gained_at_the_end(curve: Sequence[tuple[int, float]], steps: int) -> float:
+    """What the best of the last fifth of a run's steps has over the best before, of a curve of (step, value)."""
+    late = [value for step, value in curve if step > (1 - LAST_SHARE) * steps]
+    early = [value for step, value in curve if step <= (1 - LAST_SHARE) * steps]
     return max(late) - max(early) if late and early else float("nan")
 
 
@@ -336,7 +349,7 @@ class Outcome:
     """What one arm reached with a network of one size.
 
     Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor that made
-    its claims honest, `by_levels` what it is worth among fewer levels.
+    its claims honest, `by_levels` what it is worth among fewer levels. The curves are AIR by step.
     """
 
     run: str
@@ -351,6 +364,8 @@ class Outcome:
     preparing_seconds: float
     training_seconds: float
     kappa_scale: float
+    training_curve: list[tuple[int, float]]
+    validation_curve: list[tuple[int, float]]
     over_oracle: float | None = None
     by_levels: list[LevelFigures] = field(default_factory=list)
 

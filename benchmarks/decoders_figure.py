@@ -22,19 +22,20 @@ def draw(lights: list[dict[str, Any]], out: Path) -> None:
         out: the comparison's folder.
     """
     widest = max(len(light["outcomes"]) for light in lights)
-    figure = Figure(figsize=(4.6 + 2.1 * widest, 0.4 + 2.5 * len(lights)), layout="constrained")
+    figure = Figure(figsize=(8.0 + 2.1 * widest, 0.4 + 2.5 * len(lights)), layout="constrained")
     FigureCanvasAgg(figure)
-    rows = figure.subplots(len(lights), 1 + widest, squeeze=False, width_ratios=[2.2, *[1] * widest])
+    rows = figure.subplots(len(lights), 2 + widest, squeeze=False, width_ratios=[2.2, 1.6, *[1] * widest])
     for row, light in zip(rows, lights, strict=True):
-        for axis in row[1:]:
+        for axis in row[2:]:
             axis.set_axis_off()
         outcomes = light["outcomes"]
         top = max(outcome["own_mi"] for outcome in outcomes)
         _bars(row[0], light, outcomes)
-        for axis, outcome in zip(row[1:], outcomes, strict=False):
+        _curves(row[1], outcomes, top)
+        for axis, outcome in zip(row[2:], outcomes, strict=False):
             shown = axis.imshow(np.load(out / outcome["run"] / MAP), vmin=0, vmax=top, cmap="viridis")
             axis.set_title(f"{outcome['arm']}: {outcome['air']:.2f}", fontsize=9)
-        figure.colorbar(shown, ax=row[1:], shrink=0.8, label="AIR, bit/symbol")
+        figure.colorbar(shown, ax=row[2:], shrink=0.8, label="AIR, bit/symbol")
     figure.savefig(out / "figure.png", dpi=_DOTS, metadata={"Software": None})
 
 
@@ -57,3 +58,18 @@ def _bars(axis: Any, light: dict[str, Any], outcomes: list[dict[str, Any]]) -> N
         f"symbols of {light['symbol_size_px']}x{light['symbol_size_px']} pixels",
         fontsize=9,
     )
+
+
+def _curves(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
+    """How each arm learnt: AIR of the pages trained on, thin, and of those held out, thick, by share of its steps."""
+    for number, outcome in enumerate(outcomes):
+        colour = f"C{number % 10}"
+        for name, width in (("training_curve", 0.7), ("validation_curve", 1.8)):
+            steps, rates = np.reshape(outcome[name], (-1, 2)).T
+            label = outcome["arm"] if name == "validation_curve" else None
+            axis.plot(steps / outcome["steps"], rates, color=colour, linewidth=width, label=label)
+    axis.set_ylim(-0.2 * top, 1.15 * top)
+    axis.set_xlabel("share of its steps", fontsize=8)
+    axis.set_ylabel("AIR; thin: on training pages", fontsize=8)
+    axis.legend(fontsize=6)
+    axis.grid(alpha=0.3)

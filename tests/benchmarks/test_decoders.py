@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from benchmarks.comparison import gained_at_the_end
+from benchmarks.comparison import gained_at_the_end, logged
 from benchmarks.decoders import main
 from benchmarks.oracle import Oracle
 from optics.device import Device, Reference, Sensor
@@ -55,10 +55,13 @@ def test_the_oracle_is_spared_the_signals_own_power(tmp_path: Path) -> None:
 
 def test_the_gain_at_the_end_is_read_from_the_run(tmp_path: Path) -> None:
     logger = TensorBoardLogger(str(tmp_path), name="", version="tensorboard")
-    for step, value in ((20, 1.0), (60, 2.5), (79, 2.4), (90, 2.6), (100, 2.55)):
+    values = ((20, 1.0), (60, 2.5), (79, 2.4), (90, 2.6), (100, 2.55))
+    for step, value in values:
         logger.log_metrics({"val_air": value}, step)
     logger.finalize("done")
-    assert gained_at_the_end(tmp_path, 100) == pytest.approx(0.1, abs=1e-5)
+    curve = logged(tmp_path, "val_air")
+    assert curve == [(step, pytest.approx(value, abs=1e-5)) for step, value in values]
+    assert gained_at_the_end(curve, 100) == pytest.approx(0.1, abs=1e-5)
 
 
 def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path) -> None:
@@ -85,6 +88,8 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
         [],
     ]
     assert all(0 < arm["by_levels"][0]["symbol_error_rate"] <= 0.8 for arm in (coherent, refined, oracle))
+    assert all(len(arm["validation_curve"]) > 0 for arm in figures["outcomes"])
+    assert len(coherent["training_curve"]) > 0
     assert (out / "figure.png").stat().st_size > 10_000
     assert (coherent["arm"], oracle["arm"], oracle["over_oracle"]) == ("coherent", "oracle", 1)
     assert coherent["over_oracle"] == pytest.approx(coherent["air"] / oracle["air"])

@@ -8,10 +8,11 @@ import pytest
 from optics.device import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor, draw_device
 from optics.grid import field_grid
 from optics.page import symbol_phases
+from optics.profile import Profile
 from optics.registration.parameters import NAMES, PARAMETERS, PRIORS, indices
 from optics.registration.wave_fit import WaveFit
 from optics.simulator import Simulator, true_parameters
-from tests.optics.small import small_profile
+from tests.optics.small import THICK, small_profile
 from train.twin import RayTwin, TorchTwin
 
 PROFILE = small_profile()
@@ -20,12 +21,13 @@ TURN = np.deg2rad(-90 + 3)
 EVERY = tuple(dict.fromkeys(parameter.group for parameter in PARAMETERS))
 
 
-def seen_by(device: Device, seed: int) -> WaveFit:
+def seen_by(device: Device, seed: int, profile: Profile = PROFILE) -> WaveFit:
     """The fit of one random page of a device."""
-    simulator = Simulator(PROFILE, device, seed=seed)
-    symbols = np.random.default_rng(seed).integers(256, size=PROFILE.page_shape).astype(np.uint8)
+    simulator = Simulator(profile, device, seed=seed)
+    symbols = np.random.default_rng(seed).integers(256, size=profile.page_shape).astype(np.uint8)
     pair, references = simulator.page(symbols), simulator.references()
-    return WaveFit(TWIN, PROFILE, pair, references, np.exp(1j * symbol_phases(symbols, 256)))
+    twin = TWIN if profile is PROFILE else TorchTwin(RayTwin(profile))
+    return WaveFit(twin, profile, pair, references, np.exp(1j * symbol_phases(symbols, 256)))
 
 
 @pytest.mark.parametrize(("ratio", "full_well_e"), [(1.3, 15_000.0), (3.0, 15_000.0), (1.6, 100.0)])
@@ -76,9 +78,23 @@ def test_a_realistic_device_is_told_from_near_it_with_honest_deviations(seed: in
     assert found.deviations[angle] < 2e-4
     assert np.rad2deg(abs(found.turn - device.homodyne.turn_rad)) < 0.3
     moving = indices("in_phase", "quadrature")[::6], indices("in_phase", "quadrature")[1::6]
-    known = [i for i in range(len(PRIORS)) if i not in np.ravel(moving)]  # the image has moved since
+    lenses = NAMES.index("lens_path_relative")
+    assert found.deviations[lenses] == 0  # these are ideal, and it does nothing
+    known = [i for i in range(len(PRIORS)) if i not in (*np.ravel(moving), lenses)]  # the image has moved since
     off = (found.parameters - truth)[known] / found.deviations[known]
     assert np.sqrt(np.mean(off**2)) < 2
+
+
+def test_how_much_path_real_lenses_add_comes_back() -> None:
+    index = NAMES.index("lens_path_relative")
+    thick = PROFILE.model_copy(update={"lens_path": THICK.times(0.25)})  # a quarter as much takes a tenth of the time
+    device = Device(aberration=Aberration(lens_path_relative_error=0.1))
+    truth = true_parameters(thick, device)
+    start = truth.copy()
+    start[index] = 0
+    found = seen_by(device, 4, thick).fit(start, device.homodyne.turn_rad, EVERY)
+    assert 0 < found.deviations[index] < 0.02
+    assert found.parameters[index] == pytest.approx(0.1, abs=3 * found.deviations[index])
 
 
 def test_held_parameters_keep_their_values_and_priors_hold_the_others() -> None:
