@@ -8,14 +8,13 @@ large tensor: from a hundred thousand symbols on that takes longer than the arit
 
 from __future__ import annotations
 
-import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import click
 import numpy as np
 
-from benchmarks.speed import SETTLE_S, at_symbol_pitch, frames_of, session_of
+from benchmarks.speed import at_symbol_pitch, frames_of, seconds_of, session_of
 from optics.files import OutputFile, write_json
 from optics.profile import load_profile
 from runtime.cpus import available_cpus
@@ -52,12 +51,7 @@ def main(
         profile = enlarged(smallest, factor)
         session, feeds = session_of(profile, *at_symbol_pitch(profile, "coherent"), threads), frames_of(profile)
         session.run(["p"], feeds)
-        seconds = []
-        for _ in range(repeats):
-            time.sleep(SETTLE_S)
-            start = time.perf_counter()
-            session.run(["p"], feeds)
-            seconds.append(time.perf_counter() - start)
+        seconds = [seconds_of(session, feeds) for _ in range(repeats)]
         results.append(Scaled(profile.page.columns * profile.page.rows, float(np.median(seconds))))
         last, over = results[-1], results[-1].each_us / results[0].each_us
         click.echo(f"{last.symbols:>8,} {1e3 * last.seconds:>10.1f} {last.each_us:>12.2f} {over:>18.3f}")

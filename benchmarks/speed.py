@@ -104,6 +104,14 @@ def frames_of(profile: Profile) -> dict[str, np.ndarray]:
     return {name: rng.integers(60, 140, profile.frame_shape, dtype=np.uint8) for name in FRAME_INPUTS}
 
 
+def seconds_of(session: Session, feeds: dict[str, np.ndarray]) -> float:
+    """How long one decode takes, the threads of the one before at rest."""
+    time.sleep(SETTLE_S)
+    start = time.perf_counter()
+    session.run(["p"], feeds)
+    return time.perf_counter() - start
+
+
 def weights(graph: nn.Module) -> int:
     return sum(parameter.numel() for parameter in graph.parameters())
 
@@ -131,11 +139,9 @@ def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int |
     taken: dict[str, list[float]] = {name: [] for name in sessions}
     for repeat in range(repeats + 1):
         for name, session in sessions.items():  # taking turns: a slow moment meets all of them
-            time.sleep(SETTLE_S)
-            start = time.perf_counter()
-            session.run(["p"], feeds)
+            seconds = seconds_of(session, feeds)
             if repeat:
-                taken[name].append(time.perf_counter() - start)
+                taken[name].append(seconds)
     medians = {name: float(np.median(values)) for name, values in taken.items()}
     first = next(iter(medians.values()))
     results = [Timed(name, seconds, seconds / first, sizes[name]) for name, seconds in medians.items()]

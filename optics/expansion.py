@@ -52,8 +52,8 @@ class Expansion:
             first, second: sample places (x, y) of both planes.
             tolerance: singular values below this share of the largest are dropped; the error is about as large.
         """
-        axes, kernel = _sampled(phase, first, second)
-        left, values, right = np.linalg.svd(kernel, full_matrices=False)
+        axes = _axes(phase, first, second)
+        left, values, right = np.linalg.svd(_kernel(phase, axes), full_matrices=False)
         rank = int(np.sum(values > tolerance * values[0]))
         return cls(
             first=_coefficients((left[:, :rank] * values[:rank]).T, *axes[:2]),
@@ -61,9 +61,6 @@ class Expansion:
             first_axes=(axes[1].at_samples, axes[0].at_samples),
             second_axes=(axes[3].at_samples, axes[2].at_samples),
         )
-
-    def __len__(self) -> int:
-        return len(self.first)
 
     def terms(self) -> Iterator[tuple[Complex, Complex]]:
         """Pairs of factors on the planes' samples, [y, x] each; an axis on which nothing depends has one sample."""
@@ -88,10 +85,10 @@ class Interpolation:
     @classmethod
     def of(cls, phases: Sequence[Phase], first: Plane, second: Plane, tolerance: float) -> Interpolation:
         """For any of the phases and what lies between them; arguments as for `Expansion.of`."""
-        sampled = [_sampled(phase, first, second) for phase in phases]
-        finest = [max((axes[number] for axes, _ in sampled), key=lambda axis: len(axis.nodes)) for number in range(4)]
-        kernels = [_kernel(phase, finest) for phase in phases]
-        left, values, _ = np.linalg.svd(np.concatenate(kernels, axis=1), full_matrices=False)
+        by_axis = zip(*(_axes(phase, first, second) for phase in phases), strict=True)
+        finest = [max(same, key=lambda axis: len(axis.nodes)) for same in by_axis]
+        kernels = np.concatenate([_kernel(phase, finest) for phase in phases], axis=1)
+        left, values, _ = np.linalg.svd(kernels, full_matrices=False)
         basis = left[:, : int(np.sum(values > tolerance * values[0]))]
         x, y = finest[:2]
         root = np.sqrt(np.outer(x.weights, y.weights)).reshape(-1, 1)
@@ -138,15 +135,14 @@ def _extent(samples: Real) -> tuple[float, float]:
     return float(samples[0] + samples[-1]) / 2, max(float(np.ptp(samples)) / 2, _POINT)
 
 
-def _sampled(phase: Phase, first: Plane, second: Plane) -> tuple[list[_Axis], Complex]:
-    """Axes (x, y, X, Y) with as many nodes as the phase needs, and the kernel at them."""
+def _axes(phase: Phase, first: Plane, second: Plane) -> list[_Axis]:
+    """Axes (x, y, X, Y) with as many nodes as the phase needs."""
     samples = [*first, *second]
     probes = np.linspace(-1, 1, _PROBES)
     places = [centre + half * probes for centre, half in map(_extent, samples)]
     seen = np.broadcast_to(phase(*np.meshgrid(*places, indexing="ij", sparse=True)), [_PROBES] * 4)
     slopes = np.gradient(seen, probes[1] - probes[0])
-    axes = [_Axis.of(axis, float(np.abs(slope).max())) for axis, slope in zip(samples, slopes, strict=True)]
-    return axes, _kernel(phase, axes)
+    return [_Axis.of(axis, float(np.abs(slope).max())) for axis, slope in zip(samples, slopes, strict=True)]
 
 
 def _kernel(phase: Phase, axes: list[_Axis]) -> Complex:

@@ -28,10 +28,10 @@ in twenty thousand clips."""
 _GRID_MARGIN = 1.04
 """Computed camera plane over the sensor, so that rotated and shifted pixels still look inside."""
 _COARSE = 2
-"""Pixels a sample at which light on the camera plane is computed before it is interpolated: the pipe's width lets
-through detail of 12 um, five pixels."""
+"""Pixels a sample at which light on the camera plane is computed before it is interpolated: cameras that are accepted
+(`check_camera`) have four or more pixels for each period of the field, and two of these samples would do."""
 _INTERPOLATION = ("kaiser", 9.0)
-"""Window of that interpolation: an error of a few parts in 100,000."""
+"""Window of that interpolation."""
 _WALK, _RIPPLE, _NOISE = 0, 1, 2
 """Independent random streams drawn from one seed; the last has one for each page."""
 

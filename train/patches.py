@@ -76,7 +76,7 @@ class Patches(Dataset[Page]):
 
     def _start(self, count: int, side: int) -> int:
         """Where a patch begins on an axis: drawn from beyond the page too, so that its edge is asked for as often."""
-        beyond = side - 2 * self._rim - 1
+        beyond = max(0, side - 2 * self._rim - 1)  # an axis shorter than that has one place
         drawn = int(torch.randint(-beyond, count - side + beyond + 1, ()))
         return min(max(drawn, 0), count - side) // self._step * self._step
 

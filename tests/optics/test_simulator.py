@@ -15,6 +15,7 @@ from optics.profile import PageLayout, Profile, load_profile
 from optics.registration.parameters import NAMES
 from optics.registration.twin import BRANCHES
 from optics.simulator import Simulator, TrueOptics, true_parameters
+from optics.waves import FourierLens
 from tests.optics.small import THICK, on_slm, perfect_device, random_phases, small_profile
 from train.twin import RayTwin, TorchTwin
 
@@ -261,6 +262,16 @@ class TestLight:
         profile, device = small_profile(), Device(homodyne=Homodyne(quadrature_gain=2.5))
         pair = Simulator(profile, device, levels=16, seed=1, steps=16).page(symbols(profile))
         assert (pair.quadrature == 255).mean() < 0.01
+
+    def test_light_between_the_computed_samples_is_what_the_lens_makes_there(self) -> None:
+        optics = TrueOptics(TALL, mishandled())
+        page_x, page_y = optics.page_axes_m
+        exit_field = optics.exit_field(on_slm(random_phases(TALL, 0), TALL))
+        x, y = optics.camera_axes_m
+        fine = FourierLens(optics.geometry, x, y, optics.channel.cells, second=True).to_plane(exit_field)
+        inside = np.ix_(np.abs(y) < np.ptp(page_y) / 2, np.abs(x) < np.ptp(page_x) / 2)
+        off = np.linalg.norm((optics.camera_field(exit_field) - fine)[inside]) / np.linalg.norm(fine[inside])
+        assert off < 1e-4
 
     def test_illumination_falls_off_and_aberrations_bend_the_phase_towards_the_corner(self) -> None:
         profile = small_profile()

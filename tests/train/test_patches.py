@@ -52,6 +52,16 @@ def test_small_pages_are_trained_on_whole(store: FeatureStore, mask: np.ndarray)
     assert wide[0][-1].shape == (30, 40)  # the shorter side is taken whole
 
 
+def test_a_page_of_few_rows_is_cut_along_its_columns_alone(store: FeatureStore, mask: np.ndarray) -> None:
+    rows = 9
+    low = FeatureStore.__new__(FeatureStore)
+    low.__dict__ |= store.__dict__ | {"_arrays": [array[..., :rows, :] for array in store._arrays]}
+    for index in range(6):
+        phases = Patches([low], mask[:rows], SIDE, rim=5)[index][-1]
+        assert phases.shape == (rows, SIDE)
+        assert torch.isfinite(phases).any()
+
+
 def test_patches_in_which_the_network_sees_no_symbol_whole_are_refused(store: FeatureStore, mask: np.ndarray) -> None:
     with pytest.raises(InvalidInputError, match="patch: got 10 symbols, wanted more than 10"):
         training_pages([store], mask, Hyperparameters(blocks=2, patch=10))
