@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils.data import Dataset
 
 from benchmarks.decoders_figure import MAP
@@ -27,6 +26,7 @@ from optics.recording_job import RecordingJob
 from optics.registration.calibrate import calibrate
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.known import known_pages
+from train.curves import Curve
 from train.decoder import LOCALIZERS
 from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
@@ -64,7 +64,6 @@ ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, ORACLE)
 CALIBRATED = 2
 HELD_OUT_SHARE = 0.05
 LAST_SHARE = 0.2
-CURVE_POINTS = 60
 LEVEL_PAGES = 4
 """Of each number of levels, and as many as are calibrated on: thirty thousand symbols on the bench device."""
 
@@ -306,11 +305,11 @@ class Bench:
         rates = achievable_rate(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
         by_symbol[~self.mask] = rates.reshape(len(truth), -1).mean(axis=0)
         np.save(folder / MAP, by_symbol)
-        validated = logged(folder, "val_air")
+        validated = trained.curves.get("val_air", [])
         return Outcome(
             kappa_scale=scale,
             validation_curve=validated,
-            training_curve=logged(folder, "train_air"),
+            training_curve=trained.curves.get("train_air", []),
             run=str(folder.relative_to(self.out.parent)),
             arm=name,
             size=size,
@@ -325,19 +324,7 @@ class Bench:
         )
 
 
-def logged(run: Path, name: str) -> list[tuple[int, float]]:
-    """A curve of a run as (step, value), the mean over every sixtieth of its steps; none of a run too short for it."""
-    events = EventAccumulator(str(run / "tensorboard"))
-    events.Reload()
-    known = name in events.Tags()["scalars"]
-    seen = [(event.step, event.value) for event in events.Scalars(name)] if known else []
-    if not seen:
-        return []
-    parts = np.array_split(np.array(sorted(seen)), min(len(seen), CURVE_POINTS))
-    return [(round(float(part[-1, 0])), float(part[:, 1].mean())) for part in parts]
-
-
-def gained_at_the_end(curve: Sequence[tuple[int, float]], steps: int) -> float:
+def gained_at_the_end(curve: Curve, steps: int) -> float:
     """What the best of the last fifth of a run's steps has over the best before, of a curve of (step, value)."""
     late = [value for step, value in curve if step > (1 - LAST_SHARE) * steps]
     early = [value for step, value in curve if step <= (1 - LAST_SHARE) * steps]
@@ -364,8 +351,8 @@ class Outcome:
     preparing_seconds: float
     training_seconds: float
     kappa_scale: float
-    training_curve: list[tuple[int, float]]
-    validation_curve: list[tuple[int, float]]
+    training_curve: Curve
+    validation_curve: Curve
     over_oracle: float | None = None
     by_levels: list[LevelFigures] = field(default_factory=list)
 

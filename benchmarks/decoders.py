@@ -7,7 +7,8 @@ Coherent, wave and oracle share network, steps and seeds; refined is coherent, a
 with less of everything. The oracle knows the simulated truth: geometry, cameras, reference; the signal's own power is
 taken off its frames; then the wave adjoint and the same network. None, mode and ray are the published decoders, with
 their own network and training. Image shift and piston of every page, held-out ones too, are found from all of its
-symbols, for each arm alike. Interrupted, it goes on where it was; all lies in --out.
+symbols, for each arm alike. Interrupted, it goes on where it was; all lies in --out. What was trained on the same light
+before and kept (--keep) is only measured again.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ import click
 
 from benchmarks.comparison import ARMS, HEADER, ORACLE, Bench, Outcome, recorded
 from benchmarks.decoders_figure import draw
+from benchmarks.kept import TRAINED, bring, keep
 from benchmarks.levels import LEVEL_HEADER
 from optics.device import Device, Sensor
 from optics.files import write_json
 from optics.profile import load_profile
-from train.fitting import (
-    Hyperparameters,
-)
+from train.fitting import Hyperparameters
+from train.provenance import provenance
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import published_choices
 from train.run import sole_writer
@@ -89,6 +90,14 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
     help="Judge confidences among so many levels too, on pages of their own; not of the published decoders.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=5000, show_default=True)
+@click.option(
+    "--trained",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=TRAINED,
+    show_default="those of this repository",
+    help="Folder of arms that are trained already.",
+)
+@click.option("--keep", "keeps", is_flag=True, help="Keep what is trained in that folder.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for features, runs, figures.json.")
 def main(
     profile_name: str,
@@ -104,6 +113,8 @@ def main(
     names: tuple[str, ...],
     levels: tuple[int, ...],
     seed: int,
+    trained: Path,
+    keeps: bool,
     out: Path,
 ) -> None:
     """Train every arm on the same pages, light by light, and print what it says of held-out ones."""
@@ -115,7 +126,10 @@ def main(
         profile = nominal.with_symbols_of(size_px)
         device = Device(sensor=Sensor(full_well_e=full_well)).with_settings([f"geometry.pipe_angle_deg={angle_deg}"])
         folder = out / f"{angle_deg:g}deg-{full_well:g}e-{size_px}px"
+        kept = trained / Path(profile_name).stem / folder.name
         with recorded(profile, device, pages, seed, folder) as recording:
+            if brought := bring(folder, kept):
+                click.echo(f"{folder.name}: trained before and only measured: {', '.join(brought)}", err=True)
             bench = Bench.of(recording, profile, device, folder, levels, seed)
             runs: list[Callable[[], Outcome]] = []
             for name in names:
@@ -130,6 +144,8 @@ def main(
             outcomes: list[Outcome] = []
             for run in runs:
                 outcomes = compared([*outcomes, run()])
+                if keeps:
+                    keep(folder, kept, provenance("python -m benchmarks.decoders", seed))
                 light = {
                     "angle_deg": angle_deg,
                     "angle_error_deg": bench.fitted.angle_deg(profile) - angle_deg,

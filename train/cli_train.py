@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import shlex
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +27,7 @@ from train.features import FeatureExtractor
 from train.fitting import Hyperparameters
 from train.localizers.coherent import BICUBIC, BILINEAR
 from train.material import Material
+from train.provenance import provenance
 from train.published.decoder import LENS_CHOICES
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import PublishedRecipe, published_choices
@@ -323,7 +321,7 @@ def train(
             seconds=trained.seconds,
             pages=(len(groups[0]), len(groups[1]), len(groups[2])),
             synthetic_pages=trained.synthetic_pages,
-            provenance={"command": shlex.join(["lightpage", *sys.argv[1:]]), "seed": seed, "commit": _commit()},
+            provenance=provenance("lightpage", seed),
         )
         run.save(out)
     _tell(run, out, json_path)
@@ -453,15 +451,3 @@ def _own_pilots(
 
 def _digest(parts: list[object]) -> str:
     return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()
-
-
-def _commit() -> str:
-    """The commit of this source tree, empty where it is not one."""
-    tree = Path(__file__).parent.parent
-    command = ["git", "-C", str(tree), "rev-parse", "--show-toplevel", "HEAD"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError:  # no git
-        return ""
-    toplevel, _, commit = done.stdout.strip().partition("\n")
-    return commit if done.returncode == 0 and Path(toplevel) == tree.resolve() else ""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, Generic, TypeVar
 
 import lightning as L
@@ -21,9 +24,12 @@ from scipy import optimize
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, RandomSampler
 
+from optics.errors import InvalidInputError
+from optics.files import replace_file, replace_text
 from optics.measures import achievable_rate
 from optics.pilots import Pilots, estimate_piston
 from optics.profile import Profile
+from train.curves import TENSORBOARD, Curve, curves_of, thinned
 from train.field import ROUNDS
 from train.localizers.coherent import BICUBIC, CoherentLocalizer
 from train.loss import von_mises_nll
@@ -33,6 +39,10 @@ from train.parts import turned
 CHECKPOINTS = "checkpoints"
 """Folder of a run's checkpoints."""
 _LAST = "last.ckpt"
+FITTED, FITTED_WEIGHTS = "fitted.json", "fitted.pt"
+"""Of a run whose training is finished: what it reached, and the weights. They are all that it needs from then on."""
+_KEPT_POINTS = 60
+"""Of each curve in what a finished training keeps."""
 LOOKS = 60
 """How often a run looks at its validation pages."""
 _REFINEMENT_STEPS = 0.25
@@ -234,11 +244,33 @@ class Fitted(Generic[M]):
         module: the best one, in float32.
         validation_air: its AIR on the validation pages, bits per data symbol.
         seconds: of training, all stretches of an interrupted run together.
+        curves: of `train.curves.CURVES`, thinned.
     """
 
     module: M
     validation_air: float
     seconds: float
+    curves: dict[str, Curve]
+
+    def save(self, run: Path) -> None:
+        """Keep it in the folder of its run, weights first: what is said to be finished is whole."""
+        replace_file(run / FITTED_WEIGHTS, partial(torch.save, self.module.state_dict()), "weights")
+        kept = {"validation_air": self.validation_air, "seconds": self.seconds, "curves": self.curves}
+        replace_text(run / FITTED, json.dumps(kept, indent=1) + "\n", "result of a training")
+
+
+def finished(run: Path, module: M) -> Fitted[M] | None:
+    """What an earlier call of `fit` made of the module of a run, None if it is not there."""
+    if not (run / FITTED).exists():
+        return None
+    try:
+        kept = json.loads((run / FITTED).read_text())
+        module.load_state_dict(torch.load(run / FITTED_WEIGHTS, map_location="cpu", weights_only=True))
+        curves: dict[str, Curve] = {name: [tuple(point) for point in curve] for name, curve in kept["curves"].items()}
+        return Fitted(module.float().eval(), kept["validation_air"], kept["seconds"], curves)
+    except (OSError, ValueError, TypeError, KeyError, RuntimeError, UnpicklingError) as error:
+        wanted = f"{FITTED} and {FITTED_WEIGHTS} of one training, or neither, to go on from its checkpoints"
+        raise InvalidInputError(f"run {run}", error, wanted) from None
 
 
 def fit_network(
@@ -307,7 +339,8 @@ def fit(
 ) -> Fitted[M]:
     """Train, or go on with, the module of a run, looking at its validation pages after every pass of `training`.
 
-    On several devices Lightning runs the program once for each; all of them return the same.
+    What a finished training made is kept in the folder and returned when it is asked for again. On several devices
+    Lightning runs the program once for each; all of them return the same.
 
     Raises KeyboardInterrupt after Ctrl-C, with the last checkpoint in place.
 
@@ -323,6 +356,8 @@ def fit(
         devices: how many GPUs, or processes where there is none; "auto" takes all GPUs, or one process.
         progress: whether to show a bar.
     """
+    if (before := finished(run, module)) is not None:
+        return before
     folder = run / CHECKPOINTS
     last = folder / _LAST
     best = ModelCheckpoint(folder, "best", monitor="val_air", mode="max")
@@ -332,7 +367,7 @@ def fit(
         trainer = L.Trainer(
             max_steps=steps,
             precision=precision,  # type: ignore[arg-type]
-            logger=TensorBoardLogger(str(run), name="", version="tensorboard"),
+            logger=TensorBoardLogger(str(run), name="", version=TENSORBOARD),
             callbacks=[*callbacks, best, timer, newest],
             devices=devices,
             enable_progress_bar=progress,
@@ -361,7 +396,11 @@ def fit(
         rates[path] = held_out_air(*decoded, module.pilot_mask, module.levels)
     chosen = max(rates, key=lambda path: rates[path])
     module.load_state_dict(_checkpoint(chosen)["state_dict"])
-    return Fitted(module, rates[chosen], timer.time_elapsed())
+    curves = {name: thinned(curve, _KEPT_POINTS) for name, curve in curves_of(run).items()}
+    fitted = Fitted(module, rates[chosen], timer.time_elapsed(), curves)
+    if trainer.is_global_zero:
+        fitted.save(run)
+    return fitted
 
 
 @contextmanager

@@ -11,8 +11,9 @@ import pytest
 from click.testing import CliRunner
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from benchmarks.comparison import gained_at_the_end, logged
+from benchmarks.comparison import gained_at_the_end
 from benchmarks.decoders import main
+from benchmarks.kept import bring
 from benchmarks.oracle import Oracle
 from optics.device import Device, Reference, Sensor
 from optics.recording import Recording
@@ -22,6 +23,7 @@ from optics.registration.calibration import Calibration
 from optics.registration.parameters import NAMES
 from optics.simulator import true_parameters
 from tests.optics.small import small_profile
+from train.curves import curves_of
 from train.features import FeatureExtractor, PageFeatures
 
 PROFILE = small_profile()
@@ -59,7 +61,7 @@ def test_the_gain_at_the_end_is_read_from_the_run(tmp_path: Path) -> None:
     for step, value in values:
         logger.log_metrics({"val_air": value}, step)
     logger.finalize("done")
-    curve = logged(tmp_path, "val_air")
+    curve = curves_of(tmp_path)["val_air"]
     assert curve == [(step, pytest.approx(value, abs=1e-5)) for step, value in values]
     assert gained_at_the_end(curve, 100) == pytest.approx(0.1, abs=1e-5)
 
@@ -73,7 +75,8 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     calibration_of(Device()).save(light / "calibration.toml")
     arguments = f"--profile {profile} --pages 12 --steps 20 --size 8x1x0"
     arguments += "".join(f" --arm {name}" for name in ("coherent", "refined", "oracle", "fast", "none"))
-    arguments += f" --published-channels 4 --published-steps 12 --levels 4 --out {out}"
+    arguments += f" --published-channels 4 --published-steps 12 --levels 4 --trained {tmp_path / 'kept'} --keep"
+    arguments += f" --out {out}"
     first = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert first.exit_code == 0, first.output
     assert "-0.6 degree, full well 32 e-, symbols of 4x4 pixels" in first.output
@@ -101,8 +104,25 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     assert "page/s" not in again.output
     outcomes = json.loads((out / "figures.json").read_text())["lights"][0]["outcomes"]
     for one, other in zip(outcomes, figures["outcomes"], strict=True):
-        # training is timed up to the last checkpoint, some moments before its end
-        assert 0 < one.pop("training_seconds") <= other.pop("training_seconds")
         assert one == other
+    # elsewhere, what was kept is measured and not trained
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / light.name).mkdir(parents=True)
+    calibration_of(Device()).save(elsewhere / light.name / "calibration.toml")
+    arguments = arguments.replace(f"--out {out}", f"--out {elsewhere}")
+    measured = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
+    assert "trained before and only measured: coherent/8x1x0-20, coherent/8x1x0-20/refinement-1" in measured.output
+    assert not list(elsewhere.rglob("checkpoints"))
+    outcomes = json.loads((elsewhere / "figures.json").read_text())["lights"][0]["outcomes"]
+    for one, other in zip(outcomes, figures["outcomes"], strict=True):
+        assert one["air"] == pytest.approx(other["air"], abs=0.01)  # large tensors are kept in half precision
+        assert one["validation_curve"] == other["validation_curve"]
+    made_by = json.loads(
+        (tmp_path / "kept" / "small" / light.name / "oracle" / "8x1x0-20" / "made_by.json").read_text()
+    )
+    assert made_by["seed"] == 5000
+    # pages of another seed are another light
+    (elsewhere / light.name / "begun.json").write_text("{}")
+    assert not bring(elsewhere / light.name, tmp_path / "kept" / "small" / light.name)
     with pytest.raises(click.BadParameter, match="96x2x0"):
         CliRunner().invoke(main, ["--size", "96", "--out", str(out)], standalone_mode=False, catch_exceptions=False)

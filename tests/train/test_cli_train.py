@@ -23,7 +23,8 @@ from optics.recording import Recording
 from optics.registration.calibration import load_calibration
 from tests.conftest import SMALL_PAGES
 from tests.optics.small import small_profile
-from train.cli_train import _commit, _own_pilots, train
+from train.cli_train import _own_pilots, train
+from train.provenance import provenance
 from train.run import begin, sole_writer
 
 SECONDS = 120
@@ -238,7 +239,7 @@ def test_checkpoints_of_unknown_origin_are_not_taken_up(tmp_path: Path) -> None:
 
 def test_without_git_there_is_no_commit_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
-    assert _commit() == ""
+    assert provenance("lightpage", 3)["commit"] == ""
 
 
 def test_a_second_training_in_the_same_folder_is_refused(device: list[str], tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ from optics.profile import Profile
 from optics.recording import FramePair
 from optics.registration.calibration import Calibration
 from optics.registration.table import symbol_centres
+from train.curves import Curve
 from train.twin import RayTwin, TorchTwin
 
 Real = NDArray[np.float64]
-Curve = list[tuple[int, float]]
 """Optimiser steps and values."""
 
 

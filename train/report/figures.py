@@ -17,8 +17,9 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from train.curves import Curve
 from train.published.rays import RayTracer
-from train.report.data import Curve, Golden, Real, ReportData
+from train.report.data import Golden, Real, ReportData
 from train.report.tables import number, signed
 
 _SIZE, _IMAGE_SIZE = (4.8, 3.5), (4.8, 3.9)

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils.data import Dataset
 
 from optics.errors import InvalidInputError, RecordingError
 from optics.measures import concentration_calibration, decide_with_confidence, measure, reliability, symbol_maps
 from optics.page import MAX_LEVELS, MIN_LEVELS
 from optics.recording import FramePair, Recording
+from train.curves import curves_of
 from train.feature_store import FeatureStore
 from train.features import PageState
 from train.fitting import DecoderTraining, Page, SymbolTraining, decode_pages, without_piston
@@ -25,11 +25,8 @@ from train.network import Refiner, SymbolUNet
 from train.published.localizers import RayLocalizer
 from train.published.recipe import published_decoder
 from train.published.training import FramePages, PublishedChoices, PublishedTraining
-from train.report.data import Curve, Golden, Rays, ReportData, how_long
+from train.report.data import Golden, Rays, ReportData, how_long
 from train.run import GOLDEN, REFERENCES, Run, load_arrays, load_decoder, load_run, load_weights
-
-TAGS = ("train_nll", "train_air", "val_air", "angle_deg")
-"""What training logs and a report draws; the angle is that of a decoder by rays."""
 
 _PHASE_TOLERANCE = 1e-2
 """Of a level: phases are kept in float32, which knows 2 pi to 1e-5 of 256 levels."""
@@ -71,7 +68,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
         maps=symbol_maps(mu, kappa, symbols, levels, ~mask),
         confidence_bins=reliability(confidence, decided == symbols),
         concentration_bins=concentration_calibration(mu, kappa, symbols, levels),
-        curves=curves_of(folder),
+        curves=curves_of(folder) or "There are no curves: the run has no TensorBoard files any more.",
         golden=Golden(FramePair(golden["in_phase"], golden["quadrature"]), phase[0]),
     )
 
@@ -155,18 +152,6 @@ def levels_of(phases: NDArray[np.floating]) -> int:
         if np.abs(turns * levels - np.rint(turns * levels)).max() < _PHASE_TOLERANCE:
             return levels
     raise InvalidInputError("phases of the validation pages", "no equal steps", f"at most {MAX_LEVELS} levels")
-
-
-def curves_of(folder: Path) -> dict[str, Curve] | str:
-    """What TensorBoard files of a run say, by tag; a sentence where there are none."""
-    logs = folder / "tensorboard"
-    if not any(logs.glob("events.*")):
-        return "There are no curves: the run has no TensorBoard files any more."
-    events = EventAccumulator(str(logs), size_guidance={"scalars": 0})
-    events.Reload()
-    tags = [tag for tag in TAGS if tag in events.Tags()["scalars"]]
-    # an interrupted run repeats the steps behind its last checkpoint; what came later holds
-    return {tag: sorted({e.step: float(e.value) for e in events.Scalars(tag)}.items()) for tag in tags}
 
 
 def _rays(run: Run, module: DecoderTraining[Any]) -> Rays:

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from optics.device import Device
 from optics.measures import expected_calibration_error, measure, symbol_maps
@@ -23,6 +22,7 @@ from optics.profile import Profile
 from optics.progress import Progress
 from optics.recording import Recording
 from optics.recording_job import RecordingJob
+from train.curves import curves_of
 from train.features import PageState
 from train.fitting import best_kappa_scale, decode_pages, seed_stretch, without_piston
 from train.published.recipe import published_choices, published_decoder
@@ -121,7 +121,7 @@ def trained(
         "own_mi_kB": own * data / 8000,
         "steps": choices.steps,
         **figures,
-        **_curves(work / "tensorboard"),
+        **_curves(work),
     }
 
 
@@ -180,17 +180,7 @@ def _over_pages(values: Sequence[NDArray[np.floating]], mask: NDArray[np.bool_])
     return np.where(mask, np.nan, np.mean(values, axis=0)).astype(np.float32)
 
 
-def _curves(folder: Path) -> dict[str, NDArray[np.float64]]:
-    events = EventAccumulator(str(folder))
-    events.Reload()
-    known = events.Tags()["scalars"]
-
-    def scalars(name: str) -> NDArray[np.float64]:
-        seen = [(event.step, event.value) for event in events.Scalars(name)] if name in known else []
-        return np.array(seen, dtype=np.float64).reshape(-1, 2)
-
-    return {
-        "training_curve": scalars("train_air"),
-        "validation_curve": scalars("val_air"),
-        "angles": scalars("angle_deg"),
-    }
+def _curves(work: Path) -> dict[str, NDArray[np.float64]]:
+    names = {"training_curve": "train_air", "validation_curve": "val_air", "angles": "angle_deg"}
+    curves = curves_of(work)
+    return {name: np.array(curves.get(tag, []), dtype=np.float64).reshape(-1, 2) for name, tag in names.items()}
