@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from benchmarks.decoders_figure import MAP
+from benchmarks.kept import CALIBRATION
 from benchmarks.levels import LevelFigures, level_figures
 from benchmarks.oracle import Oracle
 from optics.device import Device
@@ -122,7 +123,7 @@ class Bench:
             recording=recording,
             profile=profile,
             device=device,
-            fitted=calibrated(profile, recording, out / "calibration.toml"),
+            fitted=calibrated(profile, recording, out / CALIBRATION),
             out=out,
             training=range(CALIBRATED, last - 2 * held),
             validation=range(last - 2 * held, last - held),

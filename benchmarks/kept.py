@@ -1,4 +1,4 @@
-"""Trained arms that need not be trained again: some take hours, and their weights are small."""
+"""Calibrations and trained arms that need not be made again: some take hours, and they are small."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from train.fitting import CHECKPOINTS, FITTED, FITTED_WEIGHTS
 from train.run import BEGUN
 
 TRAINED = Path(__file__).parent / "trained"
+CALIBRATION = "calibration.toml"
 MADE_BY = "made_by.json"
 """Beside an arm's weights: command, seed and commit that made them."""
 _LARGE = 1000
@@ -22,7 +23,7 @@ _LARGE = 1000
 
 
 def bring(light: Path, kept: Path) -> list[str]:
-    """Copy what was trained on a light to where it would be trained again; what is there stays.
+    """Copy what was calibrated and trained on a light to where it would be made again; what is there stays.
 
     Args:
         light: folder of the light, with its recording.
@@ -33,6 +34,8 @@ def bring(light: Path, kept: Path) -> list[str]:
     """
     if _read(kept / BEGUN) != _read(light / BEGUN):
         return []
+    if (kept / CALIBRATION).exists() and not (light / CALIBRATION).exists():
+        shutil.copyfile(kept / CALIBRATION, light / CALIBRATION)
     brought = []
     for described in sorted(kept.rglob(FITTED)):
         run = described.parent.relative_to(kept)
@@ -47,7 +50,7 @@ def bring(light: Path, kept: Path) -> list[str]:
 
 
 def keep(light: Path, kept: Path, provenance: dict[str, Any]) -> None:
-    """Copy everything that is trained of a light, large tensors in half precision; what is kept already stays.
+    """Copy calibration and trained arms of a light, large tensors in half precision; what is kept already stays.
 
     Args:
         light: folder of the light, with its recording.
@@ -56,6 +59,8 @@ def keep(light: Path, kept: Path, provenance: dict[str, Any]) -> None:
     """
     kept.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(light / BEGUN, kept / BEGUN)
+    if not (kept / CALIBRATION).exists():
+        shutil.copyfile(light / CALIBRATION, kept / CALIBRATION)
     for described in sorted(light.rglob(FITTED)):
         run = described.parent.relative_to(light)
         if (kept / run / FITTED).exists():

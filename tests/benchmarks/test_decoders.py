@@ -107,8 +107,6 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
         assert one == other
     # elsewhere, what was kept is measured and not trained
     elsewhere = tmp_path / "elsewhere"
-    (elsewhere / light.name).mkdir(parents=True)
-    calibration_of(Device()).save(elsewhere / light.name / "calibration.toml")
     arguments = arguments.replace(f"--out {out}", f"--out {elsewhere}")
     measured = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert "trained before and only measured: coherent/8x1x0-20, coherent/8x1x0-20/refinement-1" in measured.output
