@@ -34,6 +34,13 @@ _RESULTS = "results"
     show_default=True,
     help="Of the steps that the authors trained for, where a study trains: the whole takes hours for each case.",
 )
+@click.option(
+    "--channels",
+    type=click.IntRange(4, 256),
+    default=Settings.channels,
+    show_default=True,
+    help="Of the published network at sample pitch, where a study trains: half as many take a quarter of the time.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--json", "json_path", type=OutputFile(), help="Write settings and table to this file too.")
 def study(
@@ -43,6 +50,7 @@ def study(
     quick: bool,
     full: bool,
     share: float,
+    channels: int,
     seed: int,
     json_path: Path | None,
 ) -> None:
@@ -54,9 +62,12 @@ def study(
         raise InvalidInputError(f"study {name} --full", "no CUDA device", "one: it trains networks at full scale")
     if share < 1 and not chosen.trains:
         raise InvalidInputError(f"study {name} --share", f"{share:g} of a study that trains nothing", "no --share")
+    if channels != Settings.channels and (quick or not chosen.trains):
+        got = f"{channels} {'with --quick' if chosen.trains else 'of a study that trains nothing'}"
+        raise InvalidInputError(f"study {name} --channels", got, "no --channels")
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
-    settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed, share)
+    settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed, share, channels)
     context.with_resource(sole_writer(out))
     begin(out, {"study": name, **settings.key()})
     results_folder = out / _RESULTS
@@ -78,6 +89,7 @@ def study(
     figure = chosen.plot(settings, cases, results)
     replace_file(out / "figure.png", lambda file: figure.savefig(file, format="png", dpi=110), "picture of the study")
     how = "" if share == 1 else f"; {share:.0%} of the authors' steps"
+    how += "" if channels == Settings.channels else f"; network of {channels}/{2 * channels} channels"
     replace_text(out / "table.txt", f"{chosen.title} ({chosen.source}){how}\n\n{table}\n", "table of the study")
     figures = {
         "study": name,

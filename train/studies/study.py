@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from optics.files import replace_file, replace_text
 from optics.profile import Profile
 from optics.progress import Progress
+from train.published.training import PublishedChoices
 
 Case = Mapping[str, Any]
 """What is varied, by name; `name` tells it from the others and names its files."""
@@ -31,12 +32,14 @@ class Settings:
         quick: as few and as small cases as show that it works; their figures say little.
         seed: of everything random.
         share: of the authors' steps that networks are trained for.
+        channels: of the published network at sample pitch, twice as many below; the authors' if left out.
     """
 
     profile: Profile
     quick: bool = False
     seed: int = 0
     share: float = 1.0
+    channels: int = PublishedChoices.channels[0]
 
     def key(self) -> dict[str, Any]:
         """The settings as JSON keeps them."""

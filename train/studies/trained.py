@@ -91,7 +91,8 @@ def trained(
         job.run(pages)
     held = max(2, round(_HELD_SHARE * pages))
     first, second = pages - 2 * held, pages - held
-    choices = replace(published_choices(profile, first), seed=settings.seed, classes=classes)
+    widths = settings.channels, 2 * settings.channels
+    choices = replace(published_choices(profile, first), channels=widths, seed=settings.seed, classes=classes)
     if settings.quick:
         choices = replace(choices, **_QUICK)  # type: ignore[arg-type]
     choices = replace(choices, steps=max(1, round(settings.share * choices.steps)))

@@ -66,6 +66,10 @@ def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
         run("rays", "--full", "--profile", "bench", "--out", str(tmp_path / "out"))
     with pytest.raises(InvalidInputError, match=r"--share.*trains nothing"):
         run("rays", "--share", "0.5", "--out", str(tmp_path / "out"))
+    with pytest.raises(InvalidInputError, match=r"--channels.*trains nothing"):
+        run("rays", "--channels", "16", "--out", str(tmp_path / "out"))
+    with pytest.raises(InvalidInputError, match=r"--channels.*with --quick"):
+        run("angle", "--quick", "--channels", "16", "--out", str(tmp_path / "out"))
 
 
 def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) -> None:
