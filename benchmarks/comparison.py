@@ -44,6 +44,7 @@ from train.fitting import (
     seed_stretch,
     without_piston,
 )
+from train.known_light import known_light
 from train.localizers.coherent import BILINEAR
 from train.patches import training_pages
 from train.published.localizers import NAMES as PUBLISHED
@@ -169,8 +170,8 @@ class Bench:
             outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing)
             return replace(outcome, by_levels=self.at_levels(name, folder, [first], outcome.kappa_scale))
         extractor = self.extractor("coherent")
-        known = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
-        prediction = fit_prediction(extractor, self.profile, self.fitted.vector, known)
+        known = known_light(extractor, known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES]))
+        prediction = fit_prediction(self.profile, self.fitted.vector, known)
         counts = len(self.training), len(self.validation)
         material = RefinementPages(self.recording, self.pages, *counts, features)
         key = self.fitted.to_toml()

@@ -17,15 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from optics.grid import symbol_samples
 from optics.profile import Profile
 from optics.recording import Recording
-from optics.registration.calibrate import KnownPage
-from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
+from optics.registration.fitted_waves import illumination_terms
 from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
 from train.field import FieldRecovery, Measured
 from train.fitting import Fitted, Hyperparameters, SymbolTraining, fit_network
+from train.known_light import KnownLight, illuminated
 from train.localizers.wave import by_symbol
 from train.network import Refiner
 from train.parts import conjugate, multiply, parts, stacked, turned
@@ -106,38 +105,26 @@ def expected_phasors(p: Tensor) -> Tensor:
     return p / (0.5 + torch.sqrt(p.square().sum(0, keepdim=True) + 2.25))
 
 
-def fit_prediction(
-    extractor: FeatureExtractor, profile: Profile, parameters: Real, known: Sequence[KnownPage]
-) -> Prediction:
+def fit_prediction(profile: Profile, parameters: Real, known: Sequence[KnownLight]) -> Prediction:
     """The prediction of a device, illumination and floor as known pages show them.
 
     Args:
-        extractor: of that device.
         profile, parameters: the device.
         known: pages.
     """
-    prediction, samples = Prediction(profile, parameters), symbol_samples(profile)
-    waves = FittedWaves(profile, parameters, samples, filled=True)
-    terms = illumination_terms(waves.x, waves.y)
-    coefficients, squares, lengths = [], [], []
-    for shown_page in known:
-        pair, written = shown_page.pair, np.angle(shown_page.symbols)
-        state = extractor.state(extractor.field(pair), written, np.zeros(2))
-        with torch.no_grad():
-            measured, solved = extractor.look(pair, state.shift_px)
-        lit, field = measured.lit.numpy().astype(bool), solved[0].numpy() + 1j * solved[1].numpy()
-        page = on_modulator(written, samples)
-        shown = np.stack([waves.to_camera(page * term) for term in terms], axis=-1)
-        factors = np.linalg.lstsq(shown[lit], field[lit], rcond=None)[0]
-        coefficients.append(factors / factors[0])
-        e = stacked(shown @ factors) / measured.amplitude
+    prediction = Prediction(profile, parameters)
+    explained = illuminated(profile, parameters, known)
+    squares, lengths = [], []
+    for light, found in zip(known, explained, strict=True):
+        measured, seen = light.measured, light.seen
+        e = stacked(found.expected) / measured.amplitude
         for left, arm in zip(measured.left(e), (1.0, complex(measured.cos, measured.sin)), strict=True):
-            squares.append(left.numpy()[lit] ** 2)
-            lengths.append(np.abs(arm + e[0].numpy() + 1j * e[1].numpy())[lit] ** 2)
+            squares.append(left.numpy()[seen] ** 2)
+            lengths.append(np.abs(arm + e[0].numpy() + 1j * e[1].numpy())[seen] ** 2)
     # an equation's variance is that of a photon count times (|arm + e|^2 + floor)
     by_light, constant = np.polyfit(np.concatenate(lengths), np.concatenate(squares), 1)
     floor = constant / by_light if by_light > 0 else np.inf
-    prediction.illumination.copy_(stacked(np.mean(coefficients, axis=0)))
+    prediction.illumination.copy_(stacked(np.mean([found.factors for found in explained], axis=0)))
     prediction.floor.fill_(float(np.clip(floor, *_FLOORS)))
     return prediction
 

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from optics.errors import InvalidInputError
 from optics.grid import symbol_samples
 from optics.profile import Profile
-from optics.registration.calibrate import KnownPage
 from optics.registration.known import known_pages
 from train.decoder import WAVE
 from train.feature_store import FeatureStore, fill
 from train.fitting import Fitted, Hyperparameters, SymbolTraining, best_kappa_scale, fit_network
+from train.known_light import KnownLight, known_light
 from train.material import Material, Trained
 from train.network import SymbolUNet
 from train.patches import training_pages
@@ -118,7 +118,7 @@ class SymbolRecipe:
     ) -> Refined:
         """Trained refinements, which add what they have learnt to the weights."""
         device = material.profile, material.calibration.vector
-        prediction = fit_prediction(material.extractor, *device, self._likeness_pages(material))
+        prediction = fit_prediction(*device, self._known_light(material))
         refined = fit_refinements(
             material.out,
             self.choices,
@@ -157,21 +157,17 @@ class SymbolRecipe:
         return load_decoder(self.start, run).network
 
     @staticmethod
-    def _likeness_pages(material: Material) -> list[KnownPage]:
+    def _known_light(material: Material) -> list[KnownLight]:
         """Recorded pages that the wave model is compared with."""
-        return known_pages(material.recording, material.profile, material.training[:LIKENESS_PAGES])
+        pages = known_pages(material.recording, material.profile, material.training[:LIKENESS_PAGES])
+        return known_light(material.extractor, pages)
 
     def _synthetic(self, material: Material) -> list[Path]:
         """Folder with the features of synthetic pages; none where the wave model is not like the device."""
         if self.synthetic_pages == 0:
             return []
         profile, vector, seed = material.profile, material.calibration.vector, self.choices.seed
-        known = self._likeness_pages(material)
-        phases = [np.angle(page.symbols) for page in known]
-        fields = [
-            material.extractor.known_field(page.pair, written) for page, written in zip(known, phases, strict=True)
-        ]
-        like = likeness(profile, vector, fields, phases)
+        like = likeness(profile, vector, self._known_light(material))
         if like.noise > MOST_NOISE:
             click.echo(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
             return []

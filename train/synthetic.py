@@ -21,6 +21,7 @@ from optics.registration.fitted_waves import FittedWaves, illumination_terms, on
 from optics.registration.parameters import NAMES
 from optics.registration.table import sampling_table
 from train.features import PageFeatures, PageState, demodulate, localized
+from train.known_light import KnownLight, illuminated
 from train.localizers.coherent import CoherentLocalizer
 from train.localizers.wave import WaveLocalizer
 from train.twin import RayTwin, TorchTwin
@@ -73,26 +74,21 @@ class Likeness:
     seen: NDArray[np.bool_]
 
 
-def likeness(profile: Profile, parameters: Real, fields: Sequence[Complex], phases: Sequence[Real]) -> Likeness:
-    """Compare recorded fields with the fitted wave model of what was written, by least squares.
+def likeness(profile: Profile, parameters: Real, known: Sequence[KnownLight]) -> Likeness:
+    """Compare known pages with what the fitted wave model says of them.
 
     Args:
         profile: the nominal device.
         parameters: [P] fitted.
-        fields: recovered fields [Gy, Gx] of known pages, image shift taken off.
-        phases: what was written, [ny, nx] radians, one a field.
+        known: pages.
     """
-    waves = FittedWaves(profile, parameters, symbol_samples(profile), filled=True)
-    seen = _seen(profile, parameters)
-    found, left = [], []
-    for field, written in zip(fields, phases, strict=True):
-        page = on_modulator(written, symbol_samples(profile))
-        shown = np.stack([waves.to_camera(page * term)[seen] for term in illumination_terms(waves.x, waves.y)], axis=1)
-        light = field[seen]
-        factors = np.linalg.lstsq(shown, light, rcond=None)[0]
-        found.append(factors / factors[0])
-        left.append(float(np.mean(np.abs(light - shown @ factors) ** 2) / np.mean(np.abs(light) ** 2)))
-    return Likeness(np.mean(found, axis=0), float(np.mean(left)), seen)
+    explained = illuminated(profile, parameters, known)
+    left = [
+        np.mean(np.abs(light.field - found.expected)[light.seen] ** 2) / np.mean(np.abs(light.field[light.seen]) ** 2)
+        for light, found in zip(known, explained, strict=True)
+    ]
+    seen = np.all([light.seen for light in known], axis=0)
+    return Likeness(np.mean([found.factors for found in explained], axis=0), float(np.mean(left)), seen)
 
 
 class SyntheticPages:
@@ -154,12 +150,3 @@ class SyntheticPages:
             self._like.noise * np.mean(np.abs(field[self._like.seen]) ** 2) / np.sum(np.mean(noise**2, axis=(1, 2)))
         )
         return np.asarray(level * (noise[0] + 1j * noise[1]))
-
-
-def _seen(profile: Profile, parameters: Real) -> NDArray[np.bool_]:
-    """Where both cameras look at the common grid."""
-    grid = field_grid(profile)
-    places = np.stack(np.meshgrid(grid.x_m, grid.y_m), axis=-1).reshape(-1, 2)
-    pixels = TorchTwin(RayTwin(profile)).pixels(parameters, places)
-    last = np.array([profile.camera.columns_px - 1, profile.camera.rows_px - 1])
-    return np.asarray(np.all((pixels >= 0) & (pixels <= last), axis=(0, 2)).reshape(grid.shape))

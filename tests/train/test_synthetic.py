@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -9,10 +10,12 @@ import pytest
 
 from optics.device import Device, SlmDefects
 from optics.page import random_symbols, symbol_phases
+from optics.registration.calibrate import KnownPage
 from optics.registration.parameters import NAMES
 from optics.simulator import Simulator, true_parameters
 from tests.optics.small import small_profile
 from train.features import FeatureExtractor, PageFeatures
+from train.known_light import KnownLight, known_light
 from train.localizers.coherent import CoherentLocalizer
 from train.synthetic import MOST_NOISE, PAGES_PER_STATE, Likeness, SyntheticPages, likeness
 
@@ -24,21 +27,20 @@ TRUTH = true_parameters(PROFILE, DEVICE)
 
 
 @pytest.fixture(scope="module")
-def recorded() -> tuple[PageFeatures, np.ndarray, np.ndarray]:
-    """One recorded page: features, field and phases."""
+def recorded() -> tuple[PageFeatures, KnownLight]:
+    """One recorded page: features, and what was measured."""
     simulator = Simulator(PROFILE, DEVICE, seed=SEED)
     phases = symbol_phases(random_symbols(PROFILE, 256, 1, np.random.default_rng(SEED))[0], 256)
     pair = simulator.page(np.rint(phases / (2 * np.pi) * 256).astype(np.uint8))
     turn = DEVICE.homodyne.turn_rad
     extractor = FeatureExtractor(PROFILE, TRUTH, turn, simulator.references())
     features, _ = extractor.page(extractor.field(pair), phases, np.zeros(2))
-    return features, extractor.known_field(pair, phases), phases
+    return features, known_light(extractor, [KnownPage(pair, np.exp(1j * phases))])[0]
 
 
 @pytest.fixture(scope="module")
-def like(recorded: tuple[PageFeatures, np.ndarray, np.ndarray]) -> Likeness:
-    _, field, phases = recorded
-    return likeness(PROFILE, TRUTH, [field], [phases])
+def like(recorded: tuple[PageFeatures, KnownLight]) -> Likeness:
+    return likeness(PROFILE, TRUTH, [recorded[1]])
 
 
 def agreement(page: PageFeatures) -> float:
@@ -57,17 +59,17 @@ def test_the_fitted_waves_explain_the_recorded_light_and_its_fall_off(like: Like
 
 
 def test_other_symbols_explain_nothing_and_another_angle_less(
-    like: Likeness, recorded: tuple[PageFeatures, np.ndarray, np.ndarray]
+    like: Likeness, recorded: tuple[PageFeatures, KnownLight]
 ) -> None:
-    _, field, phases = recorded
-    assert likeness(PROFILE, TRUTH, [field], [phases[::-1]]).noise > MOST_NOISE
+    page = recorded[1]
+    assert likeness(PROFILE, TRUTH, [replace(page, phases=page.phases[::-1])]).noise > MOST_NOISE
     other = TRUTH.copy()
     other[NAMES.index("pipe_angle_rad")] += np.deg2rad(0.5)
-    assert likeness(PROFILE, other, [field], [phases]).noise > 3 * like.noise
+    assert likeness(PROFILE, other, [page]).noise > 3 * like.noise
 
 
 def test_synthetic_light_shows_its_symbols_as_the_recorded_light_does(
-    like: Likeness, recorded: tuple[PageFeatures, np.ndarray, np.ndarray]
+    like: Likeness, recorded: tuple[PageFeatures, KnownLight]
 ) -> None:
     pages = list(islice(SyntheticPages(PROFILE, TRUTH, like, CoherentLocalizer(PROFILE), SEED).pages(), 4))
     found = np.array([agreement(page) for page in pages])
