@@ -109,17 +109,17 @@ N = TypeVar("N", bound=nn.Module)
 class DecoderTraining(L.LightningModule, Generic[N]):
     """A decoder under the von Mises loss, validated by AIR.
 
+    Pages to train on have phases that are NaN where nothing is asked; pages to validate with have all of theirs.
+
     Args:
         network: pages without their phases to p [N, 2, ny, nx].
-        pilot_mask: bool [ny, nx]; pilots are no data: neither loss nor figure counts them.
+        pilot_mask: bool [ny, nx]; pilots are no data: no figure counts them.
         levels: M of the pages, which bounds their AIR.
     """
 
     def __init__(self, network: N, pilot_mask: NDArray[np.bool_], levels: int) -> None:
         super().__init__()
         self.network = network
-        self.data: Tensor
-        self.register_buffer("data", torch.from_numpy(~pilot_mask))
         self.pilot_mask, self.levels = pilot_mask, levels
         self._seen: list[tuple[Tensor, Tensor]] = []
 
@@ -128,10 +128,8 @@ class DecoderTraining(L.LightningModule, Generic[N]):
         return torch.as_tensor(self.network(*page))
 
     def loss(self, p: Tensor, phases: Tensor) -> Tensor:
-        """Mean over the data symbols, logged; those of a part of a page are the ones whose phases are finite."""
+        """Mean over the symbols that are asked for, logged."""
         asked = torch.isfinite(phases)
-        if phases.shape[-2:] == self.data.shape:
-            asked = asked & self.data
         loss = von_mises_nll(p, torch.where(asked, phases, 0.0))[asked].mean()
         self.log("train_nll", loss, prog_bar=True)
         self.log("train_air", air_of_nll(loss), prog_bar=True)
@@ -254,7 +252,7 @@ class Fitted(Generic[M]):
 
     def save(self, run: Path) -> None:
         """Keep it in the folder of its run, weights first: what is said to be finished is whole."""
-        replace_file(run / FITTED_WEIGHTS, partial(torch.save, self.module.state_dict()), "weights")
+        replace_file(run / FITTED_WEIGHTS, partial(torch.save, self.module.network.state_dict()), "weights")
         kept = {"validation_air": self.validation_air, "seconds": self.seconds, "curves": self.curves}
         replace_text(run / FITTED, json.dumps(kept, indent=1) + "\n", "result of a training")
 
@@ -265,7 +263,7 @@ def finished(run: Path, module: M) -> Fitted[M] | None:
         return None
     try:
         kept = json.loads((run / FITTED).read_text())
-        module.load_state_dict(torch.load(run / FITTED_WEIGHTS, map_location="cpu", weights_only=True))
+        module.network.load_state_dict(torch.load(run / FITTED_WEIGHTS, map_location="cpu", weights_only=True))
         curves: dict[str, Curve] = {name: [tuple(point) for point in curve] for name, curve in kept["curves"].items()}
         return Fitted(module.float().eval(), kept["validation_air"], kept["seconds"], curves)
     except (OSError, ValueError, TypeError, KeyError, RuntimeError, UnpicklingError) as error:

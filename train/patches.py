@@ -1,4 +1,4 @@
-"""Parts of large pages to train on: a step then sees symbols from more places and pages."""
+"""Pages to train on, and parts of large ones: a step then sees symbols from more places and pages."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import ConcatDataset, Dataset
+from torch.utils.data import Dataset
 
 from optics.errors import InvalidInputError
 from train.feature_store import FeatureStore
@@ -27,13 +27,11 @@ def training_pages(stores: Sequence[FeatureStore], mask: NDArray[np.bool_], choi
     Raises:
         InvalidInputError: patches in which the network would not see the neighbours of a single symbol.
     """
-    if max(mask.shape) <= choices.patch:
-        return ConcatDataset(stores)
     return Patches(stores, mask, choices.patch, reach(choices.blocks, choices.levels), 2**choices.levels)
 
 
 class Patches(Dataset[Page]):
-    """Patches of pages, at a place drawn anew each time.
+    """Patches of pages, at a place drawn anew each time; whole pages where they are no larger.
 
     An item is a page's as of `FeatureStore`, cut; its positions also hold column and row on the page (see
     `with_page_coordinates`), and phases that are not to be learnt from are NaN: pilots, and a rim.
@@ -51,7 +49,7 @@ class Patches(Dataset[Page]):
     def __init__(
         self, stores: Sequence[FeatureStore], mask: NDArray[np.bool_], side: int, rim: int, step: int = 1
     ) -> None:
-        if side <= 2 * rim:
+        if side < max(mask.shape) and side <= 2 * rim:
             raise InvalidInputError("patch", f"{side} symbols", f"more than {2 * rim}, twice what the network sees")
         self._rim, self._step = rim, step
         self._places = [(store, index) for store in stores for index in range(len(store))]
@@ -76,6 +74,8 @@ class Patches(Dataset[Page]):
 
     def _start(self, count: int, side: int) -> int:
         """Where a patch begins on an axis: drawn from beyond the page too, so that its edge is asked for as often."""
+        if side == count:
+            return 0
         beyond = max(0, side - 2 * self._rim - 1)  # an axis shorter than that has one place
         drawn = int(torch.randint(-beyond, count - side + beyond + 1, ()))
         return min(max(drawn, 0), count - side) // self._step * self._step

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import ConcatDataset
 
 from optics.errors import InvalidInputError
 from train.feature_store import FeatureStore, fill
 from train.features import PageFeatures, PageState
 from train.fitting import Hyperparameters, SymbolTraining
-from train.network import SymbolUNet
+from train.network import SymbolUNet, with_page_coordinates
 from train.patches import Patches, training_pages
 
 SHAPE = (30, 41)
@@ -46,9 +45,14 @@ def mask() -> np.ndarray:
 
 
 def test_small_pages_are_trained_on_whole(store: FeatureStore, mask: np.ndarray) -> None:
-    assert isinstance(training_pages([store], mask, Hyperparameters(patch=41)), ConcatDataset)
+    pages = training_pages([store, store], mask, Hyperparameters(patch=41))
+    assert len(pages) == 6  # type: ignore[arg-type]
+    light, positions, phases = store[1]
+    positions = with_page_coordinates(positions, SHAPE, (slice(None), slice(None)))
+    pilots = torch.from_numpy(mask)
+    for shown, whole in zip(pages[4], (light, positions, phases.masked_fill(pilots, torch.nan)), strict=True):
+        torch.testing.assert_close(shown, whole, rtol=0, atol=0, equal_nan=True)
     wide = training_pages([store], mask, Hyperparameters(patch=40))
-    assert isinstance(wide, Patches)
     assert wide[0][-1].shape == (30, 40)  # the shorter side is taken whole
 
 

@@ -27,6 +27,8 @@ WARM_UP = 0.02
 """Share of the steps over which learning rates rise."""
 DECAYS = (0.8, 0.9)
 """Shares of the steps at which the decoder's learning rate falls."""
+NOT_ASKED = -1
+"""Class of a symbol that is not asked for."""
 LARGEST_GRADIENT = 1.0
 """Norm of the decoder's gradient beyond which it is scaled down."""
 
@@ -91,6 +93,27 @@ class FramePages(Dataset[Page]):
         )
 
 
+class DataPages(Dataset[Page]):
+    """Pages whose pilots are not asked for: their phases are NaN.
+
+    Args:
+        pages: a list of them, all their phases known.
+        pilot_mask: bool [ny, nx].
+    """
+
+    def __init__(self, pages: Dataset[Page], pilot_mask: NDArray[np.bool_]) -> None:
+        self._pages, self._pilots = pages, torch.from_numpy(pilot_mask)
+
+    def __len__(self) -> int:
+        """Pages."""
+        return len(self._pages)  # type: ignore[arg-type]  # it has a length
+
+    def __getitem__(self, index: int) -> Page:
+        """One page."""
+        *shown, phases = self._pages[index]
+        return *shown, torch.where(self._pilots, torch.nan, phases)
+
+
 class PublishedTraining(DecoderTraining[PublishedDecoder]):
     """A published decoder, with Adam at three learning rates.
 
@@ -122,9 +145,11 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
         asked, scores = phases + state[:, 2, None, None], self.network.scores(frames, state[:, :2])
         if not self.choices.classes:
             return self.loss(scores, asked)
-        loss = functional.cross_entropy(scores.float(), nearest_class(asked, self.choices.classes), reduction="none")
-        self.log("train_air", math.log2(self.choices.classes) - loss.detach()[:, self.data].mean() / math.log(2))
-        return loss[:, self.data].mean()
+        loss = functional.cross_entropy(
+            scores.float(), nearest_class(asked, self.choices.classes), ignore_index=NOT_ASKED
+        )
+        self.log("train_air", math.log2(self.choices.classes) - loss.detach() / math.log(2))
+        return loss
 
     def configure_optimizers(self) -> Any:
         """Adam; all rates warm up, the decoder's falls towards the end."""
@@ -155,8 +180,12 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
 
 
 def nearest_class(phases: Tensor, classes: int) -> Tensor:
-    """The level nearest to each phase, int64; half a level is lost where a piston turns the phases between levels."""
-    return torch.round(phases * (classes / (2 * math.pi))).long() % classes
+    """The level nearest to each phase, int64, `NOT_ASKED` for NaN.
+
+    Half a level is lost where a piston turns the phases between levels.
+    """
+    nearest = torch.round(torch.nan_to_num(phases) * (classes / (2 * math.pi))).long() % classes
+    return torch.where(torch.isfinite(phases), nearest, NOT_ASKED)
 
 
 def fit_published(
@@ -174,7 +203,7 @@ def fit_published(
     return fit(
         run,
         module,
-        DataLoader(training, batch_size=choices.batch, shuffle=True),
+        DataLoader(DataPages(training, module.pilot_mask), batch_size=choices.batch, shuffle=True),
         validation,
         steps=choices.steps,
         precision=choices.precision,

@@ -10,7 +10,7 @@ import torch
 
 from tests.train.published.test_training import module
 from train.published.decoder import p_of_classes
-from train.published.training import PublishedChoices, nearest_class
+from train.published.training import NOT_ASKED, PublishedChoices, nearest_class
 
 LEVELS = 64
 
@@ -38,6 +38,7 @@ def test_no_belief_is_no_p_and_a_sure_one_is_finite() -> None:
 def test_the_nearest_class_goes_round() -> None:
     phases = torch.tensor([0.0, 2 * math.pi - 0.01, math.pi, -math.pi / 2])
     assert nearest_class(phases, 4).tolist() == [0, 0, 2, 3]
+    assert nearest_class(torch.tensor([math.nan]), 4).tolist() == [NOT_ASKED]
 
 
 def test_classes_are_learned_by_cross_entropy() -> None:
