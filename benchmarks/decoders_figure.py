@@ -9,9 +9,12 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from train.published.localizers import NAMES as PUBLISHED
+
 MAP = "air_map.npy"
 """File of an arm's run: AIR of each symbol, mean over the held-out pages, [ny, nx]."""
 _DOTS = 110
+_WIDTH_IN, _LIGHT_IN = 14.0, 5.2
 
 
 def draw(lights: list[dict[str, Any]], out: Path) -> None:
@@ -21,55 +24,61 @@ def draw(lights: list[dict[str, Any]], out: Path) -> None:
         lights: as `figures.json` holds them; each outcome's `run` is a folder below `out`, with its `MAP`.
         out: the comparison's folder.
     """
-    widest = max(len(light["outcomes"]) for light in lights)
-    figure = Figure(figsize=(8.0 + 2.1 * widest, 0.4 + 2.5 * len(lights)), layout="constrained")
+    figure = Figure(figsize=(_WIDTH_IN, _LIGHT_IN * len(lights)), layout="constrained")
     FigureCanvasAgg(figure)
-    rows = figure.subplots(len(lights), 2 + widest, squeeze=False, width_ratios=[2.2, 1.6, *[1] * widest])
-    for row, light in zip(rows, lights, strict=True):
-        for axis in row[2:]:
-            axis.set_axis_off()
+    for part, light in zip(figure.subfigures(len(lights), 1, squeeze=False)[:, 0], lights, strict=True):
         outcomes = light["outcomes"]
-        top = max(outcome["own_mi"] for outcome in outcomes)
-        _bars(row[0], light, outcomes)
-        _curves(row[1], outcomes, top)
-        for axis, outcome in zip(row[2:], outcomes, strict=False):
-            shown = axis.imshow(np.load(out / outcome["run"] / MAP), vmin=0, vmax=top, cmap="viridis")
-            axis.set_title(f"{outcome['arm']}: {outcome['air']:.2f}", fontsize=9)
-        figure.colorbar(shown, ax=row[2:], shrink=0.8, label="AIR, bit/symbol")
+        top = max(0.1, *(outcome["own_mi"] for outcome in outcomes))
+        size = light["symbol_size_px"]
+        part.suptitle(
+            f"{light['angle_deg']:g} degree, full well {light['full_well_e']:g} e-, symbols of {size}x{size} pixels"
+        )
+        charts, maps = part.subfigures(1, 2, width_ratios=[2, 3])
+        bars, curves = charts.subplots(2, 1)
+        _bars(bars, outcomes, top)
+        _curves(curves, outcomes, top)
+        _maps(maps, outcomes, top, out)
     figure.savefig(out / "figure.png", dpi=_DOTS, metadata={"Software": None})
 
 
-def _bars(axis: Any, light: dict[str, Any], outcomes: list[dict[str, Any]]) -> None:
-    """AIR of each arm, and, beyond it, what it claims."""
+def _bars(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
+    """AIR of each arm, and a mark where it claims to be."""
     places = np.arange(len(outcomes))[::-1]
-    air = [outcome["air"] for outcome in outcomes]
-    axis.barh(places, air, color="tab:blue", label="AIR")
-    axis.plot([outcome["own_mi"] for outcome in outcomes], places, "k|", markersize=14, label="claimed (own-MI)")
-    top = max(0.1, *(outcome["own_mi"] for outcome in outcomes))
+    axis.barh(places, [outcome["air"] for outcome in outcomes], color=[f"C{n % 10}" for n in range(len(outcomes))])
+    axis.plot([outcome["own_mi"] for outcome in outcomes], places, "k|", markersize=14)
     for place, outcome in zip(places, outcomes, strict=True):
         says = f"{outcome['air']:.2f} bit, {outcome['page_kB']:.2f} kB"
         axis.text(max(outcome["air"], outcome["own_mi"], 0) + 0.03 * top, place, says, va="center", fontsize=8)
-    axis.set_yticks(places, [outcome["arm"] for outcome in outcomes])
-    axis.set_xlim(0, 1.5 * top)
-    axis.set_xlabel("bit/symbol, held-out pages", fontsize=8)
-    axis.legend(fontsize=7, loc="lower right")
-    axis.set_title(
-        f"{light['angle_deg']:g} degree, {light['full_well_e']:g} e-, "
-        f"symbols of {light['symbol_size_px']}x{light['symbol_size_px']} pixels",
-        fontsize=9,
-    )
+    axis.set_yticks(places, [_name(outcome) for outcome in outcomes])
+    axis.set_xlim(0, 1.45 * top)
+    axis.set_xlabel("AIR of held-out pages, bit/symbol; black: what is claimed (own-MI)", fontsize=8)
 
 
 def _curves(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
     """How each arm learnt: AIR of the pages trained on, thin, and of those held out, thick, by share of its steps."""
     for number, outcome in enumerate(outcomes):
-        colour = f"C{number % 10}"
         for name, width in (("training_curve", 0.7), ("validation_curve", 1.8)):
             steps, rates = np.reshape(outcome[name], (-1, 2)).T
-            label = outcome["arm"] if name == "validation_curve" else None
-            axis.plot(steps / outcome["steps"], rates, color=colour, linewidth=width, label=label)
+            axis.plot(steps / outcome["steps"], rates, color=f"C{number % 10}", linewidth=width)
     axis.set_ylim(-0.2 * top, 1.15 * top)
-    axis.set_xlabel("share of its steps", fontsize=8)
+    axis.set_xlabel("share of its training steps", fontsize=8)
     axis.set_ylabel("AIR; thin: on training pages", fontsize=8)
-    axis.legend(fontsize=6)
     axis.grid(alpha=0.3)
+
+
+def _maps(part: Any, outcomes: list[dict[str, Any]], top: float, out: Path) -> None:
+    """Where on the page each arm reads how much."""
+    rows = 1 if len(outcomes) < 3 else 2
+    axes = part.subplots(rows, -(-len(outcomes) // rows), squeeze=False)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, outcome in zip(axes.flat, outcomes, strict=False):
+        shown = axis.imshow(np.load(out / outcome["run"] / MAP), vmin=0, vmax=top, cmap="viridis")
+        axis.set_title(f"{_name(outcome)}: {outcome['air']:.2f}", fontsize=9)
+    part.colorbar(shown, ax=axes, location="bottom", shrink=0.6, aspect=40, label="AIR of each symbol, bit")
+
+
+def _name(outcome: dict[str, Any]) -> str:
+    """An arm, without the number of its refinements if there is one; with whose it is."""
+    arm = str(outcome["arm"]).removesuffix(" 1")
+    return f"{arm} (published)" if arm in PUBLISHED else arm
