@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +19,14 @@ from optics.progress import percent_bar
 from optics.recording import Recording, hash_frames
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.known import known_pages
+from train.choices import chosen_recipe, with_choices
 from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording
-from train.decoder import LOCALIZERS, WAVE
+from train.decoder import LOCALIZERS
 from train.features import FeatureExtractor
 from train.fitting import Hyperparameters
-from train.localizers.coherent import BICUBIC, BILINEAR
 from train.material import Material
 from train.provenance import provenance
-from train.published.decoder import LENS_CHOICES
 from train.published.localizers import NAMES as PUBLISHED
-from train.published.recipe import PublishedRecipe, published_choices
-from train.published.training import PublishedChoices
 from train.run import (
     DESCRIPTION,
     GOLDEN,
@@ -45,15 +40,9 @@ from train.run import (
     save_weights,
     sole_writer,
 )
-from train.symbols import LIKENESS_PAGES, USUAL_REFINEMENTS, SymbolRecipe, default_synthetic_pages
+from train.symbols import LIKENESS_PAGES, SymbolRecipe
 
 _FEWEST_PAGES = 6
-
-
-def _default(name: str) -> str:
-    """How the help text of an option tells its default."""
-    value = getattr(Hyperparameters, name)
-    return f"[default: {value if isinstance(value, str) else format(value, 'g')}]"
 
 
 @click.command()
@@ -71,87 +60,6 @@ def _default(name: str) -> str:
 )
 @click.option("--calibration", "calibration_path", type=click.Path(path_type=Path), help="Made here if left out.")
 @click.option(
-    "--steps",
-    type=click.IntRange(min=10),
-    help="Optimiser steps: 300 for a first try, thousands for all that a device gives. "
-    f"{_default('steps')}; published: 50 passes over the pages, fewer for symbols larger than 4x4.",
-)
-@click.option(
-    "--batch",
-    type=click.IntRange(min=1),
-    help=f"Pages, or patches of large ones, a step. {_default('batch')}; published: 2.",
-)
-@click.option(
-    "--binning",
-    type=click.IntRange(min=1, max=2),
-    help="Camera pixels along each axis whose mean is sampled, instead of filtering frames first: 2 is quicker and "
-    f"less exact. {_default('binning')}; published: none to choose.",
-)
-@click.option(
-    "--samples",
-    type=click.IntRange(min=0, max=16),
-    help="Samples per symbol and axis that the coherent localizer reads; 0 takes as many as the field has. "
-    f"{_default('samples')}; published: none to choose.",
-)
-@click.option(
-    "--interpolation",
-    type=click.Choice([BICUBIC, BILINEAR]),
-    help=f"How it reads them off its grid: bilinear is quicker and less exact. {_default('interpolation')}; "
-    "published: none to choose.",
-)
-@click.option(
-    "--patch",
-    type=click.IntRange(min=16),
-    help="Larger pages are trained on in patches with so many symbols along an edge. "
-    f"{_default('patch')}; published: whole pages.",
-)
-@click.option(
-    "--channels",
-    type=click.IntRange(min=4),
-    help=f"Of the network. {_default('channels')}; published: 32, and twice as many below sample pitch.",
-)
-@click.option(
-    "--blocks",
-    type=click.IntRange(min=1),
-    help=f"Residual blocks of the network, at each of its levels. {_default('blocks')}; published: none to choose.",
-)
-@click.option(
-    "--levels",
-    type=click.IntRange(min=0, max=4),
-    help="Levels of the network below symbol pitch; 0 is the flat one. "
-    f"{_default('levels')}; published: none to choose.",
-)
-@click.option(
-    "--refinements",
-    type=click.IntRange(min=0, max=4),
-    help="How often the decoder looks again, for what the symbols decoded so far do not explain. "
-    f"[default: {USUAL_REFINEMENTS}]; published: none to choose.",
-)
-@click.option(
-    "--field-rounds",
-    type=click.IntRange(min=0, max=20),
-    help="Of descent to the field: fewer are faster, and lose most where the light is bright. "
-    f"{_default('field_rounds')}; published: none to choose.",
-)
-@click.option(
-    "--learning-rate",
-    type=float,
-    help=f"Peak of the one-cycle schedule, or that of the published network. {_default('learning_rate')}; published: "
-    f"{PublishedChoices.decoder_rate:g}.",
-)
-@click.option(
-    "--lenses",
-    type=click.Choice(LENS_CHOICES),
-    help=f"Lenses that the published rays are traced through. [default: {PublishedChoices.lenses}]",
-)
-@click.option(
-    "--precision",
-    type=click.Choice(["bf16-mixed", "16-mixed", "32-true"]),
-    default=Hyperparameters.precision,
-    show_default=True,
-    help="Of the network's arithmetic; bf16-mixed is fastest where the processor has it.",
-)
-@click.option(
     "--validation-share",
     type=click.FloatRange(0.01, 0.5),
     default=0.08,
@@ -159,20 +67,7 @@ def _default(name: str) -> str:
     help="Share of the pages that training is judged by.",
 )
 @click.option("--test-share", type=click.FloatRange(0, 0.5), default=0.08, show_default=True, help="Left for evaluate.")
-@click.option(
-    "--synthetic-pages",
-    type=click.IntRange(min=0),
-    help="Pages that the fitted device would show after drifts, trained on beside the recorded ones. "
-    f"[default: {default_synthetic_pages(load_profile('bench'))}, of larger ones fewer; published: none]",
-)
-@click.option("--start", type=click.Path(path_type=Path), help="Finished run whose weights this one begins with.")
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="Of initial weights, batches and rotations.",
-)
+@with_choices
 @click.option(
     "--devices",
     type=click.IntRange(min=1),
@@ -185,31 +80,13 @@ def train(
     localizer: str,
     out: Path,
     calibration_path: Path | None,
-    steps: int | None,
-    batch: int | None,
-    channels: int | None,
-    blocks: int | None,
-    levels: int | None,
-    refinements: int | None,
-    field_rounds: int | None,
-    patch: int | None,
-    binning: int | None,
-    samples: int | None,
-    interpolation: str | None,
-    learning_rate: float | None,
-    lenses: str | None,
-    precision: str,
     validation_share: float,
     test_share: float,
-    synthetic_pages: int | None,
-    start: Path | None,
-    seed: int,
     devices: int | None,
     json_path: Path | None,
+    **chosen: Any,
 ) -> None:
     """Train a decoder on known pages; the last pages of the recording stay unseen for `lightpage evaluate`."""
-    if learning_rate is not None and not (math.isfinite(learning_rate) and learning_rate > 0):
-        raise InvalidInputError("--learning-rate", learning_rate, "a positive number")
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
     profile = load_profile(profile_name)
@@ -220,40 +97,7 @@ def train(
         context.with_resource(sole_writer(out))
         hashes = _usable(recording)
         groups = _split(recording, list(hashes), validation_share, test_share)
-        chosen = {"steps": steps, "batch": batch, "seed": seed, "precision": precision}
-        recipe: SymbolRecipe | PublishedRecipe
-        if localizer in PUBLISHED:
-            recipe = _published(
-                localizer,
-                published_choices(profile, len(groups[0]), batch),
-                {**chosen, "channels": channels, "decoder_rate": learning_rate, "lenses": lenses},
-                {
-                    "--blocks": blocks,
-                    "--levels": levels,
-                    "--refinements": refinements,
-                    "--field-rounds": field_rounds,
-                    "--patch": patch,
-                    "--binning": binning,
-                    "--samples": samples,
-                    "--interpolation": interpolation,
-                    "--synthetic-pages": synthetic_pages,
-                    "--start": start,
-                },
-            )
-        else:
-            sizes = {"channels": channels, "blocks": blocks, "levels": levels, "refinements": refinements}
-            light = {
-                "field_rounds": field_rounds,
-                "binning": binning,
-                "samples": samples,
-                "interpolation": interpolation,
-            }
-            wanted = {**chosen, **sizes, **light, "patch": patch, "learning_rate": learning_rate}
-            refused: dict[str, object] = {"--lenses": lenses}
-            if localizer == WAVE:
-                refused |= {"--samples": samples, "--interpolation": interpolation}
-            recipe = _symbols(profile, localizer, wanted, synthetic_pages, start, refused)
-            recipe.check_start(profile)
+        recipe = chosen_recipe(localizer, profile, len(groups[0]), chosen)
         references = recording.references()
         options = {
             "--profile": profile.to_toml(),
@@ -321,45 +165,10 @@ def train(
             seconds=trained.seconds,
             pages=(len(groups[0]), len(groups[1]), len(groups[2])),
             synthetic_pages=trained.synthetic_pages,
-            provenance=provenance("lightpage", seed),
+            provenance=provenance("lightpage", recipe.choices.seed),
         )
         run.save(out)
     _tell(run, out, json_path)
-
-
-def _symbols(
-    profile: Profile,
-    localizer: str,
-    chosen: dict[str, Any],
-    synthetic_pages: int | None,
-    start: Path | None,
-    refused: dict[str, object],
-) -> SymbolRecipe:
-    """The way of training at symbol pitch; what was not chosen stays as it is by default."""
-    _check_absent(localizer, refused)
-    choices = replace(Hyperparameters(refinements=USUAL_REFINEMENTS), **_given(chosen))
-    count = default_synthetic_pages(profile) if synthetic_pages is None else synthetic_pages
-    return SymbolRecipe(localizer, choices, count, start)
-
-
-def _published(
-    localizer: str, defaults: PublishedChoices, chosen: dict[str, Any], refused: dict[str, object]
-) -> PublishedRecipe:
-    """The published way of training; what was not chosen stays as its authors had it."""
-    _check_absent(localizer, refused)
-    given = _given(chosen)
-    if "channels" in given:
-        given["channels"] = (given["channels"], 2 * given["channels"])
-    return PublishedRecipe(localizer, replace(defaults, **given))
-
-
-def _given(options: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}
-
-
-def _check_absent(localizer: str, options: dict[str, object]) -> None:
-    for name in _given(options):
-        raise InvalidInputError(name, options[name], f"no such option with --localizer {localizer}")
 
 
 def _tell(run: Run, folder: Path, json_path: Path | None) -> None:
