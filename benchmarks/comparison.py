@@ -9,12 +9,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from benchmarks.decoders_figure import MAP
-from benchmarks.kept import CALIBRATION
+from benchmarks.kept import CALIBRATION, Kept
 from benchmarks.levels import LevelFigures, level_figures
 from benchmarks.oracle import Oracle
 from optics.device import Device
@@ -44,7 +45,7 @@ from train.fitting import (
     seed_stretch,
     without_piston,
 )
-from train.known_light import known_light
+from train.known_light import explained
 from train.localizers.coherent import BILINEAR
 from train.patches import training_pages
 from train.published.localizers import NAMES as PUBLISHED
@@ -94,6 +95,7 @@ class Bench:
         training, validation, unseen: page numbers.
         levels: numbers of levels of further recordings, on which confidences are judged.
         seed: of the recording; theirs follow.
+        kept: of this light.
     """
 
     recording: Recording
@@ -106,6 +108,7 @@ class Bench:
     unseen: range
     levels: tuple[int, ...]
     seed: int
+    kept: Kept
 
     @classmethod
     def of(
@@ -113,24 +116,26 @@ class Bench:
         recording: Recording,
         profile: Profile,
         device: Device,
-        out: Path,
         levels: tuple[int, ...],
         seed: int,
+        kept: Kept,
     ) -> Bench:
         """Calibrated, and split into pages for training, for validation and for the figures."""
+        kept.bring_calibration()
         pages = recording.pages - CALIBRATED
         held, last = max(2, round(HELD_OUT_SHARE * pages)), recording.pages
         return cls(
             recording=recording,
             profile=profile,
             device=device,
-            fitted=calibrated(profile, recording, out / CALIBRATION),
-            out=out,
+            fitted=calibrated(profile, recording, kept.light / CALIBRATION),
+            out=kept.light,
             training=range(CALIBRATED, last - 2 * held),
             validation=range(last - 2 * held, last - held),
             unseen=range(last - held, last),
             levels=levels,
             seed=seed,
+            kept=kept,
         )
 
     @property
@@ -167,15 +172,18 @@ class Bench:
             choices = replace(choices, channels=channels, blocks=blocks, levels=levels)
         folder, features, first, preparing = self.first_look("coherent" if name == REFINED else name, size, choices)
         if name != REFINED:
+            self.kept.keep(folder)
             outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing)
             return replace(outcome, by_levels=self.at_levels(name, folder, [first], outcome.kappa_scale))
         extractor = self.extractor("coherent")
-        known = known_light(extractor, known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES]))
+        pages = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
+        known = explained(extractor, self.profile, self.fitted.vector, pages)
         prediction = fit_prediction(self.profile, self.fitted.vector, known)
         counts = len(self.training), len(self.validation)
         material = RefinementPages(self.recording, self.pages, *counts, features)
         key = self.fitted.to_toml()
         refined = fit_refinements(folder, choices, material, extractor, prediction, first, key, devices=1)
+        self.kept.keep(folder)
         at = folder / f"refinement-{choices.refinements}"
         held_out, preparing = self.held_out(at / "features"), refined.seconds - refined.last.seconds
         steps = choices.of_refinement().steps
@@ -272,11 +280,14 @@ class Bench:
         decoder = published_decoder(name, choices, self.profile, self.recording.references(), self.fitted.turn_rad)
         module = PublishedTraining(decoder, choices, self.mask, LEVELS)
         trained = fit_published(folder, module, training, validation, devices=1)
+        self.kept.keep(folder)
         return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing)
 
     def begun(self, folder: Path, options: dict[str, Any]) -> Path:
-        """The folder of a run that was begun with these options."""
+        """The folder of a run that was begun with these options; finished, if it was kept."""
         folder.mkdir(parents=True, exist_ok=True)
+        if self.kept.bring(folder, options):
+            click.echo(f"trained before: {folder.relative_to(self.out.parent)}", err=True)
         begin(folder, options)
         return folder
 

@@ -25,13 +25,12 @@ import click
 
 from benchmarks.comparison import ARMS, HEADER, ORACLE, Bench, Outcome, recorded
 from benchmarks.decoders_figure import draw
-from benchmarks.kept import TRAINED, bring, keep
+from benchmarks.kept import TRAINED, Kept
 from benchmarks.levels import LEVEL_HEADER
 from optics.device import Device, Sensor
 from optics.files import write_json
 from optics.profile import load_profile
 from train.fitting import Hyperparameters
-from train.provenance import provenance
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import published_choices
 from train.run import sole_writer
@@ -128,9 +127,7 @@ def main(
         folder = out / f"{angle_deg:g}deg-{full_well:g}e-{size_px}px"
         kept = trained / Path(profile_name).stem / folder.name
         with recorded(profile, device, pages, seed, folder) as recording:
-            if brought := bring(folder, kept):
-                click.echo(f"{folder.name}: trained before and only measured: {', '.join(brought)}", err=True)
-            bench = Bench.of(recording, profile, device, folder, levels, seed)
+            bench = Bench.of(recording, profile, device, levels, seed, Kept(folder, kept, keeps))
             runs: list[Callable[[], Outcome]] = []
             for name in names:
                 if name in PUBLISHED:
@@ -144,8 +141,6 @@ def main(
             outcomes: list[Outcome] = []
             for run in runs:
                 outcomes = compared([*outcomes, run()])
-                if keeps:
-                    keep(folder, kept, provenance("python -m benchmarks.decoders", seed))
                 light = {
                     "angle_deg": angle_deg,
                     "angle_error_deg": bench.fitted.angle_deg(profile) - angle_deg,

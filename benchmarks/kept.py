@@ -1,83 +1,129 @@
-"""Calibrations and trained arms that need not be made again: some take hours, and they are small."""
+"""Calibrations and trained arms that need not be made again: some take hours, and they are small.
+
+They lie in a folder for each light, which says in its `begun.json` what the light is, and there in a folder for each
+run, which says with which options it was begun.
+"""
 
 from __future__ import annotations
 
 import json
-import shutil
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from optics.files import replace_file, write_json
+from optics.errors import InvalidInputError
+from optics.files import replace_file
 from train.fitting import CHECKPOINTS, FITTED, FITTED_WEIGHTS
-from train.run import BEGUN
+from train.run import BEGUN, FORMAT
 
 TRAINED = Path(__file__).parent / "trained"
 CALIBRATION = "calibration.toml"
-MADE_BY = "made_by.json"
-"""Beside an arm's weights: command, seed and commit that made them."""
 _LARGE = 1000
 """Numbers of a tensor from which it is kept in half precision."""
 
 
-def bring(light: Path, kept: Path) -> list[str]:
-    """Copy what was calibrated and trained on a light to where it would be made again; what is there stays.
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of a light.
 
-    Args:
+    Attributes:
         light: folder of the light, with its recording.
-        kept: folder of the same light, as `keep` left it; nothing is taken if it was another one.
-
-    Returns:
-        The runs that were copied, below `light`.
+        folder: where it is kept, which need not be there.
+        adds: whether what is trained now is to be kept too.
     """
-    if _read(kept / BEGUN) != _read(light / BEGUN):
-        return []
-    if (kept / CALIBRATION).exists() and not (light / CALIBRATION).exists():
-        shutil.copyfile(kept / CALIBRATION, light / CALIBRATION)
-    brought = []
-    for described in sorted(kept.rglob(FITTED)):
-        run = described.parent.relative_to(kept)
-        if (light / run / FITTED).exists() or (light / run / CHECKPOINTS).exists():
-            continue
-        (light / run).mkdir(parents=True, exist_ok=True)
+
+    light: Path
+    folder: Path
+    adds: bool = False
+
+    @property
+    def is_of_this_light(self) -> bool:
+        """Whether something is kept, and of just this light: device, pages, seed and the code's format."""
+        return (self.folder / BEGUN).exists() and _read(self.folder / BEGUN) == _read(self.light / BEGUN)
+
+    def bring_calibration(self) -> None:
+        """Copy the calibration to where it would be made again; one that is there stays.
+
+        Raises:
+            InvalidInputError: things are to be kept, where something of another light is kept.
+        """
+        if self.adds and (self.folder / BEGUN).exists() and not self.is_of_this_light:
+            wanted = "device, pages and seed of what is kept there, or another --trained"
+            raise InvalidInputError(f"--keep in {self.folder}", "another light", wanted)
+        if self.is_of_this_light and not (self.light / CALIBRATION).exists():
+            _copy(self.folder / CALIBRATION, self.light / CALIBRATION)
+
+    def bring(self, run: Path, options: dict[str, Any]) -> bool:
+        """Copy a trained run, and what was trained on it, to where it would be trained again.
+
+        Nothing is taken where training has begun, or that was begun with other options or another calibration.
+
+        Args:
+            run: its folder below the light's.
+            options: with which it would be begun.
+
+        Returns:
+            Whether it was copied.
+        """
+        kept = self.folder / run.relative_to(self.light)
+        if (run / FITTED).exists() or (run / CHECKPOINTS).exists() or not (kept / FITTED).exists():
+            return False
+        if not self.is_of_this_light or _read(kept / BEGUN) != {"format": FORMAT, **options}:
+            return False
+        if (self.folder / CALIBRATION).read_text() != (self.light / CALIBRATION).read_text():
+            return False
+        # what says that a training is finished comes last
         for name in (BEGUN, FITTED_WEIGHTS, FITTED):
-            if (kept / run / name).exists():
-                shutil.copyfile(kept / run / name, light / run / name)
-        brought.append(str(run))
-    return brought
+            for path in sorted(kept.rglob(name)):
+                _copy(path, run / path.relative_to(kept))
+        return True
 
+    def keep(self, run: Path) -> None:
+        """Copy a trained run, and what was trained on it, large tensors in half precision, if that was wanted.
 
-def keep(light: Path, kept: Path, provenance: dict[str, Any]) -> None:
-    """Copy calibration and trained arms of a light, large tensors in half precision; what is kept already stays.
-
-    Args:
-        light: folder of the light, with its recording.
-        kept: folder that `bring` takes it from, made if missing.
-        provenance: of what is trained.
-    """
-    kept.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(light / BEGUN, kept / BEGUN)
-    if not (kept / CALIBRATION).exists():
-        shutil.copyfile(light / CALIBRATION, kept / CALIBRATION)
-    for described in sorted(light.rglob(FITTED)):
-        run = described.parent.relative_to(light)
-        if (kept / run / FITTED).exists():
-            continue
-        (kept / run).mkdir(parents=True, exist_ok=True)
-        if (light / run / BEGUN).exists():
-            shutil.copyfile(light / run / BEGUN, kept / run / BEGUN)
-        weights = torch.load(light / run / FITTED_WEIGHTS, map_location="cpu", weights_only=True)
-        halved = {name: value.half() if _is_large(value) else value for name, value in weights.items()}
-        replace_file(kept / run / FITTED_WEIGHTS, partial(torch.save, halved), "weights")
-        write_json(kept / run / MADE_BY, provenance)
-        shutil.copyfile(described, kept / run / FITTED)
+        Raises:
+            InvalidInputError: another light, another calibration, or another training with the same options is kept.
+        """
+        if not self.adds:
+            return
+        _copy_or_check(self.light / BEGUN, self.folder / BEGUN)
+        _copy_or_check(self.light / CALIBRATION, self.folder / CALIBRATION)
+        kept = self.folder / run.relative_to(self.light)
+        for path in sorted(run.rglob(FITTED), key=lambda path: len(path.parts)):
+            to = kept / path.parent.relative_to(run)
+            if not (to / FITTED).exists():
+                if (path.parent / BEGUN).exists():
+                    _copy(path.parent / BEGUN, to / BEGUN)
+                weights = torch.load(path.parent / FITTED_WEIGHTS, map_location="cpu", weights_only=True)
+                halved = {name: value.half() if _is_large(value) else value for name, value in weights.items()}
+                to.mkdir(parents=True, exist_ok=True)
+                replace_file(to / FITTED_WEIGHTS, partial(torch.save, halved), "weights")
+            _copy_or_check(path, to / FITTED)
 
 
 def _is_large(value: torch.Tensor) -> bool:
     return value.is_floating_point() and value.numel() >= _LARGE
 
 
+def _copy(path: Path, to: Path) -> None:
+    """Copy a small file, whole or not at all."""
+    to.parent.mkdir(parents=True, exist_ok=True)
+    content = path.read_bytes()
+    replace_file(to, lambda file: file.write(content))
+
+
+def _copy_or_check(path: Path, to: Path) -> None:
+    if not to.exists():
+        _copy(path, to)
+    elif to.read_bytes() != path.read_bytes():
+        raise InvalidInputError(f"--keep of {path}", f"another one in {to}", "the same one, or another --trained")
+
+
 def _read(path: Path) -> Any:
-    return json.loads(path.read_text()) if path.exists() else None
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"options {path}", error, "the JSON that was written when the work began") from None

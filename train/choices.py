@@ -173,16 +173,8 @@ def with_choices(command: C) -> C:
     return command
 
 
-def chosen_recipe(
-    localizer: str, profile: Profile, pages: int, options: Mapping[str, Any]
-) -> SymbolRecipe | PublishedRecipe:
-    """The way of training that was chosen; what was not stays as it is by default, or as its authors had it.
-
-    Args:
-        localizer: name.
-        profile: the nominal device.
-        pages: to train on.
-        options: of `CHOICES`, by name.
+def given_choices(localizer: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of `CHOICES` that were given, by name.
 
     Raises:
         InvalidInputError: an option that the localizer does not have, or one that cannot be.
@@ -194,6 +186,24 @@ def chosen_recipe(
     rate = given.get("learning_rate", 1.0)
     if not (math.isfinite(rate) and rate > 0):
         raise InvalidInputError("--learning-rate", rate, "a positive number")
+    return given
+
+
+def chosen_recipe(
+    localizer: str, profile: Profile, pages: int, given: dict[str, Any]
+) -> SymbolRecipe | PublishedRecipe:
+    """The way of training that was chosen; what was not stays as it is by default, or as its authors had it.
+
+    Args:
+        localizer: name.
+        profile: the nominal device.
+        pages: to train on.
+        given: see `given_choices`.
+
+    Raises:
+        InvalidInputError: a run to start from that is not finished, or of another size.
+    """
+    given = dict(given)
     if localizer in PUBLISHED:
         return _published(localizer, published_choices(profile, pages, given.pop("batch", None)), given)
     synthetic = given.pop("synthetic_pages", default_synthetic_pages(profile))

@@ -19,7 +19,7 @@ from optics.progress import percent_bar
 from optics.recording import Recording, hash_frames
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.known import known_pages
-from train.choices import chosen_recipe, with_choices
+from train.choices import chosen_recipe, given_choices, with_choices
 from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording
 from train.decoder import LOCALIZERS
 from train.features import FeatureExtractor
@@ -87,6 +87,7 @@ def train(
     **chosen: Any,
 ) -> None:
     """Train a decoder on known pages; the last pages of the recording stay unseen for `lightpage evaluate`."""
+    given = given_choices(localizer, chosen)
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
     profile = load_profile(profile_name)
@@ -97,7 +98,7 @@ def train(
         context.with_resource(sole_writer(out))
         hashes = _usable(recording)
         groups = _split(recording, list(hashes), validation_share, test_share)
-        recipe = chosen_recipe(localizer, profile, len(groups[0]), chosen)
+        recipe = chosen_recipe(localizer, profile, len(groups[0]), given)
         references = recording.references()
         options = {
             "--profile": profile.to_toml(),
@@ -165,7 +166,7 @@ def train(
             seconds=trained.seconds,
             pages=(len(groups[0]), len(groups[1]), len(groups[2])),
             synthetic_pages=trained.synthetic_pages,
-            provenance=provenance("lightpage", recipe.choices.seed),
+            provenance=provenance() | {"seed": recipe.choices.seed},
         )
         run.save(out)
     _tell(run, out, json_path)

@@ -35,12 +35,14 @@ from train.localizers.coherent import BICUBIC, CoherentLocalizer
 from train.loss import von_mises_nll
 from train.network import Refiner, SymbolUNet
 from train.parts import turned
+from train.provenance import provenance
 
 CHECKPOINTS = "checkpoints"
 """Folder of a run's checkpoints."""
 _LAST = "last.ckpt"
 FITTED, FITTED_WEIGHTS = "fitted.json", "fitted.pt"
-"""Of a run whose training is finished: what it reached, and the weights. They are all that it needs from then on."""
+"""Of a run whose training is finished: what it reached, and the weights. They stand in for its checkpoints."""
+_WANTED = f"{FITTED} and {FITTED_WEIGHTS} of one training, or neither, to train from the last checkpoint on"
 _KEPT_POINTS = 60
 """Of each curve in what a finished training keeps."""
 LOOKS = 60
@@ -242,7 +244,7 @@ class Fitted(Generic[M]):
         module: the best one, in float32.
         validation_air: its AIR on the validation pages, bits per data symbol.
         seconds: of training, all stretches of an interrupted run together.
-        curves: of `train.curves.CURVES`, thinned.
+        curves: of `train.curves.CURVES`, thinned; none in the processes of further devices.
     """
 
     module: M
@@ -253,22 +255,44 @@ class Fitted(Generic[M]):
     def save(self, run: Path) -> None:
         """Keep it in the folder of its run, weights first: what is said to be finished is whole."""
         replace_file(run / FITTED_WEIGHTS, partial(torch.save, self.module.network.state_dict()), "weights")
-        kept = {"validation_air": self.validation_air, "seconds": self.seconds, "curves": self.curves}
+        kept = {"validation_air": self.validation_air, "seconds": self.seconds, "made_by": provenance()}
+        kept["curves"] = self.curves
         replace_text(run / FITTED, json.dumps(kept, indent=1) + "\n", "result of a training")
 
 
 def finished(run: Path, module: M) -> Fitted[M] | None:
-    """What an earlier call of `fit` made of the module of a run, None if it is not there."""
+    """What an earlier call of `fit` made of the module of a run, None if it is not there.
+
+    Raises:
+        InvalidInputError: it is damaged, or of another module.
+    """
     if not (run / FITTED).exists():
         return None
+    kept = _kept(run)
+    try:
+        module.network.load_state_dict(torch.load(run / FITTED_WEIGHTS, map_location="cpu", weights_only=True))
+    except (OSError, RuntimeError, EOFError, UnpicklingError) as error:
+        raise InvalidInputError(f"finished training {run / FITTED_WEIGHTS}", error, _WANTED) from None
+    return Fitted(module.float().eval(), **kept)
+
+
+def fitted_curves(run: Path) -> dict[str, Curve]:
+    """The curves that a finished training kept, thinned; none of another run.
+
+    Raises:
+        InvalidInputError: what it kept is damaged.
+    """
+    return _kept(run)["curves"] if (run / FITTED).exists() else {}
+
+
+def _kept(run: Path) -> dict[str, Any]:
+    """What a finished training says of itself, as `Fitted` has it."""
     try:
         kept = json.loads((run / FITTED).read_text())
-        module.network.load_state_dict(torch.load(run / FITTED_WEIGHTS, map_location="cpu", weights_only=True))
-        curves: dict[str, Curve] = {name: [tuple(point) for point in curve] for name, curve in kept["curves"].items()}
-        return Fitted(module.float().eval(), kept["validation_air"], kept["seconds"], curves)
-    except (OSError, ValueError, TypeError, KeyError, RuntimeError, UnpicklingError) as error:
-        wanted = f"{FITTED} and {FITTED_WEIGHTS} of one training, or neither, to go on from its checkpoints"
-        raise InvalidInputError(f"run {run}", error, wanted) from None
+        curves = {str(name): [(int(step), float(value)) for step, value in c] for name, c in kept["curves"].items()}
+        return {"validation_air": float(kept["validation_air"]), "seconds": float(kept["seconds"]), "curves": curves}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise InvalidInputError(f"finished training {run / FITTED}", repr(error), _WANTED) from None
 
 
 def fit_network(
@@ -287,7 +311,8 @@ def fit_network(
     """Train, or go on with, the network of a run: see `fit`.
 
     Args:
-        run, training, validation, devices, progress: as for `fit`.
+        run, validation, devices, progress: as for `fit`.
+        training: pages whose phases are NaN where nothing is asked (`train.patches.training_pages`).
         hyperparameters: the run's choices.
         pilot_mask: bool [ny, nx].
         levels: M of the pages.
@@ -346,7 +371,7 @@ def fit(
         run: folder of the run; checkpoints and TensorBoard logs go there, and the last checkpoint is resumed from: the
             caller sees to it that it belongs to these pages and choices (`train.run.begin`).
         module: with its first weights.
-        training: batches of pages.
+        training: batches of pages whose phases are NaN where nothing is asked.
         validation: pages.
         steps: optimiser steps.
         precision: Lightning's.
@@ -394,9 +419,9 @@ def fit(
         rates[path] = held_out_air(*decoded, module.pilot_mask, module.levels)
     chosen = max(rates, key=lambda path: rates[path])
     module.load_state_dict(_checkpoint(chosen)["state_dict"])
-    curves = {name: thinned(curve, _KEPT_POINTS) for name, curve in curves_of(run).items()}
-    fitted = Fitted(module, rates[chosen], timer.time_elapsed(), curves)
+    fitted = Fitted(module, rates[chosen], timer.time_elapsed(), {})
     if trainer.is_global_zero:
+        fitted = replace(fitted, curves={name: thinned(curve, _KEPT_POINTS) for name, curve in curves_of(run).items()})
         fitted.save(run)
     return fitted
 

@@ -21,18 +21,20 @@ Complex = NDArray[np.complexfloating]
 
 
 @dataclass(frozen=True)
-class KnownLight:
-    """A known page as it was measured, its image shift taken off.
+class Explained:
+    """A known page as it was measured, its image shift taken off, and as the fitted waves explain it.
 
     Attributes:
-        phases: what was written, radians [ny, nx].
         measured: both equations of the field.
         field: that solves them, complex [Gy, Gx].
+        illumination: factors of `illumination_terms` over the first, complex [6], with which the waves explain most.
+        expected: what they say then, complex [Gy, Gx], of the field's strength and piston.
     """
 
-    phases: Real
     measured: Measured
     field: Complex
+    illumination: Complex
+    expected: Complex
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -40,47 +42,29 @@ class KnownLight:
         return self.measured.lit.numpy().astype(bool)
 
 
-def known_light(extractor: FeatureExtractor, pages: Sequence[KnownPage]) -> list[KnownLight]:
-    """Known pages as the calibrated device measured them."""
+def explained(
+    extractor: FeatureExtractor, profile: Profile, parameters: Real, pages: Sequence[KnownPage]
+) -> list[Explained]:
+    """Known pages as the calibrated device measured them and its fitted waves explain them, by least squares.
+
+    Args:
+        extractor: of the device.
+        profile: the nominal device.
+        parameters: [P] fitted.
+        pages: of the device.
+    """
+    samples = symbol_samples(profile)
+    waves = FittedWaves(profile, parameters, samples, filled=True)
+    terms = illumination_terms(waves.x, waves.y)
     found = []
     for page in pages:
         phases = np.angle(page.symbols)
         state = extractor.state(extractor.field(page.pair), phases, np.zeros(2))
         with torch.no_grad():
-            measured, field = extractor.look(page.pair, state.shift_px)
-        found.append(KnownLight(phases, measured, field[0].numpy() + 1j * field[1].numpy()))
+            measured, solved = extractor.look(page.pair, state.shift_px)
+        field, seen = solved[0].numpy() + 1j * solved[1].numpy(), measured.lit.numpy().astype(bool)
+        written = on_modulator(phases, samples)
+        shown = np.stack([waves.to_camera(written * term) for term in terms], axis=-1)
+        factors = np.linalg.lstsq(shown[seen], field[seen], rcond=None)[0]
+        found.append(Explained(measured, field, factors / factors[0], shown @ factors))
     return found
-
-
-@dataclass(frozen=True)
-class Illuminated:
-    """The light of a known page as the fitted waves explain it.
-
-    Attributes:
-        factors: of `illumination_terms`, over the first, complex [6].
-        expected: complex [Gy, Gx], of the measured field's strength and piston.
-    """
-
-    factors: Complex
-    expected: Complex
-
-
-def illuminated(profile: Profile, parameters: Real, pages: Sequence[KnownLight]) -> list[Illuminated]:
-    """The illumination under which the fitted waves show most of each known page's light, by least squares.
-
-    Args:
-        profile: the nominal device.
-        parameters: [P] fitted.
-        pages: as that device measured them.
-    """
-    samples = symbol_samples(profile)
-    waves = FittedWaves(profile, parameters, samples, filled=True)
-    return [_illuminated(waves, samples, light) for light in pages]
-
-
-def _illuminated(waves: FittedWaves, samples: int, light: KnownLight) -> Illuminated:
-    page = on_modulator(light.phases, samples)
-    terms = illumination_terms(waves.x, waves.y)
-    shown = np.stack([waves.to_camera(page * term) for term in terms], axis=-1)
-    factors = np.linalg.lstsq(shown[light.seen], light.field[light.seen], rcond=None)[0]
-    return Illuminated(factors / factors[0], shown @ factors)

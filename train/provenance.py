@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 
-def provenance(program: str, seed: int) -> dict[str, Any]:
-    """The command that is running, its seed, and the commit of this source tree, empty where it is not one.
+def provenance() -> dict[str, Any]:
+    """The command that is running, and the commit of this source tree, empty where it is not one."""
+    return {"command": f"{_program()} {shlex.join(sys.argv[1:])}".strip(), "commit": _commit()}
 
-    Args:
-        program: how a reader would start it.
-        seed: of everything random.
-    """
-    return {"command": shlex.join([*program.split(), *sys.argv[1:]]), "seed": seed, "commit": _commit()}
+
+def _program() -> str:
+    """How the running program was started."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    return f"python -m {spec.name}" if spec is not None else Path(sys.argv[0]).name
 
 
 def _commit() -> str:

@@ -24,7 +24,7 @@ from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
 from train.field import FieldRecovery, Measured
 from train.fitting import Fitted, Hyperparameters, SymbolTraining, fit_network
-from train.known_light import KnownLight, illuminated
+from train.known_light import Explained
 from train.localizers.wave import by_symbol
 from train.network import Refiner
 from train.parts import conjugate, multiply, parts, stacked, turned
@@ -105,7 +105,7 @@ def expected_phasors(p: Tensor) -> Tensor:
     return p / (0.5 + torch.sqrt(p.square().sum(0, keepdim=True) + 2.25))
 
 
-def fit_prediction(profile: Profile, parameters: Real, known: Sequence[KnownLight]) -> Prediction:
+def fit_prediction(profile: Profile, parameters: Real, known: Sequence[Explained]) -> Prediction:
     """The prediction of a device, illumination and floor as known pages show them.
 
     Args:
@@ -113,18 +113,17 @@ def fit_prediction(profile: Profile, parameters: Real, known: Sequence[KnownLigh
         known: pages.
     """
     prediction = Prediction(profile, parameters)
-    explained = illuminated(profile, parameters, known)
     squares, lengths = [], []
-    for light, found in zip(known, explained, strict=True):
+    for light in known:
         measured, seen = light.measured, light.seen
-        e = stacked(found.expected) / measured.amplitude
+        e = stacked(light.expected) / measured.amplitude
         for left, arm in zip(measured.left(e), (1.0, complex(measured.cos, measured.sin)), strict=True):
             squares.append(left.numpy()[seen] ** 2)
             lengths.append(np.abs(arm + e[0].numpy() + 1j * e[1].numpy())[seen] ** 2)
     # an equation's variance is that of a photon count times (|arm + e|^2 + floor)
     by_light, constant = np.polyfit(np.concatenate(lengths), np.concatenate(squares), 1)
     floor = constant / by_light if by_light > 0 else np.inf
-    prediction.illumination.copy_(stacked(np.mean([found.factors for found in explained], axis=0)))
+    prediction.illumination.copy_(stacked(np.mean([light.illumination for light in known], axis=0)))
     prediction.floor.fill_(float(np.clip(floor, *_FLOORS)))
     return prediction
 

@@ -24,7 +24,7 @@ from optics.files import replace_file, replace_text
 from optics.profile import Profile, parse_profile
 from optics.registration.calibration import Calibration, parse_calibration
 from train.decoder import SymbolDecoder
-from train.fitting import CHECKPOINTS, Hyperparameters
+from train.fitting import CHECKPOINTS, FITTED, Hyperparameters
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.training import PublishedChoices
 
@@ -35,7 +35,7 @@ REFERENCES = "references.npz"
 GOLDEN = "golden.npz"
 FORMAT = 5
 """Of what a run keeps while it is made: raised when features, network or checkpoints of an earlier version would not go
-together with those of this one."""
+together with those of this one, or when the simulator's pages change, or which of them the comparison trains on."""
 
 
 @dataclass(frozen=True)
@@ -141,9 +141,9 @@ def check_begun(folder: Path, options: dict[str, Any]) -> bool:
     try:
         kept = json.loads((folder / BEGUN).read_text())
     except (OSError, ValueError):
-        if (folder / CHECKPOINTS).exists():
+        if (folder / CHECKPOINTS).exists() or (folder / FITTED).exists():
             wanted = f"a run that says in {BEGUN} what it was begun with, or another --out"
-            raise InvalidInputError(f"run {folder}", "checkpoints of unknown origin", wanted) from None
+            raise InvalidInputError(f"run {folder}", "weights of unknown origin", wanted) from None
         return False
     for name, value in {"format": FORMAT, **options}.items():
         if kept.get(name) != value:

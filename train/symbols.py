@@ -16,7 +16,7 @@ from optics.registration.known import known_pages
 from train.decoder import WAVE
 from train.feature_store import FeatureStore, fill
 from train.fitting import Fitted, Hyperparameters, SymbolTraining, best_kappa_scale, fit_network
-from train.known_light import KnownLight, known_light
+from train.known_light import Explained, explained
 from train.material import Material, Trained
 from train.network import SymbolUNet
 from train.patches import training_pages
@@ -82,7 +82,8 @@ class SymbolRecipe:
             "recorded pages",
         )
         count = len(material.training)
-        stores = [FeatureStore(features, range(count)), *map(FeatureStore, self._synthetic(material))]
+        known_light = self._explained(material)
+        stores = [FeatureStore(features, range(count)), *map(FeatureStore, self._synthetic(material, known_light))]
         training = training_pages(stores, material.pilot_mask, self.choices)
         validation = FeatureStore(features, range(count, len(known)))
         fitted = fit_network(
@@ -102,6 +103,7 @@ class SymbolRecipe:
                 material,
                 RefinementPages(material.recording, known, count, len(material.validation), features),
                 fitted,
+                known_light,
                 weights,
             )
             seconds, last, validation = seconds + refined.seconds, refined.last, refined.validation
@@ -114,11 +116,15 @@ class SymbolRecipe:
         )
 
     def _refined(
-        self, material: Material, pages: RefinementPages, first: Fitted[SymbolTraining], weights: dict[str, Tensor]
+        self,
+        material: Material,
+        pages: RefinementPages,
+        first: Fitted[SymbolTraining],
+        known_light: list[Explained],
+        weights: dict[str, Tensor],
     ) -> Refined:
         """Trained refinements, which add what they have learnt to the weights."""
-        device = material.profile, material.calibration.vector
-        prediction = fit_prediction(*device, self._known_light(material))
+        prediction = fit_prediction(material.profile, material.calibration.vector, known_light)
         refined = fit_refinements(
             material.out,
             self.choices,
@@ -156,18 +162,19 @@ class SymbolRecipe:
             )
         return load_decoder(self.start, run).network
 
-    @staticmethod
-    def _known_light(material: Material) -> list[KnownLight]:
-        """Recorded pages that the wave model is compared with."""
+    def _explained(self, material: Material) -> list[Explained]:
+        """Recorded pages against the wave model; none where nothing is made of it."""
+        if not (self.synthetic_pages or self.choices.refinements):
+            return []
         pages = known_pages(material.recording, material.profile, material.training[:LIKENESS_PAGES])
-        return known_light(material.extractor, pages)
+        return explained(material.extractor, material.profile, material.calibration.vector, pages)
 
-    def _synthetic(self, material: Material) -> list[Path]:
+    def _synthetic(self, material: Material, known: list[Explained]) -> list[Path]:
         """Folder with the features of synthetic pages; none where the wave model is not like the device."""
         if self.synthetic_pages == 0:
             return []
         profile, vector, seed = material.profile, material.calibration.vector, self.choices.seed
-        like = likeness(profile, vector, self._known_light(material))
+        like = likeness(known)
         if like.noise > MOST_NOISE:
             click.echo(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
             return []

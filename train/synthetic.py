@@ -21,7 +21,7 @@ from optics.registration.fitted_waves import FittedWaves, illumination_terms, on
 from optics.registration.parameters import NAMES
 from optics.registration.table import sampling_table
 from train.features import PageFeatures, PageState, demodulate, localized
-from train.known_light import KnownLight, illuminated
+from train.known_light import Explained
 from train.localizers.coherent import CoherentLocalizer
 from train.localizers.wave import WaveLocalizer
 from train.twin import RayTwin, TorchTwin
@@ -74,21 +74,14 @@ class Likeness:
     seen: NDArray[np.bool_]
 
 
-def likeness(profile: Profile, parameters: Real, known: Sequence[KnownLight]) -> Likeness:
-    """Compare known pages with what the fitted wave model says of them.
-
-    Args:
-        profile: the nominal device.
-        parameters: [P] fitted.
-        known: pages.
-    """
-    explained = illuminated(profile, parameters, known)
+def likeness(known: Sequence[Explained]) -> Likeness:
+    """What known pages show over the fitted wave model, as means over them."""
     left = [
-        np.mean(np.abs(light.field - found.expected)[light.seen] ** 2) / np.mean(np.abs(light.field[light.seen]) ** 2)
-        for light, found in zip(known, explained, strict=True)
+        np.mean(np.abs(light.field - light.expected)[light.seen] ** 2) / np.mean(np.abs(light.field[light.seen]) ** 2)
+        for light in known
     ]
     seen = np.all([light.seen for light in known], axis=0)
-    return Likeness(np.mean([found.factors for found in explained], axis=0), float(np.mean(left)), seen)
+    return Likeness(np.mean([light.illumination for light in known], axis=0), float(np.mean(left)), seen)
 
 
 class SyntheticPages:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -13,9 +15,10 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from benchmarks.comparison import gained_at_the_end
 from benchmarks.decoders import main
-from benchmarks.kept import bring
+from benchmarks.kept import Kept
 from benchmarks.oracle import Oracle
 from optics.device import Device, Reference, Sensor
+from optics.errors import InvalidInputError
 from optics.recording import Recording
 from optics.recording_job import RecordingJob
 from optics.registration.calibrate import Registered
@@ -25,6 +28,7 @@ from optics.simulator import true_parameters
 from tests.optics.small import small_profile
 from train.curves import curves_of
 from train.features import FeatureExtractor, PageFeatures
+from train.fitting import FITTED
 
 PROFILE = small_profile()
 
@@ -109,18 +113,36 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     elsewhere = tmp_path / "elsewhere"
     arguments = arguments.replace(f"--out {out}", f"--out {elsewhere}")
     measured = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
-    assert "trained before and only measured: coherent/8x1x0-20, coherent/8x1x0-20/refinement-1" in measured.output
+    assert measured.output.count("trained before: ") == 4  # refined goes on from coherent
     assert not list(elsewhere.rglob("checkpoints"))
     outcomes = json.loads((elsewhere / "figures.json").read_text())["lights"][0]["outcomes"]
     for one, other in zip(outcomes, figures["outcomes"], strict=True):
         assert one["air"] == pytest.approx(other["air"], abs=0.01)  # large tensors are kept in half precision
         assert one["validation_curve"] == other["validation_curve"]
-    made_by = json.loads(
-        (tmp_path / "kept" / "small" / light.name / "oracle" / "8x1x0-20" / "made_by.json").read_text()
-    )
-    assert made_by["seed"] == 5000
-    # pages of another seed are another light
-    (elsewhere / light.name / "begun.json").write_text("{}")
-    assert not bring(elsewhere / light.name, tmp_path / "kept" / "small" / light.name)
+    kept = Kept(light, tmp_path / "kept" / "small" / light.name, adds=True)
+    assert "commit" in json.loads((kept.folder / "oracle" / "8x1x0-20" / FITTED).read_text())["made_by"]
+    assert kept.is_of_this_light
+    # only arms of this light, this calibration and these options are taken up
+    run = light / "oracle" / "8x1x0-20"
+    options = json.loads((run / "begun.json").read_text())
+    options.pop("format")
+    new = replace(kept, light=elsewhere / "new")
+    new.light.mkdir()
+    shutil.copyfile(light / "begun.json", new.light / "begun.json")
+    new.bring_calibration()
+    assert not new.bring(new.light / run.relative_to(light), options | {"steps": 30})
+    (new.light / "calibration.toml").write_text("another")
+    assert not new.bring(new.light / run.relative_to(light), options)
+    shutil.copyfile(light / "calibration.toml", new.light / "calibration.toml")
+    assert new.bring(new.light / run.relative_to(light), options)
+    assert not new.bring(new.light / run.relative_to(light), options)  # it is there
+    # and nothing of another light is mixed with them
+    (new.light / "begun.json").write_text("{}")
+    shutil.rmtree(new.light / run.relative_to(light))
+    assert not new.bring(new.light / run.relative_to(light), options)
+    with pytest.raises(InvalidInputError, match="another light"):
+        new.bring_calibration()
+    with pytest.raises(InvalidInputError, match="another one"):
+        new.keep(new.light / run.relative_to(light))
     with pytest.raises(click.BadParameter, match="96x2x0"):
         CliRunner().invoke(main, ["--size", "96", "--out", str(out)], standalone_mode=False, catch_exceptions=False)

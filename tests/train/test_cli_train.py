@@ -231,15 +231,16 @@ def test_shares_that_leave_nothing_to_train_on_are_named(device: list[str], tmp_
         run([*device, "--validation-share", "0.5", "--test-share", "0.5", "--out", str(tmp_path / "run")])
 
 
-def test_checkpoints_of_unknown_origin_are_not_taken_up(tmp_path: Path) -> None:
-    (tmp_path / "checkpoints").mkdir()
+@pytest.mark.parametrize("left", ["checkpoints", "fitted.json"])
+def test_weights_of_unknown_origin_are_not_taken_up(left: str, tmp_path: Path) -> None:
+    (tmp_path / left).mkdir()
     with pytest.raises(InvalidInputError, match="unknown origin"):
         begin(tmp_path, {"--steps": 60})
 
 
 def test_without_git_there_is_no_commit_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
-    assert provenance("lightpage", 3)["commit"] == ""
+    assert provenance()["commit"] == ""
 
 
 def test_a_second_training_in_the_same_folder_is_refused(device: list[str], tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,16 @@ import pytest
 import torch
 from torch.utils.data import TensorDataset
 
-from train.fitting import Hyperparameters, best_kappa_scale, fit_network, held_out_air
+from optics.errors import InvalidInputError
+from train.fitting import (
+    CHECKPOINTS,
+    FITTED,
+    FITTED_WEIGHTS,
+    Hyperparameters,
+    best_kappa_scale,
+    fit_network,
+    held_out_air,
+)
 
 PAGE = (8, 12)
 LEVELS = 256
@@ -34,11 +44,16 @@ def mask() -> np.ndarray:
     return mask
 
 
-def test_it_learns_and_a_finished_run_is_taken_up_at_its_last_step(tmp_path: Path, mask: np.ndarray) -> None:
+def test_it_learns_and_is_not_trained_twice(tmp_path: Path, mask: np.ndarray) -> None:
     training, validation = pages(12, 0), pages(3, 1)
     run = tmp_path / "run"
     first = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
     assert first.validation_air > 1.0
+    kept = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    assert (kept.validation_air, kept.seconds, kept.curves) == (first.validation_air, first.seconds, first.curves)
+    assert kept.curves["val_air"][-1][1] == pytest.approx(first.validation_air, abs=0.1)
+    torch.testing.assert_close(kept.module.network.state_dict(), first.module.network.state_dict())
+    (run / FITTED).unlink()  # interrupted after its last step
     again = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
     assert again.validation_air == pytest.approx(first.validation_air, abs=1e-6)
     for one, other in zip(first.module.parameters(), again.module.parameters(), strict=True):
@@ -47,6 +62,23 @@ def test_it_learns_and_a_finished_run_is_taken_up_at_its_last_step(tmp_path: Pat
     assert 0.5 * first.seconds < again.seconds <= first.seconds
     checkpoint = torch.load(run / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=False)
     assert checkpoint["global_step"] == CHOICES.steps
+    shutil.rmtree(run / CHECKPOINTS)
+    without = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    assert without.validation_air == again.validation_air
+    assert not (run / CHECKPOINTS).exists()
+
+
+@pytest.mark.parametrize("damaged", [FITTED, FITTED_WEIGHTS])
+def test_what_a_finished_training_kept_is_named_when_it_is_damaged(
+    damaged: str, tmp_path: Path, mask: np.ndarray
+) -> None:
+    choices = replace(CHOICES, steps=10)
+    fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1), progress=False)
+    with pytest.raises(InvalidInputError, match=FITTED_WEIGHTS):  # of another size
+        fit_network(tmp_path, replace(choices, channels=8), mask, LEVELS, pages(2, 0), pages(1, 1), progress=False)
+    (tmp_path / damaged).write_bytes(b"")
+    with pytest.raises(InvalidInputError, match=damaged):
+        fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1), progress=False)
 
 
 def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarray) -> None:

@@ -21,7 +21,7 @@ from tests.optics.small import small_profile
 from train.cli_train import train
 from train.features import FeatureExtractor
 from train.fitting import Hyperparameters
-from train.known_light import known_light
+from train.known_light import explained
 from train.parts import turned
 from train.refinement import Prediction, expected_phasors, fit_prediction
 from train.run import load_decoder, load_run
@@ -45,7 +45,9 @@ def known_page(**device: object) -> Known:
     truth, turn = true_parameters(PROFILE, state), state.homodyne.turn_rad
     extractor = FeatureExtractor(PROFILE, truth, turn, simulator.references())
     known = KnownPage(recorded.pair, np.exp(1j * phases))
-    return Known(recorded.pair, phases, extractor, fit_prediction(PROFILE, truth, known_light(extractor, [known])))
+    return Known(
+        recorded.pair, phases, extractor, fit_prediction(PROFILE, truth, explained(extractor, PROFILE, truth, [known]))
+    )
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from optics.registration.parameters import NAMES
 from optics.simulator import Simulator, true_parameters
 from tests.optics.small import small_profile
 from train.features import FeatureExtractor, PageFeatures
-from train.known_light import KnownLight, known_light
+from train.known_light import explained
 from train.localizers.coherent import CoherentLocalizer
 from train.synthetic import MOST_NOISE, PAGES_PER_STATE, Likeness, SyntheticPages, likeness
 
@@ -26,21 +27,27 @@ DEVICE = Device(slm=SlmDefects(falloff_relative=FALLOFF))
 TRUTH = true_parameters(PROFILE, DEVICE)
 
 
+class Recorded(NamedTuple):
+    features: PageFeatures
+    extractor: FeatureExtractor
+    page: KnownPage
+
+
 @pytest.fixture(scope="module")
-def recorded() -> tuple[PageFeatures, KnownLight]:
-    """One recorded page: features, and what was measured."""
+def recorded() -> Recorded:
+    """One recorded page."""
     simulator = Simulator(PROFILE, DEVICE, seed=SEED)
     phases = symbol_phases(random_symbols(PROFILE, 256, 1, np.random.default_rng(SEED))[0], 256)
     pair = simulator.page(np.rint(phases / (2 * np.pi) * 256).astype(np.uint8))
     turn = DEVICE.homodyne.turn_rad
     extractor = FeatureExtractor(PROFILE, TRUTH, turn, simulator.references())
     features, _ = extractor.page(extractor.field(pair), phases, np.zeros(2))
-    return features, known_light(extractor, [KnownPage(pair, np.exp(1j * phases))])[0]
+    return Recorded(features, extractor, KnownPage(pair, np.exp(1j * phases)))
 
 
 @pytest.fixture(scope="module")
-def like(recorded: tuple[PageFeatures, KnownLight]) -> Likeness:
-    return likeness(PROFILE, TRUTH, [recorded[1]])
+def like(recorded: Recorded) -> Likeness:
+    return likeness(explained(recorded.extractor, PROFILE, TRUTH, [recorded.page]))
 
 
 def agreement(page: PageFeatures) -> float:
@@ -58,24 +65,20 @@ def test_the_fitted_waves_explain_the_recorded_light_and_its_fall_off(like: Like
     assert -(x2 + y2).real == pytest.approx(FALLOFF, abs=0.03)
 
 
-def test_other_symbols_explain_nothing_and_another_angle_less(
-    like: Likeness, recorded: tuple[PageFeatures, KnownLight]
-) -> None:
-    page = recorded[1]
-    assert likeness(PROFILE, TRUTH, [replace(page, phases=page.phases[::-1])]).noise > MOST_NOISE
+def test_other_symbols_explain_nothing_and_another_angle_less(like: Likeness, recorded: Recorded) -> None:
+    others = replace(recorded.page, symbols=recorded.page.symbols[::-1])
+    assert likeness(explained(recorded.extractor, PROFILE, TRUTH, [others])).noise > MOST_NOISE
     other = TRUTH.copy()
     other[NAMES.index("pipe_angle_rad")] += np.deg2rad(0.5)
-    assert likeness(PROFILE, other, [page]).noise > 3 * like.noise
+    assert likeness(explained(recorded.extractor, PROFILE, other, [recorded.page])).noise > 3 * like.noise
 
 
-def test_synthetic_light_shows_its_symbols_as_the_recorded_light_does(
-    like: Likeness, recorded: tuple[PageFeatures, KnownLight]
-) -> None:
+def test_synthetic_light_shows_its_symbols_as_the_recorded_light_does(like: Likeness, recorded: Recorded) -> None:
     pages = list(islice(SyntheticPages(PROFILE, TRUTH, like, CoherentLocalizer(PROFILE), SEED).pages(), 4))
     found = np.array([agreement(page) for page in pages])
     # pages of this size differ by their symbols' chance neighbours
-    assert found.mean() == pytest.approx(agreement(recorded[0]), rel=0.06)
-    assert pages[0].light.shape == recorded[0].light.shape
+    assert found.mean() == pytest.approx(agreement(recorded.features), rel=0.06)
+    assert pages[0].light.shape == recorded.features.light.shape
 
 
 def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: Likeness) -> None:

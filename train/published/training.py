@@ -198,7 +198,7 @@ def fit_published(
     devices: int | str = "auto",
     progress: bool = True,
 ) -> Fitted[PublishedTraining]:
-    """Train, or go on with, a published decoder; arguments as for `train.fitting.fit`."""
+    """Train, or go on with, a published decoder; arguments as for `train.fitting.fit`, but whole pages to train on."""
     choices = module.choices
     return fit(
         run,

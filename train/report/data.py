@@ -17,7 +17,6 @@ from train.curves import Curve
 from train.twin import RayTwin, TorchTwin
 
 Real = NDArray[np.float64]
-"""Optimiser steps and values."""
 
 
 @dataclass(frozen=True)

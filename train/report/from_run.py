@@ -20,7 +20,7 @@ from optics.recording import FramePair, Recording
 from train.curves import curves_of
 from train.feature_store import FeatureStore
 from train.features import PageState
-from train.fitting import DecoderTraining, Page, SymbolTraining, decode_pages, without_piston
+from train.fitting import DecoderTraining, Page, SymbolTraining, decode_pages, fitted_curves, without_piston
 from train.network import Refiner, SymbolUNet
 from train.published.localizers import RayLocalizer
 from train.published.recipe import published_decoder
@@ -68,7 +68,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
         maps=symbol_maps(mu, kappa, symbols, levels, ~mask),
         confidence_bins=reliability(confidence, decided == symbols),
         concentration_bins=concentration_calibration(mu, kappa, symbols, levels),
-        curves=curves_of(folder) or "There are no curves: the run has no TensorBoard files any more.",
+        curves=curves_of(folder) or fitted_curves(folder) or "There are no curves: the run kept none.",
         golden=Golden(FramePair(golden["in_phase"], golden["quadrature"]), phase[0]),
     )
 

@@ -91,11 +91,7 @@ def trained(
         job.run(pages)
     held = max(2, round(_HELD_SHARE * pages))
     first, second = pages - 2 * held, pages - held
-    widths = settings.channels, 2 * settings.channels
-    choices = replace(published_choices(profile, first), channels=widths, seed=settings.seed, classes=classes)
-    if settings.quick:
-        choices = replace(choices, **_QUICK)  # type: ignore[arg-type]
-    choices = replace(choices, steps=max(1, round(settings.share * choices.steps)))
+    choices = chosen(settings, profile, first, classes)
     mask = pilot_mask(profile)
     begin(work, asdict(choices) | {"channels": list(choices.channels), "localizer": localizer})
     with Recording.open(path) as recording:
@@ -124,6 +120,16 @@ def trained(
         **figures,
         **_curves(work),
     }
+
+
+def chosen(settings: Settings, profile: Profile, pages: int, classes: int = 0) -> PublishedChoices:
+    """The authors' choices for a device's symbols and so many training pages, as far as the study goes with them."""
+    choices = replace(published_choices(profile, pages), seed=settings.seed, classes=classes)
+    if settings.quick:
+        choices = replace(choices, **_QUICK)  # type: ignore[arg-type]
+    else:
+        choices = replace(choices, channels=(settings.channels, 2 * settings.channels))
+    return replace(choices, steps=max(1, round(settings.share * choices.steps)))
 
 
 class _Tell(Callback):

@@ -17,8 +17,9 @@ from tests.conftest import SMALL_PAGES
 from tests.optics.small import small_profile
 from train.cli_train import train
 from train.features import PageState
+from train.fitting import Page
 from train.published.recipe import published_choices, published_decoder
-from train.published.training import FramePages, PublishedChoices, PublishedTraining
+from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining, fit_published
 from train.run import load_run
 
 STEP_RATES = (1e-3, 2e-4, 1e-4)
@@ -78,6 +79,34 @@ def test_the_authors_choices() -> None:
     coarse = paper.model_copy(update={"page": paper.page.model_copy(update={"symbol_size_px": 16})})
     chosen = published_choices(coarse, 450)
     assert (chosen.steps, chosen.decay) == (15 * 225, 1.0)
+
+
+@pytest.mark.parametrize("classes", [0, 4])
+def test_pilots_are_not_learnt_from(classes: int) -> None:
+    made = module("none", PublishedChoices(channels=(4, 8), classes=classes))
+    made.log = lambda *_, **__: None  # type: ignore[method-assign]
+    profile = small_profile()
+    frames = 100 + 10 * torch.rand(1, 2, *profile.frame_shape)
+    phases = 2 * np.pi * torch.rand(*profile.page_shape)
+    pilots = pilot_mask(profile)
+    others = torch.where(torch.from_numpy(pilots), phases + 1, phases)
+    pages: list[Page] = [(frames[0], torch.zeros(3), shown) for shown in (phases, others)]
+    asked = DataPages(pages, pilots)  # type: ignore[arg-type]  # a list is all that it takes
+    first, second = (made.training_step(tuple(part[None] for part in asked[index]), 0) for index in range(2))
+    assert torch.isfinite(first)
+    assert first == second
+    assert len(asked) == 2
+
+
+def test_training_hides_the_pilots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr("train.published.training.fit", lambda *given, **_: seen.append(given[2]))
+    made = module("none", PublishedChoices(channels=(4, 8)))
+    profile = small_profile()
+    page = (torch.zeros(2, *profile.frame_shape), torch.zeros(3), torch.zeros(*profile.page_shape))
+    fit_published(tmp_path, made, [page], [page])  # type: ignore[arg-type]
+    (batch,) = seen[0]
+    np.testing.assert_array_equal(torch.isnan(batch[-1][0]).numpy(), pilot_mask(profile))
 
 
 def test_pages_come_with_frames_state_and_phases(small_device: list[str]) -> None:

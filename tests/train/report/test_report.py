@@ -243,10 +243,14 @@ def test_curves_that_are_gone_are_said_to_be_gone(coherent: Path, tmp_path: Path
     curves = curves_of(coherent)
     assert curves["val_air"][-1][0] < int(STEPS)
     shutil.copytree(coherent, tmp_path / "run", ignore=shutil.ignore_patterns("tensorboard"))
+    _, seen = page_of(tmp_path / "run", tmp_path / "R.html")  # from what the finished training kept
+    assert seen.sections == SECTIONS
+    assert "training" in seen.pictures
+    (tmp_path / "run" / "fitted.json").unlink()
     text, seen = page_of(tmp_path / "run", tmp_path / "R.html")
     assert seen.sections == SECTIONS
     assert "training" not in seen.pictures
-    assert "no TensorBoard files any more" in text
+    assert "the run kept none" in text
 
 
 def test_levels_are_read_off_phases() -> None:

@@ -16,6 +16,7 @@ from optics.lenses import LENSES
 from optics.profile import load_profile
 from optics.simulator import TrueOptics
 from tests.optics.small import small_profile
+from train.published.training import PublishedChoices
 from train.studies import (
     STUDIES,
     cross_section,
@@ -31,6 +32,7 @@ from train.studies import (
 )
 from train.studies.cli_study import study
 from train.studies.study import Settings, aligned, measured
+from train.studies.trained import chosen
 
 SMALL = small_profile()
 
@@ -225,6 +227,12 @@ def test_a_share_of_the_steps_is_said_in_the_table(tmp_path: Path) -> None:
     run("symbol-size", "--quick", "--share", "0.5", "--profile", str(tmp_path / "small.toml"), "--out", str(out))
     assert "; 50% of the authors' steps" in (out / "table.txt").read_text()
     assert [row[-1] for row in json.loads((out / "study.json").read_text())["rows"]] == [6] * 4
+
+
+def test_a_study_trains_as_the_authors_did_unless_told_otherwise() -> None:
+    assert chosen(Settings(SMALL), SMALL, 450) == PublishedChoices()
+    smaller = chosen(Settings(SMALL, seed=3, share=0.1, channels=16), SMALL, 450, classes=16)
+    assert smaller == PublishedChoices(channels=(16, 32), steps=1125, seed=3, classes=16)
 
 
 def test_what_trains_at_full_scale_asks_for_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
