@@ -53,6 +53,7 @@ from train.published.recipe import published_decoder
 from train.published.states import page_states
 from train.published.training import FramePages, PublishedChoices, PublishedTraining, fit_published
 from train.refinement import Prediction, RefinementPages, fit_prediction, fit_refinements, refined_pages
+from train.report.data import exit_centroids
 from train.run import begin
 from train.symbols import LIKENESS_PAGES
 from train.twin import RayTwin, TorchTwin
@@ -64,6 +65,8 @@ FAST = "fast"
 HURRIED = Hyperparameters(channels=48, field_rounds=0, binning=2, samples=3, interpolation=BILINEAR)
 """A coherent decoder for when time counts more than the last half bit."""
 ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, ORACLE)
+WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
+"""Whether a symbol's light meets walls of a pair, as the columns of the table say it."""
 CALIBRATED = 2
 HELD_OUT_SHARE = 0.05
 LAST_SHARE = 0.2
@@ -318,6 +321,8 @@ class Bench:
         rates = achievable_rate(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
         by_symbol[~self.mask] = rates.reshape(len(truth), -1).mean(axis=0)
         np.save(folder / MAP, by_symbol)
+        met = np.rint(exit_centroids(self.profile, self.fitted)).astype(bool)
+        groups = {name: by_symbol[~self.mask & (met[0] == x) & (met[1] == y)] for name, (x, y) in WALLS.items()}
         validated = trained.curves.get("val_air", [])
         return Outcome(
             kappa_scale=scale,
@@ -330,6 +335,7 @@ class Bench:
             air=figures.air_bits_per_symbol,
             own_mi=figures.own_mi_bits_per_symbol,
             page_kB=figures.air_bits_per_symbol * int((~self.mask).sum()) / 8000,
+            by_walls={name: float(air.mean()) if air.size else float("nan") for name, air in groups.items()},
             validation_air=trained.validation_air,
             gained_in_last_fifth=gained_at_the_end(validated, steps),
             preparing_seconds=preparing,
@@ -349,7 +355,8 @@ class Outcome:
     """What one arm reached with a network of one size.
 
     Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor that made
-    its claims honest, `by_levels` what it is worth among fewer levels. The curves are AIR by step.
+    its claims honest, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light
+    meets the walls of `WALLS`. The curves are AIR by step.
     """
 
     run: str
@@ -359,6 +366,7 @@ class Outcome:
     air: float
     own_mi: float
     page_kB: float
+    by_walls: dict[str, float]
     validation_air: float
     gained_in_last_fifth: float
     preparing_seconds: float
@@ -371,18 +379,21 @@ class Outcome:
 
     def line(self) -> str:
         over = "" if self.over_oracle is None else f"{self.over_oracle:.3f}"
+        walls = "".join(f"{self.by_walls[name]:>7.3f} " for name in WALLS)
         return (
             f"{self.arm:<10} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} {self.page_kB:>6.2f} "
-            f"{over:>10} {self.gained_in_last_fifth:>8.3f} {self.preparing_seconds / 60:>9.1f} "
+            f"{walls}{over:>10} {self.gained_in_last_fifth:>8.3f} {self.preparing_seconds / 60:>9.1f} "
             f"{self.training_seconds / 60:>8.1f}"
         )
 
 
 HEADER = (
-    f"{'arm':<10} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'kB':>6} {'of oracle':>10} {'gained':>8} "
-    f"{'features':>9} {'training':>8}"
+    f"{'arm':<10} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'kB':>6} "
+    + "".join(f"{name:>7} " for name in WALLS)
+    + f"{'of oracle':>10} {'gained':>8} {'features':>9} {'training':>8}"
 )
-"""Held-out pages, bits a symbol and kB a page; what validation AIR gained in the last fifth of the steps; minutes."""
+"""Held-out pages, bits a symbol and kB a page; AIR where a symbol's light meets no wall of the pipe, a wall of pair
+x, of pair y, or of both; what validation AIR gained in the last fifth of the steps; minutes."""
 
 
 @contextmanager

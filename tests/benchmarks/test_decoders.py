@@ -96,6 +96,11 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     ]
     assert all(0 < arm["by_levels"][0]["symbol_error_rate"] <= 0.8 for arm in (coherent, refined, oracle))
     assert all(len(arm["validation_curve"]) > 0 for arm in figures["outcomes"])
+    # the mean over all symbols lies between those of the zones
+    assert all(
+        min(arm["by_walls"].values()) <= arm["air"] <= max(arm["by_walls"].values()) for arm in figures["outcomes"]
+    )
+    assert "no wall" in first.output
     assert len(coherent["training_curve"]) > 0
     assert (out / "figure.png").stat().st_size > 10_000
     assert (coherent["arm"], oracle["arm"], oracle["over_oracle"]) == ("coherent", "oracle", 1)
