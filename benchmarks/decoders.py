@@ -24,7 +24,7 @@ from typing import Any
 import click
 
 from benchmarks.comparison import ARMS, HEADER, ORACLE, Bench, Outcome, recorded
-from benchmarks.decoders_figure import draw
+from benchmarks.decoders_figure import draw, title
 from benchmarks.kept import TRAINED, Kept
 from benchmarks.levels import LEVEL_HEADER
 from optics.device import Device, Sensor
@@ -57,6 +57,15 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
 )
 @click.option(
     "--full-well", "full_wells", type=float, multiple=True, default=(32.0,), show_default=True, help="Electrons: noise."
+)
+@click.option(
+    "--read-noise",
+    "read_noises",
+    type=float,
+    multiple=True,
+    default=(Sensor().read_noise_e,),
+    show_default=True,
+    help="Electrons: noise that does not grow with the light.",
 )
 @click.option(
     "--symbol-size",
@@ -102,6 +111,7 @@ def main(
     profile_name: str,
     angles_deg: tuple[float, ...],
     full_wells: tuple[float, ...],
+    read_noises: tuple[float, ...],
     symbol_sizes: tuple[int, ...],
     pages: int,
     steps: int,
@@ -121,10 +131,12 @@ def main(
     click.get_current_context().with_resource(sole_writer(out))
     lights: list[dict[str, Any]] = []
     symbol_sizes = symbol_sizes or (nominal.page.symbol_size_px,)
-    for angle_deg, full_well, size_px in product(angles_deg, full_wells, symbol_sizes):
+    for angle_deg, full_well, read_noise, size_px in product(angles_deg, full_wells, read_noises, symbol_sizes):
         profile = nominal.with_symbols_of(size_px)
-        device = Device(sensor=Sensor(full_well_e=full_well)).with_settings([f"geometry.pipe_angle_deg={angle_deg}"])
-        folder = out / f"{angle_deg:g}deg-{full_well:g}e-{size_px}px"
+        sensor = Sensor(full_well_e=full_well, read_noise_e=read_noise)
+        device = Device(sensor=sensor).with_settings([f"geometry.pipe_angle_deg={angle_deg}"])
+        noisier = "" if read_noise == Sensor().read_noise_e else f"-{read_noise:g}r"
+        folder = out / f"{angle_deg:g}deg-{full_well:g}e-{size_px}px{noisier}"
         kept = trained / Path(profile_name).stem / folder.name
         with recorded(profile, device, pages, seed, folder) as recording:
             bench = Bench.of(recording, profile, device, levels, seed, Kept(folder, kept, keeps))
@@ -145,13 +157,14 @@ def main(
                     "angle_deg": angle_deg,
                     "angle_error_deg": bench.fitted.angle_deg(profile) - angle_deg,
                     "full_well_e": full_well,
+                    "read_noise_e": read_noise,
                     "symbol_size_px": size_px,
                     "outcomes": [asdict(outcome) for outcome in outcomes],
                 }
                 write_json(out / "figures.json", {"pages": pages, "seed": seed, "lights": [*lights, light]})
                 draw([*lights, light], out)
         lights.append(light)
-        click.echo(f"\n{angle_deg:g} degree, full well {full_well:g} e-, symbols of {size_px}x{size_px} pixels")
+        click.echo(f"\n{title(light)}")
         click.echo("\n".join([HEADER, *(outcome.line() for outcome in outcomes)]))
         if levels:
             lines = [figures.line(o.arm, o.size) for o in outcomes for figures in o.by_levels]

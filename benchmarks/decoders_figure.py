@@ -29,16 +29,20 @@ def draw(lights: list[dict[str, Any]], out: Path) -> None:
     for part, light in zip(figure.subfigures(len(lights), 1, squeeze=False)[:, 0], lights, strict=True):
         outcomes = light["outcomes"]
         top = max(0.1, *(outcome["own_mi"] for outcome in outcomes))
-        size = light["symbol_size_px"]
-        part.suptitle(
-            f"{light['angle_deg']:g} degree, full well {light['full_well_e']:g} e-, symbols of {size}x{size} pixels"
-        )
+        part.suptitle(title(light))
         charts, maps = part.subfigures(1, 2, width_ratios=[2, 3])
         bars, curves = charts.subplots(2, 1)
         _bars(bars, outcomes, top)
         _curves(curves, outcomes, top)
         _maps(maps, outcomes, top, out)
     figure.savefig(out / "figure.png", dpi=_DOTS, metadata={"Software": None})
+
+
+def title(light: dict[str, Any]) -> str:
+    """What a light of a comparison is."""
+    size = light["symbol_size_px"]
+    noise = f"full well {light['full_well_e']:g} e-, read noise {light['read_noise_e']:g} e-"
+    return f"{light['angle_deg']:g} degree, {noise}, symbols of {size}x{size} pixels"
 
 
 def _bars(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
