@@ -47,7 +47,7 @@ format: $(STAMP)  ## let ruff put the code in order
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Read noise of 2.5 and 13 electrons: with symbols of 4x4 pixels the oracle stands near 5.1 and near 2.5 bits there.
+# Read noise of 2.5 and 13 electrons: bright and dim light (docs/figures.md).
 bench-decoders: $(STAMP)  ## every decoder on the same light, against the oracle: days on two cores, resumed when run again
 	$(BIN)/python -m benchmarks.decoders --angle 0 --angle -0.6 --read-noise 2.5 --read-noise 13 \
 	    --symbol-size 4 --symbol-size 2 --pages 500 --levels 4 --levels 8 --levels 16 --out runs/bench-decoders
