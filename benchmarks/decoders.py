@@ -59,13 +59,13 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
     "--full-well", "full_wells", type=float, multiple=True, default=(32.0,), show_default=True, help="Electrons: noise."
 )
 @click.option(
-    "--read-noise",
-    "read_noises",
+    "--exposure",
+    "exposures",
     type=float,
     multiple=True,
-    default=(Sensor().read_noise_e,),
+    default=(Sensor().exposure_relative,),
     show_default=True,
-    help="Electrons: noise that does not grow with the light.",
+    help="Light, against what just fills the well.",
 )
 @click.option(
     "--symbol-size",
@@ -111,7 +111,7 @@ def main(
     profile_name: str,
     angles_deg: tuple[float, ...],
     full_wells: tuple[float, ...],
-    read_noises: tuple[float, ...],
+    exposures: tuple[float, ...],
     symbol_sizes: tuple[int, ...],
     pages: int,
     steps: int,
@@ -131,12 +131,16 @@ def main(
     click.get_current_context().with_resource(sole_writer(out))
     lights: list[dict[str, Any]] = []
     symbol_sizes = symbol_sizes or (nominal.page.symbol_size_px,)
-    for angle_deg, full_well, read_noise, size_px in product(angles_deg, full_wells, read_noises, symbol_sizes):
+    for angle_deg, full_well, exposure, size_px in product(angles_deg, full_wells, exposures, symbol_sizes):
         profile = nominal.with_symbols_of(size_px)
-        sensor = Sensor(full_well_e=full_well, read_noise_e=read_noise)
-        device = Device(sensor=sensor).with_settings([f"geometry.pipe_angle_deg={angle_deg}"])
-        noisier = "" if read_noise == Sensor().read_noise_e else f"-{read_noise:g}r"
-        folder = out / f"{angle_deg:g}deg-{full_well:g}e-{size_px}px{noisier}"
+        settings = {
+            "geometry.pipe_angle_deg": angle_deg,
+            "sensor.full_well_e": full_well,
+            "sensor.exposure_relative": exposure,
+        }
+        device = Device().with_settings([f"{key}={value}" for key, value in settings.items()])
+        dimmer = "" if exposure == Sensor().exposure_relative else f"-{exposure:g}x"
+        folder = out / f"{angle_deg:g}deg-{full_well:g}e-{size_px}px{dimmer}"
         kept = trained / Path(profile_name).stem / folder.name
         with recorded(profile, device, pages, seed, folder) as recording:
             bench = Bench.of(recording, profile, device, levels, seed, Kept(folder, kept, keeps))
@@ -157,7 +161,7 @@ def main(
                     "angle_deg": angle_deg,
                     "angle_error_deg": bench.fitted.angle_deg(profile) - angle_deg,
                     "full_well_e": full_well,
-                    "read_noise_e": read_noise,
+                    "exposure": exposure,
                     "symbol_size_px": size_px,
                     "outcomes": [asdict(outcome) for outcome in outcomes],
                 }

@@ -41,7 +41,7 @@ def draw(lights: list[dict[str, Any]], out: Path) -> None:
 def title(light: dict[str, Any]) -> str:
     """What a light of a comparison is."""
     size = light["symbol_size_px"]
-    noise = f"full well {light['full_well_e']:g} e-, read noise {light['read_noise_e']:g} e-"
+    noise = f"full well {light['full_well_e']:g} e-, exposure {light['exposure']:g}"
     return f"{light['angle_deg']:g} degree, {noise}, symbols of {size}x{size} pixels"
 
 

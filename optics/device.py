@@ -97,6 +97,8 @@ class Sensor(Table):
     full_well_e: Annotated[float, Field(ge=1, le=1e12, allow_inf_nan=False)] = 15_000.0
     read_noise_e: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 2.5
     bit_depth: Annotated[int, Field(ge=8, le=16)] = 8
+    exposure_relative: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 1.0
+    """Light on both cameras, against what lets the brightest fringes just fill the well."""
 
 
 class Drift(Table):

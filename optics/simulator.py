@@ -183,7 +183,9 @@ class TrueOptics:
     def electrons_per_unit(self) -> float:
         """Electrons per unit intensity (mean signal power is one)."""
         brightest = (self.device.reference.amplitude_ratio + _CLIPPING_AMPLITUDE) ** 2
-        return self.device.sensor.full_well_e / brightest / max(1.0, self.device.homodyne.quadrature_gain)
+        sensor = self.device.sensor
+        full = sensor.full_well_e * sensor.exposure_relative
+        return full / brightest / max(1.0, self.device.homodyne.quadrature_gain)
 
 
 class Simulator:

@@ -83,7 +83,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     arguments += f" --out {out}"
     first = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert first.exit_code == 0, first.output
-    assert "-0.6 degree, full well 32 e-, read noise 2.5 e-, symbols of 4x4 pixels" in first.output
+    assert "-0.6 degree, full well 32 e-, exposure 1, symbols of 4x4 pixels" in first.output
     (figures,) = json.loads((out / "figures.json").read_text())["lights"]
     coherent, refined, oracle, fast, none = figures["outcomes"]
     assert (refined["arm"], refined["steps"]) == ("refined 1", 5)

@@ -65,6 +65,7 @@ def test_no_settings_change_nothing() -> None:
         "sensor.bit_depth=8.5",
         "sensor.full_well_e=0",
         "sensor.read_noise_e=-1",
+        "sensor.exposure_relative=0",
         "slm.falloff_relative=1.0",
         "drift.piston_rad=-0.1",
         "reference.amplitude_ratio=0",

@@ -162,6 +162,13 @@ class TestFrames:
         np.testing.assert_allclose(pair.in_phase, 4 * per_unit, atol=2)
         np.testing.assert_allclose(pair.quadrature, 0.9 * 4 * per_unit, atol=2)
 
+    def test_a_shorter_exposure_collects_less_light(self) -> None:
+        def reference(exposure: float) -> np.ndarray:
+            device = gentle(sensor=FINE_SENSOR.model_copy(update={"exposure_relative": exposure}))
+            return Simulator(TINY, device, levels=16).references().in_phase.astype(float)
+
+        np.testing.assert_allclose(reference(0.25), reference(1) / 4, atol=1)
+
     def test_the_reference_ripples_by_its_share(self) -> None:
         profile = small_profile()
         beam = TrueOptics(profile, gentle(reference=Reference(amplitude_ratio=2, ripple_relative=0.1))).reference()
