@@ -36,7 +36,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     figure = Figure(figsize=(15, 8), layout="constrained")
     axes = figure.subplots(2, 2)
     angles = results[0]["angles"]
-    axes[0, 0].plot(angles[:, 0], angles[:, 1])
+    axes[0, 0].plot(angles[:, 0], angles[:, 1], marker=".")
     axes[0, 0].axhline(Device().geometry.pipe_angle_deg, color="k", linestyle="--", label="true")
     axes[0, 0].set_xlabel("step")
     axes[0, 0].set_ylabel("fitted pipe angle, degrees")
@@ -45,7 +45,12 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
         for name, style in (("training_curve", ":"), ("validation_curve", "-")):
             curve = result[name]
             axes[0, 1].plot(
-                curve[:, 0], curve[:, 1], style, color=colour, label=f"{case['localizer']}, {name.split('_')[0]}"
+                curve[:, 0],
+                curve[:, 1],
+                style,
+                marker=".",
+                color=colour,
+                label=f"{case['localizer']}, {name.split('_')[0]}",
             )
     axes[0, 1].set_xlabel("step")
     axes[0, 1].set_ylabel("AIR, bit/symbol")

@@ -57,7 +57,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
         axis.set_title(f"{case['head']}, {case['levels']} levels: {result['air']:.2f} bit")
         axis.set_axis_off()
         curve = result["training_curve"]
-        axes[-1].plot(curve[:, 0], curve[:, 1], label=f"{case['head']}, {case['levels']}")
+        axes[-1].plot(curve[:, 0], curve[:, 1], marker=".", label=f"{case['head']}, {case['levels']}")
     figure.colorbar(shown, ax=list(axes[:-1]), label="AIR, bit/symbol", shrink=0.8)
     axes[-1].set_xlabel("step")
     axes[-1].set_ylabel("AIR on the pages trained on, bit/symbol")
