@@ -8,13 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tqdm import tqdm
 
-from optics.grid import symbol_samples
+from optics.grid import field_grid, symbol_samples
 from optics.profile import Profile
 from optics.registration.calibrate import KnownPage
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
 from train.features import FeatureExtractor
 from train.field import Measured
+
+_EQUATIONS = 100_000
+"""About how many samples of the common grid say by which factors the illumination varies: six unknowns."""
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -55,16 +59,20 @@ def explained(
     """
     samples = symbol_samples(profile)
     waves = FittedWaves(profile, parameters, samples, filled=True)
-    terms = illumination_terms(waves.x, waves.y)
+    terms = np.stack(illumination_terms(waves.x, waves.y))
+    stride = max(1, int(np.sqrt(np.prod(field_grid(profile).shape) / _EQUATIONS)))
+    at_few = FittedWaves(profile, parameters, samples, filled=True, stride=stride)
     found = []
-    for page in pages:
+    for page in tqdm(pages, desc="light of known pages", unit="page"):
         phases = np.angle(page.symbols)
         state = extractor.state(extractor.field(page.pair), phases, np.zeros(2))
         with torch.no_grad():
             measured, solved = extractor.look(page.pair, state.shift_px)
         field, seen = solved[0].numpy() + 1j * solved[1].numpy(), measured.lit.numpy().astype(bool)
         written = on_modulator(phases, samples)
-        shown = np.stack([waves.to_camera(written * term) for term in terms], axis=-1)
-        factors = np.linalg.lstsq(shown[seen], field[seen], rcond=None)[0]
-        found.append(Explained(measured, field, factors / factors[0], shown @ factors))
+        few = seen[::stride, ::stride]
+        shown = np.stack([at_few.to_camera(written * term)[few] for term in terms], axis=-1)
+        factors = np.linalg.lstsq(shown, field[::stride, ::stride][few], rcond=None)[0]
+        expected = waves.to_camera(written * np.tensordot(factors, terms, 1))
+        found.append(Explained(measured, field, factors / factors[0], expected))
     return found

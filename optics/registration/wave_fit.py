@@ -203,9 +203,7 @@ class WaveFit:
     def _slopes(self, state: _State, of_light: list[int], of_cameras: list[int]) -> _Slopes:
         def waves(parameters: Real, like: FittedWaves | None = None) -> FittedWaves:
             stride, steps = self._stride, _CHORD_STEPS
-            return FittedWaves(
-                self._profile, parameters, self._few, filled=True, stride=stride, steps=steps, like=like
-            )
+            return FittedWaves(self._profile, parameters, self._few, filled=True, stride=stride, steps=steps, like=like)
 
         def stepped(index: int) -> tuple[Real, float]:
             there, step = state.parameters.copy(), _DIFFERENCE * PRIORS[index]
