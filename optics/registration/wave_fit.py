@@ -34,7 +34,7 @@ _CHORD_STEPS = 24
 """Splitting steps for that derivative: a few percent of error in it cost no round."""
 _CHORD_SAMPLES = 2
 """Samples along a symbol for it: what lenses and aberrations do within half a symbol is left out."""
-_CONVERGED = 1e-3
+_CONVERGED = 3e-3
 """Relative fall of the residual below which another round does not pay."""
 _LARGEST_MOVE_PX = 1.5
 """A round's largest step: the model is linear in the displacement over about a speckle."""
