@@ -32,8 +32,6 @@ _CHORD = 4
 """Rounds that share one derivative of the light, which costs as much as several rounds."""
 _CHORD_STEPS = 24
 """Splitting steps for that derivative: a few percent of error in it cost no round."""
-_CHORD_SAMPLES = 2
-"""Samples along a symbol for it: what lenses and aberrations do within half a symbol is left out."""
 _CONVERGED = 3e-3
 """Relative fall of the residual below which another round does not pay."""
 _LARGEST_MOVE_PX = 1.5
@@ -114,10 +112,9 @@ class WaveFit:
     ) -> None:
         self._twin, self._profile, self._symbols = twin, profile, symbols.size
         self._samples = symbol_samples(profile)
-        self._pages = self._illuminated(symbols, self._samples)
-        self._few = min(_CHORD_SAMPLES, self._samples)
-        for_more = self._samples / self._few  # a sample that stands for more area is larger
-        self._few_pages = for_more * self._illuminated(symbols, self._few)
+        page = on_modulator(np.angle(symbols), self._samples)
+        waves = self._waves(np.zeros(len(PARAMETERS)))
+        self._pages = np.stack([page * term for term in illumination_terms(waves.x, waves.y)])
         grid = field_grid(profile)
         self._pitch_px = grid.pitch_m / profile.camera.pitch_m
         self._stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
@@ -178,12 +175,6 @@ class WaveFit:
             state = self._moved(state, covariance @ pull, directions, free)
         return best
 
-    def _illuminated(self, symbols: NDArray[np.complex128], samples: int) -> Complex:
-        """The page under each of the illumination's terms, [T, ny samples, nx samples]."""
-        waves = FittedWaves(self._profile, np.zeros(len(PARAMETERS)), samples)
-        page = on_modulator(np.angle(symbols), samples)
-        return np.stack([page * term for term in illumination_terms(waves.x, waves.y)])
-
     def _waves(self, parameters: Real) -> FittedWaves:
         return FittedWaves(self._profile, parameters, self._samples, filled=True)
 
@@ -203,7 +194,9 @@ class WaveFit:
     def _slopes(self, state: _State, of_light: list[int], of_cameras: list[int]) -> _Slopes:
         def waves(parameters: Real, like: FittedWaves | None = None) -> FittedWaves:
             stride, steps = self._stride, _CHORD_STEPS
-            return FittedWaves(self._profile, parameters, self._few, filled=True, stride=stride, steps=steps, like=like)
+            return FittedWaves(
+                self._profile, parameters, self._samples, filled=True, stride=stride, steps=steps, like=like
+            )
 
         def stepped(index: int) -> tuple[Real, float]:
             there, step = state.parameters.copy(), _DIFFERENCE * PRIORS[index]
@@ -211,8 +204,8 @@ class WaveFit:
             return there, step
 
         here = waves(state.parameters)
-        by_term = np.stack([here.to_camera(page) for page in self._few_pages])
-        page, field = np.tensordot(state.light, self._few_pages, 1), np.tensordot(state.light, by_term, 1)
+        by_term = np.stack([here.to_camera(page) for page in self._pages])
+        page, field = np.tensordot(state.light, self._pages, 1), np.tensordot(state.light, by_term, 1)
         light, pixels = list[Complex](), list[Real]()
         for index in of_light:
             there, step = stepped(index)
