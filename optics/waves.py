@@ -351,28 +351,28 @@ def _parity_basis(cells: int) -> ParityBasis:
     return ParityBasis(cells)
 
 
-def _real_products(left: Real, stack: Complex, right: Real) -> Complex:
+def real_products(left: Real, stack: Complex, right: Real) -> Complex:
     """left @ stack @ right with real factors, as products of the real and the imaginary part."""
     return np.asarray((left @ stack.real @ right) + 1j * (left @ stack.imag @ right), dtype=np.complex64)
 
 
 def _split(y: Real, field: Complex, x: Real) -> Complex:
     """Field [Ny, Nx] to modes [2, 2, Ky, Kx] by parity."""
-    return _real_products(y[:, None], field[None, None], x.transpose(0, 2, 1)[None])
+    return real_products(y[:, None], field[None, None], x.transpose(0, 2, 1)[None])
 
 
 def _join(y: Real, modes: Complex, x: Real) -> Complex:
     """Modes [2, 2, Ky, Kx] to field [Ny, Nx]."""
-    return np.asarray(_real_products(y.transpose(0, 2, 1)[:, None], modes, x[None]).sum(axis=(0, 1)))
+    return np.asarray(real_products(y.transpose(0, 2, 1)[:, None], modes, x[None]).sum(axis=(0, 1)))
 
 
 def _rotate(modes: Complex, y: Real, x: Real, cos: Real, sin: Real) -> Complex:
     """Apply exp(i angle d_x d_y') to modes [2, 2, Ky, Kx]."""
-    inner = _real_products(y.transpose(0, 2, 1)[:, None], modes, x[None])
+    inner = real_products(y.transpose(0, 2, 1)[:, None], modes, x[None])
     turned = np.empty_like(inner)
     for (p, q), sign in (((0, 0), 1), ((1, 1), 1), ((0, 1), -1), ((1, 0), -1)):
         turned[p, q] = cos * inner[p, q] + (1j * sign) * (sin * inner[1 - p, 1 - q])
-    return _real_products(y[:, None], turned, x.transpose(0, 2, 1)[None])
+    return real_products(y[:, None], turned, x.transpose(0, 2, 1)[None])
 
 
 @dataclass(frozen=True)
