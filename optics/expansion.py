@@ -23,6 +23,8 @@ _PROBES = 9
 """Places along an axis that are asked how steep the phase is."""
 _FLAT = 1e-9
 """Radians over half an axis below which a phase does not depend on it."""
+_SKETCH = 100
+"""Random vectors with which the leading singular vectors of a large kernel are looked for at first."""
 _POINT = 1e-300
 """Half length of an axis with one sample, metres."""
 
@@ -53,11 +55,11 @@ class Expansion:
             tolerance: singular values below this share of the largest are dropped; the error is about as large.
         """
         axes = _axes(phase, first, second)
-        left, values, right = np.linalg.svd(_kernel(phase, axes), full_matrices=False)
-        rank = int(np.sum(values > tolerance * values[0]))
+        kernel = _kernel(phase, axes)
+        left = _leading_vectors(kernel, tolerance)
         return cls(
-            first=_coefficients((left[:, :rank] * values[:rank]).T, *axes[:2]),
-            second=_coefficients(right[:rank], *axes[2:]),
+            first=_coefficients(left.T, *axes[:2]),
+            second=_coefficients(left.conj().T @ kernel, *axes[2:]),
             first_axes=(axes[1].at_samples, axes[0].at_samples),
             second_axes=(axes[3].at_samples, axes[2].at_samples),
         )
@@ -88,8 +90,7 @@ class Interpolation:
         by_axis = zip(*(_axes(phase, first, second) for phase in phases), strict=True)
         finest = [max(same, key=lambda axis: len(axis.nodes)) for same in by_axis]
         kernels = np.concatenate([_kernel(phase, finest) for phase in phases], axis=1)
-        left, values, _ = np.linalg.svd(kernels, full_matrices=False)
-        basis = left[:, : int(np.sum(values > tolerance * values[0]))]
+        basis = _leading_vectors(kernels, tolerance)
         x, y = finest[:2]
         root = np.sqrt(np.outer(x.weights, y.weights)).reshape(-1, 1)
         _, _, pivots = qr(basis.T, pivoting=True, mode="economic")
@@ -154,6 +155,25 @@ def _kernel(phase: Phase, axes: list[_Axis]) -> Complex:
     for number, axis in enumerate(axes):
         kernel = kernel * np.sqrt(axis.weights).reshape([-1 if other == number else 1 for other in range(4)])
     return np.asarray(kernel.reshape(shape[0] * shape[1], -1))
+
+
+def _leading_vectors(kernel: Complex, tolerance: float) -> Complex:
+    """Left singular vectors [N, R] whose values exceed a share of the largest, which comes first.
+
+    Found among the columns of the kernel's products with random vectors (Halko, Martinsson and Tropp, SIAM Review 53,
+    217, 2011), as many as it takes until the least of their values no longer counts.
+    """
+    rng, columns = np.random.default_rng(0), _SKETCH
+    while True:
+        basis: Complex | None = None
+        if columns < min(kernel.shape):
+            probed = kernel @ rng.standard_normal((kernel.shape[1], columns))
+            basis = np.linalg.qr(kernel @ (kernel.conj().T @ probed))[0]
+        left, values, _ = np.linalg.svd(kernel if basis is None else basis.conj().T @ kernel, full_matrices=False)
+        if basis is None or values[-1] < tolerance / 10 * values[0]:
+            kept = left[:, values > tolerance * values[0]]
+            return kept if basis is None else np.asarray(basis @ kept)
+        columns *= 2
 
 
 def _coefficients(values: Complex, x: _Axis, y: _Axis) -> Complex:
