@@ -42,16 +42,15 @@ from train.fitting import (
     best_kappa_scale,
     decode_pages,
     fit_network,
-    seed_stretch,
     without_piston,
 )
 from train.known_light import explained
 from train.localizers.coherent import BILINEAR
 from train.patches import training_pages
 from train.published.localizers import NAMES as PUBLISHED
-from train.published.recipe import published_decoder
+from train.published.recipe import train_published
 from train.published.states import page_states
-from train.published.training import FramePages, PublishedChoices, PublishedTraining, fit_published
+from train.published.training import FramePages, PublishedChoices
 from train.refinement import Prediction, RefinementPages, fit_prediction, fit_refinements, refined_pages
 from train.report.data import exit_centroids
 from train.run import begin
@@ -279,10 +278,8 @@ class Bench:
         size = "/".join(map(str, choices.channels))
         chosen = asdict(choices) | {"channels": list(choices.channels)}
         folder = self.begun(self.out / name / f"{size.replace('/', '-')}-{choices.steps}", chosen)
-        seed_stretch(folder, choices.seed)
-        decoder = published_decoder(name, choices, self.profile, self.recording.references(), self.fitted.turn_rad)
-        module = PublishedTraining(decoder, choices, self.mask, LEVELS)
-        trained = fit_published(folder, module, training, validation, devices=1)
+        turn = self.fitted.turn_rad
+        trained = train_published(folder, name, choices, self.profile, turn, self.mask, training, validation, devices=1)
         self.kept.keep(folder)
         return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing)
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
+from lightning.pytorch.callbacks import Callback
+from numpy.typing import NDArray
+from torch.utils.data import DataLoader
 
 from optics.profile import Profile
 from optics.recording import FramePair
-from train.fitting import best_kappa_scale, seed_stretch
+from train.fitting import Fitted, best_kappa_scale, fit, seed_stretch
 from train.material import Material, Trained
 from train.published.decoder import PublishedDecoder, make_localizer
 from train.published.states import page_states
-from train.published.training import FramePages, PublishedChoices, PublishedTraining, fit_published
+from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
 from train.published.unet import samples_for
 
 EPOCHS = {4: 50, 8: 30, 16: 15}
@@ -52,18 +57,63 @@ class PublishedRecipe:
         count = len(material.training)
         training = FramePages(material.recording, known[:count], states[:count])
         validation = FramePages(material.recording, known[count:], states[count:])
-        seed_stretch(material.out, self.choices.seed)
-        decoder = published_decoder(
-            self.localizer, self.choices, material.profile, material.references, material.calibration.turn_rad
+        fitted = train_published(
+            material.out,
+            self.localizer,
+            self.choices,
+            material.profile,
+            material.calibration.turn_rad,
+            material.pilot_mask,
+            training,
+            validation,
+            devices=material.devices,
         )
-        module = PublishedTraining(decoder, self.choices, material.pilot_mask, material.recording.levels)
-        fitted = fit_published(material.out, module, training, validation, devices=material.devices)
         return Trained(
             weights=fitted.module.network.state_dict(),
             validation_air=fitted.validation_air,
             kappa_scale=best_kappa_scale(fitted.module, validation, material.pilot_mask),
             seconds=preparing + fitted.seconds,
         )
+
+
+def train_published(
+    run: Path,
+    localizer: str,
+    choices: PublishedChoices,
+    profile: Profile,
+    turn: float,
+    mask: NDArray[np.bool_],
+    training: FramePages,
+    validation: FramePages,
+    *,
+    callbacks: Sequence[Callback] = (),
+    devices: int | str = "auto",
+    progress: bool = True,
+) -> Fitted[PublishedTraining]:
+    """Train a published decoder from its first weights, or go on with it.
+
+    Args:
+        run: folder.
+        localizer, choices, profile, turn: as for `published_decoder`.
+        mask: pilots, bool [ny, nx], which are not learnt from.
+        training, validation: pages of one recording.
+        callbacks, devices, progress: as for `train.fitting.fit`.
+    """
+    seed_stretch(run, choices.seed)
+    recording = training.recording
+    decoder = published_decoder(localizer, choices, profile, recording.references(), turn)
+    module = PublishedTraining(decoder, choices, mask, recording.levels)
+    return fit(
+        run,
+        module,
+        DataLoader(DataPages(training, mask), batch_size=choices.batch, shuffle=True),
+        validation,
+        steps=choices.steps,
+        precision=choices.precision,
+        callbacks=callbacks,
+        devices=devices,
+        progress=progress,
+    )
 
 
 def published_decoder(

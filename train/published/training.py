@@ -5,21 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
 from optics.page import symbol_phases
 from optics.recording import Recording
 from train.features import PageState
-from train.fitting import DecoderTraining, Fitted, Page, fit
+from train.fitting import DecoderTraining, Page
 from train.published.decoder import PublishedDecoder
 from train.published.localizers import RayLocalizer
 
@@ -74,7 +72,7 @@ class FramePages(Dataset[Page]):
     """
 
     def __init__(self, recording: Recording, pages: Sequence[int], states: Sequence[PageState]) -> None:
-        self._recording, self._pages, self._states = recording, pages, states
+        self.recording, self._pages, self._states = recording, pages, states
 
     def __len__(self) -> int:
         """Pages."""
@@ -83,9 +81,9 @@ class FramePages(Dataset[Page]):
     def __getitem__(self, index: int) -> Page:
         """One page."""
         page, state = self._pages[index], self._states[index]
-        pair, symbols = self._recording.frames(page), self._recording.symbols(page)
+        pair, symbols = self.recording.frames(page), self.recording.symbols(page)
         assert symbols is not None
-        phases = symbol_phases(symbols, self._recording.levels).astype(np.float32)
+        phases = symbol_phases(symbols, self.recording.levels).astype(np.float32)
         return (
             torch.from_numpy(np.stack([pair.in_phase, pair.quadrature]).astype(np.float32)),
             torch.tensor([*state.shift_px, state.piston_rad], dtype=torch.float32),
@@ -186,28 +184,3 @@ def nearest_class(phases: Tensor, classes: int) -> Tensor:
     """
     nearest = torch.round(torch.nan_to_num(phases) * (classes / (2 * math.pi))).long() % classes
     return torch.where(torch.isfinite(phases), nearest, NOT_ASKED)
-
-
-def fit_published(
-    run: Path,
-    module: PublishedTraining,
-    training: Dataset[Page],
-    validation: Dataset[Page],
-    *,
-    callbacks: Sequence[Callback] = (),
-    devices: int | str = "auto",
-    progress: bool = True,
-) -> Fitted[PublishedTraining]:
-    """Train, or go on with, a published decoder; arguments as for `train.fitting.fit`, but whole pages to train on."""
-    choices = module.choices
-    return fit(
-        run,
-        module,
-        DataLoader(DataPages(training, module.pilot_mask), batch_size=choices.batch, shuffle=True),
-        validation,
-        steps=choices.steps,
-        precision=choices.precision,
-        callbacks=callbacks,
-        devices=devices,
-        progress=progress,
-    )

@@ -24,13 +24,12 @@ from optics.recording import Recording
 from optics.recording_job import RecordingJob
 from train.curves import curves_of
 from train.features import PageState
-from train.fitting import best_kappa_scale, decode_pages, seed_stretch, without_piston
-from train.published.recipe import published_choices, published_decoder
+from train.fitting import best_kappa_scale, decode_pages, without_piston
+from train.published.recipe import published_choices, train_published
 from train.published.training import (
     FramePages,
     PublishedChoices,
     PublishedTraining,
-    fit_published,
     nearest_class,
 )
 from train.run import begin
@@ -100,11 +99,10 @@ def trained(
             FramePages(recording, part, [states[page] for page in part])
             for part in (range(first), range(first, second), range(second, pages))
         )
-        seed_stretch(work, choices.seed)
-        decoder = published_decoder(localizer, choices, profile, recording.references(), device.homodyne.turn_rad)
-        module = PublishedTraining(decoder, choices, mask, levels)
-        tell = _Tell(progress, choices)
-        fitted = fit_published(work, module, training, validation, callbacks=[tell], progress=False)
+        turn, tell = device.homodyne.turn_rad, _Tell(progress, choices)
+        fitted = train_published(
+            work, localizer, choices, profile, turn, mask, training, validation, callbacks=[tell], progress=False
+        )
         scale = best_kappa_scale(fitted.module, validation, mask)
         p, phases = decode_pages(fitted.module, unseen)
         figures = _of_p(p * scale, phases, mask, levels)

@@ -18,8 +18,8 @@ from tests.optics.small import small_profile
 from train.cli_train import train
 from train.features import PageState
 from train.fitting import Page
-from train.published.recipe import published_choices, published_decoder
-from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining, fit_published
+from train.published.recipe import published_choices, published_decoder, train_published
+from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
 from train.run import load_run
 
 STEP_RATES = (1e-3, 2e-4, 1e-4)
@@ -98,15 +98,16 @@ def test_pilots_are_not_learnt_from(classes: int) -> None:
     assert len(asked) == 2
 
 
-def test_training_hides_the_pilots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_hides_the_pilots(small_device: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
-    monkeypatch.setattr("train.published.training.fit", lambda *given, **_: seen.append(given[2]))
-    made = module("none", PublishedChoices(channels=(4, 8)))
+    monkeypatch.setattr("train.published.recipe.fit", lambda *given, **_: seen.append(given[2]))
     profile = small_profile()
-    page = (torch.zeros(2, *profile.frame_shape), torch.zeros(3), torch.zeros(*profile.page_shape))
-    fit_published(tmp_path, made, [page], [page])  # type: ignore[arg-type]
-    (batch,) = seen[0]
-    np.testing.assert_array_equal(torch.isnan(batch[-1][0]).numpy(), pilot_mask(profile))
+    with Recording.open(small_device[3]) as recording:
+        pages = FramePages(recording, [2], [PageState((0.0, 0.0), 0.0)])
+        pilots, choices = pilot_mask(profile), PublishedChoices(channels=(4, 8))
+        train_published(tmp_path, "none", choices, profile, 1.5, pilots, pages, pages)
+        (batch,) = seen[0]
+    np.testing.assert_array_equal(torch.isnan(batch[-1][0]).numpy(), pilots)
 
 
 def test_pages_come_with_frames_state_and_phases(small_device: list[str]) -> None:
