@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import resample_poly
 
 from optics.cameras import CameraView, expose, in_phase_intensity, quadrature_intensity, resample, to_counts
 from optics.device import CameraPose, Device
@@ -17,7 +16,8 @@ from optics.profile import Profile
 from optics.recording import FramePair
 from optics.recording_layout import frame_type
 from optics.registration.parameters import NAMES, as_vector
-from optics.waves import WaveChannel, WaveGeometry, cells_for
+from optics.sparse import interpolation, sparse_axis
+from optics.waves import WaveChannel, WaveGeometry, cells_for, real_products
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
@@ -27,11 +27,6 @@ _CLIPPING_AMPLITUDE = 2.4
 in twenty thousand clips."""
 _GRID_MARGIN = 1.04
 """Computed camera plane over the sensor, so that rotated and shifted pixels still look inside."""
-_COARSE = 2
-"""Pixels a sample at which light on the camera plane is computed before it is interpolated: cameras that are accepted
-(`check_camera`) have four or more pixels for each period of the field, and two of these samples would do."""
-_INTERPOLATION = ("kaiser", 9.0)
-"""Window of that interpolation."""
 _WALK, _RIPPLE, _NOISE = 0, 1, 2
 """Independent random streams drawn from one seed; the last has one for each page."""
 
@@ -98,7 +93,7 @@ class TrueOptics:
 
     @cached_property
     def channel(self) -> WaveChannel:
-        """SLM to camera plane."""
+        """SLM to sparse samples of the camera plane."""
         page_x, page_y = self.page_axes_m
         camera_x, camera_y = self.camera_axes_m
         camera, pitch = self.profile.camera, self.profile.slm.pitch_m
@@ -107,8 +102,8 @@ class TrueOptics:
             self.geometry,
             page_x,
             page_y,
-            camera_x[::_COARSE],
-            camera_y[::_COARSE],
+            sparse_axis(self.profile, camera_x),
+            sparse_axis(self.profile, camera_y),
             cells=cells_for(self.geometry, page_x, page_y, *sensor),
             steps=self._steps,
             envelope_m=pitch,
@@ -147,10 +142,16 @@ class TrueOptics:
 
     def camera_field(self, exit_field: Complex) -> Complex:
         """Field on the exit facet to the computed camera plane."""
-        coarse = self.channel.delaunch_lens.to_plane(exit_field) / _COARSE  # whose samples stand for more area
-        field = resample_poly(resample_poly(coarse, _COARSE, 1, 0, _INTERPOLATION), _COARSE, 1, 1, _INTERPOLATION)
-        rows, columns = (len(axis) for axis in reversed(self.camera_axes_m))
-        return np.asarray(field[:rows, :columns], dtype=np.complex64)
+        up, across = self._between
+        return real_products(up, self.channel.delaunch_lens.to_plane(exit_field), across.T)
+
+    @cached_property
+    def _between(self) -> tuple[Real, Real]:
+        """Matrices from sparse samples to the computed camera plane's, down and across it."""
+        (x, y), channel = self.camera_axes_m, self.channel
+        axes = (y, channel.camera_y_m), (x, channel.camera_x_m)
+        up, across = (interpolation(*both).astype(np.float32) for both in axes)
+        return up, across
 
     def reference(self) -> Complex:
         """Reference beam on the computed camera plane."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from optics.profile import Profile
 
-Real = NDArray[np.float64]
+Real = NDArray[np.floating]
 
 _OVER_NYQUIST = 1.3
 _REACH = 14
