@@ -35,7 +35,7 @@ REFERENCES = "references.npz"
 GOLDEN = "golden.npz"
 FORMAT = 5
 """Of what a run keeps while it is made: raised when features, network or checkpoints of an earlier version would not go
-together with those of this one, or when the simulator's pages change, or which of them the comparison trains on."""
+together with those of this one, or when the simulator's light changes, or which pages the comparison trains on."""
 
 
 @dataclass(frozen=True)
