@@ -158,22 +158,22 @@ def _kernel(phase: Phase, axes: list[_Axis]) -> Complex:
 
 
 def _leading_vectors(kernel: Complex, tolerance: float) -> Complex:
-    """Left singular vectors [N, R] whose values exceed a share of the largest, which comes first.
+    """Left singular vectors [N, R] whose values exceed a share of the largest value, largest first.
 
-    Found among the columns of the kernel's products with random vectors (Halko, Martinsson and Tropp, SIAM Review 53,
-    217, 2011), as many as it takes until the least of their values no longer counts.
+    Those of a large kernel are found among its products with random vectors (Halko, Martinsson and Tropp, SIAM Review
+    53, 217, 2011), as many as it takes until the least of their values no longer counts.
     """
     rng, columns = np.random.default_rng(0), _SKETCH
-    while True:
-        basis: Complex | None = None
-        if columns < min(kernel.shape):
-            probed = kernel @ rng.standard_normal((kernel.shape[1], columns))
-            basis = np.linalg.qr(kernel @ (kernel.conj().T @ probed))[0]
-        left, values, _ = np.linalg.svd(kernel if basis is None else basis.conj().T @ kernel, full_matrices=False)
-        if basis is None or values[-1] < tolerance / 10 * values[0]:
-            kept = left[:, values > tolerance * values[0]]
-            return kept if basis is None else np.asarray(basis @ kept)
+    while columns < min(kernel.shape):
+        probed = np.linalg.qr(kernel @ rng.standard_normal((kernel.shape[1], columns)))[0]
+        probed = np.linalg.qr(kernel.conj().T @ probed)[0]
+        basis = np.linalg.qr(kernel @ probed)[0]
+        left, values, _ = np.linalg.svd(basis.conj().T @ kernel, full_matrices=False)
+        if values[-1] < tolerance / 10 * values[0]:
+            return np.asarray(basis @ left[:, values > tolerance * values[0]])
         columns *= 2
+    left, values, _ = np.linalg.svd(kernel, full_matrices=False)
+    return np.asarray(left[:, values > tolerance * values[0]])
 
 
 def _coefficients(values: Complex, x: _Axis, y: _Axis) -> Complex:

@@ -60,6 +60,18 @@ class SeidelTerms(NamedTuple):
         by_aperture = 2 * self.coma * product + 2 * self.field_curvature * r2 + 4 * self.spherical * aperture2
         return by_field * x + by_aperture * across, by_field * y + by_aperture * up
 
+    def slope_on_field(self, x: Any, y: Any, across: Any, up: Any) -> tuple[Any, Any]:
+        """Derivatives of W by the field's two coordinates, rad/m."""
+        swapped = SeidelTerms(
+            piston=self.spherical,
+            distortion=self.coma,
+            astigmatism=self.astigmatism,
+            field_curvature=self.field_curvature,
+            coma=self.distortion,
+            spherical=self.piston,
+        )
+        return swapped.slope(across, up, x, y)
+
     def bend(self, x: Any, y: Any, across: Any, up: Any) -> tuple[Any, Any]:
         """Second derivatives of W by either of the aperture's coordinates, rad/m^2."""
         r2, aperture2, product = x * x + y * y, across * across + up * up, x * across + y * up

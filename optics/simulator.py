@@ -16,8 +16,7 @@ from optics.profile import Profile
 from optics.recording import FramePair
 from optics.recording_layout import frame_type
 from optics.registration.parameters import NAMES, as_vector
-from optics.sparse import interpolation, sparse_axis
-from optics.waves import WaveChannel, WaveGeometry, cells_for, real_products
+from optics.waves import WaveChannel, WaveGeometry, cells_for
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
@@ -93,7 +92,7 @@ class TrueOptics:
 
     @cached_property
     def channel(self) -> WaveChannel:
-        """SLM to sparse samples of the camera plane."""
+        """SLM to camera plane."""
         page_x, page_y = self.page_axes_m
         camera_x, camera_y = self.camera_axes_m
         camera, pitch = self.profile.camera, self.profile.slm.pitch_m
@@ -102,8 +101,8 @@ class TrueOptics:
             self.geometry,
             page_x,
             page_y,
-            sparse_axis(self.profile, camera_x),
-            sparse_axis(self.profile, camera_y),
+            camera_x,
+            camera_y,
             cells=cells_for(self.geometry, page_x, page_y, *sensor),
             steps=self._steps,
             envelope_m=pitch,
@@ -142,16 +141,7 @@ class TrueOptics:
 
     def camera_field(self, exit_field: Complex) -> Complex:
         """Field on the exit facet to the computed camera plane."""
-        up, across = self._between
-        return real_products(up, self.channel.delaunch_lens.to_plane(exit_field), across.T)
-
-    @cached_property
-    def _between(self) -> tuple[Real, Real]:
-        """Matrices from sparse samples to the computed camera plane's, down and across it."""
-        (x, y), channel = self.camera_axes_m, self.channel
-        axes = (y, channel.camera_y_m), (x, channel.camera_x_m)
-        up, across = (interpolation(*both).astype(np.float32) for both in axes)
-        return up, across
+        return self.channel.camera_field(exit_field)
 
     def reference(self) -> Complex:
         """Reference beam on the computed camera plane."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from optics.expansion import Expansion, Interpolation, Phase
 from optics.lens_path import IDEAL, SeidelTerms
+from optics.sparse import interpolation, sparse_axis
 
 Complex = NDArray[np.complexfloating]
 Real = NDArray[np.floating]
@@ -25,6 +26,9 @@ _TOLERANCE = 1e-7
 
 _TOLERANCE_WITH_PATH = 1e-3
 """The same for a real lens, a field error of about 0.002; 1e-5 would take twice the terms, a hundred at full size."""
+
+_PROBES = 5
+"""Places along an axis that are asked how fast the light's phase runs."""
 
 _MODE_MARGIN = 1.04
 """Modes beyond the one that the page's edge excites: an edge of the facet spreads it."""
@@ -138,6 +142,24 @@ def couplings(geometry: WaveGeometry, xp: Any = np) -> Couplings:
 def on_facet(factors: Couplings, across: Any, up: Any) -> tuple[Any, Any]:
     """A point (X, Y') of the oblique facet as Cartesian coordinates of the lens's plane."""
     return factors.x_to_x * across + factors.x_to_y * up, factors.y_to_x * across + factors.y_to_y * up
+
+
+def highest_frequencies(geometry: WaveGeometry, path: SeidelTerms, x_m: Real, y_m: Real) -> tuple[float, float]:
+    """Highest frequencies along x and y that a facet's light has on a lens's plane, cycles a metre.
+
+    Args:
+        geometry: the device.
+        path: of that lens.
+        x_m, y_m: what is looked at of the plane.
+    """
+    edges = np.linspace(-0.5, 0.5, _PROBES) * geometry.pipe_width_m
+    plane = (np.linspace(axis[0], axis[-1], _PROBES) for axis in (x_m, y_m))
+    x, y, across, up = np.meshgrid(*plane, edges, edges, indexing="ij", sparse=True)
+    on_lens = on_facet(couplings(geometry), across, up)
+    per_metre = geometry.wave_number / geometry.focal_length_m
+    slopes = zip(on_lens, path.slope_on_field(x, y, *on_lens), strict=True)
+    along_x, along_y = (float(np.abs(slope - per_metre * place).max() / (2 * np.pi)) for place, slope in slopes)
+    return along_x, along_y
 
 
 def entrance_window(
@@ -387,6 +409,9 @@ class WaveChannel:
         steps: splitting steps of a sheared pipe.
         envelope_m: edge of the SLM pixel, whose sinc is applied on the entrance facet; 0 for point samples.
         blur_m: standard deviation of the SLM's blur.
+
+    Every term of the de-launch lens is a product over the camera plane, so its light is computed on few samples
+    (`sparse_axis`), and interpolated.
     """
 
     geometry: WaveGeometry
@@ -406,8 +431,26 @@ class WaveChannel:
 
     @cached_property
     def delaunch_lens(self) -> FourierLens:
-        """Camera plane to exit facet (its `to_plane` is the de-launch)."""
-        return FourierLens(self.geometry, self.camera_x_m, self.camera_y_m, self.cells, second=True)
+        """Sparse samples of the camera plane to exit facet (its `to_plane` is the de-launch)."""
+        return FourierLens(self.geometry, *self.sparse_axes_m, self.cells, second=True)
+
+    @cached_property
+    def sparse_axes_m(self) -> tuple[Real, Real]:
+        """Axes (x, y) of the samples on which light at the camera plane is computed."""
+        axes = self.camera_x_m, self.camera_y_m
+        highest = highest_frequencies(self.geometry, self.geometry.lens_path.mirrored(), *axes)
+        x, y = (sparse_axis(axis, frequency) for axis, frequency in zip(axes, highest, strict=True))
+        return x, y
+
+    @cached_property
+    def _between(self) -> tuple[Real, Real] | None:
+        """Matrices from those samples to the camera plane's, down and across it; none if they are the same."""
+        x, y = self.sparse_axes_m
+        if x is self.camera_x_m and y is self.camera_y_m:
+            return None
+        axes = (self.camera_y_m, y), (self.camera_x_m, x)
+        down, across = (interpolation(*both).astype(np.float32) for both in axes)
+        return down, across
 
     @cached_property
     def pipe(self) -> PipePropagator:
@@ -423,13 +466,24 @@ class WaveChannel:
 
     def forward(self, field: Complex) -> Complex:
         """Field on the SLM [ny, nx] to the field on the camera plane."""
-        return self.delaunch_lens.to_plane(self.exit_field(field))
+        return self.camera_field(self.exit_field(field))
 
     def exit_field(self, field: Complex) -> Complex:
         """Field on the SLM [ny, nx] to the field on the exit facet's grid."""
         return self.pipe.forward(self.launch_lens.to_facet(field) * self.entrance_window)
 
+    def camera_field(self, exit_field: Complex) -> Complex:
+        """Field on the exit facet's grid to the field on the camera plane."""
+        sparse = self.delaunch_lens.to_plane(exit_field)
+        if self._between is None:
+            return sparse
+        down, across = self._between
+        return real_products(down, sparse, across.T)
+
     def adjoint(self, field: Complex) -> Complex:
         """Field on the camera plane back to the SLM: undoes the pipe exactly, the chain inside the pipe's band."""
+        if self._between is not None:
+            down, across = self._between
+            field = real_products(down.T, field, across)
         at_entrance = self.pipe.adjoint(self.delaunch_lens.to_facet(field))
         return self.launch_lens.to_plane(at_entrance * self.entrance_window)

@@ -61,11 +61,11 @@ class LensMatrices(NamedTuple):
 
 
 class WaveMatrices(NamedTuple):
-    """Everything that depends on the device's parameters."""
+    """Everything that depends on the device's parameters; `down` and `across` interpolate light to the common grid."""
 
     launch: LensMatrices
     delaunch: LensMatrices
-    up: Tensor
+    down: Tensor
     across: Tensor
     window: Tensor
     at_launch: Parts
@@ -98,8 +98,8 @@ class Waves(nn.Module):
         self.y_m: Tensor
         self.grid_x_m: Tensor
         self.grid_y_m: Tensor
-        self.seen_x_m: Tensor
-        self.seen_y_m: Tensor
+        self.sparse_x_m: Tensor
+        self.sparse_y_m: Tensor
         self.facet_x: Tensor
         self.facet_y: Tensor
         self._ideal = profile.ideal_lenses
@@ -109,8 +109,8 @@ class Waves(nn.Module):
             "y_m": y,
             "grid_x_m": grid.x_m,
             "grid_y_m": grid.y_m,
-            "seen_x_m": channel.camera_x_m,
-            "seen_y_m": channel.camera_y_m,
+            "sparse_x_m": channel.sparse_axes_m[0],
+            "sparse_y_m": channel.sparse_axes_m[1],
             "facet_x": np.arange(1, channel.cells[1]) / channel.cells[1] - 0.5,
             "facet_y": np.arange(1, channel.cells[0]) / channel.cells[0] - 0.5,
         }.items():
@@ -139,9 +139,9 @@ class Waves(nn.Module):
         centre = torch.stack([value["page_centre_x_m"], value["page_centre_y_m"]])
         return WaveMatrices(
             self._lens(geometry, *x, facet, path, self._on_page, centre),
-            self._lens(geometry, self.seen_x_m, self.seen_y_m, facet, path.mirrored(), self._on_camera, 0 * centre),
-            interpolation(self.grid_y_m, self.seen_y_m, xp=torch),
-            interpolation(self.grid_x_m, self.seen_x_m, xp=torch),
+            self._lens(geometry, self.sparse_x_m, self.sparse_y_m, facet, path.mirrored(), self._on_camera, 0 * centre),
+            interpolation(self.grid_y_m, self.sparse_y_m, xp=torch),
+            interpolation(self.grid_x_m, self.sparse_x_m, xp=torch),
             window,
             _phasor(at_launch),
             _phasor(at_camera),
@@ -152,13 +152,13 @@ class Waves(nn.Module):
         """Field on the modulator [2, ny samples, nx samples] to the common grid [2, Gy, Gx], against the reference."""
         real, imaginary = _to_facet(at.launch, multiply(parts(page), at.at_launch))
         exit_field = self._pipe.run((real * at.window, imaginary * at.window), at, backwards=False)
-        real, imaginary = (at.up @ part @ at.across.T for part in _to_plane(at.delaunch, exit_field))
+        real, imaginary = (at.down @ part @ at.across.T for part in _to_plane(at.delaunch, exit_field))
         return torch.stack(multiply((real, imaginary), at.against_reference))
 
     def to_page(self, at: WaveMatrices, field: Tensor) -> Tensor:
         """Field on the common grid [2, Gy, Gx] back to the modulator, by the adjoint."""
         seen = multiply(parts(field), conjugate(at.against_reference))
-        real, imaginary = (at.up.T @ part @ at.across for part in seen)
+        real, imaginary = (at.down.T @ part @ at.across for part in seen)
         exit_field = _to_facet(at.delaunch, (real, imaginary))
         real, imaginary = self._pipe.run(exit_field, at, backwards=True)
         page = _to_plane(at.launch, (real * at.window, imaginary * at.window))

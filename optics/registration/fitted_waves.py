@@ -12,8 +12,7 @@ from optics.grid import field_grid
 from optics.profile import Profile
 from optics.registration.parameters import as_dict
 from optics.registration.phases import camera_phase, launch_phase
-from optics.sparse import interpolation, sparse_axis
-from optics.waves import WaveChannel, WaveGeometry, cells_for, real_products
+from optics.waves import WaveChannel, WaveGeometry, cells_for
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -80,7 +79,7 @@ class FittedWaves:
 
     Attributes:
         x, y: places of the modulator's samples over the page's half width and half height, [nx samples], [ny samples].
-        channel: lenses and pipe, to sparse samples of the camera plane.
+        channel: lenses and pipe.
         launch: [ny samples, nx samples] phasor of the smooth phases at the launch side.
         against_reference: [Gy, Gx] phasor of the smooth phases at the camera, which multiplies all light there.
     """
@@ -112,14 +111,12 @@ class FittedWaves:
             self.channel = WaveChannel(
                 geometry,
                 *page,
-                sparse_axis(profile, grid_x),
-                sparse_axis(profile, grid_y),
+                grid_x,
+                grid_y,
                 cells=cells_for(geometry, *page, float(grid.x_m[-1]), float(grid.y_m[-1])),
                 steps=steps,
                 envelope_m=pitch if filled else 0.0,
             )
-        seen = (grid_y, self.channel.camera_y_m), (grid_x, self.channel.camera_x_m)
-        self._up, self._across = (interpolation(*axes).astype(np.float32) for axes in seen)
         at_launch = fitted_launch_phase(profile, value, geometry, x[None, :], y[:, None])
         at_camera = fitted_camera_phase(profile, value, geometry, grid_x[None, :], grid_y[:, None])
         self.launch: Complex = np.exp(1j * at_launch)
@@ -128,13 +125,11 @@ class FittedWaves:
 
     def to_camera(self, field: Complex) -> Complex:
         """Field on the modulator [ny samples, nx samples] to the common grid [Gy, Gx], against the reference."""
-        seen = real_products(self._up, self.channel.forward(field * self.launch), self._across.T)
-        return np.asarray(seen * self._camera)
+        return np.asarray(self.channel.forward(field * self.launch) * self._camera)
 
     def to_page(self, field: Complex) -> Complex:
         """Field on the common grid [Gy, Gx] back to the modulator, by the adjoint."""
-        seen = real_products(self._up.T, field * self._camera.conj(), self._across)
-        return np.asarray(self.channel.adjoint(seen) * self.launch.conj())
+        return np.asarray(self.channel.adjoint(field * self._camera.conj()) * self.launch.conj())
 
 
 def on_modulator(phases: Real, samples: int) -> Complex:
