@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, signal
 
 from optics.cameras import expose, resample
 from optics.device import Device
@@ -97,7 +97,8 @@ def locate(frame: NDArray[np.integer], scale: float) -> Real:
     kernel = np.zeros((2 * arm + 1, 2 * arm + 1))
     kernel[arm - line : arm + line + 1] = kernel[:, arm - line : arm + line + 1] = 1
     kernel -= kernel.mean()
-    likeness = ndimage.gaussian_filter(ndimage.convolve(flat, kernel, mode="nearest"), 1.0) ** 2
+    matched = signal.oaconvolve(np.pad(flat, arm, mode="edge"), kernel, mode="valid")
+    likeness = ndimage.gaussian_filter(matched, 1.0) ** 2
     peaks = np.argwhere((likeness == ndimage.maximum_filter(likeness, 2 * arm + 1)) & (likeness > 0))
     best = peaks[np.argsort(likeness[tuple(peaks.T)])[::-1][: _CROSSHAIRS**2]]
     around = round(scale)
