@@ -242,8 +242,9 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     air_axis.axhline(_KEPT, color="k", linestyle="--", linewidth=1)
     air_axis.set_xlabel("drift")
     air_axis.set_ylabel("share of the AIR that is left")
+    air_axis.set_ylim(bottom=0)
     if cases[1:]:
-        air_axis.legend()
+        air_axis.legend(loc="lower left")
     return figure
 
 
