@@ -24,6 +24,10 @@ _BAND_TAPS = 31
 _BAND_HEADROOM = 1.06
 """Pass band over the pipe's nominal band, for misalignment of the pipe against the lens axes."""
 
+_FEWEST_STEPS = 64
+_LARGEST_LAG = 11.0
+"""Radians; see `splitting_steps`."""
+
 _ROUNDING = 1e-9
 _MOST_SAMPLES = 4
 
@@ -112,6 +116,23 @@ def symbol_samples(profile: Profile) -> int:
     of their light where four samples see it.
     """
     return min(_MOST_SAMPLES, profile.page.symbol_size_px)
+
+
+def splitting_steps(profile: Profile, share: float = 1.0) -> int:
+    """Steps in which light goes through a sheared pipe (`optics.waves.PipePropagator`).
+
+    In each the light of the page's corner falls behind that along the axis by at most `_LARGEST_LAG`, so a long pipe
+    takes as many more as it is longer. The field error is 0.005 on the bench device, with 64, and four times that with
+    half as many.
+
+    Args:
+        profile: the device.
+        share: of them, where less accuracy will do.
+    """
+    pipe, lens = profile.pipe, profile.lens
+    steepness = profile.corner_m / lens.focal_length_m
+    lag = np.pi * steepness**2 * pipe.length_m / (profile.light.wavelength_m * pipe.refractive_index)
+    return int(np.ceil(share * max(_FEWEST_STEPS, np.ceil(lag / _LARGEST_LAG))))
 
 
 def _low_pass(taps: int, passed: float, stopped: float) -> Real:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from optics.cameras import CameraView, expose, in_phase_intensity, quadrature_intensity, resample, to_counts
 from optics.device import CameraPose, Device
-from optics.grid import check_camera
+from optics.grid import check_camera, splitting_steps
 from optics.page import check_levels, check_symbols, symbol_phases
 from optics.profile import Profile
 from optics.recording import FramePair
@@ -50,10 +50,10 @@ class SimulatedPage:
 class TrueOptics:
     """The noise-free optics of one device: what a simulator, or an oracle that may know the truth, computes with."""
 
-    def __init__(self, profile: Profile, device: Device, steps: int = 64) -> None:
+    def __init__(self, profile: Profile, device: Device, steps: int | None = None) -> None:
         self.profile = profile
         self.device = device
-        self._steps = steps
+        self._steps = splitting_steps(profile) if steps is None else steps
 
     @cached_property
     def geometry(self) -> WaveGeometry:
@@ -188,14 +188,16 @@ class Simulator:
         levels: levels M of the symbols it will be given.
         seed: of noise and drift from page to page; the same seed and calls give the same frames. The ripple of the
             reference belongs to the device (`reference.ripple_seed`).
-        steps: splitting steps of a sheared pipe.
+        steps: splitting steps of a sheared pipe; `splitting_steps` if left out.
 
     Raises:
         PageError: a level count outside 2..256.
         ProfileError: the profile's camera is too coarse or too small for its page.
     """
 
-    def __init__(self, profile: Profile, device: Device, levels: int = 256, seed: int = 0, steps: int = 64) -> None:
+    def __init__(
+        self, profile: Profile, device: Device, levels: int = 256, seed: int = 0, steps: int | None = None
+    ) -> None:
         check_levels(levels)
         check_camera(profile)
         self.optics = TrueOptics(profile, device, steps)

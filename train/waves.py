@@ -41,8 +41,8 @@ _TOLERANCE_WITH_PATH = 3e-3
 """The same for lenses that are not ideal: half of the terms that the other takes, and a field error of 0.014."""
 _AT_ONCE = 12
 """Terms that go through a product together: as many as an ideal lens has, and a memory's worth of another's."""
-_STEPS = 32
-"""Splitting steps: half of the fitted waves', each of which is time in every decode; a field error of 0.02."""
+_ACCURACY = 1 / 2
+"""Share of the fitted waves' splitting steps, each of which is time in every decode; a field error of 0.02."""
 
 
 class LensMatrices(NamedTuple):
@@ -90,7 +90,7 @@ class Waves(nn.Module):
     def __init__(self, profile: Profile, parameters: Real, *, filled: bool = False) -> None:
         super().__init__()
         self.samples = symbol_samples(profile)
-        waves = FittedWaves(profile, parameters, self.samples, filled=filled, steps=_STEPS)
+        waves = FittedWaves(profile, parameters, self.samples, filled=filled, accuracy=_ACCURACY)
         channel, grid = waves.channel, field_grid(profile)
         x, y = modulator_axes(profile, self.samples)
         self._profile, self._envelope_m = profile, channel.envelope_m

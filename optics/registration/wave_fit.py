@@ -30,8 +30,8 @@ READ_NOISE = 0.3
 _ROUNDS = 9
 _CHORD = 4
 """Rounds that share one derivative of the light, which costs as much as several rounds."""
-_CHORD_STEPS = 24
-"""Splitting steps for that derivative: a few percent of error in it cost no round."""
+_CHORD_ACCURACY = 3 / 8
+"""Share of the splitting steps for that derivative: a few percent of error in it cost no round."""
 _CONVERGED = 3e-3
 """Relative fall of the residual below which another round does not pay."""
 _LARGEST_MOVE_PX = 1.5
@@ -193,9 +193,9 @@ class WaveFit:
 
     def _slopes(self, state: _State, of_light: list[int], of_cameras: list[int]) -> _Slopes:
         def waves(parameters: Real, like: FittedWaves | None = None) -> FittedWaves:
-            stride, steps = self._stride, _CHORD_STEPS
+            stride, accuracy = self._stride, _CHORD_ACCURACY
             return FittedWaves(
-                self._profile, parameters, self._samples, filled=True, stride=stride, steps=steps, like=like
+                self._profile, parameters, self._samples, filled=True, stride=stride, accuracy=accuracy, like=like
             )
 
         def stepped(index: int) -> tuple[Real, float]:
