@@ -161,13 +161,12 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
             for x, y, real in zip(symbols, values, measured, strict=True):
                 axis.plot(x, y, "o", color=colour, fillstyle="full" if real else "none")
         memory_axis.loglog(symbols, [result["bytes"] / 1e6 for result in chosen], color=colour, label=method)
-    time_axis.set_ylabel("seconds a page")
+    time_axis.set_ylabel("seconds a page, in torch (open: extrapolated)")
     memory_axis.set_ylabel("what the decoder holds of the device, MB")
     for axis in (time_axis, memory_axis):
         axis.set_xlabel("symbols on a page")
         axis.grid(alpha=0.3)
-        axis.legend()
-    time_axis.set_title("in torch; open: extrapolated")
+        axis.legend(loc="lower left", bbox_to_anchor=(0, 1))
     return figure
 
 
