@@ -49,7 +49,7 @@ format: $(STAMP)  ## let ruff put the code in order
 
 # Exposures of 1 and 0.2: bright and dim light; what the oracle reads in the latter is not measured yet.
 bench-decoders: $(STAMP)  ## every decoder on the same light, against the oracle: days on two cores, resumed when run again
-	$(BIN)/python -m benchmarks.decoders --angle 0 --angle -0.6 --exposure 1 --exposure 0.2 \
+	$(BIN)/python -m benchmarks.decoders --angle 0 --angle -0.6 --exposure 1 --exposure 0.13 \
 	    --symbol-size 4 --symbol-size 2 --pages 500 --levels 4 --levels 8 --levels 16 --out runs/bench-decoders
 
 bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
