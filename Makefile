@@ -47,7 +47,7 @@ format: $(STAMP)  ## let ruff put the code in order
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Exposures of 1 and 0.2: bright and dim light; what the oracle reads in the latter is not measured yet.
+# Exposures of 1 and 0.13: bright light, and about the dimmest in which two known pages still calibrate the device.
 bench-decoders: $(STAMP)  ## every decoder on the same light, against the oracle: days on two cores, resumed when run again
 	$(BIN)/python -m benchmarks.decoders --angle 0 --angle -0.6 --exposure 1 --exposure 0.13 \
 	    --symbol-size 4 --symbol-size 2 --pages 500 --levels 4 --levels 8 --levels 16 --out runs/bench-decoders

@@ -27,9 +27,6 @@ _TOLERANCE = 1e-7
 _TOLERANCE_WITH_PATH = 1e-3
 """The same for a real lens, a field error of about 0.002; 1e-5 would take twice the terms, a hundred at full size."""
 
-_PROBES = 5
-"""Places along an axis that are asked how fast the light's phase runs."""
-
 _MODE_MARGIN = 1.04
 """Modes beyond the one that the page's edge excites: an edge of the facet spreads it."""
 
@@ -145,20 +142,22 @@ def on_facet(factors: Couplings, across: Any, up: Any) -> tuple[Any, Any]:
 
 
 def highest_frequencies(geometry: WaveGeometry, path: SeidelTerms, x_m: Real, y_m: Real) -> tuple[float, float]:
-    """Highest frequencies along x and y that a facet's light has on a lens's plane, cycles a metre.
+    """Bounds on the frequencies along x and y that a facet's light has on a lens's plane, cycles a metre.
 
     Args:
         geometry: the device.
         path: of that lens.
         x_m, y_m: what is looked at of the plane.
     """
-    edges = np.linspace(-0.5, 0.5, _PROBES) * geometry.pipe_width_m
-    plane = (np.linspace(axis[0], axis[-1], _PROBES) for axis in (x_m, y_m))
-    x, y, across, up = np.meshgrid(*plane, edges, edges, indexing="ij", sparse=True)
-    on_lens = on_facet(couplings(geometry), across, up)
+    edge, factors = geometry.pipe_width_m / 2, np.abs(couplings(geometry))
+    furthest = on_facet(Couplings(*factors), edge, edge)
+    corner = np.abs(x_m).max(), np.abs(y_m).max()
+    # each term as if it added to the others at the corner of both planes
+    slopes = SeidelTerms(*np.abs(path)).slope_on_field(*corner, *furthest)
     per_metre = geometry.wave_number / geometry.focal_length_m
-    slopes = zip(on_lens, path.slope_on_field(x, y, *on_lens), strict=True)
-    along_x, along_y = (float(np.abs(slope - per_metre * place).max() / (2 * np.pi)) for place, slope in slopes)
+    along_x, along_y = (
+        float(per_metre * place + slope) / (2 * np.pi) for place, slope in zip(furthest, slopes, strict=True)
+    )
     return along_x, along_y
 
 

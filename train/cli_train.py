@@ -137,7 +137,6 @@ def train(
                 profile=profile,
                 calibration=calibration,
                 extractor=extractor,
-                references=references,
                 training=groups[0],
                 validation=groups[1],
                 pilot_mask=mask,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from optics.profile import Profile
-from optics.recording import FramePair, Recording
+from optics.recording import Recording
 from optics.registration.calibration import Calibration
 from train.features import FeatureExtractor
 
@@ -25,7 +25,6 @@ class Material:
         profile: the nominal device.
         calibration: the fitted device.
         extractor: of the calibrated device, for the run's localizer.
-        references: reference-only frames.
         training, validation: page numbers.
         pilot_mask: bool [ny, nx].
         key: digest of profile, recording and calibration.
@@ -37,7 +36,6 @@ class Material:
     profile: Profile
     calibration: Calibration
     extractor: FeatureExtractor
-    references: FramePair
     training: list[int]
     validation: list[int]
     pilot_mask: NDArray[np.bool_]

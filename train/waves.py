@@ -61,7 +61,10 @@ class LensMatrices(NamedTuple):
 
 
 class WaveMatrices(NamedTuple):
-    """Everything that depends on the device's parameters; `down` and `across` interpolate light to the common grid."""
+    """Everything that depends on the device's parameters; and `down` and `across`, which interpolate to the grid.
+
+    Those two depend on nothing, but would be large as constants.
+    """
 
     launch: LensMatrices
     delaunch: LensMatrices

@@ -45,10 +45,10 @@ _KEPT = 0.98
 """Share of the AIR below which a device is recalibrated."""
 _BOTH_CAMERAS = ("in_phase_camera", "quadrature_camera")
 _DRIFTS: dict[str, tuple[tuple[str, ...], str, tuple[float, ...]]] = {
-    "pipe angle, degrees": (("geometry",), "pipe_angle_deg", (0.005, 0.01, 0.03)),
+    "pipe angle, degrees": (("geometry",), "pipe_angle_deg", (0.0025, 0.005, 0.01, 0.03)),
     "focal length, relative": (("geometry",), "focal_length_relative_error", (5e-5, 1e-4, 3e-4)),
-    "camera rotation, degrees": (_BOTH_CAMERAS, "rotation_deg", (0.01, 0.03, 0.1)),
-    "camera scale, relative": (_BOTH_CAMERAS, "scale_relative_error", (2e-4, 5e-4, 1.5e-3)),
+    "camera rotation, degrees": (_BOTH_CAMERAS, "rotation_deg", (0.002, 0.005, 0.01, 0.03)),
+    "camera scale, relative": (_BOTH_CAMERAS, "scale_relative_error", (5e-5, 1e-4, 2e-4, 5e-4)),
     "camera shift, pixels": (_BOTH_CAMERAS, "shift_x_px", (0.5, 1.0, 2.0)),
 }
 """What drifts: its place in the device's state, and by how much."""
