@@ -272,6 +272,17 @@ class TestLight:
         pair = Simulator(profile, device, levels=16, seed=1, steps=16).page(symbols(profile))
         assert (pair.quadrature == 255).mean() < 0.01
 
+    @pytest.mark.parametrize(
+        ("angle_deg", "share", "error"), [(-0.6, 1.0, 0.005), (-0.6, 0.5, 0.023), (-5.0, 1.0, 0.07)]
+    )
+    def test_splitting_errs_as_its_description_says(self, angle_deg: float, share: float, error: float) -> None:
+        profile, device = load_profile("bench"), Device(geometry=Geometry(pipe_angle_deg=angle_deg))
+        written = on_slm(random_phases(profile, 0), profile)
+        found, many = (
+            TrueOptics(profile, device, splitting_steps(profile, part)).exit_field(written) for part in (share, 4.0)
+        )
+        assert np.linalg.norm(found - many) / np.linalg.norm(many) == pytest.approx(error, rel=0.15)
+
     def test_a_longer_pipe_takes_as_many_more_steps_as_it_needs(self) -> None:
         profile = TALL.model_copy(
             update={"pipe": TALL.pipe.model_copy(update={"length_m": 4 * TALL.pipe.length_m})},
