@@ -32,21 +32,19 @@ def mean_resultant(kappa: Floats) -> Floats:
     return np.asarray(i1e(kappa) / i0e(kappa), np.float64)
 
 
-def own_information(kappa: NDArray[np.floating], levels: int | None = None) -> Floats:
-    """Bits that a belief of concentration `kappa` claims to know about a phase, same shape as `kappa`.
+def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int) -> Floats:
+    """Bits that a belief claims to know of a symbol: log2 M less the entropy of its posterior; shape as `mu`.
 
-    kappa I1(kappa) / (I0(kappa) ln 2) - log2 I0(kappa). With `levels`, capped at log2 of it: a symbol of M levels has
-    no more to know. It is the model's own claim and bounds nothing; see `achievable_rate`.
+    Where kappa is far below M^2 this is kappa I1(kappa) / (I0(kappa) ln 2) - log2 I0(kappa), which is all that there is
+    to know of a phase that may take any value; among few levels it is less. It is the model's own claim and bounds
+    nothing; see `achievable_rate`.
 
     Raises:
-        PageError: a concentration that is negative or not a number.
+        PageError: shapes differ, a phase or concentration that is not finite, a concentration below 0.
     """
-    k = _concentration(kappa)
-    bits = (k * ((i1e(k) - i0e(k)) / i0e(k)) - np.log(i0e(k))) / np.log(2)
-    if levels is None:
-        return np.asarray(bits)
-    check_levels(levels)
-    return np.asarray(np.minimum(bits, np.log2(levels)))
+    m, phase, k = _checked_belief(mu, kappa, levels)
+    log_partition, away = _partition(phase, k, m)
+    return np.asarray(np.log2(m) - (log_partition + k * away) / np.log(2))
 
 
 def decide(mu: NDArray[np.floating], levels: int) -> NDArray[np.uint8]:
@@ -67,7 +65,7 @@ def log_posterior(
     """
     m, phase, k, s = _checked(mu, kappa, symbols, levels)
     error = s * (2 * np.pi / m) - phase
-    return np.asarray(k * (np.cos(error) - 1) - _log_partition(phase, k, m))
+    return np.asarray(k * (np.cos(error) - 1) - _partition(phase, k, m)[0])
 
 
 def decide_with_confidence(
@@ -234,7 +232,7 @@ def measure(
         count=int(truth.size),
         levels=levels,
         air_bits_per_symbol=float(achievable_rate(mu, kappa, truth, levels).mean()),
-        own_mi_bits_per_symbol=float(own_information(kappa, levels).mean()),
+        own_mi_bits_per_symbol=float(own_information(mu, kappa, levels).mean()),
         gmi_bits_per_symbol=None if levels & (levels - 1) else float(gray_rate(mu, kappa, truth, levels).mean()),
         symbol_error_rate=float(1 - correct.mean()),
         ece=expected_calibration_error(confidence, correct),
@@ -284,32 +282,36 @@ def symbol_maps(
 
     turned = s * (2 * np.pi / m) - phase
     error = np.abs(turned - 2 * np.pi * np.rint(turned / (2 * np.pi)))
-    return SymbolMaps(spread(achievable_rate(phase, k, s, m)), spread(own_information(k, m)), spread(error))
+    return SymbolMaps(spread(achievable_rate(phase, k, s, m)), spread(own_information(phase, k, m)), spread(error))
 
 
-def _log_partition(phase: Floats, kappa: Floats, levels: int) -> Floats:
-    """log sum_k exp(kappa (cos(theta_k - mu) - 1)) without M terms a symbol; agrees with the plain sum to 1e-9.
+def _partition(phase: Floats, kappa: Floats, levels: int) -> tuple[Floats, Floats]:
+    """log Z, Z = sum_k exp(kappa (cos(theta_k - mu) - 1)), and the posterior's mean of 1 - cos(theta_k - mu).
 
-    The sum is M (I0 + 2 sum_n I_nM cos(n M mu)) exp(-kappa): for kappa << M^2 only I0 counts. For a larger kappa only
-    the levels near mu count.
+    Without M terms a symbol; log Z agrees with the plain sum to 1e-9. Z is M (I0 + 2 sum_n I_nM cos(n M mu))
+    exp(-kappa): for kappa << M^2 only I0 counts. For a larger kappa only the levels near mu count.
     """
     if levels <= 2 * _WINDOW + 1:
-        return _window_sum(phase, kappa, levels, np.arange(levels))
+        return _window_sums(phase, kappa, levels, np.arange(levels))
     smooth = kappa <= levels**2 / _ALIASING
-    result = np.log(levels) + np.log(i0e(kappa))
+    log_partition, away = np.log(levels) + np.log(i0e(kappa)), 1 - mean_resultant(kappa)
     if not smooth.all():
-        result[~smooth] = _window_sum(phase[~smooth], kappa[~smooth], levels, np.arange(-_WINDOW, _WINDOW + 1))
-    return np.asarray(result)
+        near = _window_sums(phase[~smooth], kappa[~smooth], levels, np.arange(-_WINDOW, _WINDOW + 1))
+        log_partition[~smooth], away[~smooth] = near
+    return np.asarray(log_partition), np.asarray(away)
 
 
-def _window_sum(phase: Floats, kappa: Floats, levels: int, offsets: NDArray[np.int_]) -> Floats:
+def _window_sums(phase: Floats, kappa: Floats, levels: int, offsets: NDArray[np.int_]) -> tuple[Floats, Floats]:
     step = 2 * np.pi / levels
     nearest = np.rint(phase / step) * step
-    total = np.zeros_like(phase)
-    top = kappa * (np.cos(nearest - phase) - 1)
+    total, away = np.zeros_like(phase), np.zeros_like(phase)
+    closest = 1 - np.cos(nearest - phase)
     for offset in offsets:
-        total += np.exp(kappa * (np.cos(nearest + offset * step - phase) - 1) - top)
-    return np.asarray(np.log(total) + top)
+        distance = 1 - np.cos(nearest + offset * step - phase)
+        weight = np.exp(kappa * (closest - distance))
+        total += weight
+        away += weight * distance
+    return np.asarray(np.log(total) - kappa * closest), np.asarray(away / total)
 
 
 def _logits(phase: Floats, kappa: Floats, levels: int) -> Floats:
@@ -331,13 +333,20 @@ def _concentration(kappa: NDArray[np.floating]) -> Floats:
 def _checked(
     mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
 ) -> tuple[int, Floats, Floats, NDArray[np.int64]]:
-    check_levels(levels)
-    phase, k = np.atleast_1d(np.asarray(mu, np.float64)), _concentration(kappa)
+    levels, phase, k = _checked_belief(mu, kappa, levels)
     s = np.atleast_1d(np.asarray(symbols))
-    if not phase.shape == k.shape == s.shape:
-        raise PageError("phase, concentration, symbols", (phase.shape, k.shape, s.shape), "three equal shapes")
-    if not np.isfinite(phase).all():
-        raise PageError("decoded phase", "NaN or infinity", "finite radians")
+    if phase.shape != s.shape:
+        raise PageError("phase, symbols", (phase.shape, s.shape), "two equal shapes")
     if s.size and (int(s.min()) < 0 or int(s.max()) >= levels):
         raise PageError("symbols", f"{s.min()}..{s.max()}", f"0..{levels - 1}")
     return levels, phase, k, s.astype(np.int64)
+
+
+def _checked_belief(mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int) -> tuple[int, Floats, Floats]:
+    check_levels(levels)
+    phase, k = np.atleast_1d(np.asarray(mu, np.float64)), _concentration(kappa)
+    if phase.shape != k.shape:
+        raise PageError("phase, concentration", (phase.shape, k.shape), "two equal shapes")
+    if not np.isfinite(phase).all():
+        raise PageError("decoded phase", "NaN or infinity", "finite radians")
+    return levels, phase, k

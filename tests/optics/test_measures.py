@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.special import i0e, logsumexp
+from scipy.special import i0e, logsumexp, softmax
+from scipy.stats import entropy
 
 from optics import measures
 from optics.errors import PageError
@@ -19,19 +20,27 @@ def drawn_page(levels: int, kappa: np.ndarray, seed: int) -> tuple[np.ndarray, n
 
 
 @pytest.mark.parametrize("kappa", [0.1, 1.0, 7.0, 60.0, 900.0])
-def test_own_information_is_the_integral_of_the_density(kappa: float) -> None:
+def test_own_information_of_many_levels_is_the_integral_of_the_density(kappa: float) -> None:
     def integrand(error: float) -> float:
         density = np.exp(kappa * (np.cos(error) - 1)) / (2 * np.pi * i0e(kappa))
         return float(density * np.log2(2 * np.pi * max(density, 1e-300)))
 
     expected = quad(integrand, -np.pi, np.pi, points=[-0.1, 0.1], limit=400)[0]
-    assert measures.own_information(np.array([kappa]))[0] == pytest.approx(expected, rel=1e-7)
+    assert measures.own_information(np.array([0.3]), np.array([kappa]), 256)[0] == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.parametrize("levels", [2, 3, 16, 25, 26, 100, 256])
+def test_own_information_is_what_the_posterior_leaves_unknown(levels: int) -> None:
+    rng = np.random.default_rng(levels)
+    kappa, mu = 10 ** rng.uniform(-3, 6, 400), rng.uniform(-20, 20, 400)
+    logits = kappa[:, None] * (np.cos(np.arange(levels) * 2 * np.pi / levels - mu[:, None]) - 1)
+    expected = np.log2(levels) - entropy(softmax(logits, axis=1), base=2, axis=1)
+    np.testing.assert_allclose(measures.own_information(mu, kappa, levels), expected, atol=1e-8)
 
 
 def test_own_information_is_nothing_without_concentration_and_never_more_than_the_levels_hold() -> None:
-    bits = measures.own_information(np.array([0.0, 1e4, 1e30]), levels=16)
-    assert bits[0] == 0
-    assert bits[1] == bits[2] == 4
+    bits = measures.own_information(np.zeros(3), np.array([0.0, 1e4, 1e30]), levels=16)
+    np.testing.assert_allclose(bits, [0, 4, 4], atol=1e-12)
 
 
 @pytest.mark.parametrize("levels", [2, 3, 5, 16, 25, 26, 32, 100, 256])
@@ -55,11 +64,12 @@ def test_decision_is_the_nearest_level_whatever_the_winding(levels: int) -> None
         assert np.array_equal(measures.decide(mu + 2 * np.pi * turns, levels), symbols)
 
 
-def test_air_of_honest_beliefs_equals_own_information_at_256_levels() -> None:
-    kappa = np.full(200_000, 20.0)
-    symbols, mu = drawn_page(256, kappa, 1)
-    air = measures.achievable_rate(mu, kappa, symbols, 256).mean()
-    assert air == pytest.approx(measures.own_information(kappa).mean(), abs=0.01)
+@pytest.mark.parametrize("levels", [3, 4, 8, 16, 256])
+def test_air_of_honest_beliefs_equals_own_information(levels: int) -> None:
+    kappa = np.random.default_rng(0).lognormal(np.log(10), 1, 200_000)
+    symbols, mu = drawn_page(levels, kappa, 1)
+    air = measures.achievable_rate(mu, kappa, symbols, levels).mean()
+    assert air == pytest.approx(measures.own_information(mu, kappa, levels).mean(), abs=0.01)
 
 
 def test_air_at_256_levels_agrees_with_the_continuous_form() -> None:
