@@ -61,7 +61,7 @@ LEVELS = 256
 ORACLE = "oracle"
 REFINED = "refined"
 FAST = "fast"
-HURRIED = Hyperparameters(channels=48, field_rounds=0, binning=2, samples=3, interpolation=BILINEAR)
+HURRIED = Hyperparameters(channels=48, field_rounds=0, binning=2, field_step=3, samples=3, interpolation=BILINEAR)
 """A coherent decoder for when time counts more than the last half bit."""
 ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, ORACLE)
 WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
@@ -161,6 +161,7 @@ class Bench:
             "coherent" if arm == FAST else arm,
             rounds=choices.field_rounds,
             binning=choices.binning,
+            grid=choices.grid(self.profile),
             coherent=choices.coherent_localizer(self.profile),
         )
 
@@ -180,7 +181,7 @@ class Bench:
         extractor = self.extractor("coherent")
         pages = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
         known = explained(extractor, self.profile, self.fitted.vector, pages)
-        prediction = fit_prediction(self.profile, self.fitted.vector, known)
+        prediction = fit_prediction(self.profile, self.fitted.vector, known, extractor.grid)
         counts = len(self.training), len(self.validation)
         material = RefinementPages(self.recording, self.pages, *counts, features)
         key = self.fitted.to_toml()

@@ -42,7 +42,10 @@ class DecoderGraph(nn.Module):
 
     def __init__(self, profile: Profile, decoder: SymbolDecoder, kappa_scale: float) -> None:
         super().__init__()
-        self.recovery = FieldRecovery(profile, rounds=decoder.choices.field_rounds, binning=decoder.choices.binning)
+        choices = decoder.choices
+        self.recovery = FieldRecovery(
+            profile, rounds=choices.field_rounds, binning=choices.binning, grid=choices.grid(profile)
+        )
         self.decoder = decoder
         self.kappa_scale = kappa_scale
         with torch.no_grad():

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from optics.errors import ProfileError
+from optics.errors import InvalidInputError, ProfileError
 from optics.profile import Profile
 
 Real = NDArray[np.float64]
 
 GRID_STEP_PX = 2
-"""Grid pitch in camera pixels: twice the Nyquist rate of the field, just above that of its intensity."""
+"""Usual grid pitch in camera pixels: twice the Nyquist rate of the field, just above that of its intensity."""
 _MARGIN_PX = 70
 """Grid beyond the nominal image of the page, camera pixels on each side: page shift and diffraction."""
 _PREFILTER_TAPS = 11
@@ -23,6 +23,10 @@ _PASS_STEPS = 8
 _BAND_TAPS = 31
 _BAND_HEADROOM = 1.06
 """Pass band over the pipe's nominal band, for misalignment of the pipe against the lens axes."""
+_BAND_STOP = 1.36
+"""Where its stop band begins, over the same."""
+_NYQUIST = 0.5
+"""Cycles per sample."""
 
 _FEWEST_STEPS = 64
 _LARGEST_LAG = 11.0
@@ -86,26 +90,33 @@ def check_camera(profile: Profile) -> None:
             )
 
 
-def field_grid(profile: Profile) -> FieldGrid:
-    """The grid for a device: covers the nominal page image and a margin, pitch two camera pixels.
+def field_grid(profile: Profile, step_px: int = GRID_STEP_PX) -> FieldGrid:
+    """The grid for a device: covers the nominal page image and a margin.
+
+    Args:
+        profile: the device.
+        step_px: pitch in camera pixels, where a coarser grid than the usual one will do.
 
     Raises:
         ProfileError: the camera is too coarse or too small (`check_camera`).
+        InvalidInputError: a pitch too coarse for the pipe's band.
     """
     check_camera(profile)
     pixel = profile.camera.pitch_m
-    pitch = GRID_STEP_PX * pixel
+    pitch = step_px * pixel
 
     def axis(extent_m: float) -> Real:
         count = int(np.ceil((extent_m + 2 * _MARGIN_PX * pixel) / pitch / 2)) * 2
         return np.asarray((np.arange(count) - (count - 1) / 2) * pitch)
 
     edge = profile.pipe.width_m / 2 / (profile.light.wavelength_m * profile.lens.focal_length_m)
+    if (coarsest := int(_NYQUIST / (_BAND_STOP * edge * pixel))) < step_px:
+        raise InvalidInputError("pitch of the common grid, camera pixels", step_px, f"at most {coarsest}")
     return FieldGrid(
         x_m=axis(profile.page_width_m),
         y_m=axis(profile.page_height_m),
-        prefilter=_before_linear(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / GRID_STEP_PX - edge * pixel, 0.36)),
-        band=_low_pass(_BAND_TAPS, _BAND_HEADROOM * edge * pitch, 1.36 * edge * pitch),
+        prefilter=_before_linear(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / step_px - edge * pixel, 0.36)),
+        band=_low_pass(_BAND_TAPS, _BAND_HEADROOM * edge * pitch, _BAND_STOP * edge * pitch),
     )
 
 

@@ -117,6 +117,12 @@ CHOICES = (
         localizers=LOCALIZERS,
     ),
     Choice(
+        "--field-step",
+        click.IntRange(min=1),
+        "Camera pixels from one sample of the field to the next: more are quicker and less exact.",
+        localizers=LOCALIZERS,
+    ),
+    Choice(
         "--samples",
         click.IntRange(min=0, max=16),
         "Samples per symbol and axis that the localizer reads; 0 takes as many as the field has.",

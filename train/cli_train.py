@@ -121,6 +121,7 @@ def train(
             features,
             rounds=choices.field_rounds,
             binning=choices.binning,
+            grid=choices.grid(profile),
             coherent=choices.coherent_localizer(profile),
         )
         extractor.check(known_pages(recording, profile, groups[0][:1])[0], calibration.coherence_after)

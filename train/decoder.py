@@ -33,12 +33,14 @@ class SymbolDecoder(nn.Module):
 
     def __init__(self, profile: Profile, parameters: Real, localizer: str, choices: Hyperparameters) -> None:
         super().__init__()
-        self.choices = choices
-        chosen = choices.coherent_localizer(profile) if localizer == COHERENT else WaveLocalizer(profile, parameters)
+        self.choices, grid = choices, choices.grid(profile)
+        chosen = (
+            choices.coherent_localizer(profile) if localizer == COHERENT else WaveLocalizer(profile, parameters, grid)
+        )
         self.localizer: CoherentLocalizer | WaveLocalizer = chosen
         self.network = SymbolUNet(chosen.light_channels, choices.channels, choices.blocks, choices.levels)
         small = choices.of_refinement()
-        self.prediction = Prediction(profile, parameters) if choices.refinements else None
+        self.prediction = Prediction(profile, parameters, grid) if choices.refinements else None
         unexplained = self.prediction.light_channels if self.prediction else 0
         self.refiners = nn.ModuleList(
             Refiner(unexplained, small.channels, small.blocks, small.levels) for _ in range(choices.refinements)

@@ -12,7 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from optics.errors import CalibrationError
-from optics.grid import GRID_STEP_PX, field_grid
+from optics.grid import GRID_STEP_PX, FieldGrid
 from optics.page import symbol_phases
 from optics.profile import Profile
 from optics.recording import FramePair, Recording
@@ -76,6 +76,7 @@ class FeatureExtractor:
         localizer: `coherent` or `wave`.
         with_signal_power, rounds, binning: see `FieldRecovery`.
         coherent: the coherent localizer, where it is not the usual one.
+        grid: the common grid, where it is not the usual one.
     """
 
     def __init__(
@@ -90,17 +91,25 @@ class FeatureExtractor:
         rounds: int = ROUNDS,
         binning: int = 1,
         coherent: CoherentLocalizer | None = None,
+        grid: FieldGrid | None = None,
     ) -> None:
         self._profile, self._parameters, self._twin = profile, parameters, TorchTwin(RayTwin(profile))
         self.table: Table = sampling_table(self._twin, parameters, turn, profile)
-        self.recovery = FieldRecovery(profile, with_signal_power=with_signal_power, rounds=rounds, binning=binning)
+        self.recovery = FieldRecovery(
+            profile, with_signal_power=with_signal_power, rounds=rounds, binning=binning, grid=grid
+        )
         self._solve = TorchFieldSolver(self.recovery)
-        self._coherent = coherent or CoherentLocalizer(profile)
-        self._wave = WaveLocalizer(profile, parameters) if localizer == "wave" else None
+        self._coherent = coherent or CoherentLocalizer(profile, grid=grid)
+        self._wave = WaveLocalizer(profile, parameters, grid) if localizer == "wave" else None
         self._references = references
         shares = branch_shares(self.table["positions"].reshape(2, -1).T.astype(float))
         self._shares = shares.reshape(len(COHERENT_BRANCHES), *profile.page_shape)
         self._chosen = [BRANCHES.index(name) for name in COHERENT_BRANCHES]
+
+    @property
+    def grid(self) -> FieldGrid:
+        """The common grid."""
+        return self.recovery.grid
 
     def field(self, pair: FramePair) -> NDArray[np.complex64]:
         """Recovered field on the common grid."""
@@ -125,7 +134,7 @@ class FeatureExtractor:
             CalibrationError: it shows hardly more of them than chance does, or clearly less than those pages.
         """
         field = self.known_field(page.pair, np.angle(page.symbols))
-        sampler = FieldSampler(field, field_grid(self._profile))
+        sampler = FieldSampler(field, self.grid)
         found = page_coherence(sampler, self._twin, self._parameters, self._profile, page.symbols)
         least = max(least_coherence(page.symbols.size), LEAST_KEPT * calibrated)
         if not found >= least:
@@ -138,7 +147,7 @@ class FeatureExtractor:
     def known_field(self, pair: FramePair, phases: Real) -> NDArray[np.complex64]:
         """Recovered field of a known page, its image shift taken off."""
         field = self.field(pair)
-        return moved(field, np.array(self.page(field, phases, np.zeros(2))[0].state.shift_px))
+        return self._moved(field, np.array(self.page(field, phases, np.zeros(2))[0].state.shift_px))
 
     def pages(
         self, recording: Recording, indices: Sequence[int], shift_px: tuple[float, float] = (0.0, 0.0)
@@ -156,7 +165,7 @@ class FeatureExtractor:
         """Features of one page, and its shift, found from the known phases [ny, nx] starting from `shift` (x, y)."""
         state = self.state(field, phases, shift)
         shift, piston = np.array(state.shift_px), state.piston_rad
-        light = self._light(field, shift) if self._wave is None else localized(self._wave, moved(field, shift))
+        light = self._light(field, shift) if self._wave is None else localized(self._wave, self._moved(field, shift))
         if self._wave is not None:
             centre = light[:, 0].mean(1)
             piston = float(np.angle(np.sum((centre[0] + 1j * centre[1]) * np.exp(-1j * phases))))
@@ -177,6 +186,9 @@ class FeatureExtractor:
             shift = shift + self._shift_step(field, known, shift)
         piston = float(np.angle(self._agreement(self._light(field, shift), known)))
         return PageState((float(shift[0]), float(shift[1])), piston)
+
+    def _moved(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.complex64]:
+        return moved(field, shift * self._profile.camera.pitch_m / self.grid.pitch_m)
 
     def _light(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.float32]:
         return demodulate(self._coherent, field, self.table, shift)
@@ -225,7 +237,6 @@ def localized(waves: WaveLocalizer, field: NDArray[np.complexfloating]) -> NDArr
 
 
 def moved(field: NDArray[np.complex64], shift: Real) -> NDArray[np.complex64]:
-    """The field as seen `shift` (x, y) camera pixels further on."""
-    by = -shift[::-1] / GRID_STEP_PX
-    real, imaginary = (ndimage.shift(part, by, order=3) for part in (field.real, field.imag))
+    """The field as seen `shift` (x, y) samples further on."""
+    real, imaginary = (ndimage.shift(part, -shift[::-1], order=3) for part in (field.real, field.imag))
     return np.asarray(real + 1j * imaginary, dtype=np.complex64)

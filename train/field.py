@@ -86,15 +86,22 @@ class FieldRecovery(nn.Module):
         rounds: of descent.
         binning: camera pixels along each axis whose mean is sampled; one filters the frames first instead, which takes
             longer and loses less.
+        grid: the common grid, where it is not the usual one.
     """
 
     def __init__(
-        self, profile: Profile, *, with_signal_power: bool = True, rounds: int = ROUNDS, binning: int = 1
+        self,
+        profile: Profile,
+        *,
+        with_signal_power: bool = True,
+        rounds: int = ROUNDS,
+        binning: int = 1,
+        grid: FieldGrid | None = None,
     ) -> None:
         super().__init__()
         self.with_signal_power, self.rounds, self.binning = with_signal_power, rounds, binning
-        grid = field_grid(profile)
-        self.grid: FieldGrid = grid
+        grid = grid or field_grid(profile)
+        self.grid = grid
         self.rows_px, self.columns_px = profile.frame_shape
         # the outer pixels' centres, where blocks' outer edges lie at -1 and 1
         blocked = [(count, -(-count // binning) * binning) for count in profile.frame_shape]
@@ -133,13 +140,15 @@ class FieldRecovery(nn.Module):
                 the page's corner radius.
             homodyne: [2], cosine and sine of the turn between the two arms.
         """
-        frames = torch.stack([in_phase, quadrature]).to(torch.float32)
-        references = torch.stack([reference_in_phase, reference_quadrature]).to(torch.float32)
+        frames = _block_means(torch.stack([in_phase, quadrature]).to(torch.float32), self.binning)
+        references = _block_means(
+            torch.stack([reference_in_phase, reference_quadrature]).to(torch.float32), self.binning
+        )
         where = self._where(registration, self.binning)
         beyond = frames - references
         if self.binning == 1:
             beyond = self.prefilter(beyond)
-        gained = self._block_means(beyond, where, self.binning)
+        gained = _sampled(beyond, where)
         reference = self._reference(references, registration)
         floor = _FLOOR * references.mean(dim=(1, 2))[:, None, None]
         seen = (where.abs().amax(dim=-1) <= self._edge) & (reference > floor)
@@ -215,20 +224,27 @@ class FieldRecovery(nn.Module):
             [powers.index((i, j)) if (i, j) in powers else absent for i in range(_CUBIC + 1)] for j in range(_CUBIC + 1)
         ]
         by_power = cubic[..., torch.tensor(table, device=cubic.device)]  # [2, 2, powers of y, powers of x]
-        return (self.v[:, ::step].T @ by_power @ self.u[:, ::step]).permute(0, 2, 3, 1)
+        along_rows = (by_power @ self.u[:, ::step]).permute(0, 2, 3, 1)
+        return (self.v[:, ::step].T @ along_rows.flatten(2)).unflatten(2, (-1, 2))
 
     def _reference(self, references: Tensor, registration: Tensor) -> Tensor:
-        """The references on the grid, [2, ny, nx]: beams are smooth, so few places are looked at."""
+        """Binned references on the grid, [2, ny, nx]: beams are smooth, so few places are looked at."""
         coarse = self._where(registration, _REFERENCE_BLOCK_PX, _REFERENCE_STEP)
-        return self.between_y @ self._block_means(references, coarse, _REFERENCE_BLOCK_PX) @ self.between_x.T
+        blocks = _block_means(references, _REFERENCE_BLOCK_PX // self.binning)
+        return self.between_y @ _sampled(blocks, coarse) @ self.between_x.T
 
-    @staticmethod
-    def _block_means(images: Tensor, where: Tensor, side: int) -> Tensor:
-        """Means of blocks of pixels of images [2, H, W], interpolated where `_where` says, [2, ny, nx]."""
-        blocks = images[:, None]
-        if side > 1:
-            blocks = functional.avg_pool2d(blocks, side, ceil_mode=True, count_include_pad=False)
-        return functional.grid_sample(blocks, where, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
+
+def _block_means(images: Tensor, side: int) -> Tensor:
+    """Means of blocks of pixels of images [2, H, W]."""
+    if side == 1:
+        return images
+    return functional.avg_pool2d(images[:, None], side, ceil_mode=True, count_include_pad=False)[:, 0]
+
+
+def _sampled(images: Tensor, where: Tensor) -> Tensor:
+    """Images [2, H, W] interpolated where `FieldRecovery._where` says, [2, ny, nx]."""
+    seen = functional.grid_sample(images[:, None], where, mode="bilinear", padding_mode="border", align_corners=False)
+    return seen[:, 0]
 
 
 def _interpolation(count: int) -> NDArray[np.float64]:

@@ -26,6 +26,7 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 
 from optics.errors import InvalidInputError
 from optics.files import replace_file, replace_text
+from optics.grid import GRID_STEP_PX, FieldGrid, field_grid
 from optics.measures import achievable_rate
 from optics.pilots import Pilots, estimate_piston
 from optics.profile import Profile
@@ -61,6 +62,7 @@ class Hyperparameters:
         channels, blocks, levels: size of the network, see `SymbolUNet`.
         refinements: how often the decoder looks again, see `train.refinement`.
         field_rounds, binning: of the field's recovery, see `train.field.FieldRecovery`.
+        field_step: pitch of the common grid, camera pixels.
         samples, interpolation: see `CoherentLocalizer`.
         steps: optimiser steps.
         batch: pages a step, or patches of large ones.
@@ -77,6 +79,7 @@ class Hyperparameters:
     refinements: int = 0
     field_rounds: int = ROUNDS
     binning: int = 1
+    field_step: int = GRID_STEP_PX
     samples: int = 0
     interpolation: str = BICUBIC
     steps: int = 6000
@@ -90,11 +93,15 @@ class Hyperparameters:
     @property
     def first_look(self) -> str:
         """What the features of the first look depend on."""
-        return f"{self.field_rounds} {self.binning} {self.samples} {self.interpolation}"
+        return f"{self.field_rounds} {self.binning} {self.field_step} {self.samples} {self.interpolation}"
+
+    def grid(self, profile: Profile) -> FieldGrid:
+        """The common grid of these choices."""
+        return field_grid(profile, self.field_step)
 
     def coherent_localizer(self, profile: Profile) -> CoherentLocalizer:
         """The localizer of these choices."""
-        return CoherentLocalizer(profile, self.samples, self.interpolation)
+        return CoherentLocalizer(profile, self.samples, self.interpolation, self.grid(profile))
 
     def of_refinement(self) -> Hyperparameters:
         """The choices for a refinement's network, which starts from a good belief and sees little light."""

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from optics.grid import field_grid, symbol_samples
+from optics.grid import symbol_samples
 from optics.profile import Profile
 from optics.registration.calibrate import KnownPage
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
@@ -58,10 +58,11 @@ def explained(
         pages: of the device.
     """
     samples = symbol_samples(profile)
-    waves = FittedWaves(profile, parameters, samples, filled=True)
+    grid = extractor.grid
+    waves = FittedWaves(profile, parameters, samples, filled=True, grid=grid)
     terms = np.stack(illumination_terms(waves.x, waves.y))
-    stride = max(1, int(np.sqrt(np.prod(field_grid(profile).shape) / _EQUATIONS)))
-    at_few = FittedWaves(profile, parameters, samples, filled=True, stride=stride)
+    stride = max(1, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
+    at_few = FittedWaves(profile, parameters, samples, filled=True, stride=stride, grid=grid)
     found = []
     for page in tqdm(pages, desc="light of known pages", unit="page"):
         phases = np.angle(page.symbols)

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from optics.grid import FieldGrid
 from optics.profile import Profile
 from optics.recording import Recording
 from optics.registration.fitted_waves import illumination_terms
@@ -41,15 +42,16 @@ class Prediction(nn.Module):
     Args:
         profile: the nominal device.
         parameters: [P] fitted.
+        grid: the common grid, where it is not the usual one.
 
     Attributes:
         illumination: real and imaginary parts of the factors of `illumination_terms`, [2, 6]; even until fitted.
         floor: see `Measured.pull`; one until it is fitted (`fit_prediction`).
     """
 
-    def __init__(self, profile: Profile, parameters: Real) -> None:
+    def __init__(self, profile: Profile, parameters: Real, grid: FieldGrid | None = None) -> None:
         super().__init__()
-        self.waves = Waves(profile, parameters, filled=True)
+        self.waves = Waves(profile, parameters, filled=True, grid=grid)
         self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
         self.illumination: Tensor
         self.floor: Tensor
@@ -105,14 +107,16 @@ def expected_phasors(p: Tensor) -> Tensor:
     return p / (0.5 + torch.sqrt(p.square().sum(0, keepdim=True) + 2.25))
 
 
-def fit_prediction(profile: Profile, parameters: Real, known: Sequence[Explained]) -> Prediction:
+def fit_prediction(
+    profile: Profile, parameters: Real, known: Sequence[Explained], grid: FieldGrid | None = None
+) -> Prediction:
     """The prediction of a device, illumination and floor as known pages show them.
 
     Args:
-        profile, parameters: the device.
-        known: pages.
+        profile, parameters, grid: see `Prediction`.
+        known: pages, on that grid.
     """
-    prediction = Prediction(profile, parameters)
+    prediction = Prediction(profile, parameters, grid)
     squares, lengths = [], []
     for light in known:
         measured, seen = light.measured, light.seen

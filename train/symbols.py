@@ -124,7 +124,7 @@ class SymbolRecipe:
         weights: dict[str, Tensor],
     ) -> Refined:
         """Trained refinements, which add what they have learnt to the weights."""
-        prediction = fit_prediction(material.profile, material.calibration.vector, known_light)
+        prediction = fit_prediction(material.profile, material.calibration.vector, known_light, material.extractor.grid)
         refined = fit_refinements(
             material.out,
             self.choices,
@@ -181,7 +181,9 @@ class SymbolRecipe:
         click.echo(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
         folder = material.out / "synthetic"
         reader = self.choices.coherent_localizer(profile)
-        pages = SyntheticPages(profile, vector, like, None if self.localizer == WAVE else reader, seed)
+        pages = SyntheticPages(
+            profile, vector, like, None if self.localizer == WAVE else reader, seed, material.extractor.grid
+        )
         key = f"{self.localizer} {self.choices.first_look} {seed} "
         key += f"{profile.to_toml()} {material.calibration.to_toml()} {like.noise:.6f} "
         key += f"{np.round(like.illumination, 6).tolist()}"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from optics.grid import field_grid, symbol_samples
+from optics.grid import FieldGrid, field_grid, symbol_samples
 from optics.page import MAX_LEVELS, random_symbols, symbol_phases
 from optics.profile import Profile
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
@@ -93,13 +93,20 @@ class SyntheticPages:
         like: what recorded pages show over that geometry.
         localizer: the coherent one; None for that by waves.
         seed: of drifts, symbols and noise.
+        grid: the common grid, where it is not the usual one.
     """
 
     def __init__(
-        self, profile: Profile, parameters: Real, like: Likeness, localizer: CoherentLocalizer | None, seed: int
+        self,
+        profile: Profile,
+        parameters: Real,
+        like: Likeness,
+        localizer: CoherentLocalizer | None,
+        seed: int,
+        grid: FieldGrid | None = None,
     ) -> None:
         self._profile, self._parameters, self._like, self._seed = profile, parameters, like, seed
-        self._twin = TorchTwin(RayTwin(profile))
+        self._twin, self._grid = TorchTwin(RayTwin(profile)), grid or field_grid(profile)
         self._per_state = PAGES_PER_STATE if np.prod(profile.page_shape) < _LARGE else 1
         self._coherent = localizer
 
@@ -117,8 +124,8 @@ class SyntheticPages:
         rng = np.random.default_rng([self._seed, number])
         drift = np.array([_DRIFT.get(name, 0.0) for name in NAMES]) * rng.uniform(-1, 1, len(NAMES))
         parameters = self._parameters + drift
-        waves = FittedWaves(profile, parameters, symbol_samples(profile), filled=True)
-        waves_back = WaveLocalizer(profile, parameters) if self._coherent is None else None
+        waves = FittedWaves(profile, parameters, symbol_samples(profile), filled=True, grid=self._grid)
+        waves_back = WaveLocalizer(profile, parameters, self._grid) if self._coherent is None else None
         table = sampling_table(self._twin, parameters, np.pi / 2, profile)
         light_on = np.tensordot(self._like.illumination, np.stack(illumination_terms(waves.x, waves.y)), 1)
         for symbols in random_symbols(profile, MAX_LEVELS, self._per_state, rng):
@@ -135,7 +142,7 @@ class SyntheticPages:
 
     def _noise(self, field: Complex, rng: np.random.Generator) -> Complex:
         """White noise in the pipe's band with the power that the model leaves unexplained."""
-        band = field_grid(self._profile).band
+        band = self._grid.band
         white = rng.standard_normal((2, *field.shape))
         noise = signal.oaconvolve(white, band[None, :, None], mode="same", axes=1)
         noise = signal.oaconvolve(noise, band[None, None, :], mode="same", axes=2)

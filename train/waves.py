@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from optics.expansion import Interpolation
-from optics.grid import field_grid, symbol_samples
+from optics.grid import FieldGrid, field_grid, symbol_samples
 from optics.lens_path import SeidelTerms
 from optics.profile import Profile
 from optics.registration.fitted_waves import (
@@ -84,17 +84,20 @@ class Waves(nn.Module):
     Args:
         profile: the nominal device.
         parameters: [P] of the ray twin, fitted (or, for an oracle, true): they say how finely the pipe is sampled.
-        filled: see `FittedWaves`.
+        filled, grid: see `FittedWaves`.
 
     Attributes:
         samples: on the modulator, per symbol and axis.
     """
 
-    def __init__(self, profile: Profile, parameters: Real, *, filled: bool = False) -> None:
+    def __init__(
+        self, profile: Profile, parameters: Real, *, filled: bool = False, grid: FieldGrid | None = None
+    ) -> None:
         super().__init__()
+        grid = grid or field_grid(profile)
         self.samples = symbol_samples(profile)
-        waves = FittedWaves(profile, parameters, self.samples, filled=filled, accuracy=_ACCURACY)
-        channel, grid = waves.channel, field_grid(profile)
+        waves = FittedWaves(profile, parameters, self.samples, filled=filled, accuracy=_ACCURACY, grid=grid)
+        channel = waves.channel
         x, y = modulator_axes(profile, self.samples)
         self._profile, self._envelope_m = profile, channel.envelope_m
         self.x_m: Tensor

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from optics.grid import field_grid, splitting_steps
+from optics.grid import FieldGrid, field_grid, splitting_steps
 from optics.profile import Profile
 from optics.registration.parameters import as_dict
 from optics.registration.phases import camera_phase, launch_phase
@@ -73,6 +73,7 @@ class FittedWaves:
         filled: whether each sample stands for a pixel of that size; else for a point.
         stride: samples of the common grid from one to the next that is computed.
         accuracy: share of the splitting steps that a simulation takes; with 3/8, a fit would err in the angle.
+        grid: the common grid, where it is not the usual one.
         like: waves whose work is shared where geometry and sampling are the same.
 
     Attributes:
@@ -91,17 +92,27 @@ class FittedWaves:
         filled: bool = False,
         stride: int = 1,
         accuracy: float = 1.0,
+        grid: FieldGrid | None = None,
         like: FittedWaves | None = None,
     ) -> None:
         value = as_dict(parameters)
         geometry = fitted_geometry(profile, value)
-        grid = field_grid(profile)
+        grid = grid or field_grid(profile)
         grid_x, grid_y = grid.x_m[::stride], grid.y_m[::stride]
         x, y = modulator_axes(profile, samples)
         pitch = profile.symbol_pitch_m / samples
         self.x, self.y = x / (profile.page_width_m / 2), y / (profile.page_height_m / 2)
         page = x + value["page_centre_x_m"], y + value["page_centre_y_m"]
-        self._sampling = geometry, value["page_centre_x_m"], value["page_centre_y_m"], samples, filled, stride, accuracy
+        self._sampling = (
+            geometry,
+            value["page_centre_x_m"],
+            value["page_centre_y_m"],
+            samples,
+            filled,
+            stride,
+            accuracy,
+            grid.shape,
+        )
         self.channel: WaveChannel
         if like is not None and like._sampling == self._sampling:
             self.channel = like.channel

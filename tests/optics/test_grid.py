@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from optics.errors import ProfileError
+from optics.errors import InvalidInputError, ProfileError
 from optics.grid import FieldGrid, check_camera, field_grid
 from optics.profile import Profile, load_profile
 from tests.optics.small import small_profile
@@ -35,7 +35,9 @@ def band_edge(profile: Profile) -> float:
     return profile.pipe.width_m / 2 / (profile.light.wavelength_m * profile.lens.focal_length_m)
 
 
-def test_axes_are_uniform_centred_and_reach_past_the_page(profile: Profile, grid: FieldGrid) -> None:
+@pytest.mark.parametrize("step_px", [2, 3])
+def test_axes_are_uniform_centred_and_reach_past_the_page(profile: Profile, step_px: int) -> None:
+    grid = field_grid(profile, step_px)
     for axis, extent in ((grid.x_m, profile.page_width_m), (grid.y_m, profile.page_height_m)):
         np.testing.assert_allclose(np.diff(axis), grid.pitch_m)
         assert axis[0] == pytest.approx(-axis[-1])
@@ -49,9 +51,16 @@ def test_the_grid_samples_the_field_above_its_rate(profile: Profile, grid: Field
     assert 1 / grid.pitch_m > 4 * band_edge(profile)
 
 
+def test_a_grid_too_coarse_for_the_pipes_light_is_refused(profile: Profile) -> None:
+    with pytest.raises(InvalidInputError, match=r"pitch of the common grid.*4.*at most 3"):
+        field_grid(profile, 4)
+
+
+@pytest.mark.parametrize("step_px", [2, 3])
 def test_the_band_filter_is_flat_on_the_pipes_light_and_stops_what_the_pipe_cannot_carry(
-    profile: Profile, grid: FieldGrid
+    profile: Profile, step_px: int
 ) -> None:
+    grid = field_grid(profile, step_px)
     edge = band_edge(profile) * grid.pitch_m
     assert np.abs(gain(grid.band, np.linspace(0, edge, 200)) - 1).max() < 0.02
     assert np.abs(gain(grid.band, np.linspace(1.4 * edge, 0.5, 200))).max() < 0.03

@@ -73,6 +73,8 @@ def test_options_of_the_first_look_are_kept_and_those_that_do_nothing_refused(
     hurried = [
         "--binning",
         "2",
+        "--field-step",
+        "3",
         "--samples",
         "3",
         "--interpolation",
@@ -84,8 +86,11 @@ def test_options_of_the_first_look_are_kept_and_those_that_do_nothing_refused(
     ]
     run([*small, *hurried, "--out", str(tmp_path / "run")])
     kept = json.loads((tmp_path / "run" / "run.json").read_text())["hyperparameters"]
-    assert {name: kept[name] for name in ("binning", "samples", "interpolation", "field_rounds", "patch")} == {
+    assert {
+        name: kept[name] for name in ("binning", "field_step", "samples", "interpolation", "field_rounds", "patch")
+    } == {
         "binning": 2,
+        "field_step": 3,
         "samples": 3,
         "interpolation": "bilinear",
         "field_rounds": 0,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from optics.device import Device, Drift, SlmDefects
+from optics.grid import GRID_STEP_PX, field_grid
 from optics.page import random_symbols, symbol_phases
 from optics.registration.coherence import COHERENT_BRANCHES, branch_shares
 from optics.simulator import Simulator, true_parameters
@@ -15,8 +16,8 @@ from train.features import FeatureExtractor
 SEED = 3
 
 
-@pytest.fixture(scope="module")
-def page() -> tuple[np.ndarray, dict[str, np.ndarray], FeatureExtractor]:
+@pytest.fixture(scope="module", params=[GRID_STEP_PX, 3])
+def page(request: pytest.FixtureRequest) -> tuple[np.ndarray, dict[str, np.ndarray], FeatureExtractor]:
     profile = small_profile()
     device = Device(slm=SlmDefects(phase_noise_rad=0), drift=Drift(piston_rad=1.0, shift_px=0.3))
     simulator = Simulator(profile, device, seed=SEED)
@@ -24,9 +25,11 @@ def page() -> tuple[np.ndarray, dict[str, np.ndarray], FeatureExtractor]:
     recorded = simulator.simulate(symbols)
     phases = symbol_phases(symbols, 256)
     turn = device.homodyne.turn_rad
-    features = {}
+    features, grid = {}, field_grid(profile, request.param)
     for localizer in ("coherent", "wave"):
-        extractor = FeatureExtractor(profile, true_parameters(profile, device), turn, simulator.references(), localizer)
+        extractor = FeatureExtractor(
+            profile, true_parameters(profile, device), turn, simulator.references(), localizer, grid=grid
+        )
         found, shift = extractor.page(extractor.field(recorded.pair), phases, np.zeros(2))
         features[localizer] = found.light.astype(np.float32)
         np.testing.assert_allclose(shift, recorded.shift_px, atol=0.1)

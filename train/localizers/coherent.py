@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from optics.grid import field_grid, symbol_samples
+from optics.grid import FieldGrid, field_grid, symbol_samples
 from optics.profile import Profile
 from optics.registration.twin import BRANCHES
 
@@ -19,13 +19,21 @@ class CoherentLocalizer(nn.Module):
     Args:
         profile: the nominal device.
         samples: per symbol and axis; 0 takes as many as the field has, see `symbol_samples`.
-        interpolation: of the field between the grid's samples, `bicubic` or `bilinear`: an error of -32 or -23 dB.
+        interpolation: of the field between the grid's samples, `bicubic` or `bilinear`: an error of -32 or -23 dB on
+            the usual grid.
+        grid: the common grid, where it is not the usual one.
     """
 
-    def __init__(self, profile: Profile, samples: int = 0, interpolation: str = BICUBIC) -> None:
+    def __init__(
+        self, profile: Profile, samples: int = 0, interpolation: str = BICUBIC, grid: FieldGrid | None = None
+    ) -> None:
         super().__init__()
         self.interpolation = interpolation
-        self.grid_shape = field_grid(profile).shape
+        usual, own = field_grid(profile), grid or field_grid(profile)
+        self._last = tuple(count - 1 for count in usual.shape)
+        """Row and column of the usual grid's last sample, in whose units a table's places are."""
+        self._span = tuple((count - 1) * own.pitch_m / usual.pitch_m for count in own.shape)
+        """From the first to the last sample of its own grid, in the same units; both have the same middle."""
         self.page_shape = profile.page_shape
         self.samples = samples or symbol_samples(profile)
         steps = (torch.arange(self.samples, dtype=torch.float32) + 0.5) / self.samples - 0.5
@@ -55,8 +63,8 @@ class CoherentLocalizer(nn.Module):
         row = places[:, 1:2] + gradients[:, 2:3] * x + gradients[:, 3:4] * y
         value, along_x, along_y, xx, xy, yy = phases.unsqueeze(2).unbind(1)
         phase = value + along_x * x + along_y * y + xx * x * x / 2 + xy * x * y + yy * y * y / 2
-        height, width = self.grid_shape
-        where = torch.stack([2 * column / (width - 1) - 1, 2 * row / (height - 1) - 1], dim=-1)
+        (last_row, last_column), (height, width) = self._last, self._span
+        where = torch.stack([(2 * column - last_column) / width, (2 * row - last_row) / height], dim=-1)
         ny, nx = self.page_shape
         sampled = functional.grid_sample(
             field[None], where.reshape(1, -1, nx, 2), mode=self.interpolation, padding_mode="zeros", align_corners=True

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from optics.grid import FieldGrid
 from optics.profile import Profile
 from train.waves import Real, Waves
 
@@ -13,12 +14,12 @@ class WaveLocalizer(nn.Module):
     """Runs a field back through camera lens, pipe and launch lens to the SLM.
 
     Args:
-        profile, parameters: as for `Waves`.
+        profile, parameters, grid: as for `Waves`.
     """
 
-    def __init__(self, profile: Profile, parameters: Real) -> None:
+    def __init__(self, profile: Profile, parameters: Real, grid: FieldGrid | None = None) -> None:
         super().__init__()
-        self.waves = Waves(profile, parameters)
+        self.waves = Waves(profile, parameters, grid=grid)
 
     @property
     def light_channels(self) -> int:
