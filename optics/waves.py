@@ -27,6 +27,9 @@ _TOLERANCE = 1e-7
 _TOLERANCE_WITH_PATH = 1e-3
 """The same for a real lens, a field error of about 0.002; 1e-5 would take twice the terms, a hundred at full size."""
 
+_UNCOUPLED = 1.2 * np.pi, 0.8 * np.pi
+"""Radians in a step by which modes fall apart that are not coupled, and that are fully coupled."""
+
 _MODE_MARGIN = 1.04
 """Modes beyond the one that the page's edge excites: an edge of the facet spreads it."""
 
@@ -285,6 +288,10 @@ class PipePropagator:
     splitting), paraxially, as an exact exponential: the derivative couples odd with even sine modes only, and in the
     singular basis of that coupling the exponential is a rotation of pairs. So power is kept to rounding for any step.
 
+    Pairs of modes that fall apart by more than half a turn in a step are left uncoupled (`ParityBasis`). In the pipe
+    such a pair hardly exchanges light, as its phase turns; but kicks in the rhythm of its turns would drive it, and that
+    is most of what splitting in few steps does wrong.
+
     Args:
         geometry: the device.
         cells: sample intervals along (y', x).
@@ -301,11 +308,11 @@ class PipePropagator:
     def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], steps: int) -> None:
         self.sheared = abs(geometry.pipe_angle) > 0
         self.steps = steps if self.sheared else 1
-        self.bases = [_parity_basis(n) for n in cells]
         w, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
+        dz = geometry.pipe_length_m / self.steps
+        self.bases = [_parity_basis(n, float(dz * (np.pi / w) ** 2 / (2 * nk))) for n in cells]
         y, x = (basis.mode_numbers for basis in self.bases)
         detuning = mode_detuning(geometry, y[:, None, :, None], x[None, :, None, :])
-        dz = geometry.pipe_length_m / self.steps
         self.half = np.exp(0.5j * dz * detuning).astype(np.complex64)
         coupling = np.outer(self.bases[0].couplings, self.bases[1].couplings) / w**2
         angle = dz / nk * np.sin(geometry.pipe_angle) * coupling
@@ -339,14 +346,16 @@ class ParityBasis:
 
     Args:
         cells: sample intervals.
+        lag: phase in radians by which a mode falls behind in a step, over the square of its number.
 
     Attributes:
         sine_by_parity: samples of the modes, [2, K, cells - 1], zero where a parity has one mode less.
         mode_numbers: [2, K].
-        singular, couplings: singular vectors on either side, [2, K, K], and values [K] of the derivative.
+        singular, couplings: singular vectors on either side, [2, K, K], and values [K] of the derivative between modes
+            that stay together.
     """
 
-    def __init__(self, cells: int) -> None:
+    def __init__(self, cells: int, lag: float) -> None:
         count = cells - 1
         size = (count + 1) // 2
         odd = np.arange(1, count + 1, 2)
@@ -354,7 +363,7 @@ class ParityBasis:
         coupling = np.zeros((size, size))
         m, n = odd[:, None].astype(float), even[None, :].astype(float)
         # (2/w) integral of sin(m pi x/w) d/dx sin(n pi x/w), times w
-        coupling[: len(odd), : len(even)] = 4 * m * n / (m**2 - n**2)
+        coupling[: len(odd), : len(even)] = 4 * m * n / (m**2 - n**2) * _stay_together(lag * (m**2 - n**2))
         left, self.couplings, right = np.linalg.svd(coupling)
         self.singular = np.stack([left, right.T]).astype(np.float32)
         self.mode_numbers = np.zeros((2, size))
@@ -366,10 +375,16 @@ class ParityBasis:
         self.sine_by_parity[1, : len(even)] = sine[even - 1]
 
 
+def _stay_together(apart: Real) -> Real:
+    """How far modes are coupled that fall apart by so many radians in a step: beyond about half a turn, not at all."""
+    uncoupled, fully = _UNCOUPLED
+    return np.clip((uncoupled - np.abs(apart)) / (uncoupled - fully), 0, 1)
+
+
 @lru_cache(maxsize=8)
-def _parity_basis(cells: int) -> ParityBasis:
+def _parity_basis(cells: int, lag: float) -> ParityBasis:
     """It depends on nothing else, and takes as long as the rest of a small propagator."""
-    return ParityBasis(cells)
+    return ParityBasis(cells, lag)
 
 
 def real_products(left: Real, stack: Complex, right: Real) -> Complex:

@@ -225,7 +225,8 @@ class FieldRecovery(nn.Module):
         ]
         by_power = cubic[..., torch.tensor(table, device=cubic.device)]  # [2, 2, powers of y, powers of x]
         along_rows = (by_power @ self.u[:, ::step]).permute(0, 2, 3, 1)
-        return (self.v[:, ::step].T @ along_rows.flatten(2)).unflatten(2, (-1, 2))
+        places = self.v[:, ::step].T @ along_rows.flatten(2)
+        return places.reshape(*places.shape[:2], -1, 2)
 
     def _reference(self, references: Tensor, registration: Tensor) -> Tensor:
         """Binned references on the grid, [2, ny, nx]: beams are smooth, so few places are looked at."""

@@ -41,8 +41,8 @@ _TOLERANCE_WITH_PATH = 3e-3
 """The same for lenses that are not ideal: half of the terms that the other takes, and a field error of 0.014."""
 _AT_ONCE = 12
 """Terms that go through a product together: as many as an ideal lens has, and a memory's worth of another's."""
-_ACCURACY = 1 / 2
-"""Share of the fitted waves' splitting steps, each of which is time in every decode; a field error of 0.02."""
+ACCURACY = 3 / 8
+"""Share of the fitted waves' splitting steps, each of which is time in every decode; a field error of 0.012."""
 
 
 class LensMatrices(NamedTuple):
@@ -96,7 +96,7 @@ class Waves(nn.Module):
         super().__init__()
         grid = grid or field_grid(profile)
         self.samples = symbol_samples(profile)
-        waves = FittedWaves(profile, parameters, self.samples, filled=filled, accuracy=_ACCURACY, grid=grid)
+        waves = FittedWaves(profile, parameters, self.samples, filled=filled, accuracy=ACCURACY, grid=grid)
         channel = waves.channel
         x, y = modulator_axes(profile, self.samples)
         self._profile, self._envelope_m = profile, channel.envelope_m

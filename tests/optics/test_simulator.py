@@ -273,13 +273,13 @@ class TestLight:
         assert (pair.quadrature == 255).mean() < 0.01
 
     @pytest.mark.parametrize(
-        ("angle_deg", "share", "error"), [(-0.6, 1.0, 0.005), (-0.6, 0.5, 0.023), (-5.0, 1.0, 0.07)]
+        ("angle_deg", "share", "error"), [(-0.6, 1.0, 0.0019), (-0.6, 0.375, 0.0123), (-5.0, 1.0, 0.054)]
     )
     def test_splitting_errs_as_its_description_says(self, angle_deg: float, share: float, error: float) -> None:
         profile, device = load_profile("bench"), Device(geometry=Geometry(pipe_angle_deg=angle_deg))
         written = on_slm(random_phases(profile, 0), profile)
         found, many = (
-            TrueOptics(profile, device, splitting_steps(profile, part)).exit_field(written) for part in (share, 4.0)
+            TrueOptics(profile, device, splitting_steps(profile, part)).exit_field(written) for part in (share, 12.0)
         )
         assert np.linalg.norm(found - many) / np.linalg.norm(many) == pytest.approx(error, rel=0.15)
 
@@ -292,9 +292,9 @@ class TestLight:
             TrueOptics(profile, Device(), steps).exit_field(written)
             for steps in (splitting_steps(TALL), None, 4 * splitting_steps(profile))
         )
-        # measured 0.006, and 0.09 with the steps of the pipe that is not longer
+        # measured 0.006, and 0.03 with the steps of the pipe that is not longer
         assert np.linalg.norm(usual - many) / np.linalg.norm(many) < 0.01
-        assert np.linalg.norm(fewer - many) / np.linalg.norm(many) > 0.05
+        assert np.linalg.norm(fewer - many) / np.linalg.norm(many) > 0.02
 
     @pytest.mark.parametrize(
         ("lenses", "geometry"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import fft, integrate, linalg, ndimage
 
+from optics import waves
 from optics.lens_path import SeidelTerms
 from optics.waves import FourierLens, PipePropagator, WaveChannel, WaveGeometry, cells_for, modes_for, sine_matrix
 
@@ -103,11 +104,22 @@ class TestPipe:
         assert errors[2] ** 2 < 1e-4
         assert errors[0] / errors[1] == pytest.approx(4, rel=0.25)
 
-    @pytest.mark.parametrize("angle_deg", [-2.0, 4.0])
-    def test_a_step_is_the_matrix_exponential_of_the_cross_term_between_half_steps(self, angle_deg: float) -> None:
+    @pytest.mark.parametrize(
+        ("angle_deg", "length_m", "kept"), [(-10.0, 7e-5, 1.0), (20.0, 7e-5, 1.0), (4.0, 1e-3, 0.5)]
+    )
+    def test_a_step_is_the_matrix_exponential_of_the_cross_term_between_half_steps(
+        self, angle_deg: float, length_m: float, kept: float
+    ) -> None:
         cells, w = (8, 11), 30e-6
-        geometry = replace(device(angle_deg, length_m=1e-3), pipe_width_m=w)
-        derivatives = [_derivative_between_sines(n - 1) / w for n in cells]
+        geometry = replace(device(angle_deg, length_m=length_m), pipe_width_m=w)
+        derivatives, coupled = [], []
+        for n in cells:
+            squares = (np.pi * np.arange(1, n) / w) ** 2
+            apart = np.abs(squares[:, None] - squares) * length_m / (2 * GLASS)
+            derivative = _derivative_between_sines(n - 1) / w
+            derivatives.append(derivative * np.clip(3 - apart / (0.4 * np.pi), 0, 1))
+            coupled.append(np.linalg.norm(derivatives[-1]) / np.linalg.norm(derivative))
+        assert min(coupled) == pytest.approx(kept, abs=0.25 if kept < 1 else 1e-12)
         laplacian = 2 * np.sin(geometry.pipe_angle) * np.kron(*derivatives)
         step = linalg.expm(1j * geometry.pipe_length_m / (2 * GLASS) * laplacian)
         numbers = [np.pi * np.arange(1, n) / w for n in cells]
@@ -118,6 +130,23 @@ class TestPipe:
         expected = fft.dstn((half * (step @ (half * modes))).reshape(field.shape), type=1, norm="ortho")
         assert off(step, np.eye(len(step))) > 0.1
         assert off(PipePropagator(geometry, cells, 1).forward(field), expected) < 1e-5
+
+    @pytest.mark.parametrize("angle_deg", [-0.6, -3.0])
+    def test_without_kicks_between_modes_that_fall_apart_a_field_errs_several_times_less(
+        self, angle_deg: float, page_at_entrance: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        geometry = device(angle_deg, length_m=8 * DEVICE.pipe_length_m)
+
+        def field(steps: int) -> np.ndarray:
+            return PipePropagator(geometry, CELLS, steps).forward(page_at_entrance)
+
+        exact, without = field(512), field(16)
+        waves._parity_basis.cache_clear()
+        monkeypatch.setattr(waves, "_UNCOUPLED", (1e9, 1e8))
+        kicked = field(16)
+        waves._parity_basis.cache_clear()
+        assert off(without, exact) < off(kicked, exact) / 7
+        assert off(kicked, exact) < 0.15
 
     def test_modes_that_the_glass_cannot_carry_are_refused(self) -> None:
         with pytest.raises(ValueError, match="wanted below"):

@@ -13,7 +13,7 @@ from optics.registration.parameters import NAMES, PRIORS, nominal
 from optics.simulator import true_parameters
 from tests.optics.small import THICK, small_profile
 from train.parts import stacked
-from train.waves import Waves
+from train.waves import ACCURACY, Waves
 
 PROFILE = small_profile()
 SAMPLES = 4
@@ -30,7 +30,7 @@ def models(request: pytest.FixtureRequest) -> tuple[FittedWaves, Waves, float]:
     profile = PROFILE.model_copy(update={"lens_path": THICK}) if thick else PROFILE
     parameters = true_parameters(profile, Device())
     parameters[NAMES.index("pipe_angle_rad")] = angle_rad
-    fitted = FittedWaves(profile, parameters, SAMPLES, filled=filled, accuracy=0.5)
+    fitted = FittedWaves(profile, parameters, SAMPLES, filled=filled, accuracy=ACCURACY)
     return fitted, Waves(profile, parameters, filled=filled), 0.02 if thick else 1e-3
 
 
@@ -64,7 +64,7 @@ def test_other_parameters_make_the_waves_of_the_device_that_has_drifted() -> Non
     drifted = parameters + 0.02 * PRIORS
     drifted[NAMES.index("page_centre_y_m")] -= 0.02 * PRIORS[NAMES.index("page_centre_y_m")]  # it changes the sampling
     expected, waves = (
-        FittedWaves(PROFILE, drifted, SAMPLES, filled=True, accuracy=0.5),
+        FittedWaves(PROFILE, drifted, SAMPLES, filled=True, accuracy=ACCURACY),
         Waves(PROFILE, parameters, filled=True),
     )
     page = noise(expected.launch.shape)
