@@ -289,8 +289,8 @@ class PipePropagator:
     singular basis of that coupling the exponential is a rotation of pairs. So power is kept to rounding for any step.
 
     Pairs of modes that fall apart by more than half a turn in a step are left uncoupled (`ParityBasis`). In the pipe
-    such a pair hardly exchanges light, as its phase turns; but kicks in the rhythm of its turns would drive it, and that
-    is most of what splitting in few steps does wrong.
+    such a pair hardly exchanges light, as its phase turns; but kicks in the rhythm of its turns would drive it. That is
+    most of what few steps do wrong.
 
     Args:
         geometry: the device.
