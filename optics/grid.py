@@ -18,6 +18,8 @@ GRID_STEP_PX = 2
 _MARGIN_PX = 70
 """Grid beyond the nominal image of the page, camera pixels on each side: page shift and diffraction."""
 _PREFILTER_TAPS = 11
+_PREFILTER_STOP = 0.36
+"""Cycles per pixel: so few taps stop nothing below it. On a grid of every third pixel some noise folds."""
 _PASS_STEPS = 8
 """Straight pieces of the prefilter's gain in its pass band."""
 _BAND_TAPS = 31
@@ -99,7 +101,7 @@ def field_grid(profile: Profile, step_px: int = GRID_STEP_PX) -> FieldGrid:
 
     Raises:
         ProfileError: the camera is too coarse or too small (`check_camera`).
-        InvalidInputError: a pitch too coarse for the pipe's band.
+        InvalidInputError: a pitch finer than the usual one, or too coarse for the pipe's band.
     """
     check_camera(profile)
     pixel = profile.camera.pitch_m
@@ -110,12 +112,14 @@ def field_grid(profile: Profile, step_px: int = GRID_STEP_PX) -> FieldGrid:
         return np.asarray((np.arange(count) - (count - 1) / 2) * pitch)
 
     edge = profile.pipe.width_m / 2 / (profile.light.wavelength_m * profile.lens.focal_length_m)
-    if (coarsest := int(_NYQUIST / (_BAND_STOP * edge * pixel))) < step_px:
-        raise InvalidInputError("pitch of the common grid, camera pixels", step_px, f"at most {coarsest}")
+    coarsest = int(_NYQUIST / (_BAND_STOP * edge * pixel))
+    if not GRID_STEP_PX <= step_px <= coarsest:
+        wanted = f"{GRID_STEP_PX} to {coarsest}"
+        raise InvalidInputError("pitch of the common grid, camera pixels", step_px, wanted)
     return FieldGrid(
         x_m=axis(profile.page_width_m),
         y_m=axis(profile.page_height_m),
-        prefilter=_before_linear(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / step_px - edge * pixel, 0.36)),
+        prefilter=_before_linear(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / step_px - edge * pixel, _PREFILTER_STOP)),
         band=_low_pass(_BAND_TAPS, _BAND_HEADROOM * edge * pitch, _BAND_STOP * edge * pitch),
     )
 

@@ -40,7 +40,7 @@ def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], level
     nothing; see `achievable_rate`.
 
     Raises:
-        PageError: shapes differ, a phase or concentration that is not finite, a concentration below 0.
+        PageError: shapes differ, a phase that is not finite, a concentration that is negative or not a number.
     """
     m, phase, k = _checked_belief(mu, kappa, levels)
     log_partition, away = _partition(phase, k, m)

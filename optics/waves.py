@@ -288,9 +288,9 @@ class PipePropagator:
     splitting), paraxially, as an exact exponential: the derivative couples odd with even sine modes only, and in the
     singular basis of that coupling the exponential is a rotation of pairs. So power is kept to rounding for any step.
 
-    Pairs of modes that fall apart by more than half a turn in a step are left uncoupled (`ParityBasis`). In the pipe
-    such a pair hardly exchanges light, as its phase turns; but kicks in the rhythm of its turns would drive it. That is
-    most of what few steps do wrong.
+    Modes of an axis that fall apart by more than half a turn in a step are left uncoupled (`ParityBasis`). They are far
+    apart and weakly coupled, and in the pipe the phase of what they exchange turns; but kicks in the rhythm of those
+    turns would drive it. That is most of what few steps do wrong.
 
     Args:
         geometry: the device.

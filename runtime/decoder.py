@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.errors import BundleError, FrameError, InvalidInputError
+from optics.grid import field_grid
 from optics.measures import decide_with_confidence
 from optics.page import MAX_LEVELS, check_levels
 from optics.pilots import Pilots, estimate_piston, estimate_trust, remove_piston
@@ -242,6 +243,10 @@ class Decoder:
         if session is self._session:
             feeds = {**self._table, **feeds}
         (real, imaginary), left = session.run(FIELD_OUTPUTS, feeds)
+        if real.shape != (wanted := field_grid(self.bundle.profile).shape):
+            raise BundleError(
+                f"{self._thing}: output field", f"shape {real.shape}", f"{wanted}, or a {FIELD} beside it"
+            )
         return np.asarray(real + 1j * imaginary, np.complex64), left
 
     @cached_property

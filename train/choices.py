@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import click
 
 from optics.errors import InvalidInputError
+from optics.grid import GRID_STEP_PX
 from optics.profile import Profile, load_profile
 from train.decoder import LOCALIZERS, WAVE
 from train.fitting import Hyperparameters
@@ -118,7 +119,7 @@ CHOICES = (
     ),
     Choice(
         "--field-step",
-        click.IntRange(min=1),
+        click.IntRange(min=GRID_STEP_PX),
         "Camera pixels from one sample of the field to the next: more are quicker and less exact.",
         localizers=LOCALIZERS,
     ),
@@ -207,7 +208,8 @@ def chosen_recipe(
         given: see `given_choices`.
 
     Raises:
-        InvalidInputError: a run to start from that is not finished, or of another size.
+        InvalidInputError: a run to start from that is not finished, or of another size; a grid too coarse for the
+            device.
     """
     given = dict(given)
     if localizer in PUBLISHED:
@@ -215,6 +217,7 @@ def chosen_recipe(
     synthetic = given.pop("synthetic_pages", default_synthetic_pages(profile))
     start = given.pop("start", None)
     choices = replace(Hyperparameters(refinements=USUAL_REFINEMENTS), **given)
+    choices.grid(profile)
     recipe = SymbolRecipe(localizer, choices, synthetic, start)
     recipe.check_start(profile)
     return recipe

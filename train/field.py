@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from optics.errors import InvalidInputError
 from optics.grid import FieldGrid, field_grid
 from optics.profile import Profile
 from optics.recording import FramePair
@@ -87,6 +88,9 @@ class FieldRecovery(nn.Module):
         binning: camera pixels along each axis whose mean is sampled; one filters the frames first instead, which takes
             longer and loses less.
         grid: the common grid, where it is not the usual one.
+
+    Raises:
+        InvalidInputError: a binning that the blocks of the reference are no multiple of.
     """
 
     def __init__(
@@ -99,6 +103,8 @@ class FieldRecovery(nn.Module):
         grid: FieldGrid | None = None,
     ) -> None:
         super().__init__()
+        if binning < 1 or _REFERENCE_BLOCK_PX % binning:
+            raise InvalidInputError("binning, camera pixels", binning, f"a divisor of {_REFERENCE_BLOCK_PX}")
         self.with_signal_power, self.rounds, self.binning = with_signal_power, rounds, binning
         grid = grid or field_grid(profile)
         self.grid = grid

@@ -83,7 +83,8 @@ class Waves(nn.Module):
 
     Args:
         profile: the nominal device.
-        parameters: [P] of the ray twin, fitted (or, for an oracle, true): they say how finely the pipe is sampled.
+        parameters: [P] of the ray twin, fitted (or, for an oracle, true): they say how finely the pipe is sampled
+            and which of its modes couple.
         filled, grid: see `FittedWaves`.
 
     Attributes:

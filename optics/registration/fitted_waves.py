@@ -72,7 +72,7 @@ class FittedWaves:
         samples: samples per symbol and axis on the modulator's side.
         filled: whether each sample stands for a pixel of that size; else for a point.
         stride: samples of the common grid from one to the next that is computed.
-        accuracy: share of the splitting steps that a simulation takes; with 3/8, a fit would err in the angle.
+        accuracy: share of the splitting steps that a simulation takes.
         grid: the common grid, where it is not the usual one.
         like: waves whose work is shared where geometry and sampling are the same.
 

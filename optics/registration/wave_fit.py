@@ -31,7 +31,7 @@ _ROUNDS = 9
 _CHORD = 4
 """Rounds that share one derivative of the light, which costs as much as several rounds."""
 _CHORD_ACCURACY = 3 / 8
-"""Share of the splitting steps for that derivative: a few percent of error in it cost no round."""
+"""Share of the splitting steps for that derivative: an error of a percent in it costs no round."""
 _CONVERGED = 3e-3
 """Relative fall of the residual below which another round does not pay."""
 _LARGEST_MOVE_PX = 1.5

@@ -51,9 +51,10 @@ def test_the_grid_samples_the_field_above_its_rate(profile: Profile, grid: Field
     assert 1 / grid.pitch_m > 4 * band_edge(profile)
 
 
-def test_a_grid_too_coarse_for_the_pipes_light_is_refused(profile: Profile) -> None:
-    with pytest.raises(InvalidInputError, match=r"pitch of the common grid.*4.*at most 3"):
-        field_grid(profile, 4)
+def test_a_grid_too_coarse_for_the_pipes_light_or_finer_than_the_usual_one_is_refused(profile: Profile) -> None:
+    for step_px in (1, 4):
+        with pytest.raises(InvalidInputError, match=rf"pitch of the common grid.*{step_px}.*2 to 3"):
+            field_grid(profile, step_px)
 
 
 @pytest.mark.parametrize("step_px", [2, 3])

@@ -10,8 +10,10 @@ import torch
 
 from optics.cameras import resample
 from optics.device import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor
+from optics.errors import InvalidInputError
 from optics.grid import field_grid
 from optics.recording import FramePair
+from optics.registration.samplers import FieldSampler
 from optics.registration.table import monomial_powers
 from optics.simulator import Simulator
 from tests.optics.small import small_profile
@@ -123,6 +125,24 @@ class TestAccuracy:
         dim = record(full_well_e=64)
         full = error_db(solve(dim)[0], dim.truth)
         assert error_db(solve(dim, rounds=0)[0], dim.truth) > full + 2
+
+    @pytest.mark.parametrize(
+        ("rounds", "binning", "step_px", "expected_db"),
+        [(ROUNDS, 1, 2, -12.4), (ROUNDS, 1, 3, -10.1), (0, 2, 2, -10.2), (0, 2, 3, -8.6)],
+    )
+    def test_hurry_and_a_coarser_grid_cost_what_the_documents_say(
+        self, rounds: int, binning: int, step_px: int, expected_db: float
+    ) -> None:
+        dim, grid, usual = record(full_well_e=32), field_grid(PROFILE, step_px), field_grid(PROFILE)
+        recovery = FieldRecovery(PROFILE, rounds=rounds, binning=binning, grid=grid)
+        homodyne = np.array([np.cos(dim.turn), np.sin(dim.turn)], np.float32)
+        field, _ = TorchFieldSolver(recovery)(dim.pair, dim.references, registration(), homodyne)
+        seen = FieldSampler(field, grid)(np.stack(np.meshgrid(usual.x_m, usual.y_m), axis=-1))
+        assert error_db(seen, dim.truth) == pytest.approx(expected_db, abs=0.5)
+
+    def test_blocks_that_the_references_blocks_are_no_multiple_of_are_refused(self) -> None:
+        with pytest.raises(InvalidInputError, match=r"binning.*3.*divisor of 4"):
+            FieldRecovery(PROFILE, binning=3)
 
     def test_the_linear_estimate_alone_is_far_worse(self, recorded: Recorded) -> None:
         """Half a quadrature pair minus its references, each over its reference: what neglects |E|^2."""

@@ -29,7 +29,9 @@ class CoherentLocalizer(nn.Module):
     ) -> None:
         super().__init__()
         self.interpolation = interpolation
-        usual, own = field_grid(profile), grid or field_grid(profile)
+        usual = field_grid(profile)
+        own = grid or usual
+        self.grid_shape = own.shape
         self._last = tuple(count - 1 for count in usual.shape)
         """Row and column of the usual grid's last sample, in whose units a table's places are."""
         self._span = tuple((count - 1) * own.pitch_m / usual.pitch_m for count in own.shape)
@@ -57,7 +59,12 @@ class CoherentLocalizer(nn.Module):
         Returns:
             [2, B, S, ny, nx]: real and imaginary part, S samples of each symbol row by row, over the field's root
             mean square.
+
+        Raises:
+            ValueError: a field on another grid.
         """
+        if tuple(field.shape[-2:]) != self.grid_shape:
+            raise ValueError(f"field: got {tuple(field.shape[-2:])}, wanted the localizer's grid {self.grid_shape}")
         x, y = self.offset_x, self.offset_y
         column = places[:, 0:1] + gradients[:, 0:1] * x + gradients[:, 1:2] * y
         row = places[:, 1:2] + gradients[:, 2:3] * x + gradients[:, 3:4] * y
