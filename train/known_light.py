@@ -16,6 +16,7 @@ from optics.registration.calibrate import KnownPage
 from optics.registration.fitted_waves import FittedWaves, illumination_terms, on_modulator
 from train.features import FeatureExtractor
 from train.field import Measured
+from train.waves import ACCURACY
 
 _EQUATIONS = 100_000
 """About how many samples of the common grid say by which factors the illumination varies: six unknowns."""
@@ -51,6 +52,8 @@ def explained(
 ) -> list[Explained]:
     """Known pages as the calibrated device measured them and its fitted waves explain them, by least squares.
 
+    The waves are as exact as those of a decoder that looks again.
+
     Args:
         extractor: of the device.
         profile: the nominal device.
@@ -59,10 +62,10 @@ def explained(
     """
     samples = symbol_samples(profile)
     grid = extractor.grid
-    waves = FittedWaves(profile, parameters, samples, filled=True, grid=grid)
+    waves = FittedWaves(profile, parameters, samples, filled=True, accuracy=ACCURACY, grid=grid)
     terms = np.stack(illumination_terms(waves.x, waves.y))
     stride = max(1, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
-    at_few = FittedWaves(profile, parameters, samples, filled=True, stride=stride, grid=grid)
+    at_few = FittedWaves(profile, parameters, samples, filled=True, stride=stride, accuracy=ACCURACY, grid=grid)
     found = []
     for page in tqdm(pages, desc="light of known pages", unit="page"):
         phases = np.angle(page.symbols)
