@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from export.graph import TABLE_INPUTS
 from export.parity import check_parity
 from optics.device import Device
 from optics.errors import BundleError, InvalidInputError
+from optics.grid import field_grid
 from optics.page import pilot_mask, random_symbols
 from optics.registration.calibrate import Registered
 from optics.registration.calibration import Calibration
@@ -103,7 +105,9 @@ def test_the_bundle_says_what_torch_says(exported: tuple[Bundle, float, Path]) -
     assert exported[1] <= 1e-3
 
 
-def test_the_fields_own_graph_shows_the_decoders_field(exported: tuple[Bundle, float, Path], tmp_path: Path) -> None:
+def test_the_fields_own_graph_shows_the_decoders_field(
+    exported: tuple[Bundle, float, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bundle = exported[0]
     files = {name: data for name, data in bundle.files.items() if name != FIELD}
     without = Decoder.load(write_bundle(tmp_path / "without.zip", bundle.manifest, files))
@@ -113,6 +117,10 @@ def test_the_fields_own_graph_shows_the_decoders_field(exported: tuple[Bundle, f
     expected, expected_left = without.recover_field(*asked)
     np.testing.assert_allclose(field, expected, atol=1e-4)
     np.testing.assert_allclose(left, expected_left, atol=1e-4)
+    # as a decoder that looks at the field more coarsely would have it
+    monkeypatch.setattr("runtime.decoder.field_grid", partial(field_grid, step_px=3))
+    with pytest.raises(BundleError, match=r"output field.*wanted .*field\.onnx beside it"):
+        without.recover_field(*asked)
 
 
 def test_the_table_is_a_default_that_can_be_fed_instead(exported: tuple[Bundle, float, Path]) -> None:
