@@ -32,6 +32,8 @@ _CHORD = 4
 """Rounds that share one derivative of the light, which costs as much as several rounds."""
 _CHORD_ACCURACY = 3 / 8
 """Share of the splitting steps for that derivative: an error of a percent in it costs no round."""
+_NEARLY = 0.02
+"""Relative fall of the residual below which the derivative at hand serves to the end."""
 _CONVERGED = 3e-3
 """Relative fall of the residual below which another round does not pay."""
 _LARGEST_MOVE_PX = 1.5
@@ -154,13 +156,15 @@ class WaveFit:
         centre = np.zeros(len(PARAMETERS)) if centre is None else centre
         state = self._start(start, turn)
         best = WaveFitted(start, np.zeros(len(PARAMETERS)), turn, np.inf)
+        fall = 1.0
         for number in range(_ROUNDS):
-            if number % _CHORD == 0:
+            if number % _CHORD == 0 and fall > _NEARLY:
                 slopes = self._slopes(state, of_light, of_cameras)
             directions = _directions(state.light, bends="launch" not in groups)
             columns, left = self._equations(state, slopes, directions)
             residual = float(np.sqrt(np.mean(left**2)))
-            if not residual < best.residual * (1 - _CONVERGED):
+            fall = 1 - residual / best.residual
+            if not fall > _CONVERGED:
                 break
             # What is unexplained differs from symbol to symbol, so equations tell no more than symbols do.
             variance = residual**2 * max(1.0, len(left) / (2 * self._symbols))
