@@ -27,7 +27,7 @@ from benchmarks.comparison import ARMS, HEADER, ORACLE, Bench, Outcome, recorded
 from benchmarks.decoders_figure import draw, title
 from benchmarks.kept import TRAINED, Kept
 from benchmarks.levels import LEVEL_HEADER
-from optics.device import Device, Sensor
+from optics.device import Device, Sensor, ideal_device
 from optics.files import write_json
 from optics.profile import load_profile
 from train.fitting import Hyperparameters
@@ -74,6 +74,7 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
     multiple=True,
     help="Edge of a symbol, modulator pixels; the profile's if left out.",
 )
+@click.option("--ideal", is_flag=True, help="A device without defects but the pipe's angle and the cameras' noise.")
 @click.option(
     "--pages", type=click.IntRange(12), default=500, show_default=True, help="With 5% validation, 5% held out."
 )
@@ -113,6 +114,7 @@ def main(
     full_wells: tuple[float, ...],
     exposures: tuple[float, ...],
     symbol_sizes: tuple[int, ...],
+    ideal: bool,
     pages: int,
     steps: int,
     sizes: tuple[str, ...],
@@ -138,9 +140,10 @@ def main(
             "sensor.full_well_e": full_well,
             "sensor.exposure_relative": exposure,
         }
-        device = Device().with_settings([f"{key}={value}" for key, value in settings.items()])
-        dimmer = "" if exposure == Sensor().exposure_relative else f"-{exposure:g}x"
-        folder = out / f"{angle_deg:g}deg-{full_well:g}e-{size_px}px{dimmer}"
+        usual = ideal_device() if ideal else Device()
+        device = usual.with_settings([f"{key}={value}" for key, value in settings.items()])
+        apart = ("" if exposure == Sensor().exposure_relative else f"-{exposure:g}x") + ("-ideal" if ideal else "")
+        folder = out / f"{angle_deg:g}deg-{full_well:g}e-{size_px}px{apart}"
         kept = trained / Path(profile_name).stem / folder.name
         with recorded(profile, device, pages, seed, folder) as recording:
             bench = Bench.of(recording, profile, device, levels, seed, Kept(folder, kept, keeps))
@@ -163,6 +166,7 @@ def main(
                     "full_well_e": full_well,
                     "exposure": exposure,
                     "symbol_size_px": size_px,
+                    "ideal": ideal,
                     "outcomes": [asdict(outcome) for outcome in outcomes],
                 }
                 write_json(out / "figures.json", {"pages": pages, "seed": seed, "lights": [*lights, light]})

@@ -42,7 +42,8 @@ def title(light: dict[str, Any]) -> str:
     """What a light of a comparison is."""
     size = light["symbol_size_px"]
     noise = f"full well {light['full_well_e']:g} e-, exposure {light['exposure']:g}"
-    return f"{light['angle_deg']:g} degree, {noise}, symbols of {size}x{size} pixels"
+    device = ", ideal device" if light["ideal"] else ""
+    return f"{light['angle_deg']:g} degree, {noise}, symbols of {size}x{size} pixels{device}"
 
 
 def _bars(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:

@@ -18,7 +18,7 @@ from benchmarks.comparison import gained_at_the_end
 from benchmarks.decoders import main
 from benchmarks.kept import Kept
 from benchmarks.oracle import Oracle
-from optics.device import Device, Reference, Sensor
+from optics.device import Device, Reference, Sensor, ideal_device
 from optics.errors import InvalidInputError
 from optics.recording import Recording
 from optics.recording_job import RecordingJob
@@ -152,3 +152,18 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
         new.keep(new.light / run.relative_to(light))
     with pytest.raises(click.BadParameter, match="96x2x0"):
         CliRunner().invoke(main, ["--size", "96", "--out", str(out)], standalone_mode=False, catch_exceptions=False)
+
+
+def test_an_ideal_device_has_the_angle_and_the_noise_alone(tmp_path: Path) -> None:
+    profile = tmp_path / "small.toml"
+    profile.write_text(PROFILE.to_toml())
+    light = tmp_path / "out" / "-0.3deg-32e-4px-ideal"
+    light.mkdir(parents=True)
+    ideal = ideal_device().with_settings(["geometry.pipe_angle_deg=-0.3", "sensor.full_well_e=32"])
+    calibration_of(ideal).save(light / "calibration.toml")
+    arguments = f"--profile {profile} --ideal --angle -0.3 --pages 12 --arm none --published-channels 4"
+    arguments += f" --published-steps 10 --trained {tmp_path / 'kept'} --out {tmp_path / 'out'}"
+    ran = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
+    assert ran.exit_code == 0, ran.output
+    assert "symbols of 4x4 pixels, ideal device" in ran.output
+    assert Device.model_validate(json.loads((light / "begun.json").read_text())["device"]) == ideal
