@@ -15,7 +15,7 @@ from optics.profile import Table, validate
 
 # Bounds lie far beyond any device that can be built; they keep a slip of the pen from filling the machine's memory.
 Angle = Annotated[float, Field(ge=-5, le=5, allow_inf_nan=False)]
-Phase = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]
+Phase = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
 Pixels = Annotated[float, Field(ge=-500, le=500, allow_inf_nan=False)]
 Few = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 

@@ -134,6 +134,16 @@ class Profile(Table):
         return math.hypot(self.page_width_m, self.page_height_m) / 2
 
     @property
+    def light_curvature_rad(self) -> float:
+        """Phase at the page's corner by which its light, steeper in the pipe, is behind that of the page's centre.
+
+        A reference beam of this `curvature_rad` is matched to it: against that beam light that met no wall is flat, and
+        what walls reflected has only a ramp left, as from a source beside the pipe.
+        """
+        path_m = self.pipe.length_m * (self.corner_m / self.lens.focal_length_m) ** 2 / (2 * self.pipe.refractive_index)
+        return -2 * math.pi / self.light.wavelength_m * path_m
+
+    @property
     def page_height_m(self) -> float:
         """Height of the page on the SLM, metres."""
         return self.page.rows * self.page.symbol_size_px * self.slm.pitch_m

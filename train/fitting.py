@@ -50,6 +50,8 @@ LOOKS = 60
 """How often a run looks at its validation pages."""
 _REFINEMENT_STEPS = 0.25
 """Steps of a refinement's network over those of the first."""
+SCALE_BOUNDS = (-1.5, 1.5)
+"""Logarithm of a factor that makes a decoder's claims honest."""
 AVERAGED_SHARE = 0.05
 """Share of a run's steps over which its weights are averaged, exponentially: what is validated, kept and exported."""
 
@@ -476,5 +478,5 @@ def best_kappa_scale(module: DecoderTraining[Any], pages: Dataset[Page], mask: N
     def nll(log_scale: float) -> float:
         return float(von_mises_nll(p_all * math.exp(log_scale), truth_all).mean())
 
-    found = optimize.minimize_scalar(nll, bounds=(-1.5, 1.5), method="bounded")
+    found = optimize.minimize_scalar(nll, bounds=SCALE_BOUNDS, method="bounded")
     return math.exp(float(found.x))

@@ -10,7 +10,18 @@ import pytest
 
 from optics import waves
 from optics.cameras import resample
-from optics.device import Aberration, CameraPose, Device, Drift, Geometry, Homodyne, Reference, Sensor, SlmDefects
+from optics.device import (
+    Aberration,
+    CameraPose,
+    Device,
+    Drift,
+    Geometry,
+    Homodyne,
+    Reference,
+    Sensor,
+    SlmDefects,
+    ideal_device,
+)
 from optics.errors import PageError, ProfileError
 from optics.grid import splitting_steps
 from optics.profile import PageLayout, Profile, load_profile
@@ -476,3 +487,18 @@ def _centre_of_spot(frame: np.ndarray, reach_px: float = 14) -> np.ndarray:
         # the window pulls the centroid part of the way back, so iterate until it stays
         centre = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
     return centre
+
+
+def test_against_a_matched_reference_light_that_met_no_wall_is_flat() -> None:
+    profile = small_profile()
+
+    def likeness(curvature: float) -> float:
+        """Of an even page's light and the reference in the middle of the page."""
+        optics = TrueOptics(profile, ideal_device().with_settings([f"reference.curvature_rad={curvature}"]))
+        light = optics.camera_field(optics.exit_field(np.zeros((28 * 4, 44 * 4)))) / optics.reference()
+        x, y = optics.camera_axes_m
+        middle = light[np.ix_(np.abs(y) < 0.25e-3, np.abs(x) < 0.25e-3)]  # beyond 0.35 mm light meets a wall
+        return float(abs(middle.sum()) / np.abs(middle).sum())
+
+    assert likeness(profile.light_curvature_rad) > 0.95
+    assert likeness(0) < 0.2

@@ -1,4 +1,8 @@
-"""Whether rays find the pipe's angle in training, from zero on; and what a decoder without rays sees."""
+"""Whether rays find the pipe's angle in training, from zero on; and what a decoder without rays sees.
+
+Rays say where light lands, not its phase, which runs hundreds of radians over the page and is left to the network.
+Against a reference beam of the same curvature most of it does not show: what it costs to learn, the third case says.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +11,32 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from optics.device import Device
 from optics.progress import Progress
 from train.studies.study import Case, Result, Row, Settings, Study
 from train.studies.trained import Light, trained
 
+_LOCKED = 0.1
+"""Training AIR, bits a symbol, from which a decoder has begun to see."""
+
 
 def _cases(settings: Settings) -> list[Case]:
-    return [{"name": localizer, "localizer": localizer} for localizer in ("ray", "none")]
+    return [
+        {"name": "ray", "localizer": "ray", "matched": False},
+        {"name": "none", "localizer": "none", "matched": False},
+        {"name": "ray-matched", "localizer": "ray", "matched": True},
+    ]
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
     light = Light("light", settings.profile, Device())
+    if case["matched"]:
+        curvature = settings.profile.light_curvature_rad
+        light = Light(
+            "light-matched", settings.profile, Device().with_settings([f"reference.curvature_rad={curvature}"])
+        )
     return trained(settings, light, case["localizer"], work, progress)
 
 
@@ -28,40 +45,43 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
     rows: list[Row] = []
     for case, result in zip(cases, results, strict=True):
         fitted = float(result["angles"][-1, 1]) if len(result["angles"]) else float("nan")
-        rows.append((case["localizer"], fitted, true, result["air"], result["own_mi"], result["steps"]))
+        reference = "matched" if case["matched"] else "flat"
+        locked = first_step(result["training_curve"])
+        rows.append(
+            (case["localizer"], reference, fitted, true, locked, result["air"], result["own_mi"], result["steps"])
+        )
     return rows
 
 
+def first_step(curve: NDArray[np.float64], least: float = _LOCKED) -> float:
+    """Step at which a curve [points, 2] first reaches so many bits; not a number where it never does."""
+    reached = curve[curve[:, 1] >= least, 0]
+    return float(reached[0]) if len(reached) else float("nan")
+
+
 def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) -> Figure:
-    figure = Figure(figsize=(15, 8), layout="constrained")
-    axes = figure.subplots(2, 2)
-    angles = results[0]["angles"]
-    axes[0, 0].plot(angles[:, 0], angles[:, 1], marker=".")
-    axes[0, 0].axhline(Device().geometry.pipe_angle_deg, color="k", linestyle="--", label="true")
-    axes[0, 0].set_xlabel("step")
-    axes[0, 0].set_ylabel("fitted pipe angle, degrees")
-    axes[0, 0].legend()
-    for case, result, colour in zip(cases, results, ("tab:blue", "tab:red"), strict=True):
-        for name, style in (("training_curve", ":"), ("validation_curve", "-")):
-            curve = result[name]
-            axes[0, 1].plot(
-                curve[:, 0],
-                curve[:, 1],
-                style,
-                marker=".",
-                color=colour,
-                label=f"{case['localizer']}, {name.split('_')[0]}",
-            )
-    axes[0, 1].set_xlabel("step")
-    axes[0, 1].set_ylabel("AIR, bit/symbol")
-    axes[0, 1].set_ylim(bottom=-1)
-    axes[0, 1].legend()
+    figure = Figure(figsize=(16, 8), layout="constrained")
+    grid = figure.add_gridspec(2, 2 * len(cases))
+    angles, rates = figure.add_subplot(grid[0, : len(cases)]), figure.add_subplot(grid[0, len(cases) :])
+    maps = [figure.add_subplot(grid[1, 2 * number : 2 * number + 2]) for number in range(len(cases))]
     top = max(float(np.nanmax(result["own_mi_map"])) for result in results)
-    for axis, case, result in zip(axes[1], cases, results, strict=True):
+    for number, (axis, case, result) in enumerate(zip(maps, cases, results, strict=True)):
+        name = f"{case['localizer']}, matched reference" if case["matched"] else case["localizer"]
+        if len(result["angles"]):
+            angles.plot(*result["angles"].T, color=f"C{number}", label=name)
+        rates.plot(*result["training_curve"].T, color=f"C{number}", linewidth=0.8, alpha=0.6)
+        rates.plot(*result["validation_curve"].T, "o-", color=f"C{number}", markersize=3, label=name)
         shown = axis.imshow(result["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
-        axis.set_title(f"{case['localizer']}: own-MI {result['own_mi']:.2f}, AIR {result['air']:.2f} bit/symbol")
+        axis.set_title(f"{name}: own-MI {result['own_mi']:.2f}, AIR {result['air']:.2f} bit/symbol", fontsize="medium")
         axis.set_axis_off()
-    figure.colorbar(shown, ax=axes[1], label="own-MI, bit/symbol")
+    angles.axhline(Device().geometry.pipe_angle_deg, color="k", linestyle="--", label="true")
+    angles.set_ylabel("fitted pipe angle, degrees")
+    rates.set_ylabel("AIR, bit/symbol; thin: pages trained on")
+    rates.set_ylim(bottom=-1)
+    for axis in (angles, rates):
+        axis.set_xlabel("step")
+        axis.legend()
+    figure.colorbar(shown, ax=maps, label="own-MI, bit/symbol", shrink=0.8)
     return figure
 
 
@@ -70,7 +90,7 @@ STUDY = Study(
     source="figures 4C and 2C",
     cases=_cases,
     measure=_measure,
-    header=("localizer", "fitted angle", "true", "AIR", "own-MI", "steps"),
+    header=("localizer", "reference", "fitted angle", "true", "locked at", "AIR", "own-MI", "steps"),
     rows=_rows,
     plot=_plot,
     trains=True,

@@ -21,8 +21,8 @@ def _cases(settings: Settings) -> list[Case]:
     levels = LEVELS[:1] if settings.quick else LEVELS
     return [
         {"name": f"{head}-{count}".replace(" ", "-"), "head": head, "levels": count}
-        for head in HEADS
         for count in levels
+        for head in HEADS
     ]
 
 

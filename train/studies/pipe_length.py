@@ -37,8 +37,8 @@ def _cases(settings: Settings) -> list[Case]:
     lengths = LENGTHS_MM[2:4] if settings.quick else LENGTHS_MM
     return [
         {"name": f"{localizer}-{length:g}mm", "length_mm": length, "localizer": localizer}
-        for localizer in LOCALIZERS
         for length in lengths
+        for localizer in LOCALIZERS
     ]
 
 

@@ -21,8 +21,8 @@ def _cases(settings: Settings) -> list[Case]:
     sizes = SIZES_PX[1:3] if settings.quick else SIZES_PX
     return [
         {"name": f"{localizer}-{size}x{size}", "size": size, "localizer": localizer}
-        for localizer in LOCALIZERS
         for size in sizes
+        for localizer in LOCALIZERS
     ]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,9 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
+from scipy import optimize
+from torch import Tensor
+from torch.nn import functional
 
 from optics.device import Device
 from optics.measures import expected_calibration_error, measure, symbol_maps
@@ -24,7 +27,7 @@ from optics.recording import Recording
 from optics.recording_job import RecordingJob
 from train.curves import curves_of
 from train.features import PageState
-from train.fitting import best_kappa_scale, decode_pages, without_piston
+from train.fitting import SCALE_BOUNDS, best_kappa_scale, decode_pages, without_piston
 from train.published.recipe import published_choices, train_published
 from train.published.training import (
     FramePages,
@@ -64,7 +67,8 @@ def trained(
 ) -> Result:
     """What a published decoder reaches on held-out pages of a simulated device, trained as its authors did.
 
-    Piston and shift of the pages are those that were simulated.
+    Piston and shift of the pages are those that were simulated. Recordings are large: those of other lights are
+    dropped, so cases on one light should follow each other.
 
     Args:
         settings: of the study.
@@ -85,6 +89,8 @@ def trained(
     path = work.parent / f"{light.name}.h5"
     progress("record", 0.0)
     if not path.exists():
+        for other in work.parent.glob("*.h5"):
+            other.unlink()
         job = RecordingJob(profile, device, levels, settings.seed, truth=True, out=path)
         job.claim(force=False)
         job.run(pages)
@@ -107,7 +113,8 @@ def trained(
         p, phases = decode_pages(fitted.module, unseen)
         figures = _of_p(p * scale, phases, mask, levels)
         if classes:
-            figures = {"air_of_p": _mean(figures["air_map"])} | figures | _of_classes(fitted.module, unseen, mask)
+            of_classes = _of_classes(fitted.module, validation, unseen, mask)
+            figures = {"air_of_p": _mean(figures["air_map"])} | figures | of_classes
     air, own, data = _mean(figures["air_map"]), _mean(figures["own_mi_map"]), int((~mask).sum())
     return {
         "air": air,
@@ -160,20 +167,25 @@ def _of_p(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.
     return {"air_map": maps.air, "own_mi_map": maps.own_mi, "error_map": maps.error_rad, "ece": figures.ece}
 
 
-def _of_classes(module: PublishedTraining, pages: FramePages, mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """The same of beliefs in classes, without errors of the phase."""
-    classes = module.choices.classes
+def _of_classes(
+    module: PublishedTraining, validation: FramePages, unseen: FramePages, mask: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """The same of beliefs in classes, without errors of the phase; the validation pages choose their temperature."""
+    classes, data = module.choices.classes, torch.from_numpy(~mask)
+    scores, symbols = (torch.cat(parts, dim=-1) for parts in zip(*_scored(module, validation, data), strict=True))
+
+    def nll(log_scale: float) -> float:
+        return float(functional.cross_entropy(scores.T * math.exp(log_scale), symbols))
+
+    scale = math.exp(float(optimize.minimize_scalar(nll, bounds=SCALE_BOUNDS, method="bounded").x))
     rates, claims, beliefs, right = [], [], [], []
-    with torch.no_grad():
-        for frames, state, phases in (pages[index] for index in range(len(pages))):
-            scores = module.network.scores(frames[None], state[None, :2])[0].double()
-            log = torch.log_softmax(scores, dim=0) / math.log(2)
-            symbols = nearest_class(phases + state[2], classes)
-            rates.append((math.log2(classes) + log.gather(0, symbols[None])[0]).numpy())
-            claims.append((math.log2(classes) + (log.exp2() * log).sum(0)).numpy())
-            confidence, decided = log.exp2().max(0)
-            beliefs.append(confidence.numpy()[~mask])
-            right.append((decided == symbols).numpy()[~mask])
+    for page, truth in _scored(module, unseen, data):
+        log = torch.log_softmax(page.double() * scale, dim=0) / math.log(2)
+        rates.append((math.log2(classes) + log.gather(0, truth[None])[0]).numpy())
+        claims.append((math.log2(classes) + (log.exp2() * log).sum(0)).numpy())
+        confidence, decided = log.exp2().max(0)
+        beliefs.append(confidence.numpy())
+        right.append((decided == truth).numpy())
     return {
         "air_map": _over_pages(rates, mask),
         "own_mi_map": _over_pages(claims, mask),
@@ -181,8 +193,19 @@ def _of_classes(module: PublishedTraining, pages: FramePages, mask: NDArray[np.b
     }
 
 
+def _scored(module: PublishedTraining, pages: FramePages, data: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Scores [classes, N] and true classes [N] of the data symbols of each page."""
+    with torch.no_grad():
+        for frames, state, phases in (pages[index] for index in range(len(pages))):
+            scores = module.network.scores(frames[None], state[None, :2])[0]
+            yield scores[:, data].float(), nearest_class(phases + state[2], module.choices.classes)[data]
+
+
 def _over_pages(values: Sequence[NDArray[np.floating]], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    return np.where(mask, np.nan, np.mean(values, axis=0)).astype(np.float32)
+    """Means over pages of what data symbols have, [ny, nx], NaN at pilots."""
+    over = np.full(mask.shape, np.nan, dtype=np.float32)
+    over[~mask] = np.mean(values, axis=0)
+    return over
 
 
 def _curves(work: Path) -> dict[str, NDArray[np.float64]]:

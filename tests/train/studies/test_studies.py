@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from click.testing import CliRunner
 from PIL import Image
+from torch.nn import functional
 
 from optics.device import Device
 from optics.errors import InvalidInputError
 from optics.lenses import LENSES
 from optics.profile import load_profile
+from optics.recording_job import RecordingJob
 from optics.simulator import TrueOptics
 from tests.optics.small import small_profile
 from train.published.training import PublishedChoices
@@ -32,7 +37,7 @@ from train.studies import (
 )
 from train.studies.cli_study import study
 from train.studies.study import Settings, aligned, measured
-from train.studies.trained import chosen
+from train.studies.trained import _of_classes, chosen
 
 SMALL = small_profile()
 
@@ -203,13 +208,22 @@ def test_a_matrix_that_does_not_fit_is_extrapolated_and_says_so() -> None:
     assert rows[1][2] == pytest.approx(16.0)
 
 
-@pytest.mark.parametrize("name", [name for name in STUDIES if STUDIES[name].trains])
-def test_each_that_trains_makes_maps_of_every_case_and_shares_its_light(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "lights"), [("angle", 2), ("symbol-size", 2), ("pipe-length", 2), ("heads", 1)])
+def test_each_that_trains_makes_maps_of_every_case_and_each_light_once(
+    name: str, lights: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "small.toml").write_text(SMALL.to_toml())
-    out = tmp_path / "out"
+    out, made = tmp_path / "out", list[Path]()
+
+    def made_and_noted(job: RecordingJob, pages: int, run: Callable[..., None] = RecordingJob.run) -> None:
+        made.append(job.out)
+        run(job, pages)
+
+    monkeypatch.setattr(RecordingJob, "run", made_and_noted)
     run(name, "--quick", "--profile", str(tmp_path / "small.toml"), "--out", str(out))
     cases = STUDIES[name].cases(Settings(SMALL, quick=True))
-    assert len(list(out.glob("results/*.h5"))) == len(cases) // 2  # two decoders on the same light
+    assert len(made) == len(set(made)) == lights  # several decoders on the same one
+    assert list(out.glob("results/*.h5")) == made[-1:]
     written = json.loads((out / "study.json").read_text())
     assert len(written["rows"]) == len(cases)
     for case in cases:
@@ -219,6 +233,32 @@ def test_each_that_trains_makes_maps_of_every_case_and_shares_its_light(name: st
             assert np.isnan(maps["own_mi_map"]).any()  # pilots carry nothing
             assert len(maps["validation_curve"]) > 1
             assert (len(maps["angles"]) > 0) == (case.get("localizer") == "ray")
+
+
+def test_beliefs_in_classes_are_made_honest_before_they_are_judged() -> None:
+    classes, spread, shape = 4, 0.6, (40, 50)
+    generator, mask = torch.Generator().manual_seed(0), np.zeros(shape, dtype=bool)
+    mask[::10, ::10] = True
+
+    def page() -> tuple[torch.Tensor, ...]:
+        truth = torch.randint(classes, shape, generator=generator)
+        observed = functional.one_hot(truth, classes).movedim(-1, 0).float()
+        observed = observed + spread * torch.randn(observed.shape, generator=generator)
+        return observed, torch.zeros(3), truth * (2 * np.pi / classes)
+
+    def boasting(by: float) -> SimpleNamespace:
+        """Scores that claim the evidence of `by` as many observations."""
+        network = SimpleNamespace(scores=lambda frames, shift: frames * by / spread**2)
+        return SimpleNamespace(choices=PublishedChoices(classes=classes), network=network)
+
+    validation, unseen = [page() for _ in range(4)], [page() for _ in range(8)]
+    honest, loud = (_of_classes(boasting(by), validation, unseen, mask) for by in (1.0, 3.0))  # type: ignore[arg-type]
+    for found in (honest, loud):
+        air, own = (float(np.nanmean(found[name])) for name in ("air_map", "own_mi_map"))
+        assert own == pytest.approx(air, abs=0.03)
+        assert found["ece"] < 0.02
+    np.testing.assert_allclose(loud["air_map"], honest["air_map"], atol=1e-3)
+    assert np.array_equal(np.isnan(honest["air_map"]), mask)
 
 
 def test_a_share_of_the_steps_is_said_in_the_table(tmp_path: Path) -> None:
