@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +58,7 @@ class ReportData:
         measures: over the data symbols of all pages together.
         maps: means over the pages at every place.
         confidence_bins, concentration_bins: what was claimed against what happened.
-        curves: of the training, by TensorBoard's tag.
+        curves: of the training, by TensorBoard's tag, for each look at the light.
         golden: one page.
     """
 
@@ -71,7 +72,7 @@ class ReportData:
     maps: SymbolMaps
     confidence_bins: list[ConfidenceBin]
     concentration_bins: list[ConcentrationBin]
-    curves: dict[str, Curve] | str
+    curves: Sequence[Mapping[str, Curve]] | str
     golden: Golden | str
 
     @property

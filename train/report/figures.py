@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -177,38 +178,60 @@ def concentration(data: ReportData) -> Picture:
     return _picture(figure, alt, caption)
 
 
-def training(curves: dict[str, Curve]) -> list[Picture]:
-    """Loss and AIR while the run was trained, and the pipe's angle where rays were."""
+def training(looks: Sequence[Mapping[str, Curve]]) -> list[Picture]:
+    """Loss and AIR while the run was trained, and the pipe's angle where rays were; one look behind the other."""
     pictures = []
-    if "train_nll" in curves:
+    if losses := _in_a_row(looks, "train_nll"):
         figure, axis = _one()
-        axis.plot(*_xy(curves["train_nll"]), color=BLUE, linewidth=0.8, label="training")
+        for index, curve in enumerate(losses):
+            axis.plot(*_xy(curve), color=BLUE, linewidth=0.8, label="training" if not index else None)
+        _mark_looks(axis, losses)
         axis.set(xlabel="step", ylabel="loss, nat/symbol")
         axis.legend(frameon=False)
-        last = curves["train_nll"][-1]
+        last = losses[-1][-1]
         caption = "Loss, the von Mises negative log-likelihood, of training batches. Validation is logged as AIR only."
         pictures.append(
             _picture(figure, f"Loss over the steps, {number(last[1], 2)} nat/symbol at step {last[0]}.", caption)
         )
     rates = {"train_air": ("training batches", BLUE, "-"), "val_air": ("validation pages", ORANGE, "o-")}
-    if any(tag in curves for tag in rates):
+    if any(tag in curves for tag in rates for curves in looks):
         figure, axis = _one()
         for tag, (name, colour, style) in rates.items():
-            if tag in curves:
-                axis.plot(*_xy(curves[tag]), style, color=colour, linewidth=0.9, markersize=2.5, label=name)
+            for index, curve in enumerate(_in_a_row(looks, tag)):
+                label = None if index else name
+                axis.plot(*_xy(curve), style, color=colour, linewidth=0.9, markersize=2.5, label=label)
+        _mark_looks(axis, _in_a_row(looks, "train_air"))
         axis.set(xlabel="step", ylabel="AIR, bit/symbol")
         axis.legend(frameon=False, loc="lower right")
-        best = max((value for _, value in curves.get("val_air", [])), default=math.nan)
-        caption = f"AIR of training batches and of the validation pages, whose best look was {best:.3f} bit/symbol."
+        best = [max(value for _, value in curve) for curve in _in_a_row(looks, "val_air")]
+        reached = ", with one more look ".join(f"{air:.3f}" for air in best) or "not logged"
+        caption = f"AIR of training batches and of the validation pages, at its best {reached} bit/symbol."
         pictures.append(_picture(figure, f"AIR over the steps. {caption}", caption))
-    if "angle_deg" in curves:
+    if angles := _in_a_row(looks, "angle_deg"):
         figure, axis = _one()
-        axis.plot(*_xy(curves["angle_deg"]), color=GREEN, linewidth=1.2)
+        axis.plot(*_xy(angles[0]), color=GREEN, linewidth=1.2)
         axis.set(xlabel="step", ylabel="pipe angle, degree")
-        last = curves["angle_deg"][-1]
+        last = angles[0][-1]
         caption = f"Pipe angle that the rays were trained to, {number(last[1], 3)} degrees at step {last[0]}."
         pictures.append(_picture(figure, caption, caption))
     return pictures
+
+
+def _in_a_row(looks: Sequence[Mapping[str, Curve]], tag: str) -> list[Curve]:
+    """The curves of a tag, each look's steps counted on from those of the looks before it."""
+    found, before = list[Curve](), 0
+    for curves in looks:
+        if curve := curves.get(tag):
+            found.append([(before + step, value) for step, value in curve])
+        before += max((step + 1 for other in curves.values() for step, _ in other), default=0)
+    return found
+
+
+def _mark_looks(axis: Axes, curves: Sequence[Curve]) -> None:
+    """A line where each further look begins."""
+    for curve in curves[1:]:
+        axis.axvline(curve[0][0], color="gray", linewidth=0.8, linestyle=":")
+        axis.annotate(" looks again", (curve[0][0], 1), xycoords=("data", "axes fraction"), va="top", fontsize=7)
 
 
 def page(golden: Golden) -> list[Picture]:

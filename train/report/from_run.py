@@ -7,17 +7,18 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import nn
 from torch.utils.data import Dataset
 
 from optics.errors import InvalidInputError, RecordingError
 from optics.measures import concentration_calibration, decide_with_confidence, measure, reliability, symbol_maps
 from optics.page import MAX_LEVELS, MIN_LEVELS
 from optics.recording import FramePair, Recording
-from train.curves import curves_of
+from train.curves import Curve, curves_of
 from train.feature_store import FeatureStore
 from train.features import PageState
 from train.fitting import DecoderTraining, Page, SymbolTraining, decode_pages, fitted_curves, without_piston
@@ -31,7 +32,13 @@ from train.run import GOLDEN, REFERENCES, Run, load_arrays, load_decoder, load_r
 _PHASE_TOLERANCE = 1e-2
 """Of a level: phases are kept in float32, which knows 2 pi to 1e-5 of 256 levels."""
 
-Decodable = tuple[DecoderTraining[Any], Dataset[Page]]
+
+class _Decodable(NamedTuple):
+    """What decodes the validation pages as it takes them, and how many parameters the whole decoder has."""
+
+    module: DecoderTraining[Any]
+    pages: Dataset[Page]
+    parameters: int
 
 
 def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportData:
@@ -46,8 +53,9 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
     """
     run, kept = load_run(folder), load_arrays(folder / REFERENCES)
     mask = kept["pilots"]
-    with _decodable(folder, run, kept, recording_path) as (module, pages):
-        outputs, phases = decode_pages(module.eval(), pages)
+    with _decodable(folder, run, kept, recording_path) as decodable:
+        module = decodable.module
+        outputs, phases = decode_pages(module.eval(), decodable.pages)
     levels = levels_of(phases)
     p = np.stack([without_piston(run.kappa_scale * o, t, mask) for o, t in zip(outputs, phases, strict=True)])
     symbols = np.rint(phases[:, ~mask] * (levels / (2 * np.pi))).astype(np.int64) % levels
@@ -60,7 +68,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
         pages=f"All figures are of the {len(p)} validation pages of this run. No weights were fitted to them, but "
         "which weights were kept and how their concentrations are scaled was chosen by them: they are no held-out "
         "test. For that, make the report of an evaluation.",
-        facts=_facts(run, module),
+        facts=_facts(run, decodable.parameters),
         profile=run.profile,
         calibration=run.calibration,
         rays=_rays(run, module),
@@ -68,7 +76,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
         maps=symbol_maps(mu, kappa, symbols, levels, ~mask),
         confidence_bins=reliability(confidence, decided == symbols),
         concentration_bins=concentration_calibration(mu, kappa, symbols, levels),
-        curves=curves_of(folder) or fitted_curves(folder) or "There are no curves: the run kept none.",
+        curves=_curves(folder, run) or "There are no curves: the run did not keep them for every look.",
         golden=Golden(FramePair(golden["in_phase"], golden["quadrature"]), phase[0]),
     )
 
@@ -76,8 +84,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
 @contextmanager
 def _decodable(
     folder: Path, run: Run, kept: dict[str, NDArray[Any]], recording_path: Path | None
-) -> Iterator[Decodable]:
-    """The trained decoder and the validation pages as it takes them."""
+) -> Iterator[_Decodable]:
     choices = run.hyperparameters
     if recording_path is None:
         if isinstance(choices, PublishedChoices):
@@ -93,23 +100,40 @@ def _decodable(
         references = FramePair(kept["in_phase"], kept["quadrature"])
         decoder = published_decoder(run.localizer, choices, run.profile, references, run.calibration.turn_rad)
         module = PublishedTraining(load_weights(folder, decoder), choices, kept["pilots"], recording.levels)
-        yield module, FramePages(recording, validation, _states(folder, run))
+        yield _Decodable(module, FramePages(recording, validation, _states(folder, run)), _size(decoder))
 
 
-def _at_symbol_pitch(folder: Path, run: Run, kept: dict[str, NDArray[Any]]) -> Decodable:
+def _at_symbol_pitch(folder: Path, run: Run, kept: dict[str, NDArray[Any]]) -> _Decodable:
     first, validated, _ = run.pages
     choices = run.hyperparameters
     assert not isinstance(choices, PublishedChoices)
-    last = folder / f"refinement-{choices.refinements}" if choices.refinements else folder
     try:
-        store = FeatureStore(last / "features", range(first, first + validated))
+        store = FeatureStore(_looks(folder, run)[-1] / "features", range(first, first + validated))
         _ = store[0]
     except (OSError, ValueError, IndexError) as error:
         raise InvalidInputError(f"run {folder}: features", error, "the features that training left there") from None
     decoder = load_decoder(folder, run)
     network = decoder.refiners[-1] if choices.refinements else decoder.network
     assert isinstance(network, SymbolUNet | Refiner)
-    return SymbolTraining(network, choices, kept["pilots"], MAX_LEVELS), store
+    size = _size(decoder.network) + _size(decoder.refiners)
+    return _Decodable(SymbolTraining(network, choices, kept["pilots"], MAX_LEVELS), store, size)
+
+
+def _looks(folder: Path, run: Run) -> list[Path]:
+    """Folders of all that was trained, one look behind the other."""
+    choices = run.hyperparameters
+    again = 0 if isinstance(choices, PublishedChoices) else choices.refinements
+    return [folder, *(folder / f"refinement-{number}" for number in range(1, again + 1))]
+
+
+def _curves(folder: Path, run: Run) -> list[dict[str, Curve]]:
+    """Those of each look; none unless they were kept for all."""
+    found = [curves_of(look) or fitted_curves(look) for look in _looks(folder, run)]
+    return found if all(found) else []
+
+
+def _size(network: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in network.parameters())
 
 
 def validation_pages(run: Run, recording: Recording) -> list[int]:
@@ -162,20 +186,26 @@ def _rays(run: Run, module: DecoderTraining[Any]) -> Rays:
     return Rays(run.calibration.angle_deg(run.profile), "the calibrated angle")
 
 
-def _facts(run: Run, module: DecoderTraining[Any]) -> list[tuple[str, str]]:
+def _facts(run: Run, size: int) -> list[tuple[str, str]]:
     choices, (trained, validated, left) = run.hyperparameters, run.pages
-    size = sum(parameter.numel() for parameter in module.network.parameters())
+    steps = f"{choices.steps:,} steps of {choices.batch} pages"
     if isinstance(choices, PublishedChoices):
         network = "published U-Net of {} and {} channels".format(*choices.channels)
     else:
         network = f"{choices.channels} channels, {choices.blocks} blocks, {choices.levels} levels below symbol pitch"
+        if choices.refinements:
+            again = choices.of_refinement()
+            network += (
+                f"; for each of {choices.refinements} further looks {again.channels} channels, {again.blocks} block"
+            )
+            steps += f", {again.steps:,} for each further look,"
     provenance = run.provenance
     return [
         ("Localizer", run.localizer),
-        ("Network", f"{network}; {size:,} parameters"),
+        ("Network", f"{network}; {size:,} parameters in all"),
         ("Training pages", f"{trained} recorded, {run.synthetic_pages} synthetic"),
         ("Other pages", f"{validated} for validation, {left} left for an evaluation"),
-        ("Training", f"{choices.steps:,} steps of {choices.batch} pages in {how_long(run.seconds)}"),
+        ("Training", f"{steps} in {how_long(run.seconds)}"),
         ("Validation AIR in training", f"{run.validation_air:.3f} bit/symbol, before concentrations were scaled"),
         ("Scale of the concentrations", f"{run.kappa_scale:.3f}"),
         ("Trained by", str(provenance.get("command", "")) or "not noted"),

@@ -27,6 +27,7 @@ from train.cli_train import train
 from train.curves import curves_of
 from train.report.cli_report import report
 from train.report.data import exit_centroids
+from train.report.figures import training
 from train.report.from_evaluation import report_of_evaluation
 from train.report.from_run import levels_of, report_of_run, validation_pages
 from train.report.tables import geometry, zones
@@ -113,6 +114,26 @@ def test_a_run_at_symbol_pitch(coherent: Path, tmp_path: Path) -> None:
     assert counts == {"maps": 4, "honesty": 2, "training": 2, "page": 3, "rays": 4}
     assert "2 validation pages" in text
     assert "8 channels, 1 blocks" in text
+
+
+def test_the_steps_of_another_look_are_counted_on() -> None:
+    looks = [{"train_nll": [(4, 1.0), (9, 0.5)]}, {"train_nll": [(4, 0.4)]}]
+    (loss,) = training(looks)
+    assert "0.40 nat/symbol at step 14" in loss.alt
+
+
+def test_a_run_that_looks_twice_is_told_as_a_whole(coherent: Path) -> None:
+    described, data = load_run(coherent), report_of_run(coherent)
+    (first, second), facts = data.curves, dict(data.facts)
+    best = max(value for _, value in second["val_air"])
+    assert best == pytest.approx(described.validation_air, abs=0.02)  # looked at in bfloat16 while it trains
+    _, air = training([first, second])
+    assert f"with one more look {best:.3f} bit/symbol" in air.caption
+    weights = torch.load(coherent / "decoder.pt", weights_only=True)
+    learnt = sum(value.numel() for name, value in weights.items() if name.startswith(("network.", "refiners.")))
+    assert f"; {learnt:,} parameters in all" in facts["Network"]
+    assert "for each of 1 further looks 5 channels, 1 block" in facts["Network"]
+    assert facts["Training"].startswith("12 steps of 4 pages, 3 for each further look, in ")
 
 
 def test_a_run_by_rays_shows_the_angle_that_it_was_trained_to(
@@ -250,7 +271,7 @@ def test_curves_that_are_gone_are_said_to_be_gone(coherent: Path, tmp_path: Path
     text, seen = page_of(tmp_path / "run", tmp_path / "R.html")
     assert seen.sections == SECTIONS
     assert "training" not in seen.pictures
-    assert "the run kept none" in text
+    assert "the run did not keep them" in text
 
 
 def test_levels_are_read_off_phases() -> None:
