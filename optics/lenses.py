@@ -112,3 +112,12 @@ LENSES = {
     )
 }
 """By name. AC508-080-A: Thorlabs' cemented achromat of 80 mm, N-BAF10 and N-SF6HT, indices at 532 nm."""
+
+_THICK_WITHIN = 0.05
+"""A prescription stands for lenses whose focal length is that close to its own."""
+
+
+def lens_of(focal_length_m: float) -> LensPrescription | None:
+    """The prescription that a focal length suggests, if there is one."""
+    suited = [lens for lens in LENSES.values() if abs(lens.effective_focal_m / focal_length_m - 1) < _THICK_WITHIN]
+    return suited[0] if suited else None

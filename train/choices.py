@@ -139,7 +139,7 @@ CHOICES = (
         "--lenses",
         click.Choice(LENS_CHOICES),
         "Lenses that the published rays are traced through.",
-        published=PublishedChoices.lenses,
+        published="those of the profile",
         localizers=PUBLISHED,
     ),
     Choice(

@@ -11,11 +11,12 @@ from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
+from optics.lenses import lens_of
 from optics.profile import Profile
 from optics.recording import FramePair
 from train.fitting import Fitted, best_kappa_scale, fit, seed_stretch
 from train.material import Material, Trained
-from train.published.decoder import PublishedDecoder, make_localizer
+from train.published.decoder import PARAXIAL, PublishedDecoder, make_localizer
 from train.published.states import page_states
 from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
 from train.published.unet import samples_for
@@ -25,11 +26,16 @@ EPOCHS = {4: 50, 8: 30, 16: 15}
 
 
 def published_choices(profile: Profile, pages: int, batch: int | None = None) -> PublishedChoices:
-    """The authors' hyperparameters for a device's symbols and so many training pages; `batch` in place of two."""
+    """The authors' hyperparameters for a device's symbols and so many training pages; `batch` in place of two.
+
+    As with them, rays go through thick lenses where the device has real ones, if there is a prescription of those.
+    """
     samples = samples_for(profile.page.symbol_size_px)
     batch = PublishedChoices.batch if batch is None else batch
     steps = EPOCHS[samples] * -(-pages // batch)
-    return PublishedChoices(steps=steps, batch=batch, decay=PublishedChoices.decay if samples == 4 else 1.0)
+    decay = PublishedChoices.decay if samples == 4 else 1.0
+    lens = None if profile.ideal_lenses else lens_of(profile.lens.focal_length_m)
+    return PublishedChoices(steps=steps, batch=batch, decay=decay, lenses=lens.name if lens else PARAXIAL)
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from optics.lens_path import SeidelTerms
-from optics.lenses import LENSES, LensPrescription
+from optics.lenses import LENSES, LensPrescription, lens_of
 from optics.profile import LensPath, Profile
 from optics.progress import Progress
 from train.published.rays import launched_path
-from train.studies.rays import lens_for
 from train.studies.study import Case, Result, Row, Settings, Study
 
 Real = NDArray[np.float64]
@@ -73,7 +72,7 @@ def _path(terms: SeidelTerms, field: Real, facet: Real) -> Real:
 
 
 def _cases(settings: Settings) -> list[Case]:
-    lens = lens_for(settings.profile)
+    lens = lens_of(settings.profile.lens.focal_length_m)
     return [{"name": lens.name if lens else "ideal"}]
 
 

@@ -10,7 +10,7 @@ import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from optics.lenses import LENSES, LensPrescription
+from optics.lenses import lens_of
 from optics.profile import Profile
 from optics.progress import Progress
 from train.published.localizers import page_places
@@ -22,20 +22,11 @@ _GRID = (90, 140)
 _QUICK_GRID = (18, 28)
 _DRAWN = 9
 """Rays drawn along each axis."""
-_THICK_WITHIN = 0.05
-"""A prescription stands for the profile's lenses if its focal length is that close to theirs."""
-
-
-def lens_for(profile: Profile) -> LensPrescription | None:
-    """The prescription that the profile's focal length suggests; None for ideal lenses."""
-    focal = profile.lens.focal_length_m
-    suited = [lens for lens in LENSES.values() if abs(lens.effective_focal_m / focal - 1) < _THICK_WITHIN]
-    return suited[0] if suited else None
 
 
 def tracer_for(profile: Profile) -> RayTracer:
-    """A tracer through that prescription, or through ideal lenses."""
-    return RayTracer(profile, lens_for(profile))
+    """A tracer through the prescription that the profile's focal length suggests, or through ideal lenses."""
+    return RayTracer(profile, lens_of(profile.lens.focal_length_m))
 
 
 def _cases(settings: Settings) -> list[Case]:

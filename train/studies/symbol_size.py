@@ -48,7 +48,7 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
 
 def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) -> Figure:
     sizes = list(dict.fromkeys(case["size"] for case in cases))
-    figure = Figure(figsize=(3.4 * len(sizes) + 4, 9), layout="constrained")
+    figure = Figure(figsize=(3.4 * len(sizes) + 4, 7.5), layout="constrained")
     axes = figure.subplots(3, len(sizes) + 1, squeeze=False)
     top = max(float(np.nanmax(result["own_mi_map"])) for result in results)
     by_case = {(case["localizer"], case["size"]): result for case, result in zip(cases, results, strict=True)}

@@ -12,9 +12,10 @@ from click.testing import CliRunner
 
 from optics.errors import InvalidInputError
 from optics.page import pilot_mask
+from optics.profile import load_profile
 from optics.recording import FramePair, Recording
 from tests.conftest import SMALL_PAGES
-from tests.optics.small import small_profile
+from tests.optics.small import THICK, small_profile
 from train.cli_train import train
 from train.features import PageState
 from train.fitting import Page
@@ -79,6 +80,10 @@ def test_the_authors_choices() -> None:
     coarse = paper.model_copy(update={"page": paper.page.model_copy(update={"symbol_size_px": 16})})
     chosen = published_choices(coarse, 450)
     assert (chosen.steps, chosen.decay) == (15 * 225, 1.0)
+    assert published_choices(load_profile("paper"), 450).lenses == "AC508-080-A"  # its lenses are real
+    assert (
+        published_choices(paper.model_copy(update={"lens_path": THICK}), 450).lenses == "paraxial"
+    )  # of no known lens
 
 
 @pytest.mark.parametrize("classes", [0, 4])
