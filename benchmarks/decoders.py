@@ -160,6 +160,7 @@ def main(
             outcomes: list[Outcome] = []
             for run in runs:
                 outcomes = compared([*outcomes, run()])
+                click.echo(f"{HEADER}\n{outcomes[-1].line()}", err=True)
                 light = {
                     "angle_deg": angle_deg,
                     "angle_error_deg": bench.fitted.angle_deg(profile) - angle_deg,
@@ -180,12 +181,20 @@ def main(
 
 
 def compared(outcomes: list[Outcome]) -> list[Outcome]:
-    """The outcomes with their share of what the oracle reached, with a network of the same size if there was one."""
+    """The outcomes with what they reached over the oracle, with a network of the same size if there was one, and ours
+    over the best of the published decoders.
+    """
     oracles = {outcome.size: outcome.air for outcome in outcomes if outcome.arm == ORACLE}
-    if not oracles:
-        return outcomes
-    best = max(oracles.values())
-    return [replace(outcome, over_oracle=outcome.air / oracles.get(outcome.size, best)) for outcome in outcomes]
+    published = [outcome.air for outcome in outcomes if outcome.arm in PUBLISHED]
+
+    def over(outcome: Outcome) -> Outcome:
+        if oracles:
+            outcome = replace(outcome, over_oracle=outcome.air / oracles.get(outcome.size, max(oracles.values())))
+        if published and outcome.arm not in PUBLISHED:
+            outcome = replace(outcome, over_published=outcome.air / max(published))
+        return outcome
+
+    return [over(outcome) for outcome in outcomes]
 
 
 if __name__ == "__main__":

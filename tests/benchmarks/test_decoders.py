@@ -109,6 +109,9 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     assert (fast["arm"], fast["size"], fast["steps"]) == ("fast", "48x2x0", 20)
     assert (none["arm"], none["size"], none["steps"]) == ("none", "4/8", 12)
     assert none["over_oracle"] == pytest.approx(none["air"] / oracle["air"])
+    assert coherent["over_published"] == pytest.approx(coherent["air"] / none["air"])
+    assert none["over_published"] is None
+    assert first.output.count("of theirs") == len(figures["outcomes"]) + 1  # as soon as an arm is there, and in the end
     assert figures["angle_error_deg"] == pytest.approx(0, abs=1e-9)
     again = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert set(re.findall(r"\r([^\r:]+):[^\r]*page/s", again.output)) == {"light of known pages"}
