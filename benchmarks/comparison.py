@@ -28,6 +28,7 @@ from optics.recording_job import RecordingJob
 from optics.registration.calibrate import calibrate
 from optics.registration.calibration import Calibration, load_calibration
 from optics.registration.known import known_pages
+from optics.simulator import true_parameters
 from train.curves import Curve
 from train.decoder import LOCALIZERS
 from train.feature_store import FeatureStore, fill
@@ -57,13 +58,18 @@ from train.run import begin
 from train.symbols import LIKENESS_PAGES
 from train.twin import RayTwin, TorchTwin
 
+Real = NDArray[np.float64]
+
 LEVELS = 256
 ORACLE = "oracle"
 REFINED = "refined"
+ORACLE_REFINED = "oracle-refined"
+FIRST_LOOKS = {REFINED: "coherent", ORACLE_REFINED: ORACLE}
+"""Arms that look again, and the arm whose first look they share."""
 FAST = "fast"
 HURRIED = Hyperparameters(channels=48, field_rounds=0, binning=2, field_step=3, samples=3, interpolation=BILINEAR)
 """A coherent decoder for when time counts more than the last half bit."""
-ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, ORACLE)
+ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, ORACLE, ORACLE_REFINED)
 WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
 """Whether a symbol's light meets walls of a pair, as the columns of the table say it."""
 CALIBRATED = 2
@@ -150,8 +156,15 @@ class Bench:
         """All that is not calibrated on, in order."""
         return [*self.training, *self.validation, *self.unseen]
 
+    def parameters(self, arm: str) -> Real:
+        """The device as an arm knows it, [P]: fitted, or true."""
+        return true_parameters(self.profile, self.device) if arm == ORACLE else self.fitted.vector
+
     def extractor(self, arm: str) -> FeatureExtractor:
-        """Of the calibrated device."""
+        """Of the calibrated device; of the true one for what an oracle looks at again, the signal's power left in."""
+        if arm == ORACLE:
+            turn, references = self.device.homodyne.turn_rad, self.recording.references()
+            return FeatureExtractor(self.profile, self.parameters(arm), turn, references, "coherent")
         choices = HURRIED if arm == FAST else Hyperparameters()
         return FeatureExtractor(
             self.profile,
@@ -173,18 +186,19 @@ class Bench:
         else:
             channels, blocks, levels = map(int, size.split("x"))
             choices = replace(choices, channels=channels, blocks=blocks, levels=levels)
-        folder, features, first, preparing = self.first_look("coherent" if name == REFINED else name, size, choices)
-        if name != REFINED:
+        look = FIRST_LOOKS.get(name, name)
+        folder, features, first, preparing = self.first_look(look, size, choices)
+        if name not in FIRST_LOOKS:
             self.kept.keep(folder)
             outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing)
             return replace(outcome, by_levels=self.at_levels(name, folder, [first], outcome.kappa_scale))
-        extractor = self.extractor("coherent")
+        extractor, parameters = self.extractor(look), self.parameters(look)
         pages = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
-        known = explained(extractor, self.profile, self.fitted.vector, pages)
-        prediction = fit_prediction(self.profile, self.fitted.vector, known, extractor.grid)
+        known = explained(extractor, self.profile, parameters, pages)
+        prediction = fit_prediction(self.profile, parameters, known, extractor.grid)
         counts = len(self.training), len(self.validation)
         material = RefinementPages(self.recording, self.pages, *counts, features)
-        key = self.fitted.to_toml()
+        key = self.key(look)
         refined = fit_refinements(folder, choices, material, extractor, prediction, first, key, devices=1)
         self.kept.keep(folder)
         at = folder / f"refinement-{choices.refinements}"
@@ -192,7 +206,8 @@ class Bench:
         steps = choices.of_refinement().steps
         outcome = self.outcome(f"{name} {choices.refinements}", size, steps, at, refined.last, *held_out, preparing)
         looks = [first, *refined.trained]
-        return replace(outcome, by_levels=self.at_levels("coherent", at, looks, outcome.kappa_scale, prediction))
+        by_levels = self.at_levels(look, at, looks, outcome.kappa_scale, prediction)
+        return replace(outcome, looks=len(looks), by_levels=by_levels)
 
     def at_levels(
         self,
@@ -353,8 +368,8 @@ class Outcome:
     """What one arm reached with a network of one size.
 
     Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor that made
-    its claims honest, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light
-    meets the walls of `WALLS`. The curves are AIR by step.
+    its claims honest, `looks` how often it looks, `by_levels` what it is worth among fewer levels, `by_walls` the AIR
+    of the symbols whose light meets the walls of `WALLS`. The curves are AIR by step.
     """
 
     run: str
@@ -372,6 +387,7 @@ class Outcome:
     kappa_scale: float
     training_curve: Curve
     validation_curve: Curve
+    looks: int = 1
     over_oracle: float | None = None
     over_published: float | None = None
     by_levels: list[LevelFigures] = field(default_factory=list)
@@ -380,14 +396,14 @@ class Outcome:
         over = ["" if ratio is None else f"{ratio:.3f}" for ratio in (self.over_oracle, self.over_published)]
         walls = "".join(f"{self.by_walls[name]:>7.3f} " for name in WALLS)
         return (
-            f"{self.arm:<10} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} "
+            f"{self.arm:<16} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} "
             f"{self.own_mi - self.air:>7.3f} {self.page_kB:>6.2f} {walls}{over[0]:>10} {over[1]:>10} "
             f"{self.gained_in_last_fifth:>8.3f} {self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f}"
         )
 
 
 HEADER = (
-    f"{'arm':<10} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} "
+    f"{'arm':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} "
     + "".join(f"{name:>7} " for name in WALLS)
     + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8} {'features':>9} {'training':>8}"
 )

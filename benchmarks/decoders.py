@@ -3,12 +3,12 @@
     python -m benchmarks.decoders --angle -0.6 --out runs/decoders
     python -m benchmarks.decoders --arm coherent --size 64x2x0 --size 96x2x1 --steps 1500 --out runs/decoders
 
-Coherent, wave and oracle share network, steps and seeds; refined is coherent, and then looks again; fast is coherent
-with less of everything. The oracle knows the simulated truth: geometry, cameras, reference; the signal's own power is
-taken off its frames; then the wave adjoint and the same network. None, mode and ray are the published decoders, with
-their own network and training. Image shift and piston of every page, held-out ones too, are found from all of its
-symbols, for each arm alike. Interrupted, it goes on where it was; all lies in --out. What was trained on the same light
-before and kept (--keep) is only measured again.
+Coherent, wave and oracle share network, steps and seeds; refined is coherent, and then looks again, as oracle-refined
+is the oracle; fast is coherent with less of everything. The oracle knows the simulated truth: geometry, cameras,
+reference; the signal's own power is taken off its frames; then the wave adjoint and the same network. None, mode and
+ray are the published decoders, with their own network and training. Image shift and piston of every page, held-out
+ones too, are found from all of its symbols, for each arm alike. Interrupted, it goes on where it was; all lies in
+--out. What was trained on the same light before and kept (--keep) is only measured again.
 """
 
 from __future__ import annotations
@@ -181,15 +181,18 @@ def main(
 
 
 def compared(outcomes: list[Outcome]) -> list[Outcome]:
-    """The outcomes with what they reached over the oracle, with a network of the same size if there was one, and ours
-    over the best of the published decoders.
+    """The outcomes with what they reached over the oracle, and ours over the best of the published decoders.
+
+    That oracle has a network of the same size, if there was one, and looks as often, if one did.
     """
-    oracles = {outcome.size: outcome.air for outcome in outcomes if outcome.arm == ORACLE}
+    oracles = {(o.looks, o.size): o.air for o in outcomes if o.arm.startswith(ORACLE)}
+    once = [air for (looks, _), air in oracles.items() if looks == 1]
     published = [outcome.air for outcome in outcomes if outcome.arm in PUBLISHED]
 
     def over(outcome: Outcome) -> Outcome:
-        if oracles:
-            outcome = replace(outcome, over_oracle=outcome.air / oracles.get(outcome.size, max(oracles.values())))
+        alike = [oracles[looks, outcome.size] for looks in (outcome.looks, 1) if (looks, outcome.size) in oracles]
+        if alike or once:
+            outcome = replace(outcome, over_oracle=outcome.air / (alike[0] if alike else max(once)))
         if published and outcome.arm not in PUBLISHED:
             outcome = replace(outcome, over_published=outcome.air / max(published))
         return outcome

@@ -79,22 +79,19 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     light.mkdir(parents=True)
     calibration_of(Device()).save(light / "calibration.toml")
     arguments = f"--profile {profile} --pages 12 --steps 20 --size 8x1x0"
-    arguments += "".join(f" --arm {name}" for name in ("coherent", "refined", "oracle", "fast", "none"))
+    arguments += "".join(
+        f" --arm {name}" for name in ("coherent", "refined", "oracle", "fast", "none", "oracle-refined")
+    )
     arguments += f" --published-channels 4 --published-steps 12 --levels 4 --trained {tmp_path / 'kept'} --keep"
     arguments += f" --out {out}"
     first = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert first.exit_code == 0, first.output
     assert "-0.6 degree, full well 32 e-, exposure 1, symbols of 4x4 pixels" in first.output
     (figures,) = json.loads((out / "figures.json").read_text())["lights"]
-    coherent, refined, oracle, fast, none = figures["outcomes"]
+    coherent, refined, oracle, fast, none, again = figures["outcomes"]
     assert (refined["arm"], refined["steps"]) == ("refined 1", 5)
-    assert [[figures["levels"] for figures in arm["by_levels"]] for arm in (coherent, refined, oracle, fast, none)] == [
-        [4],
-        [4],
-        [4],
-        [4],
-        [],
-    ]
+    by_levels = [[figures["levels"] for figures in arm["by_levels"]] for arm in figures["outcomes"]]
+    assert by_levels == [[4], [4], [4], [4], [], [4]]
     assert all(0 < arm["by_levels"][0]["symbol_error_rate"] <= 0.8 for arm in (coherent, refined, oracle))
     assert all(len(arm["validation_curve"]) > 0 for arm in figures["outcomes"])
     # the mean over all symbols lies between those of the zones
@@ -111,6 +108,9 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     assert none["over_oracle"] == pytest.approx(none["air"] / oracle["air"])
     assert coherent["over_published"] == pytest.approx(coherent["air"] / none["air"])
     assert none["over_published"] is None
+    # who looks twice is compared with an oracle that does
+    assert (again["arm"], again["looks"], again["steps"], again["over_oracle"]) == ("oracle-refined 1", 2, 5, 1)
+    assert refined["over_oracle"] == pytest.approx(refined["air"] / again["air"])
     assert first.output.count("of theirs") == len(figures["outcomes"]) + 1  # as soon as an arm is there, and in the end
     assert figures["angle_error_deg"] == pytest.approx(0, abs=1e-9)
     again = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
