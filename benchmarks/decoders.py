@@ -74,7 +74,11 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
     multiple=True,
     help="Edge of a symbol, modulator pixels; the profile's if left out.",
 )
-@click.option("--ideal", is_flag=True, help="A device without defects but the pipe's angle and the cameras' noise.")
+@click.option(
+    "--ideal",
+    is_flag=True,
+    help="A device without defects but the pipe's angle and noise, its lenses as in the profile.",
+)
 @click.option(
     "--pages", type=click.IntRange(12), default=500, show_default=True, help="With 5% validation, 5% held out."
 )
@@ -150,7 +154,7 @@ def main(
             runs: list[Callable[[], Outcome]] = []
             for name in names:
                 if name in PUBLISHED:
-                    authors = replace(published_choices(profile, len(bench.training)), seed=seed)
+                    authors = replace(published_choices(name, profile, len(bench.training)), seed=seed)
                     authors = authors if published_steps is None else replace(authors, steps=published_steps)
                     widths = [replace(authors, channels=(width, 2 * width)) for width in published_channels]
                     runs += [partial(bench.published_arm, name, choices) for choices in widths]
@@ -181,7 +185,7 @@ def main(
 
 
 def compared(outcomes: list[Outcome]) -> list[Outcome]:
-    """The outcomes with what they reached over the oracle, and ours over the best of the published decoders.
+    """The outcomes with what they reached over the oracle, and the others over the best of the published decoders.
 
     That oracle has a network of the same size, if there was one, and looks as often, if one did.
     """

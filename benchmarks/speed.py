@@ -71,7 +71,7 @@ def published(profile: Profile, localizer: str, channels: tuple[int, int]) -> tu
 
 
 def makers(profile: Profile) -> dict[str, Callable[[], tuple[Graph, Tensors]]]:
-    """Every decoder by name; others are compared with the first, unless told otherwise."""
+    """Every decoder by name; the others are compared with the first."""
     rays = {name: lambda width=width: published(profile, "ray", width) for name, width in WIDTHS.items()}
     return {
         "coherent": lambda: at_symbol_pitch(profile, "coherent"),
@@ -118,7 +118,7 @@ def weights(graph: nn.Module) -> int:
 
 @click.command()
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="Shipped profile or TOML file.")
-@click.option("--decoder", "names", multiple=True, help="Only these, over the first; all if left out.")
+@click.option("--decoder", "names", multiple=True, help="Only these; ratios are over the first of them.")
 @click.option("--repeats", type=click.IntRange(1, 1000), default=15, show_default=True)
 @click.option("--threads", type=click.IntRange(1), help="Of one decode; the usable cores if left out.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
@@ -131,7 +131,7 @@ def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int |
             raise click.BadParameter(f"{name!r}: wanted one of {', '.join(known)}", param_hint="--decoder")
     threads = threads or available_cpus()
     sessions, sizes = {}, {}
-    for name in names or known:
+    for name in dict.fromkeys(names or known):
         graph, tensors = known[name]()
         sessions[name], sizes[name] = session_of(profile, graph, tensors, threads), weights(graph)
     feeds = frames_of(profile)

@@ -135,7 +135,7 @@ class Profile(Table):
 
     @property
     def light_curvature_rad(self) -> float:
-        """Phase at the page's corner by which its light, steeper in the pipe, is behind that of the page's centre.
+        """Phase of the light of the page's corner, steeper in the pipe, against that of its centre, radians: negative.
 
         A reference beam of this `curvature_rad` is matched to it: against that beam light that met no wall is flat, and
         what walls reflected has only a ramp left, as from a source beside the pipe.

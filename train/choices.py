@@ -213,7 +213,7 @@ def chosen_recipe(
     """
     given = dict(given)
     if localizer in PUBLISHED:
-        return _published(localizer, published_choices(profile, pages, given.pop("batch", None)), given)
+        return _published(localizer, published_choices(localizer, profile, pages, given.pop("batch", None)), given)
     synthetic = given.pop("synthetic_pages", default_synthetic_pages(profile))
     start = given.pop("start", None)
     choices = replace(Hyperparameters(refinements=USUAL_REFINEMENTS), **given)

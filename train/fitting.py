@@ -51,7 +51,7 @@ LOOKS = 60
 _REFINEMENT_STEPS = 0.25
 """Steps of a refinement's network over those of the first."""
 SCALE_BOUNDS = (-1.5, 1.5)
-"""Logarithm of a factor that makes a decoder's claims honest."""
+"""Bounds of the logarithm of a factor that makes a decoder's claims honest."""
 AVERAGED_SHARE = 0.05
 """Share of a run's steps over which its weights are averaged, exponentially: what is validated, kept and exported."""
 

@@ -33,7 +33,7 @@ _CHORD = 4
 _CHORD_ACCURACY = 3 / 8
 """Share of the splitting steps for that derivative: an error of a percent in it costs no round."""
 _NEARLY = 0.02
-"""Relative fall of the residual below which the derivative at hand serves to the end."""
+"""Relative fall of the residual, by a whole step, below which the derivative at hand serves to the end."""
 _CONVERGED = 3e-3
 """Relative fall of the residual below which another round does not pay."""
 _LARGEST_MOVE_PX = 1.5
@@ -156,9 +156,9 @@ class WaveFit:
         centre = np.zeros(len(PARAMETERS)) if centre is None else centre
         state = self._start(start, turn)
         best = WaveFitted(start, np.zeros(len(PARAMETERS)), turn, np.inf)
-        fall = 1.0
+        fall, whole = 1.0, False
         for number in range(_ROUNDS):
-            if number % _CHORD == 0 and fall > _NEARLY:
+            if number % _CHORD == 0 and not (whole and fall < _NEARLY):
                 slopes = self._slopes(state, of_light, of_cameras)
             directions = _directions(state.light, bends="launch" not in groups)
             columns, left = self._equations(state, slopes, directions)
@@ -176,7 +176,7 @@ class WaveFit:
             deviations = np.zeros(len(PARAMETERS))
             deviations[free] = np.sqrt(np.diag(covariance)[others:])
             best = WaveFitted(state.parameters, deviations, state.turn, residual)
-            state = self._moved(state, covariance @ pull, directions, free)
+            state, whole = self._moved(state, covariance @ pull, directions, free)
         return best
 
     def _waves(self, parameters: Real) -> FittedWaves:
@@ -265,19 +265,20 @@ class WaveFit:
             columns.append(np.stack(mine, axis=1))
         return np.concatenate(columns), np.concatenate(left)
 
-    def _moved(self, state: _State, step: Real, directions: Complex, free: list[int]) -> _State:
-        """The state after a step, shortened where it would move a camera too far."""
+    def _moved(self, state: _State, step: Real, directions: Complex, free: list[int]) -> tuple[_State, bool]:
+        """The state after a step, shortened where it would move a camera too far, and whether it was whole."""
         change = np.zeros(len(PARAMETERS))
         change[free] = step[len(directions) + 1 :]
         few = self._places[self._inside][:: 1 + len(self._places)]
         seen = [self._twin.pixels(at, few) for at in (state.parameters, state.parameters + change)]
         furthest = float(np.sqrt(np.mean(np.sum((seen[1] - seen[0]) ** 2, axis=-1), axis=-1)).max())
         share = min(1.0, _LARGEST_MOVE_PX / max(furthest, 1e-9))
-        return _State(
+        moved = _State(
             state.parameters + share * change,
             state.turn + share * float(step[len(directions)]),
             state.light + share * step[: len(directions)] @ directions,
         )
+        return moved, share == 1
 
 
 def _directions(light: Complex, *, bends: bool) -> Complex:

@@ -25,7 +25,7 @@ EPOCHS = {4: 50, 8: 30, 16: 15}
 """Passes over the training pages, by samples per symbol and axis (table 1)."""
 
 
-def published_choices(profile: Profile, pages: int, batch: int | None = None) -> PublishedChoices:
+def published_choices(localizer: str, profile: Profile, pages: int, batch: int | None = None) -> PublishedChoices:
     """The authors' hyperparameters for a device's symbols and so many training pages; `batch` in place of two.
 
     As with them, rays go through thick lenses where the device has real ones, if there is a prescription of those.
@@ -34,7 +34,7 @@ def published_choices(profile: Profile, pages: int, batch: int | None = None) ->
     batch = PublishedChoices.batch if batch is None else batch
     steps = EPOCHS[samples] * -(-pages // batch)
     decay = PublishedChoices.decay if samples == 4 else 1.0
-    lens = None if profile.ideal_lenses else lens_of(profile.lens.focal_length_m)
+    lens = None if localizer != "ray" or profile.ideal_lenses else lens_of(profile.lens.focal_length_m)
     return PublishedChoices(steps=steps, batch=batch, decay=decay, lenses=lens.name if lens else PARAXIAL)
 
 

@@ -204,8 +204,10 @@ def training(looks: Sequence[Mapping[str, Curve]]) -> list[Picture]:
         axis.set(xlabel="step", ylabel="AIR, bit/symbol")
         axis.legend(frameon=False, loc="lower right")
         best = [max(value for _, value in curve) for curve in _in_a_row(looks, "val_air")]
-        reached = ", with one more look ".join(f"{air:.3f}" for air in best) or "not logged"
-        caption = f"AIR of training batches and of the validation pages, at its best {reached} bit/symbol."
+        caption = "AIR of training batches and of the validation pages"
+        if best:
+            caption += f", at its best {', with one more look '.join(f'{air:.3f}' for air in best)} bit/symbol"
+        caption += "."
         pictures.append(_picture(figure, f"AIR over the steps. {caption}", caption))
     if angles := _in_a_row(looks, "angle_deg"):
         figure, axis = _one()

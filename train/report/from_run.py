@@ -85,6 +85,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
 def _decodable(
     folder: Path, run: Run, kept: dict[str, NDArray[Any]], recording_path: Path | None
 ) -> Iterator[_Decodable]:
+    """The trained decoder and the validation pages, as long as the recording is open."""
     choices = run.hyperparameters
     if recording_path is None:
         if isinstance(choices, PublishedChoices):
@@ -195,9 +196,7 @@ def _facts(run: Run, size: int) -> list[tuple[str, str]]:
         network = f"{choices.channels} channels, {choices.blocks} blocks, {choices.levels} levels below symbol pitch"
         if choices.refinements:
             again = choices.of_refinement()
-            network += (
-                f"; for each of {choices.refinements} further looks {again.channels} channels, {again.blocks} block"
-            )
+            network += f"; {choices.refinements} more with {again.channels} channels, {again.blocks} block"
             steps += f", {again.steps:,} for each further look,"
     provenance = run.provenance
     return [

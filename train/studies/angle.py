@@ -18,8 +18,8 @@ from optics.progress import Progress
 from train.studies.study import Case, Result, Row, Settings, Study
 from train.studies.trained import Light, trained
 
-_LOCKED = 0.1
-"""Training AIR, bits a symbol, from which a decoder has begun to see."""
+_LOCKED = 0.3
+"""Training AIR, bits a symbol, from which a decoder sees more than `none` does."""
 
 
 def _cases(settings: Settings) -> list[Case]:
@@ -45,7 +45,7 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
     rows: list[Row] = []
     for case, result in zip(cases, results, strict=True):
         fitted = float(result["angles"][-1, 1]) if len(result["angles"]) else float("nan")
-        reference = "matched" if case["matched"] else "flat"
+        reference = "matched" if case["matched"] else "nearly flat"
         locked = first_step(result["training_curve"])
         rows.append(
             (case["localizer"], reference, fitted, true, locked, result["air"], result["own_mi"], result["steps"])

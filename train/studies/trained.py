@@ -96,7 +96,7 @@ def trained(
         job.run(pages)
     held = max(2, round(_HELD_SHARE * pages))
     first, second = pages - 2 * held, pages - held
-    choices = chosen(settings, profile, first, classes)
+    choices = chosen(settings, localizer, profile, first, classes)
     mask = pilot_mask(profile)
     begin(work, asdict(choices) | {"channels": list(choices.channels), "localizer": localizer})
     with Recording.open(path) as recording:
@@ -127,9 +127,9 @@ def trained(
     }
 
 
-def chosen(settings: Settings, profile: Profile, pages: int, classes: int = 0) -> PublishedChoices:
+def chosen(settings: Settings, localizer: str, profile: Profile, pages: int, classes: int = 0) -> PublishedChoices:
     """The authors' choices for a device's symbols and so many training pages, as far as the study goes with them."""
-    choices = replace(published_choices(profile, pages), seed=settings.seed, classes=classes)
+    choices = replace(published_choices(localizer, profile, pages), seed=settings.seed, classes=classes)
     if settings.quick:
         choices = replace(choices, **_QUICK)  # type: ignore[arg-type]
     else:
@@ -172,10 +172,11 @@ def _of_classes(
 ) -> dict[str, Any]:
     """The same of beliefs in classes, without errors of the phase; the validation pages choose their temperature."""
     classes, data = module.choices.classes, torch.from_numpy(~mask)
-    scores, symbols = (torch.cat(parts, dim=-1) for parts in zip(*_scored(module, validation, data), strict=True))
+    known = list(_scored(module, validation, data))
 
     def nll(log_scale: float) -> float:
-        return float(functional.cross_entropy(scores.T * math.exp(log_scale), symbols))
+        pages = (functional.cross_entropy(math.exp(log_scale) * scores.T, symbols) for scores, symbols in known)
+        return float(sum(pages))
 
     scale = math.exp(float(optimize.minimize_scalar(nll, bounds=SCALE_BOUNDS, method="bounded").x))
     rates, claims, beliefs, right = [], [], [], []

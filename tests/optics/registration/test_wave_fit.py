@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from optics.device import Aberration, CameraPose, Device, Drift, Homodyne, Refer
 from optics.grid import field_grid
 from optics.page import symbol_phases
 from optics.profile import Profile
+from optics.registration import wave_fit
 from optics.registration.parameters import NAMES, PARAMETERS, PRIORS, indices
 from optics.registration.wave_fit import WaveFit
 from optics.simulator import Simulator, true_parameters
@@ -83,6 +86,30 @@ def test_a_realistic_device_is_told_from_near_it_with_honest_deviations(seed: in
     known = [i for i in range(len(PRIORS)) if i not in (*np.ravel(moving), lenses)]  # the image has moved since
     off = (found.parameters - truth)[known] / found.deviations[known]
     assert np.sqrt(np.mean(off**2)) < 2
+
+
+def test_a_derivative_that_has_all_but_converged_serves_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked, taken = list[float](), list[int]()
+
+    def counted(fit: WaveFit, *arguments: Any, slopes: Any = WaveFit._slopes) -> Any:
+        taken.append(len(looked))
+        return slopes(fit, *arguments)
+
+    def noted(fit: WaveFit, *arguments: Any, equations: Any = WaveFit._equations) -> Any:
+        columns, left = equations(fit, *arguments)
+        looked.append(float(np.sqrt(np.mean(left**2))))
+        return columns, left
+
+    monkeypatch.setattr(WaveFit, "_slopes", counted)
+    monkeypatch.setattr(WaveFit, "_equations", noted)
+    monkeypatch.setattr(wave_fit, "_CONVERGED", 0.0)  # as long as anything is gained
+    device = Device(drift=Drift(shift_px=0))
+    start = true_parameters(PROFILE, device)
+    start[indices("in_phase")] += [0.03, 0.01, 1e-4, 0, 1e-4, 0]
+    seen_by(device, 1).fit(start, device.homodyne.turn_rad, ("in_phase", "quadrature"))
+    assert len(looked) > wave_fit._CHORD  # rounds enough for a second derivative
+    assert looked[3] > (1 - wave_fit._NEARLY) * looked[2]
+    assert taken == [0]
 
 
 def test_how_much_path_real_lenses_add_comes_back() -> None:

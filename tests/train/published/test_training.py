@@ -76,14 +76,14 @@ def test_the_gradient_of_the_network_alone_is_clipped() -> None:
 
 def test_the_authors_choices() -> None:
     paper = small_profile()
-    assert published_choices(paper, 450) == PublishedChoices()
+    assert published_choices("mode", paper, 450) == PublishedChoices()
     coarse = paper.model_copy(update={"page": paper.page.model_copy(update={"symbol_size_px": 16})})
-    chosen = published_choices(coarse, 450)
+    chosen = published_choices("ray", coarse, 450)
     assert (chosen.steps, chosen.decay) == (15 * 225, 1.0)
-    assert published_choices(load_profile("paper"), 450).lenses == "AC508-080-A"  # its lenses are real
-    assert (
-        published_choices(paper.model_copy(update={"lens_path": THICK}), 450).lenses == "paraxial"
-    )  # of no known lens
+    assert published_choices("ray", load_profile("paper"), 450).lenses == "AC508-080-A"  # its lenses are real
+    thick = paper.model_copy(update={"lens_path": THICK})
+    assert published_choices("ray", thick, 450).lenses == "paraxial"  # of no known lens
+    assert published_choices("mode", load_profile("paper"), 450) == PublishedChoices()  # which traces none
 
 
 @pytest.mark.parametrize("classes", [0, 4])

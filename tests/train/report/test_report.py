@@ -132,7 +132,7 @@ def test_a_run_that_looks_twice_is_told_as_a_whole(coherent: Path) -> None:
     weights = torch.load(coherent / "decoder.pt", weights_only=True)
     learnt = sum(value.numel() for name, value in weights.items() if name.startswith(("network.", "refiners.")))
     assert f"; {learnt:,} parameters in all" in facts["Network"]
-    assert "for each of 1 further looks 5 channels, 1 block" in facts["Network"]
+    assert "; 1 more with 5 channels, 1 block;" in facts["Network"]
     assert facts["Training"].startswith("12 steps of 4 pages, 3 for each further look, in ")
 
 

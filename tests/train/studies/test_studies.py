@@ -24,6 +24,7 @@ from tests.optics.small import small_profile
 from train.published.training import PublishedChoices
 from train.studies import (
     STUDIES,
+    angle,
     cross_section,
     drift,
     folding,
@@ -208,7 +209,28 @@ def test_a_matrix_that_does_not_fit_is_extrapolated_and_says_so() -> None:
     assert rows[1][2] == pytest.approx(16.0)
 
 
-@pytest.mark.parametrize(("name", "lights"), [("angle", 2), ("symbol-size", 2), ("pipe-length", 2), ("heads", 1)])
+LIGHTS = {"angle": 2, "symbol-size": 2, "pipe-length": 2, "heads": 1}
+"""How many recordings each study that trains asks for, its few cases."""
+
+
+def test_all_that_train_are_known() -> None:
+    assert {name for name, study in STUDIES.items() if study.trains} == set(LIGHTS)
+
+
+def test_the_first_step_above_a_threshold_is_told_or_none() -> None:
+    curve = np.array([[10, 0.0], [20, 0.4], [30, 0.2], [40, 0.6]])
+    assert angle.first_step(curve) == 20
+    assert np.isnan(angle.first_step(curve, 0.7))
+    assert np.isnan(angle.first_step(curve[:0]))
+
+
+def test_the_device_for_studies_that_train_has_the_zones_of_the_full_one() -> None:
+    eighth, paper = load_profile("benchmarks/eighth.toml"), load_profile("paper")
+    ratio = [p.page_width_m * p.pipe.length_m / p.lens.focal_length_m / p.pipe.width_m for p in (eighth, paper)]
+    assert ratio[0] == pytest.approx(ratio[1], rel=0.02)
+
+
+@pytest.mark.parametrize(("name", "lights"), LIGHTS.items())
 def test_each_that_trains_makes_maps_of_every_case_and_each_light_once(
     name: str, lights: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -270,8 +292,8 @@ def test_a_share_of_the_steps_is_said_in_the_table(tmp_path: Path) -> None:
 
 
 def test_a_study_trains_as_the_authors_did_unless_told_otherwise() -> None:
-    assert chosen(Settings(SMALL), SMALL, 450) == PublishedChoices()
-    smaller = chosen(Settings(SMALL, seed=3, share=0.1, channels=16), SMALL, 450, classes=16)
+    assert chosen(Settings(SMALL), "ray", SMALL, 450) == PublishedChoices()
+    smaller = chosen(Settings(SMALL, seed=3, share=0.1, channels=16), "mode", SMALL, 450, classes=16)
     assert smaller == PublishedChoices(channels=(16, 32), steps=1125, seed=3, classes=16)
 
 
