@@ -420,7 +420,7 @@ class WaveChannel:
         page_x_m, page_y_m: SLM sample positions against the optical axis, uniform.
         camera_x_m, camera_y_m: camera-plane sample positions against the optical axis, uniform.
         cells: sample intervals of the pipe along (y', x).
-        steps: splitting steps of a sheared pipe.
+        steps: splitting steps of a sheared pipe (`optics.grid.splitting_steps`).
         envelope_m: edge of the SLM pixel, whose sinc is applied on the entrance facet; 0 for point samples.
         blur_m: standard deviation of the SLM's blur.
 
@@ -434,7 +434,7 @@ class WaveChannel:
     camera_x_m: Real
     camera_y_m: Real
     cells: tuple[int, int]
-    steps: int = 64
+    steps: int
     envelope_m: float = 0.0
     blur_m: float = 0.0
 

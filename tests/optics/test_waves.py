@@ -302,7 +302,7 @@ class TestChannel:
         pitch, blur_px = 2.3e-6, 2.0
         page = np.zeros((80, 80), np.complex64)
         page[30:50, 30:50] = noise(20, 20)
-        sharp = WaveChannel(DEVICE, axis(80, pitch), axis(80, pitch), axis(9, pitch), axis(9, pitch), CELLS)
+        sharp = WaveChannel(DEVICE, axis(80, pitch), axis(80, pitch), axis(9, pitch), axis(9, pitch), CELLS, steps=4)
         blurred = replace(sharp, blur_m=blur_px * pitch)
         by_hand = ndimage.gaussian_filter(page.real, blur_px, truncate=6) + 1j * ndimage.gaussian_filter(
             page.imag, blur_px, truncate=6
