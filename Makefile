@@ -55,9 +55,7 @@ bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: th
 	$(COMPARE) --angle 0 $(LOOKS) --out runs/bench-decoders/square
 	$(COMPARE) --angle -0.6 --exposure 0.13 --steps 3000 --arm coherent --arm refined --arm oracle \
 	    --levels 4 --levels 8 --levels 16 --out runs/bench-decoders/dim
-	$(COMPARE) --profile paper --angle -0.6 --pages 20 --steps 4000 --arm coherent --arm refined --arm oracle \
-	    --out runs/bench-decoders/full-size
-	$(COMPARE) --profile paper --angle 0 --pages 20 --steps 4000 --arm coherent --arm refined --arm oracle \
+	$(COMPARE) --profile paper --angle -0.6 --angle 0 --pages 20 --steps 4000 --arm coherent --arm refined --arm oracle \
 	    --out runs/bench-decoders/full-size
 
 # Exposures of 1 and 0.13: bright light, and about the dimmest in which two known pages still calibrate the device.
