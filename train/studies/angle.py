@@ -19,7 +19,7 @@ from train.studies.study import Case, Result, Row, Settings, Study
 from train.studies.trained import Light, trained
 
 _LOCKED = 0.3
-"""Training AIR, bits a symbol, from which a decoder sees more than `none` does."""
+"""Training AIR, bits a symbol, from which a decoder counts as locked; `none` comes to it too, if later, by heart."""
 
 
 def _cases(settings: Settings) -> list[Case]:
