@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import signal
-import threading
-from collections.abc import Iterator
+import socket
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -64,7 +64,7 @@ def serve(
     """Run the service until SIGTERM or Ctrl-C; calls in flight are finished first."""
     check_address("--address", address, least_port=0)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
-    with stop_signals() as stop:
+    with stop_signals() as wait_for_stop:
         base = Decoder.load(bundle_path(bundle), threads)
         models = ModelStore(store, base.bundle) if store is not None else None
         registry = ModelRegistry(base, tracker_for) if tracking else ModelRegistry(base)
@@ -80,7 +80,7 @@ def serve(
             ):
                 version, source_name = registry.current.version, pages.name if pages is not None else "no source"
                 click.echo(f"serving {version} from {source_name} at {server.target}")
-                stop.wait()
+                wait_for_stop()
                 click.echo("stopping")
         finally:
             if pages is not None:
@@ -88,23 +88,34 @@ def serve(
 
 
 @contextmanager
-def stop_signals() -> Iterator[threading.Event]:
-    """An event that SIGTERM and SIGINT set; a second one of either ends the process the usual way."""
-    stop = threading.Event()
-    before: dict[signal.Signals, object] = {}
+def stop_signals() -> Iterator[Callable[[], None]]:
+    """Yields what waits for SIGTERM or SIGINT; a second one of either ends the process the usual way.
 
-    def ask(number: int, _: object) -> None:
-        stop.set()
+    It waits for the byte that the interpreter's own handler writes. Waiting for a lock that a Python handler releases
+    would miss a signal that comes between the last look for one and the sleep.
+    """
+    before: dict[int, object] = {}
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+
+    def no_more(number: int, _: object) -> None:
         for kind in before:
             signal.signal(kind, signal.SIG_DFL)
 
-    for kind in (signal.SIGTERM, signal.SIGINT):
-        before[kind] = signal.signal(kind, ask)
-    try:
-        yield stop
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)  # type: ignore[arg-type]
+    def wait() -> None:
+        while receiver.recv(1)[0] not in before:
+            pass
+
+    with receiver, sender:
+        waking = signal.set_wakeup_fd(sender.fileno())
+        try:
+            for kind in (signal.SIGTERM, signal.SIGINT):
+                before[kind] = signal.signal(kind, no_more)
+            yield wait
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)  # type: ignore[arg-type]
+            signal.set_wakeup_fd(waking)
 
 
 def _resume(registry: ModelRegistry, store: ModelStore, threads: int | None) -> None:

@@ -543,6 +543,34 @@ def test_serve_decodes_until_it_is_told_to_stop(
         served.process.wait()
 
 
+_STOPPED_AT_ANY_MOMENT = """
+import os, random, signal, threading, time
+from runtime.cli_serve import stop_signals
+
+def ask(go, delay_s):
+    go.wait()
+    until = time.perf_counter() + delay_s
+    while time.perf_counter() < until:
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+draw = random.Random(7)
+for _ in range(2000):
+    with stop_signals() as wait_for_stop:
+        go = threading.Event()
+        asking = threading.Thread(target=ask, args=(go, draw.random() * 1e-4), daemon=True)
+        asking.start()
+        go.set()
+        wait_for_stop()
+        asking.join()
+"""
+
+
+def test_a_signal_is_never_missed_whenever_it_comes() -> None:
+    stopped = subprocess.run([sys.executable, "-c", _STOPPED_AT_ANY_MOMENT], cwd=ROOT, timeout=60, check=False)
+    assert stopped.returncode == 0
+
+
 def test_a_restarted_service_uses_the_model_that_was_in_service(toy_zip: Path, tmp_path: Path) -> None:
     from runtime.store import ModelStore
 
