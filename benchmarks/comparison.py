@@ -190,7 +190,8 @@ class Bench:
         folder, features, first, preparing = self.first_look(look, size, choices)
         if name not in FIRST_LOOKS:
             self.kept.keep(folder)
-            outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing)
+            drawn = choices.drawn(self.profile.page_shape)
+            outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing, drawn)
             return replace(outcome, by_levels=self.at_levels(name, folder, [first], outcome.kappa_scale))
         extractor, parameters = self.extractor(look), self.parameters(look)
         pages = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
@@ -203,8 +204,10 @@ class Bench:
         self.kept.keep(folder)
         at = folder / f"refinement-{choices.refinements}"
         held_out, preparing = self.held_out(at / "features"), refined.seconds - refined.last.seconds
-        steps = choices.of_refinement().steps
-        outcome = self.outcome(f"{name} {choices.refinements}", size, steps, at, refined.last, *held_out, preparing)
+        again = choices.of_refinement()
+        drawn = again.drawn(self.profile.page_shape)
+        arm = f"{name} {choices.refinements}"
+        outcome = self.outcome(arm, size, again.steps, at, refined.last, *held_out, preparing, drawn)
         looks = [first, *refined.trained]
         by_levels = self.at_levels(look, at, looks, outcome.kappa_scale, prediction)
         return replace(outcome, looks=len(looks), by_levels=by_levels)
@@ -297,7 +300,8 @@ class Bench:
         turn = self.fitted.turn_rad
         trained = train_published(folder, name, choices, self.profile, turn, self.mask, training, validation, devices=1)
         self.kept.keep(folder)
-        return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing)
+        drawn = choices.steps * choices.batch
+        return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing, drawn)
 
     def begun(self, folder: Path, options: dict[str, Any]) -> Path:
         """The folder of a run that was begun with these options; finished, if it was kept."""
@@ -322,6 +326,7 @@ class Bench:
         validation: Dataset[Page],
         unseen: Dataset[Page],
         preparing: float,
+        drawn: float,
     ) -> Outcome:
         """Figures of the held-out pages, kappa made honest on the validation pages."""
         module: DecoderTraining[Any] = trained.module
@@ -353,6 +358,7 @@ class Bench:
             gained_in_last_fifth=gained_at_the_end(validated, steps),
             preparing_seconds=preparing,
             training_seconds=trained.seconds,
+            pages_per_second=drawn / trained.seconds,
         )
 
 
@@ -369,8 +375,8 @@ class Outcome:
 
     Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor that made
     its claims honest, `looks` how often it looks, `by_levels` what it is worth among fewer levels, `by_walls` the AIR
-    of the symbols whose light meets the walls of `WALLS`. The curves are AIR by step; `benchmarks.decoders.compared`
-    tells `over_oracle` and `over_published`.
+    of the symbols whose light meets the walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by
+    step; `benchmarks.decoders.compared` tells `over_oracle` and `over_published`.
     """
 
     run: str
@@ -385,6 +391,7 @@ class Outcome:
     gained_in_last_fifth: float
     preparing_seconds: float
     training_seconds: float
+    pages_per_second: float
     kappa_scale: float
     training_curve: Curve
     validation_curve: Curve
@@ -399,18 +406,20 @@ class Outcome:
         return (
             f"{self.arm:<16} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} "
             f"{self.own_mi - self.air:>7.3f} {self.page_kB:>6.2f} {walls}{over[0]:>10} {over[1]:>10} "
-            f"{self.gained_in_last_fifth:>8.3f} {self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f}"
+            f"{self.gained_in_last_fifth:>8.3f} {self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f} "
+            f"{self.pages_per_second:>7.2f}"
         )
 
 
 HEADER = (
     f"{'arm':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} "
     + "".join(f"{name:>7} " for name in WALLS)
-    + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8} {'features':>9} {'training':>8}"
+    + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8} {'features':>9} {'training':>8} {'pages/s':>7}"
 )
 """Held-out pages, bits a symbol and kB a page; what own-MI claims beyond the AIR; AIR where a symbol's light meets no
 wall of the pipe, a wall of pair x, of pair y, or of both; AIR over the oracle's, and over that of the best published
-decoder; what validation AIR gained in the last fifth of the steps; minutes."""
+decoder; what validation AIR gained in the last fifth of the steps; minutes; pages that were trained on a second, on a
+GPU where there is one."""
 
 
 @contextmanager

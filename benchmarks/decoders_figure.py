@@ -13,6 +13,8 @@ from train.published.localizers import NAMES as PUBLISHED
 
 MAP = "air_map.npy"
 """File of an arm's run: AIR of each symbol, mean over the held-out pages, [ny, nx]."""
+_BRIGHT = 99.0
+"""Percentile of the symbols' rates at which the colours of the maps end."""
 _DOTS = 110
 _WIDTH_IN, _LIGHT_IN = 14.0, 5.2
 
@@ -34,7 +36,7 @@ def draw(lights: list[dict[str, Any]], out: Path) -> None:
         bars, curves = charts.subplots(2, 1)
         _bars(bars, outcomes, top)
         _curves(curves, outcomes, top)
-        _maps(maps, outcomes, top, out)
+        _maps(maps, outcomes, out)
     figure.savefig(out / "figure.png", dpi=_DOTS, metadata={"Software": None})
 
 
@@ -71,14 +73,16 @@ def _curves(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
     axis.grid(alpha=0.3)
 
 
-def _maps(part: Any, outcomes: list[dict[str, Any]], top: float, out: Path) -> None:
+def _maps(part: Any, outcomes: list[dict[str, Any]], out: Path) -> None:
     """Where on the page each arm reads how much."""
+    maps = [np.load(out / outcome["run"] / MAP) for outcome in outcomes]
+    top = max(0.1, *(float(np.nanpercentile(rates, _BRIGHT)) for rates in maps))
     rows = 1 if len(outcomes) < 3 else 2
     axes = part.subplots(rows, -(-len(outcomes) // rows), squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
-    for axis, outcome in zip(axes.flat, outcomes, strict=False):
-        shown = axis.imshow(np.load(out / outcome["run"] / MAP), vmin=0, vmax=top, cmap="viridis")
+    for axis, outcome, rates in zip(axes.flat, outcomes, maps, strict=False):
+        shown = axis.imshow(rates, vmin=0, vmax=top, cmap="viridis")
         axis.set_title(f"{_name(outcome)}: {outcome['air']:.2f}", fontsize=9)
     part.colorbar(shown, ax=axes, location="bottom", shrink=0.6, aspect=40, label="AIR of each symbol, bit")
 

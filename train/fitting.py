@@ -105,6 +105,11 @@ class Hyperparameters:
         """The localizer of these choices."""
         return CoherentLocalizer(profile, self.samples, self.interpolation, self.grid(profile))
 
+    def drawn(self, page_shape: tuple[int, int]) -> float:
+        """Pages that all steps together are shown, a patch counting for its share of one."""
+        share = math.prod(min(count, self.patch) / count for count in page_shape)
+        return self.steps * self.batch * share
+
     def of_refinement(self) -> Hyperparameters:
         """The choices for a refinement's network, which starts from a good belief and sees little light."""
         steps = max(1, round(_REFINEMENT_STEPS * self.steps))
