@@ -31,7 +31,9 @@ from optics.profile import Profile, load_profile
 from optics.recording import FramePair
 from optics.registration.parameters import nominal
 from optics.registration.table import sampling_table
+from runtime.built_in import GraphFile
 from runtime.cpus import available_cpus
+from runtime.decoder import PAGE_INPUTS
 from runtime.ort import Session, open_session
 from train.decoder import SymbolDecoder
 from train.fitting import Hyperparameters
@@ -94,8 +96,9 @@ class Timed:
 
 
 def session_of(profile: Profile, graph: Graph, tensors: Tensors, threads: int) -> Session:
-    """The graph in the runtime that serves."""
-    return open_session(decoder_onnx(graph.eval(), "uint8", profile.frame_shape, tensors), "speed", threads)
+    """The graph in the runtime that serves, its table built in as it does that."""
+    model = decoder_onnx(graph.eval(), "uint8", profile.frame_shape, tensors)
+    return open_session(GraphFile(model, "speed").built_in({}, PAGE_INPUTS), "speed", threads)
 
 
 def frames_of(profile: Profile) -> dict[str, np.ndarray]:

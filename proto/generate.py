@@ -34,8 +34,12 @@ def generate(target: Path) -> list[Path]:
             if parent.is_relative_to(target):
                 (parent / "__init__.py").write_text(INIT, "utf-8")
                 written.append(parent / "__init__.py")
+        serves = re.search(r"^service ", source.read_text("utf-8"), re.M)
         for suffix in ("_pb2.py", "_pb2.pyi", "_pb2_grpc.py"):
             path = folder / (source.stem + suffix)
+            if suffix == "_pb2_grpc.py" and not serves:
+                path.unlink()
+                continue
             text = re.sub(r"^from lightpage\.", f"from {PACKAGE}.lightpage.", path.read_text("utf-8"), flags=re.M)
             path.write_text("# mypy: ignore-errors\n" + text, "utf-8")
             written.append(path)

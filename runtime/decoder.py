@@ -16,6 +16,7 @@ from optics.measures import decide_with_confidence
 from optics.page import MAX_LEVELS, check_levels
 from optics.pilots import Pilots, estimate_piston, estimate_trust, remove_piston
 from optics.recording import FramePair
+from runtime.built_in import GraphFile
 from runtime.bundle import Bundle, Table
 from runtime.frames import check_pair
 from runtime.manifest import DECODER, FIELD, GOLDEN
@@ -25,6 +26,8 @@ OUTPUTS = ("p", "phase", "concentration")
 FIELD_OUTPUTS = ("field", "unexplained")
 """Outputs of the field graph, or of a decoder that shows them, [2, Gy, Gx] each: the recovered field, and what is left
 of the homodyne equations."""
+PAGE_INPUTS = frozenset(["registration"])
+"""Table inputs that may differ from page to page, as the image shifts; all others are built into the graph."""
 GOLDEN_TOLERANCE = 1e-3
 """Largest error of p on the golden page, relative to its norm: room for another CPU's rounding, not for another net."""
 
@@ -123,11 +126,17 @@ class Decoder:
     def __init__(self, bundle: Bundle, threads: int | None = None) -> None:
         self.bundle, self.threads = bundle, threads
         self._thing = f"{bundle.thing}: {DECODER}"
-        self._session = open_session(bundle.files[DECODER], self._thing, threads)
-        self._ports = self._check_graph(self._session)
+        graph = GraphFile(bundle.files[DECODER], self._thing)
+        self._ports = {name: _Port(port.dtype, port.shape) for name, port in graph.table_inputs.items()}
+        if set(self._ports) != set(bundle.manifest.table_inputs):
+            wanted = sorted(bundle.manifest.table_inputs)
+            raise BundleError(f"{self._thing}: table inputs", sorted(self._ports), wanted)
+        self._table = self._checked_defaults(bundle.table)
+        self._fed = {name: value for name, value in self._table.items() if name in PAGE_INPUTS}
+        self._session = open_session(graph.built_in(self._table, PAGE_INPUTS), self._thing, threads)
+        self._check_graph(self._session)
         residual = bundle.manifest.residual_output
         self._outputs = [*OUTPUTS, *([residual] if residual else [])]
-        self._table = self._checked_defaults(bundle.table)
         self._pilots: dict[int, Pilots] = {}
         self.pilots(MAX_LEVELS)  # damaged pilots are noticed now, not with the first page
         self._check_golden()
@@ -203,10 +212,12 @@ class Decoder:
             InvalidInputError: a table that does not fit.
             FrameError: the frames contradict the homodyne equations beyond the bundle's limit.
         """
-        if table:
-            self.check_table(table)
-        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **self._table, **(table or {})}
-        p, phase, concentration, *rest = self._session.run(self._outputs, feeds)
+        table = table or {}
+        self.check_table(table)
+        usual = PAGE_INPUTS.issuperset(table)
+        session, own = (self._session, self._fed) if usual else (self._whole_session, self._table)
+        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **own, **table}
+        p, phase, concentration, *rest = session.run(self._outputs, feeds)
         limit = self.bundle.manifest.residual_limit
         if rest and limit is not None and not (residual := float(np.max(rest[0]))) <= limit:
             raise FrameError(
@@ -240,7 +251,7 @@ class Decoder:
         }
         self.check_table(table)
         feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
-        if session is self._session:
+        if session is self._whole_session:
             feeds = {**self._table, **feeds}
         (real, imaginary), left = session.run(FIELD_OUTPUTS, feeds)
         if real.shape != (wanted := field_grid(self.bundle.profile).shape):
@@ -250,10 +261,15 @@ class Decoder:
         return np.asarray(real + 1j * imaginary, np.complex64), left
 
     @cached_property
+    def _whole_session(self) -> Session:
+        """The decoder's graph with all of its inputs, for who feeds more than a page does."""
+        return open_session(self.bundle.files[DECODER], self._thing, self.threads)
+
+    @cached_property
     def _field_session(self) -> Session:
         """The field's own graph, which does no more than is asked for; without one, the decoder's."""
         if FIELD not in self.bundle.files:
-            return self._session
+            return self._whole_session
         return open_session(self.bundle.files[FIELD], f"{self.bundle.thing}: {FIELD}", self.threads)
 
     def decode(
@@ -314,8 +330,8 @@ class Decoder:
         piston = float(remove_piston(np.asarray(page.piston_rad), -again.piston_rad))
         return replace(again, piston_rad=piston, timings=page.timings)
 
-    def _check_graph(self, session: Session) -> dict[str, _Port]:
-        """The overridable inputs by name, after checking names, types and shapes of everything."""
+    def _check_graph(self, session: Session) -> None:
+        """Check names, types and shapes of the frames and of what the graph says of them."""
         manifest, profile = self.bundle.manifest, self.bundle.profile
         inputs = {node.name: _Port.of(node) for node in session.get_inputs()}
         if set(inputs) != {"in_phase", "quadrature"}:
@@ -324,9 +340,6 @@ class Decoder:
             if not port.admits(manifest.frame_dtype, profile.frame_shape):
                 wanted = f"{manifest.frame_dtype} {profile.frame_shape}"
                 raise BundleError(f"{self._thing}: input {name}", f"{port.dtype} {port.shape}", wanted)
-        table = {node.name: _Port.of(node) for node in session.get_overridable_initializers()}
-        if set(table) != set(manifest.table_inputs):
-            raise BundleError(f"{self._thing}: table inputs", sorted(table), sorted(manifest.table_inputs))
         outputs = {node.name: _Port.of(node) for node in session.get_outputs()}
         shapes = {"p": (2, *profile.page_shape), "phase": profile.page_shape, "concentration": profile.page_shape}
         for name, shape in shapes.items():
@@ -335,7 +348,6 @@ class Decoder:
                 raise BundleError(f"{self._thing}: output {name}", got, f"float32 {shape}")
         if manifest.residual_output is not None and manifest.residual_output not in outputs:
             raise BundleError(f"{self._thing}: output {manifest.residual_output}", "nothing", "a scalar residual")
-        return table
 
     def _checked_defaults(self, table: Table) -> Table:
         try:

@@ -31,9 +31,6 @@ class Session(Protocol):
     def get_inputs(self) -> Sequence[Node]:
         """Inputs that must be fed."""
 
-    def get_overridable_initializers(self) -> Sequence[Node]:
-        """Inputs that have a default."""
-
     def get_outputs(self) -> Sequence[Node]:
         """Outputs."""
 
