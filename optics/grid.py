@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,11 +20,8 @@ _MARGIN_PX = 70
 _PREFILTER_TAPS = 11
 _PREFILTER_STOP = 0.36
 """Cycles per pixel: so few taps stop nothing below it. On a grid of every third pixel some noise folds."""
-_EMPHASIS_TAPS = 3
-"""More read the field no better: what is left differs from place to place."""
-_STOP_WEIGHT = 1.3
 _PASS_STEPS = 8
-"""Straight pieces of these filters' gain in their pass band."""
+"""Straight pieces of the prefilter's gain in its pass band."""
 _BAND_TAPS = 31
 _BAND_HEADROOM = 1.06
 """Pass band over the pipe's nominal band, for misalignment of the pipe against the lens axes."""
@@ -51,32 +47,12 @@ class FieldGrid:
         prefilter: taps applied along each axis of a raw frame before it is resampled to the grid, linearly: they make
             good, on average over the places between two pixels, what that takes off high frequencies.
         band: taps applied along each axis of the field on the grid: the pipe's band.
-        emphasis: taps applied along each axis of that field before it is read linearly between the grid's samples: what
-            the prefilter is to the frames.
-        step_px: pitch in camera pixels.
-        edge: of the pipe's band, cycles per sample.
     """
 
     x_m: Real
     y_m: Real
     prefilter: Real
     band: Real
-    emphasis: Real
-    step_px: int
-    edge: float
-
-    def band_of_binned(self, binning: int) -> Real:
-        """Taps of the band filter for what was read, linearly, in frames whose pixels were binned instead of filtered.
-
-        They make good, on average over places, what that takes off high frequencies.
-
-        Args:
-            binning: camera pixels along each axis whose mean is a bin.
-        """
-        bin_samples = binning / self.step_px
-        return np.convolve(
-            self.band, _making_good(lambda at: np.sinc(bin_samples * at) ** 3, _EMPHASIS_TAPS, self.edge)
-        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -143,13 +119,8 @@ def field_grid(profile: Profile, step_px: int = GRID_STEP_PX) -> FieldGrid:
     return FieldGrid(
         x_m=axis(profile.page_width_m),
         y_m=axis(profile.page_height_m),
-        prefilter=_making_good(
-            _linear, _PREFILTER_TAPS, 2 * edge * pixel, max(1 / step_px - edge * pixel, _PREFILTER_STOP)
-        ),
+        prefilter=_before_linear(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / step_px - edge * pixel, _PREFILTER_STOP)),
         band=_low_pass(_BAND_TAPS, _BAND_HEADROOM * edge * pitch, _BAND_STOP * edge * pitch),
-        emphasis=_making_good(_linear, _EMPHASIS_TAPS, edge * pitch),
-        step_px=step_px,
-        edge=edge * pitch,
     )
 
 
@@ -185,23 +156,10 @@ def _low_pass(taps: int, passed: float, stopped: float) -> Real:
     return np.asarray(kernel / kernel.sum())
 
 
-def _linear(frequencies: Real) -> Real:
-    """Mean gain of linear interpolation over places between samples; frequencies in cycles per sample."""
-    return np.asarray(np.sinc(frequencies) ** 2)
-
-
-def _making_good(lost: Callable[[Real], Real], taps: int, passed: float, stopped: float = _NYQUIST) -> Real:
-    """Least-squares filter with the inverse of a gain up to `passed`, which stops what lies from `stopped` on.
-
-    Args:
-        lost: the gain at frequencies in cycles per sample, one at zero.
-        taps: how many.
-        passed, stopped: cycles per sample.
-    """
+def _before_linear(taps: int, passed: float, stopped: float) -> Real:
+    """Least-squares low-pass with the inverse of linear interpolation's mean gain, sinc^2, in its pass band."""
     steps = np.linspace(0, passed, _PASS_STEPS + 1)
-    bands = np.repeat(steps, 2)[1:-1]
-    gains, weights = 1 / lost(bands), [1.0] * _PASS_STEPS
-    if stopped < _NYQUIST:
-        bands, gains, weights = np.r_[bands, stopped, _NYQUIST], np.r_[gains, 0, 0], [*weights, _STOP_WEIGHT]
-    kernel = signal.firls(taps, bands, gains, weight=weights, fs=1.0)
+    bands = [*np.repeat(steps, 2)[1:-1], stopped, 0.5]
+    gains = [*(1 / np.sinc(bands[:-2]) ** 2), 0, 0]
+    kernel = signal.firls(taps, bands, gains, weight=[1] * _PASS_STEPS + [1.3], fs=1.0)
     return np.asarray(kernel / kernel.sum())

@@ -115,7 +115,6 @@ class FieldRecovery(nn.Module):
         corner = profile.corner_m
         self.prefilter = SeparableFilter(grid.prefilter)
         self.band = SeparableFilter(grid.band)
-        self.first_band = self.band if binning == 1 else SeparableFilter(grid.band_of_binned(binning))
         self.u: Tensor
         self.v: Tensor
         self.between_x: Tensor
@@ -199,7 +198,7 @@ class FieldRecovery(nn.Module):
         pipe's band.
         """
         a, b, cos, sin, amplitude, _ = measured
-        start = self.first_band(torch.stack([a, (b - cos * a) / sin]) * amplitude) / amplitude
+        start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) / amplitude
         if not self.with_signal_power:
             return torch.as_tensor(start)
         # Im e = slope Re e - offset, from the difference of the equations; then a quadratic in Re e
@@ -209,7 +208,7 @@ class FieldRecovery(nn.Module):
         discriminant = linear * linear - quadratic * (offset * offset - 2 * a)
         middle = -linear / quadratic
         real = middle + torch.sign(start[0] - middle) * torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
-        before = estimate = self.first_band(torch.stack([real, slope * real - offset]) * amplitude) / amplitude
+        before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) / amplitude
         for _ in range(self.rounds):
             ahead = estimate + _MOMENTUM * (estimate - before)
             step = _STEP * measured.pull(ahead, READ_NOISE)

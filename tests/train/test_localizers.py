@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from optics.device import Device, Drift, SlmDefects
 from optics.grid import GRID_STEP_PX, field_grid
 from optics.page import random_symbols, symbol_phases
 from optics.registration.coherence import COHERENT_BRANCHES, branch_shares
-from optics.registration.parameters import nominal
-from optics.registration.table import sampling_table
 from optics.simulator import Simulator, true_parameters
 from tests.optics.small import small_profile
 from train.features import FeatureExtractor
-from train.filters import SeparableFilter
-from train.localizers.coherent import BICUBIC, BILINEAR, CoherentLocalizer
-from train.twin import RayTwin, TorchTwin
 
 SEED = 3
 
@@ -53,29 +47,6 @@ def test_the_coherent_localizer_brings_out_each_symbol_where_its_branch_has_the_
         z = symbol[branch][clean] * np.exp(-1j * phases[clean])
         assert abs(z.mean()) / np.sqrt(np.mean(np.abs(z) ** 2)) > 0.95
         assert abs(np.angle(z.mean())) < 0.02
-
-
-@pytest.mark.parametrize(("step_px", "expected_db"), [(GRID_STEP_PX, -22.6), (3, -17.0)])
-def test_light_is_read_linearly_with_an_error_that_its_emphasis_brings_down(step_px: int, expected_db: float) -> None:
-    """Against cubic reading of the same light; without the emphasis, which is replaced by nothing, far worse."""
-    profile = small_profile()
-    grid = field_grid(profile, step_px)
-    table = sampling_table(TorchTwin(RayTwin(profile)), nominal(), np.pi / 2, profile)
-    where = [torch.from_numpy(table[name]) for name in ("places", "place_gradients", "phases")]
-    noise = torch.randn(2, *grid.shape, generator=torch.Generator().manual_seed(SEED))
-    light = SeparableFilter(grid.band)(noise)
-    exact = CoherentLocalizer(profile, interpolation=BICUBIC, grid=grid)(light, *where)
-
-    def error_db(localizer: CoherentLocalizer) -> float:
-        left = localizer(light, *where) - exact
-        return float(10 * torch.log10(left.square().mean() / exact.square().mean()))
-
-    linear = CoherentLocalizer(profile, interpolation=BILINEAR, grid=grid)
-    emphasised = error_db(linear)
-    assert emphasised == pytest.approx(expected_db, abs=1)
-    linear.emphasis = torch.zeros_like(linear.emphasis)
-    linear.emphasis[..., 1, 1] = 1
-    assert error_db(linear) > emphasised + 4
 
 
 def test_the_wave_localizer_brings_out_nearly_all_of_the_page(page) -> None:

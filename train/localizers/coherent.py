@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -20,8 +19,8 @@ class CoherentLocalizer(nn.Module):
     Args:
         profile: the nominal device.
         samples: per symbol and axis; 0 takes as many as the field has, see `symbol_samples`.
-        interpolation: of the field between the grid's samples, `bicubic` or, after an emphasis of high frequencies,
-            `bilinear`.
+        interpolation: of the field between the grid's samples, `bicubic` or `bilinear`: an error of -32 or -23 dB on
+            the usual grid.
         grid: the common grid, where it is not the usual one.
     """
 
@@ -44,9 +43,6 @@ class CoherentLocalizer(nn.Module):
         self.offset_y: Tensor
         self.register_buffer("offset_x", steps.repeat(self.samples).reshape(1, -1, 1, 1), persistent=False)
         self.register_buffer("offset_y", steps.repeat_interleave(self.samples).reshape(1, -1, 1, 1), persistent=False)
-        emphasis = torch.tensor(np.outer(own.emphasis, own.emphasis), dtype=torch.float32)
-        self.emphasis: Tensor
-        self.register_buffer("emphasis", emphasis[None, None], persistent=False)
 
     @property
     def light_channels(self) -> int:
@@ -77,13 +73,8 @@ class CoherentLocalizer(nn.Module):
         (last_row, last_column), (height, width) = self._last, self._span
         where = torch.stack([(2 * column - last_column) / width, (2 * row - last_row) / height], dim=-1)
         ny, nx = self.page_shape
-        shown = (
-            field
-            if self.interpolation == BICUBIC
-            else functional.conv2d(field[:, None], self.emphasis, padding=1)[:, 0]
-        )
         sampled = functional.grid_sample(
-            shown[None], where.reshape(1, -1, nx, 2), mode=self.interpolation, padding_mode="zeros", align_corners=True
+            field[None], where.reshape(1, -1, nx, 2), mode=self.interpolation, padding_mode="zeros", align_corners=True
         ).reshape(2, len(BRANCHES), self.samples**2, ny, nx)
         cos, sin = torch.cos(phase), torch.sin(phase)
         scale = torch.rsqrt((field * field).mean() * 2 + 1e-12)
