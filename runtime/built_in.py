@@ -6,25 +6,19 @@ ONNX Runtime folds constants, but not defaults of inputs that may be fed. So the
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 
 import numpy as np
 from google.protobuf.message import DecodeError
 
 from optics.errors import BundleError
 from runtime.bundle import Table
+from runtime.ort import Port
 from runtime.pb.lightpage.onnx import graph_pb2 as pb
 
 _DTYPES = {1: "float32", 2: "uint8", 4: "uint16", 6: "int32", 7: "int64", 11: "float64"}
 """numpy's names of ONNX's element types."""
-
-
-@dataclass(frozen=True)
-class TableInput:
-    """An input that has a default: its numpy type and shape."""
-
-    dtype: str
-    shape: tuple[int, ...]
+_DEFAULTS_FROM = 4
+"""Version of ONNX's representation from which an input may have a default; before, weights are listed as inputs too."""
 
 
 class GraphFile:
@@ -33,6 +27,9 @@ class GraphFile:
     Args:
         model: the serialised model.
         thing: what it is, for the error.
+
+    Attributes:
+        table_inputs: inputs that have a default, by name, of its type and shape.
 
     Raises:
         BundleError: the bytes are no ONNX model.
@@ -47,12 +44,11 @@ class GraphFile:
             raise BundleError(thing, error, wanted) from None
         if not whole.HasField("graph"):
             raise BundleError(thing, "no graph", wanted)
-        graph = whole.graph
-        named = {entry.name for entry in graph.input}
+        fed = {entry.name for entry in whole.graph.input} if whole.ir_version >= _DEFAULTS_FROM else set()
         self.table_inputs = {
-            tensor.name: TableInput(_DTYPES.get(tensor.data_type, str(tensor.data_type)), tuple(tensor.dims))
-            for tensor in graph.initializer
-            if tensor.name in named
+            tensor.name: Port(_DTYPES.get(tensor.data_type, str(tensor.data_type)), tuple(tensor.dims))
+            for tensor in whole.graph.initializer
+            if tensor.name in fed
         }
 
     def built_in(self, table: Table, fed: Collection[str]) -> bytes:

@@ -37,7 +37,7 @@ from runtime.manifest import (
 )
 
 Table = dict[str, NDArray[Any]]
-"""Tensors fed to the decoder instead of its defaults, by input name."""
+"""Tensors that a decoder takes instead of its graph's defaults, by input name."""
 
 MAX_ARRAY_BYTES = MAX_BYTES
 """All arrays of one .npz file, unpacked: it is compressed by itself, and may be a bomb inside a small bundle."""

@@ -113,9 +113,9 @@ def stop_signals() -> Iterator[Callable[[], None]]:
                 before[kind] = signal.signal(kind, no_more)
             yield wait
         finally:
+            signal.set_wakeup_fd(waking)
             for number, handler in before.items():
                 signal.signal(number, handler)  # type: ignore[arg-type]
-            signal.set_wakeup_fd(waking)
 
 
 def _resume(registry: ModelRegistry, store: ModelStore, threads: int | None) -> None:

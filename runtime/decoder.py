@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +21,7 @@ from runtime.built_in import GraphFile
 from runtime.bundle import Bundle, Table
 from runtime.frames import check_pair
 from runtime.manifest import DECODER, FIELD, GOLDEN
-from runtime.ort import Node, Session, open_session
+from runtime.ort import Port, Session, open_session
 
 OUTPUTS = ("p", "phase", "concentration")
 FIELD_OUTPUTS = ("field", "unexplained")
@@ -28,17 +29,10 @@ FIELD_OUTPUTS = ("field", "unexplained")
 of the homodyne equations."""
 PAGE_INPUTS = frozenset(["registration"])
 """Table inputs that may differ from page to page, as the image shifts; all others are built into the graph."""
+_LARGE_WITH_REAL_LENSES = frozenset(["parameters"])
+"""Table inputs from which gigabytes follow, with lenses that are not ideal: no sooner read than made again."""
 GOLDEN_TOLERANCE = 1e-3
 """Largest error of p on the golden page, relative to its norm: room for another CPU's rounding, not for another net."""
-
-_TYPES = {
-    "tensor(float)": "float32",
-    "tensor(double)": "float64",
-    "tensor(int32)": "int32",
-    "tensor(int64)": "int64",
-    "tensor(uint8)": "uint8",
-    "tensor(uint16)": "uint16",
-}
 
 
 @dataclass(frozen=True)
@@ -91,26 +85,6 @@ class DecodedPage:
     timings: Timings
 
 
-@dataclass(frozen=True)
-class _Port:
-    """Name, numpy type and shape of a graph's input or output; None stands for a free dimension."""
-
-    dtype: str
-    shape: tuple[int | None, ...]
-
-    @classmethod
-    def of(cls, node: Node) -> _Port:
-        shape = tuple(size if isinstance(size, int) else None for size in node.shape)
-        return cls(_TYPES.get(node.type, node.type), shape)
-
-    def admits(self, dtype: str, shape: tuple[int, ...]) -> bool:
-        return (
-            self.dtype == dtype
-            and len(self.shape) == len(shape)
-            and all(own in (None, other) for own, other in zip(self.shape, shape, strict=True))
-        )
-
-
 class Decoder:
     """The decoder of one bundle. Its methods may be called from many threads at once.
 
@@ -127,13 +101,11 @@ class Decoder:
         self.bundle, self.threads = bundle, threads
         self._thing = f"{bundle.thing}: {DECODER}"
         graph = GraphFile(bundle.files[DECODER], self._thing)
-        self._ports = {name: _Port(port.dtype, port.shape) for name, port in graph.table_inputs.items()}
+        self._ports = graph.table_inputs
         if set(self._ports) != set(bundle.manifest.table_inputs):
             wanted = sorted(bundle.manifest.table_inputs)
             raise BundleError(f"{self._thing}: table inputs", sorted(self._ports), wanted)
-        self._table = self._checked_defaults(bundle.table)
-        self._fed = {name: value for name, value in self._table.items() if name in PAGE_INPUTS}
-        self._session = open_session(graph.built_in(self._table, PAGE_INPUTS), self._thing, threads)
+        self._build_in(graph, self._checked_defaults(bundle.table))
         self._check_graph(self._session)
         residual = bundle.manifest.residual_output
         self._outputs = [*OUTPUTS, *([residual] if residual else [])]
@@ -146,6 +118,17 @@ class Decoder:
         """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
         return cls(Bundle.open(path), threads)
 
+    def with_table(self, table: Table) -> Decoder:
+        """This decoder with other tensors in its table, by name; those left out stay. The golden page is not looked at.
+
+        Raises:
+            InvalidInputError: a table that does not fit.
+        """
+        self.check_table(table)
+        other = copy(self)
+        other._build_in(GraphFile(self.bundle.files[DECODER], self._thing), {**self._table, **table})
+        return other
+
     @property
     def version(self) -> str:
         """The bundle's version."""
@@ -153,7 +136,7 @@ class Decoder:
 
     @property
     def table_shapes(self) -> dict[str, tuple[int | None, ...]]:
-        """Shape of every tensor that may be fed instead of its default."""
+        """Shape of every tensor of the table."""
         return {name: port.shape for name, port in self._ports.items()}
 
     def pilots(self, levels: int, mask: NDArray[np.bool_] | None = None) -> Pilots:
@@ -187,7 +170,7 @@ class Decoder:
         check_pair(pair, self.bundle.profile.frame_shape, manifest.frame_dtype, manifest.camera_bit_depth)
 
     def check_table(self, table: Table) -> None:
-        """Check tensors that are to be fed instead of defaults.
+        """Check tensors that are to stand in the table instead of the graph's defaults.
 
         Raises:
             InvalidInputError: an unknown name, a wrong type or shape, or values that are not finite.
@@ -206,7 +189,7 @@ class Decoder:
 
         Args:
             pair: both frames, as `check` accepts them.
-            table: tensors fed instead of the bundle's, by name; those left out stay as they are.
+            table: tensors for this page alone, of `PAGE_INPUTS`; all others take `with_table`.
 
         Raises:
             InvalidInputError: a table that does not fit.
@@ -214,10 +197,10 @@ class Decoder:
         """
         table = table or {}
         self.check_table(table)
-        usual = PAGE_INPUTS.issuperset(table)
-        session, own = (self._session, self._fed) if usual else (self._whole_session, self._table)
-        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **own, **table}
-        p, phase, concentration, *rest = session.run(self._outputs, feeds)
+        if others := set(table) - PAGE_INPUTS:
+            raise InvalidInputError("table of a page", ", ".join(sorted(others)), f"only {', '.join(PAGE_INPUTS)}")
+        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **self._fed, **table}
+        p, phase, concentration, *rest = self._session.run(self._outputs, feeds)
         limit = self.bundle.manifest.residual_limit
         if rest and limit is not None and not (residual := float(np.max(rest[0]))) <= limit:
             raise FrameError(
@@ -251,7 +234,7 @@ class Decoder:
         }
         self.check_table(table)
         feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
-        if session is self._whole_session:
+        if FIELD not in self.bundle.files:
             feeds = {**self._table, **feeds}
         (real, imaginary), left = session.run(FIELD_OUTPUTS, feeds)
         if real.shape != (wanted := field_grid(self.bundle.profile).shape):
@@ -261,16 +244,10 @@ class Decoder:
         return np.asarray(real + 1j * imaginary, np.complex64), left
 
     @cached_property
-    def _whole_session(self) -> Session:
-        """The decoder's graph with all of its inputs, for who feeds more than a page does."""
-        return open_session(self.bundle.files[DECODER], self._thing, self.threads)
-
-    @cached_property
     def _field_session(self) -> Session:
-        """The field's own graph, which does no more than is asked for; without one, the decoder's."""
-        if FIELD not in self.bundle.files:
-            return self._whole_session
-        return open_session(self.bundle.files[FIELD], f"{self.bundle.thing}: {FIELD}", self.threads)
+        """The field's own graph, which does no more than is asked for; without one, the decoder's, all of it fed."""
+        name = FIELD if FIELD in self.bundle.files else DECODER
+        return open_session(self.bundle.files[name], f"{self.bundle.thing}: {name}", self.threads)
 
     def decode(
         self, pair: FramePair, levels: int = 256, table: Table | None = None, pilots: Pilots | None = None
@@ -330,17 +307,23 @@ class Decoder:
         piston = float(remove_piston(np.asarray(page.piston_rad), -again.piston_rad))
         return replace(again, piston_rad=piston, timings=page.timings)
 
+    def _build_in(self, graph: GraphFile, table: Table) -> None:
+        """Open the graph with this table, which was checked."""
+        fed = PAGE_INPUTS if self.bundle.profile.ideal_lenses else PAGE_INPUTS | _LARGE_WITH_REAL_LENSES
+        self._table, self._fed = table, {name: value for name, value in table.items() if name in fed}
+        self._session = open_session(graph.built_in(table, fed), self._thing, self.threads)
+
     def _check_graph(self, session: Session) -> None:
         """Check names, types and shapes of the frames and of what the graph says of them."""
         manifest, profile = self.bundle.manifest, self.bundle.profile
-        inputs = {node.name: _Port.of(node) for node in session.get_inputs()}
+        inputs = {node.name: Port.of(node) for node in session.get_inputs()}
         if set(inputs) != {"in_phase", "quadrature"}:
             raise BundleError(f"{self._thing}: inputs", sorted(inputs), "in_phase and quadrature")
         for name, port in inputs.items():
             if not port.admits(manifest.frame_dtype, profile.frame_shape):
                 wanted = f"{manifest.frame_dtype} {profile.frame_shape}"
                 raise BundleError(f"{self._thing}: input {name}", f"{port.dtype} {port.shape}", wanted)
-        outputs = {node.name: _Port.of(node) for node in session.get_outputs()}
+        outputs = {node.name: Port.of(node) for node in session.get_outputs()}
         shapes = {"p": (2, *profile.page_shape), "phase": profile.page_shape, "concentration": profile.page_shape}
         for name, shape in shapes.items():
             if name not in outputs or not outputs[name].admits("float32", shape):

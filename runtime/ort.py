@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
@@ -23,6 +24,38 @@ class Node(Protocol):
     name: str
     type: str
     shape: Sequence[int | str | None]
+
+
+_TYPES = {
+    "tensor(float)": "float32",
+    "tensor(double)": "float64",
+    "tensor(int32)": "int32",
+    "tensor(int64)": "int64",
+    "tensor(uint8)": "uint8",
+    "tensor(uint16)": "uint16",
+}
+
+
+@dataclass(frozen=True)
+class Port:
+    """Numpy type and shape of a graph's input or output; None stands for a free dimension."""
+
+    dtype: str
+    shape: tuple[int | None, ...]
+
+    @classmethod
+    def of(cls, node: Node) -> Port:
+        """As a session describes it."""
+        shape = tuple(size if isinstance(size, int) else None for size in node.shape)
+        return cls(_TYPES.get(node.type, node.type), shape)
+
+    def admits(self, dtype: str, shape: tuple[int, ...]) -> bool:
+        """Whether an array of this type and shape fits."""
+        return (
+            self.dtype == dtype
+            and len(self.shape) == len(shape)
+            and all(own in (None, other) for own, other in zip(self.shape, shape, strict=True))
+        )
 
 
 class Session(Protocol):

@@ -179,13 +179,14 @@ def recalibrate(
     try:
         result = fit(decoder.bundle, fitted, lambda step, share: progress(step, 0.05 + 0.85 * share), decoder)
         progress("judge by the held-back pages", 0.9)
-        rates = _air(decoder, held_back, result.table)
+        refitted = decoder.with_table(result.table)
+        rates = _air(refitted, held_back)
     except (CalibrationError, FrameError) as error:
         raise RecalibrationRefusedError(error.thing, error.got, error.wanted) from error
     after = fmean(rates)
     _judge(before, rates, pages.levels)
     progress("write the new bundle", 0.95)
-    files, manifest = _new_contents(decoder, held_back.pairs[0], pages, result, version, before, after)
+    files, manifest = _new_contents(refitted, held_back.pairs[0], pages, result, version, before, after)
     write_bundle(out, manifest, files)
     return RecalibrationOutcome(
         path=out,
@@ -208,7 +209,7 @@ def next_version(version: str, taken: Sequence[str] = ()) -> str:
     return f"{base}+r{last + 1}"
 
 
-def _air(decoder: Decoder, pages: KnownPages, table: Table | None) -> list[float]:
+def _air(decoder: Decoder, pages: KnownPages, table: Table | None = None) -> list[float]:
     """AIR over the data symbols of each page, bits per symbol; `FrameError` where the model refuses the frames."""
     mask = decoder.bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
     data, rates = ~mask, []
@@ -245,9 +246,9 @@ def _new_contents(
     before: float,
     after: float,
 ) -> tuple[dict[str, bytes], Manifest]:
-    """Files and manifest of the new bundle: the same graphs, the new table, and a golden page that belongs to it."""
+    """Files and manifest of the new bundle: the same graphs, the re-fitted decoder's table, and its golden page."""
     bundle = decoder.bundle
-    p = decoder.infer(golden, result.table).p
+    p = decoder.infer(golden).p
     files = {
         **bundle.files,
         TABLE: npz(**{**bundle.table, **result.table}),

@@ -11,7 +11,7 @@ from runtime.decoder import Decoder
 from runtime.tracking import NoTracker, Tracker
 
 KEPT_MODELS = 4
-"""Models held loaded, the current one included: enough to step back over a bad day, little enough to bound memory."""
+"""Models held loaded, the current one included: enough to step back over a bad day, and a bound on the memory."""
 
 TrackerFactory = Callable[[Decoder], Tracker]
 ModelNote = Callable[["Model"], None]

@@ -55,21 +55,21 @@ def test_the_bundle_decodes_without_torch_what_the_run_decoded(
     assert found > load_run(run).validation_air - 0.6 > 1
 
 
-def test_fed_with_the_drifted_devices_table_it_decodes_the_drifted_device(made: tuple[Path, Path, float]) -> None:
+def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(made: tuple[Path, Path, float]) -> None:
     profile, decoder = small_profile(), Decoder.load(made[1])
     drifted = DEVICE.with_settings([f"geometry.pipe_angle_deg={DEVICE.geometry.pipe_angle_deg + 0.12}"])
     symbols = random_symbols(profile, 256, 1, np.random.default_rng(9))[0]
     pair = Simulator(profile, drifted, seed=9).page(symbols)
     twin, parameters = TorchTwin(RayTwin(profile)), true_parameters(profile, drifted)
     table = sampling_table(twin, parameters, drifted.homodyne.turn_rad, profile)
-    fed = {name: value for name, value in table.items() if name in decoder.table_shapes}
+    own = {name: value for name, value in table.items() if name in decoder.table_shapes}
     mask = decoder.pilots(256).mask
 
-    def air(table: dict[str, np.ndarray] | None) -> float:
-        page = decoder.decode(pair, 256, table, Pilots.of_symbols(mask, symbols, 256))
+    def air(decoder: Decoder) -> float:
+        page = decoder.decode(pair, 256, pilots=Pilots.of_symbols(mask, symbols, 256))
         return measure(page.phase[~mask], page.concentration[~mask], symbols[~mask], 256).air_bits_per_symbol
 
-    assert air(fed) > air(None) + 0.5
+    assert air(decoder.with_table(own)) > air(decoder) + 0.5
 
 
 def test_the_image_is_followed(made: tuple[Path, Path, float], small_device: list[str]) -> None:

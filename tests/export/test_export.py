@@ -123,12 +123,13 @@ def test_the_fields_own_graph_shows_the_decoders_field(
         without.recover_field(*asked)
 
 
-def test_the_table_is_a_default_that_can_be_fed_instead(exported: tuple[Bundle, float, Path]) -> None:
+def test_the_table_is_a_default_that_another_replaces(exported: tuple[Bundle, float, Path]) -> None:
     decoder = Decoder.load(exported[2])
     golden = decoder.bundle.golden
     plain = decoder.infer(golden.pair).p
     phases = decoder.table_shapes["phases"]
-    fed = decoder.infer(golden.pair, {"phases": np.zeros([n or 1 for n in phases], dtype=np.float32)}).p
+    other = decoder.with_table({"phases": np.zeros([n or 1 for n in phases], dtype=np.float32)})
+    fed = other.infer(golden.pair).p
     assert set(decoder.table_shapes) == {*TABLE_INPUTS, "positions", "places", "place_gradients", "phases"}
     assert np.linalg.norm(fed - plain) > 0.01 * np.linalg.norm(plain)
 

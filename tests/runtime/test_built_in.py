@@ -8,8 +8,8 @@ import pytest
 from onnx import TensorProto, helper
 
 from optics.errors import BundleError
-from runtime.built_in import GraphFile, TableInput
-from runtime.ort import open_session
+from runtime.built_in import GraphFile
+from runtime.ort import Port, open_session
 from tests.runtime import toy
 
 FRAMES = {"in_phase", "quadrature"}
@@ -21,13 +21,13 @@ def names_of(model: bytes) -> set[str]:
 
 def test_table_inputs_are_listed_with_type_and_shape() -> None:
     assert GraphFile(toy.decoder_onnx(), "graph").table_inputs == {
-        "reference_in_phase": TableInput("float32", toy.SHAPE),
-        "reference_quadrature": TableInput("float32", toy.SHAPE),
-        "homodyne": TableInput("float32", (2,)),
+        "reference_in_phase": Port("float32", toy.SHAPE),
+        "reference_quadrature": Port("float32", toy.SHAPE),
+        "homodyne": Port("float32", (2,)),
     }
 
 
-@pytest.mark.parametrize("fed", [(), ("homodyne",), toy.TABLE_INPUTS])
+@pytest.mark.parametrize("fed", [(), ("homodyne",)])
 def test_a_graph_with_its_table_built_in_answers_as_one_that_is_fed(fed: tuple[str, ...]) -> None:
     device = toy.ToyDevice()
     pair = device.page(toy.symbols_of(256, 1)[0], 256)
@@ -54,6 +54,14 @@ def test_defaults_that_are_kept_number_by_number_are_replaced_too() -> None:
     built = GraphFile(model.SerializeToString(), "graph").built_in({"gain": np.array([3, 5], np.float32)}, ())
     (answer,) = open_session(built, "built in", 1).run(["y"], {"x": np.ones(2, np.float32)})
     assert answer.tolist() == [3, 5]
+
+
+def test_weights_that_an_old_graph_lists_as_inputs_are_no_table() -> None:
+    model = onnx.load_from_string(toy.decoder_onnx())
+    model.ir_version = 3
+    graph = GraphFile(model.SerializeToString(), "graph")
+    assert graph.table_inputs == {}
+    assert names_of(graph.built_in({}, ())) == FRAMES | set(toy.TABLE_INPUTS)
 
 
 @pytest.mark.parametrize("model", [b"", b"no model", toy.decoder_onnx()[:1000]])

@@ -101,14 +101,31 @@ def test_pilot_phases_that_do_not_fit_are_refused_when_loading(phases: np.ndarra
         Decoder.load(path, threads=1)
 
 
-def test_a_fed_table_replaces_the_default(decoder: Decoder) -> None:
+def test_another_table_replaces_the_default_in_a_decoder_of_its_own(decoder: Decoder) -> None:
     symbols, pair = pair_of(offsets=(150.0, 65.0))
     assert (decoder.decode(pair, 16).symbols != symbols).mean() > 0.05
     table = {
         "reference_in_phase": np.full(toy.SHAPE, 150, np.float32),
         "reference_quadrature": np.full(toy.SHAPE, 65, np.float32),
     }
-    assert (decoder.decode(pair, 16, table).symbols == symbols).all()
+    assert (decoder.with_table(table).decode(pair, 16).symbols == symbols).all()
+    assert (decoder.decode(pair, 16).symbols != symbols).mean() > 0.05
+
+
+def test_what_may_differ_from_page_to_page_is_fed_and_stays_as_it_was_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("runtime.decoder.PAGE_INPUTS", frozenset(["homodyne"]))
+    default, bundled, fed = (np.array([gain, 1.0], np.float32) for gain in (400 / toy.AMPLITUDE, 2.0, 3.0))
+    _, pair = pair_of()
+    p = toy.expected_p(pair)
+    golden = npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=p * (bundled[0] / default[0]))
+    contents = toy.files() | {TABLE: npz(homodyne=bundled), GOLDEN: golden}
+    decoder = Decoder.load(write_bundle(tmp_path / "t.zip", toy.manifest(), contents), threads=1)
+    for table, gain in ((None, bundled), ({"homodyne": fed}, fed), (None, bundled)):
+        np.testing.assert_allclose(decoder.infer(pair, table).p, p * (gain[0] / default[0]), rtol=1e-5, atol=1e-3)
+    with pytest.raises(InvalidInputError, match=r"table of a page: got reference_in_phase, wanted only homodyne"):
+        decoder.infer(pair, {"reference_in_phase": np.full(toy.SHAPE, 150, np.float32)})
 
 
 def test_the_table_in_a_bundle_is_used_and_its_golden_page_belongs_to_it(tmp_path: Path) -> None:
@@ -138,6 +155,8 @@ def test_the_table_in_a_bundle_is_used_and_its_golden_page_belongs_to_it(tmp_pat
 def test_a_table_that_does_not_fit_is_refused(table: dict[str, np.ndarray], named: str, decoder: Decoder) -> None:
     with pytest.raises(InvalidInputError, match=named):
         decoder.decode(pair_of()[1], 16, table)
+    with pytest.raises(InvalidInputError, match=named):
+        decoder.with_table(table)
 
 
 def test_a_bundled_table_that_does_not_fit_is_refused(tmp_path: Path) -> None:
@@ -203,7 +222,7 @@ def foreign_models() -> dict[str, tuple[dict[str, bytes], dict[str, object], str
     return {
         "garbage": (good | {DECODER: b"no model"}, {}, "ONNX"),
         "empty": (good | {DECODER: b""}, {}, "ONNX"),
-        "a twin": (good | {DECODER: toy.twin_onnx()}, {}, "inputs"),
+        "a twin": (good | {DECODER: toy.twin_onnx()}, {"table_inputs": ()}, r"decoder\.onnx: inputs"),
         "another camera": (good | {DECODER: toy.decoder_onnx(shape=(64, 128))}, {}, "input in_phase"),
         "another type": (good | {DECODER: toy.decoder_onnx(frame_type=TensorProto.UINT16)}, {}, "input in_phase"),
         "other tables": (good, {"table_inputs": ("homodyne",)}, "table inputs"),

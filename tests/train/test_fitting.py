@@ -27,6 +27,13 @@ LEVELS = 256
 CHOICES = Hyperparameters(channels=16, blocks=1, steps=120, batch=2, precision="32-true", learning_rate=5e-3)
 
 
+def test_pages_that_a_run_is_shown_count_patches_for_their_share() -> None:
+    choices = Hyperparameters(steps=100, batch=4, patch=96)
+    assert choices.drawn((56, 87)) == 400
+    assert choices.drawn((192, 64)) == 200
+    assert choices.drawn((192, 384)) == 50
+
+
 def pages(count: int, seed: int) -> TensorDataset:
     """Light that shows its symbol, in noise."""
     rng = np.random.default_rng(seed)

@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1alightpage/onnx/graph.proto\x12\x0elightpage.onnx\"-\n\x05Model\x12$\n\x05graph\x18\x07 \x01(\x0b\x32\x15.lightpage.onnx.Graph\"Z\n\x05Graph\x12+\n\x0binitializer\x18\x05 \x03(\x0b\x32\x16.lightpage.onnx.Tensor\x12$\n\x05input\x18\x0b \x03(\x0b\x32\x15.lightpage.onnx.Input\"\x15\n\x05Input\x12\x0c\n\x04name\x18\x01 \x01(\t\"\xaf\x01\n\x06Tensor\x12\x0c\n\x04\x64ims\x18\x01 \x03(\x03\x12\x11\n\tdata_type\x18\x02 \x01(\x05\x12\x12\n\nfloat_data\x18\x04 \x03(\x02\x12\x12\n\nint32_data\x18\x05 \x03(\x05\x12\x12\n\nint64_data\x18\x07 \x03(\x03\x12\x0c\n\x04name\x18\x08 \x01(\t\x12\x10\n\x08raw_data\x18\t \x01(\x0c\x12\x13\n\x0b\x64ouble_data\x18\n \x03(\x01\x12\x13\n\x0buint64_data\x18\x0b \x03(\x04\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1alightpage/onnx/graph.proto\x12\x0elightpage.onnx\"A\n\x05Model\x12\x12\n\nir_version\x18\x01 \x01(\x03\x12$\n\x05graph\x18\x07 \x01(\x0b\x32\x15.lightpage.onnx.Graph\"Z\n\x05Graph\x12+\n\x0binitializer\x18\x05 \x03(\x0b\x32\x16.lightpage.onnx.Tensor\x12$\n\x05input\x18\x0b \x03(\x0b\x32\x15.lightpage.onnx.Input\"\x15\n\x05Input\x12\x0c\n\x04name\x18\x01 \x01(\t\"\xaf\x01\n\x06Tensor\x12\x0c\n\x04\x64ims\x18\x01 \x03(\x03\x12\x11\n\tdata_type\x18\x02 \x01(\x05\x12\x12\n\nfloat_data\x18\x04 \x03(\x02\x12\x12\n\nint32_data\x18\x05 \x03(\x05\x12\x12\n\nint64_data\x18\x07 \x03(\x03\x12\x0c\n\x04name\x18\x08 \x01(\t\x12\x10\n\x08raw_data\x18\t \x01(\x0c\x12\x13\n\x0b\x64ouble_data\x18\n \x03(\x01\x12\x13\n\x0buint64_data\x18\x0b \x03(\x04\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,11 +33,11 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'lightpage.onnx.graph_pb2', 
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_MODEL']._serialized_start=46
-  _globals['_MODEL']._serialized_end=91
-  _globals['_GRAPH']._serialized_start=93
-  _globals['_GRAPH']._serialized_end=183
-  _globals['_INPUT']._serialized_start=185
-  _globals['_INPUT']._serialized_end=206
-  _globals['_TENSOR']._serialized_start=209
-  _globals['_TENSOR']._serialized_end=384
+  _globals['_MODEL']._serialized_end=111
+  _globals['_GRAPH']._serialized_start=113
+  _globals['_GRAPH']._serialized_end=203
+  _globals['_INPUT']._serialized_start=205
+  _globals['_INPUT']._serialized_end=226
+  _globals['_TENSOR']._serialized_start=229
+  _globals['_TENSOR']._serialized_end=404
 # @@protoc_insertion_point(module_scope)
