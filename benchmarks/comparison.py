@@ -418,7 +418,7 @@ HEADER = (
 )
 """Held-out pages, bits a symbol and kB a page; what own-MI claims beyond the AIR; AIR where a symbol's light meets no
 wall of the pipe, a wall of pair x, of pair y, or of both; AIR over the oracle's, and over that of the best published
-decoder; what validation AIR gained in the last fifth of the steps; minutes of features and of training, and pages that it
+decoder; what validation AIR gained in the last fifth of the steps; minutes of features and of training, and pages it
 trained on a second, validation counted as time: of a kept arm, on the machine that trained it."""
 
 

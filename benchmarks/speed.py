@@ -33,7 +33,7 @@ from optics.registration.parameters import nominal
 from optics.registration.table import sampling_table
 from runtime.built_in import GraphFile
 from runtime.cpus import available_cpus
-from runtime.decoder import PAGE_INPUTS
+from runtime.decoder import inputs_left
 from runtime.ort import Session, open_session
 from train.decoder import SymbolDecoder
 from train.fitting import Hyperparameters
@@ -98,7 +98,7 @@ class Timed:
 def session_of(profile: Profile, graph: Graph, tensors: Tensors, threads: int) -> Session:
     """The graph in the runtime that serves, its table built in as it does that."""
     model = decoder_onnx(graph.eval(), "uint8", profile.frame_shape, tensors)
-    return open_session(GraphFile(model, "speed").built_in({}, PAGE_INPUTS), "speed", threads)
+    return open_session(GraphFile(model, "speed").built_in({}, inputs_left(profile)), "speed", threads)
 
 
 def frames_of(profile: Profile) -> dict[str, np.ndarray]:

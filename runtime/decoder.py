@@ -16,6 +16,7 @@ from optics.grid import field_grid
 from optics.measures import decide_with_confidence
 from optics.page import MAX_LEVELS, check_levels
 from optics.pilots import Pilots, estimate_piston, estimate_trust, remove_piston
+from optics.profile import Profile
 from optics.recording import FramePair
 from runtime.built_in import GraphFile
 from runtime.bundle import Bundle, Table
@@ -28,11 +29,16 @@ FIELD_OUTPUTS = ("field", "unexplained")
 """Outputs of the field graph, or of a decoder that shows them, [2, Gy, Gx] each: the recovered field, and what is left
 of the homodyne equations."""
 PAGE_INPUTS = frozenset(["registration"])
-"""Table inputs that may differ from page to page, as the image shifts; all others are built into the graph."""
+"""Table inputs that may differ from page to page, as the image shifts."""
 _LARGE_WITH_REAL_LENSES = frozenset(["parameters"])
 """Table inputs from which gigabytes follow, with lenses that are not ideal: no sooner read than made again."""
 GOLDEN_TOLERANCE = 1e-3
 """Largest error of p on the golden page, relative to its norm: room for another CPU's rounding, not for another net."""
+
+
+def inputs_left(profile: Profile) -> frozenset[str]:
+    """Table inputs of a device's decoder that are not built into its graph."""
+    return PAGE_INPUTS if profile.ideal_lenses else PAGE_INPUTS | _LARGE_WITH_REAL_LENSES
 
 
 @dataclass(frozen=True)
@@ -309,7 +315,7 @@ class Decoder:
 
     def _build_in(self, graph: GraphFile, table: Table) -> None:
         """Open the graph with this table, which was checked."""
-        fed = PAGE_INPUTS if self.bundle.profile.ideal_lenses else PAGE_INPUTS | _LARGE_WITH_REAL_LENSES
+        fed = inputs_left(self.bundle.profile)
         self._table, self._fed = table, {name: value for name, value in table.items() if name in fed}
         self._session = open_session(graph.built_in(table, fed), self._thing, self.threads)
 
