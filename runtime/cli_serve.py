@@ -8,6 +8,7 @@ import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -94,7 +95,7 @@ def stop_signals() -> Iterator[Callable[[], None]]:
     It waits for the byte that the interpreter's own handler writes. Waiting for a lock that a Python handler releases
     would miss a signal that comes between the last look for one and the sleep.
     """
-    before: dict[int, object] = {}
+    before: dict[int, Any] = {}
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
 
@@ -115,7 +116,7 @@ def stop_signals() -> Iterator[Callable[[], None]]:
         finally:
             signal.set_wakeup_fd(waking)
             for number, handler in before.items():
-                signal.signal(number, handler)  # type: ignore[arg-type]
+                signal.signal(number, handler)
 
 
 def _resume(registry: ModelRegistry, store: ModelStore, threads: int | None) -> None:
