@@ -263,7 +263,9 @@ class Recording:
         found = self._file.get(name)
         if not isinstance(found, h5py.Dataset):
             raise RecordingError(
-                self._thing(f"dataset '{name}'"), "none" if found is None else "a group", f"{dimensions} dimensions"
+                self._thing(f"dataset '{name}'"),
+                "none" if found is None else "a group",
+                f"an array of {dimensions} dimensions",
             )
         if found.ndim != dimensions:
             raise RecordingError(self._thing(f"dataset '{name}'"), f"shape {found.shape}", f"{dimensions} dimensions")

@@ -16,6 +16,11 @@ from runtime.refused import refusal
 from runtime.shipped import DEFAULT, bundle_path
 from runtime.tracking import NoTracker, tracker_for
 
+_NOT_OF_THIS_DEVICE = (
+    "the bundle reads nothing right here: the recording may be of another device, its two cameras the other way round, "
+    "or its symbols of another number of levels"
+)
+
 
 @click.command()
 @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
@@ -35,6 +40,8 @@ def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int |
     if json_path is not None:
         write_json(json_path, result.to_json())
     click.echo(describe(result))
+    if result.figures.air_bits_per_symbol <= 0:
+        click.echo(f"lightpage: warning: {_NOT_OF_THIS_DEVICE}", err=True)
     if result.refused:
         raise refusal(f"recording {recording}", result.refused, count)
 

@@ -50,7 +50,7 @@ LOOKS = 60
 """How often a run looks at its validation pages."""
 _REFINEMENT_STEPS = 0.25
 """Steps of a refinement's network over those of the first."""
-SCALE_BOUNDS = (-1.5, 1.5)
+SCALE_BOUNDS = (-3.0, 3.0)
 """Bounds of the logarithm of a factor that makes a decoder's claims honest."""
 AVERAGED_SHARE = 0.05
 """Share of a run's steps over which its weights are averaged, exponentially: what is validated, kept and exported."""

@@ -13,8 +13,10 @@ _HARMONICS = (0.5, 1.0, 2.0)
 _CONDITIONS = 6 + 4 * len(_HARMONICS)
 _CONDITION_WIDTH = 64
 _TYPICAL_LOG_KAPPA = 5.0
-_KAPPA_UNIT = 20.0
+_KAPPA_UNIT = 100.0
 """What an output of one adds to p: with concentrations in the hundreds, the net need not learn large numbers."""
+_LOG_KAPPA_UNIT = 10.0
+"""What an output of one adds to the logarithm of p's length: few steps are to make large factors."""
 
 
 def with_page_coordinates(positions: Tensor, shape: tuple[int, ...], part: tuple[slice, slice]) -> Tensor:
@@ -91,10 +93,23 @@ def reach(blocks: int, levels: int) -> int:
     return 1 + inner + (convolutions << levels)
 
 
+def belief(outputs: Tensor, before: Tensor | float = 0.0) -> Tensor:
+    """p of a network's outputs [N, 3, ny, nx]: the first two add to it, the third multiplies it.
+
+    From a page's dark edge to its middle concentration grows a hundredfold: a factor says so more easily than a sum.
+
+    Args:
+        outputs: of the network; zeros leave p as it was before.
+        before: p of an earlier look, [N, 2, ny, nx].
+    """
+    return torch.as_tensor(torch.exp(_LOG_KAPPA_UNIT * outputs[:, 2:]) * (before + _KAPPA_UNIT * outputs[:, :2]))
+
+
 class SymbolUNet(nn.Module):
     """Light at symbol pitch to the vector p of each symbol.
 
     All samples of a symbol are its channels (pixel-unshuffled), so a 3x3 kernel sees the neighbouring symbols whole.
+    Untrained, it claims nothing: p is zero everywhere.
 
     Args:
         light_channels: real and imaginary parts of a symbol's samples.
@@ -119,7 +134,9 @@ class SymbolUNet(nn.Module):
             self.outward.append(nn.Sequential(*(Residual(width) for _ in range(blocks))))
             width *= 2
         self.bottom = nn.Sequential(*(Residual(width) for _ in range(blocks)))
-        self.head = nn.Conv2d(channels, 2, 1)
+        self.head = nn.Conv2d(channels, 3, 1)
+        for value in self.head.parameters():
+            nn.init.zeros_(value)
 
     def forward(self, light: Tensor, positions: Tensor) -> Tensor:
         """Light and exit centroids to p: its angle is the phase, its length kappa.
@@ -131,6 +148,10 @@ class SymbolUNet(nn.Module):
         Returns:
             p = (px, py), [N, 2, ny, nx].
         """
+        return belief(self.outputs(light, positions))
+
+    def outputs(self, light: Tensor, positions: Tensor) -> Tensor:
+        """What `belief` makes p of, [N, 3, ny, nx]; light and exit centroids as for p itself."""
         x = self.where(self.stem(light), positions)
         kept = []
         for inward, down in zip(self.inward, self.down, strict=True):
@@ -160,8 +181,8 @@ class Refiner(nn.Module):
         self.unet = SymbolUNet(light_channels + 3, channels, blocks, levels)
         self.trust = nn.Parameter(torch.ones(()))
 
-    def forward(self, light: Tensor, positions: Tensor, belief: Tensor) -> Tensor:
+    def forward(self, light: Tensor, positions: Tensor, earlier: Tensor) -> Tensor:
         """Unexplained light, exit centroids and the earlier p, [N, 2, ny, nx], to p: see `SymbolUNet`."""
-        kappa = torch.sqrt(belief.square().sum(1, keepdim=True) + 1e-12)
-        known = torch.cat([light, belief / kappa, torch.log(kappa) - _TYPICAL_LOG_KAPPA], dim=1)
-        return torch.as_tensor(self.trust * belief + _KAPPA_UNIT * self.unet(known, positions))
+        kappa = torch.sqrt(earlier.square().sum(1, keepdim=True) + 1e-12)
+        known = torch.cat([light, earlier / kappa, torch.log(kappa) - _TYPICAL_LOG_KAPPA], dim=1)
+        return belief(self.unet.outputs(known, positions), self.trust * earlier)

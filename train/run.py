@@ -33,7 +33,7 @@ DESCRIPTION = "run.json"
 WEIGHTS = "decoder.pt"
 REFERENCES = "references.npz"
 GOLDEN = "golden.npz"
-FORMAT = 7
+FORMAT = 8
 """Of what a run keeps while it is made: raised when features, network or checkpoints of an earlier version would not go
 together with those of this one, or when the simulator's light changes, or which pages the comparison trains on."""
 

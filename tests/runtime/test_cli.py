@@ -257,6 +257,17 @@ def test_evaluate_refuses_what_it_cannot_measure_in_one_line(
     assert not out.exists()
 
 
+def test_evaluate_warns_where_a_bundle_reads_nothing(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(toy_zip, recording[0], tmp_path / "e.json")["air_bits_per_symbol"] > 0  # type: ignore[operator]
+    assert "warning" not in capsys.readouterr().err
+    with h5py.File(recording[0], "r+") as file:
+        file["symbols"][...] = np.random.default_rng(0).permutation(file["symbols"][()], axis=2)
+    assert evaluate(toy_zip, recording[0], tmp_path / "f.json")["air_bits_per_symbol"] < 0  # type: ignore[operator]
+    assert "warning: the bundle reads nothing right here" in capsys.readouterr().err
+
+
 @pytest.fixture
 def with_bad_pages(recording: tuple[Path, np.ndarray]) -> Path:
     """The recording with a black page and one whose counts lie in no 8 bits."""

@@ -12,12 +12,14 @@ import torch
 from torch.utils.data import TensorDataset
 
 from optics.errors import InvalidInputError
+from optics.measures import achievable_rate
 from train.fitting import (
     CHECKPOINTS,
     FITTED,
     FITTED_WEIGHTS,
     Hyperparameters,
     best_kappa_scale,
+    decode_pages,
     fit_network,
     held_out_air,
 )
@@ -34,12 +36,12 @@ def test_pages_that_a_run_is_shown_count_patches_for_their_share() -> None:
     assert choices.drawn((192, 384)) == 50
 
 
-def pages(count: int, seed: int) -> TensorDataset:
+def pages(count: int, seed: int, noise: float | np.ndarray = 0.2) -> TensorDataset:
     """Light that shows its symbol, in noise."""
     rng = np.random.default_rng(seed)
     phases = rng.uniform(0, 2 * np.pi, (count, *PAGE))
     light = np.stack([np.cos(phases), np.sin(phases)], axis=1)[:, :, None, None]
-    light = light + 0.2 * rng.standard_normal(light.shape)
+    light = light + noise * rng.standard_normal(light.shape)
     light = torch.from_numpy(light.astype(np.float16)).flatten(1, 3)
     return TensorDataset(light, torch.zeros(count, 2, *PAGE), torch.from_numpy(phases.astype(np.float32)))
 
@@ -88,15 +90,27 @@ def test_what_a_finished_training_kept_is_named_when_it_is_damaged(
         fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1), progress=False)
 
 
+def test_few_steps_teach_large_confidences_and_small_ones(tmp_path: Path, mask: np.ndarray) -> None:
+    noise = np.where(np.arange(PAGE[1]) < PAGE[1] // 2, 0.03, 0.6)
+    training, validation = pages(12, 0, noise), pages(8, 1, noise)
+    module = fit_network(tmp_path, CHOICES, mask, LEVELS, training, validation, progress=False).module
+    p, phases = decode_pages(module, validation)
+    mu, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])
+    clear, noisy = np.split(kappa, 2, axis=2)
+    assert np.median(clear) > 20 * np.median(noisy)
+    level = (np.rint(phases * (LEVELS / (2 * np.pi))) % LEVELS).astype(np.uint8)
+    assert achievable_rate(mu, kappa, level, LEVELS)[..., : PAGE[1] // 2].mean() > 3.6
+
+
 def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarray) -> None:
     training, validation = pages(12, 0), pages(3, 1)
     choices = replace(CHOICES, steps=60)
     module = fit_network(tmp_path, choices, mask, LEVELS, training, validation, progress=False).module
     honest = best_kappa_scale(module, validation, mask)
     with torch.no_grad():
-        module.network.head.weight *= 3
         assert module.network.head.bias is not None
-        module.network.head.bias *= 3
+        for value in (module.network.head.weight, module.network.head.bias):
+            value[:2] *= 3
     assert best_kappa_scale(module, validation, mask) == pytest.approx(honest / 3, rel=0.02)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
-from train.network import PositionModulation, SymbolUNet
+from train.network import PositionModulation, Refiner, SymbolUNet, belief
 
 
 @pytest.mark.parametrize("levels", [0, 1, 2])
@@ -19,6 +21,7 @@ def test_a_flat_network_sees_the_neighbours_and_no_further() -> None:
     network = SymbolUNet(3, channels=8, blocks=2).eval()
     for block in network.bottom:
         torch.nn.init.normal_(block.second.weight, std=0.1)
+    torch.nn.init.normal_(network.head.weight)
     x = torch.randn(1, 3, 31, 31, requires_grad=True)
     network(x, torch.zeros(1, 2, 31, 31))[0, 0, 15, 15].backward()
     assert x.grad is not None
@@ -36,3 +39,17 @@ def test_the_filter_depends_on_where_a_beam_leaves_the_pipe() -> None:
     assert torch.equal(modulation(x, positions), x)  # at the start, everywhere the same
     torch.nn.init.normal_(modulation.outer.weight)
     assert not torch.allclose(modulation(x, positions), x)
+
+
+def test_untrained_it_claims_nothing_and_a_further_look_leaves_what_was_believed() -> None:
+    light, positions, earlier = torch.randn(2, 3, 5, 6), torch.rand(2, 2, 5, 6), torch.randn(2, 2, 5, 6)
+    assert not SymbolUNet(3, channels=8, blocks=1)(light, positions).any()
+    torch.testing.assert_close(Refiner(3, channels=8, blocks=1)(light, positions, earlier), earlier)
+
+
+def test_outputs_add_to_a_belief_and_scale_it() -> None:
+    before = torch.tensor([3.0, 4.0]).reshape(1, 2, 1, 1)
+    more = belief(torch.tensor([0.03, 0.04, 0.0]).reshape(1, 3, 1, 1), before)
+    torch.testing.assert_close(more / before, torch.full_like(before, 2.0))
+    scaled = belief(torch.tensor([0.0, 0.0, 0.2]).reshape(1, 3, 1, 1), before)
+    torch.testing.assert_close(scaled / before, torch.full_like(before, math.exp(2)))
