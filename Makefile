@@ -55,8 +55,8 @@ bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: th
 	$(COMPARE) --angle 0 $(LOOKS) --out runs/bench-decoders/square
 	$(COMPARE) --angle -0.6 --exposure 0.13 --steps 3000 --arm coherent --arm refined --arm oracle \
 	    --levels 4 --levels 8 --levels 16 --out runs/bench-decoders/dim
-	$(COMPARE) --angle -0.6 --symbol-size 2 --pages 130 --steps 4000 --arm coherent --arm refined --arm oracle \
-	    --out runs/bench-decoders/small-symbols
+	$(COMPARE) --angle -0.6 --symbol-size 2 --pages 130 --steps 4000 --published-steps 1125 --arm mode --arm coherent \
+	    --arm refined --arm oracle --out runs/bench-decoders/small-symbols
 	$(COMPARE) --profile paper --angle -0.6 --angle 0 --pages 20 --steps 4000 --arm coherent --arm refined --arm oracle \
 	    --out runs/bench-decoders/full-size
 

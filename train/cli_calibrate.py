@@ -15,6 +15,7 @@ from optics.progress import Progress, percent_bar
 from optics.recording import Recording
 from optics.registration.calibrate import calibrate as register
 from optics.registration.calibration import Calibration
+from optics.registration.coherence import seen_share
 from optics.registration.known import known_pages
 from train.field import FieldRecovery, TorchFieldSolver
 from train.twin import RayTwin, TorchTwin
@@ -40,9 +41,14 @@ def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_pa
         calibration = calibrate_recording(file, profile, pages, progress)
     seconds = time.perf_counter() - start
     calibration.save(out)
+    lost = int(np.sum(seen_share(TorchTwin(RayTwin(profile)), calibration.vector, profile) < 0.5))
     if json_path is not None:
-        write_json(json_path, figures(calibration, profile, seconds))
+        write_json(json_path, figures(calibration, profile, seconds) | {"symbols_beside_cameras": lost})
     click.echo(table(calibration, profile))
+    if lost:
+        total = profile.page.columns * profile.page.rows
+        what = f"{lost} of {total} symbols: most of their light misses a camera, so little of them can be read"
+        click.echo(f"lightpage: warning: {what}", err=True)
     click.echo(
         f"\ncoherence {calibration.coherence_before:.3f} -> {calibration.coherence_after:.3f}, "
         f"{calibration.pages_used} known pages, {seconds:.0f} s; written to {out}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,17 +51,33 @@ def page_coherence(
     return float(abs(total) / max(norm, 1e-30))
 
 
-def branch_shares(positions: Real) -> Real:
-    """Share of each coherent branch in a symbol's light, to first order: a triangle in the exit centroid per axis.
+def branch_shares(positions: Real, branches: Sequence[str] = COHERENT_BRANCHES) -> Real:
+    """Share of each branch in a symbol's light, to first order: a triangle in the exit centroid per axis.
 
     Args:
         positions: exit centroid over the pipe's width, (x, y') last, [N, 2].
+        branches: of them; the two mixed ones are each given all of their light.
 
     Returns:
-        [branches of COHERENT_BRANCHES, N].
+        [branches, N].
     """
     even = np.clip(1 - np.abs(positions - 2 * np.round(positions / 2)), 0, 1)
     odd = np.clip(1 - np.abs(positions - (2 * np.floor(positions / 2) + 1)), 0, 1)
-    return np.stack(
-        [(odd if name == "x" else even)[:, 0] * (odd if name == "y" else even)[:, 1] for name in COHERENT_BRANCHES]
-    )
+    return np.stack([(odd if "x" in name else even)[:, 0] * (odd if "y" in name else even)[:, 1] for name in branches])
+
+
+def seen_share(twin: Twin, parameters: Real, profile: Profile) -> Real:
+    """Share of each symbol's light that lands on both cameras, by rays, [ny, nx].
+
+    Args:
+        twin, parameters: the device.
+        profile: the nominal device.
+    """
+    rays = twin.trace(parameters, symbol_centres(profile))
+    shares = branch_shares(rays.positions, BRANCHES)
+    size = np.array([profile.camera.columns_px, profile.camera.rows_px])
+    seen = np.zeros(shares.shape[1])
+    for share, places in zip(shares / shares.sum(axis=0), rays.places, strict=True):
+        pixels = twin.pixels(parameters, places)
+        seen += share * np.all((pixels > -0.5) & (pixels < size - 0.5), axis=(0, 2))
+    return seen.reshape(profile.page_shape)

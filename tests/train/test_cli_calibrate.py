@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -94,6 +95,16 @@ def test_black_and_saturated_frames_are_named(tmp_path: Path, level: int, words:
     assert not (tmp_path / "calibration.toml").exists()
 
 
+def test_symbols_whose_light_misses_a_camera_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    aside = np.where(np.array(NAMES) == "in_phase_shift_x_px", 100.0, REGISTERED.parameters)
+    fake_registration(monkeypatch, replace(REGISTERED, parameters=aside))
+    figures = tmp_path / "figures.json"
+    text = run(flat_recording(tmp_path / "R.h5", 100), tmp_path / "calibration.toml", "--json", str(figures))
+    lost = json.loads(figures.read_text())["symbols_beside_cameras"]
+    assert 100 < lost < 2000
+    assert f"warning: {lost} of 4872 symbols" in text
+
+
 def test_the_table_is_for_people_and_the_json_for_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_registration(monkeypatch, REGISTERED)
     out, figures = tmp_path / "calibration.toml", tmp_path / "figures.json"
@@ -105,6 +116,8 @@ def test_the_table_is_for_people_and_the_json_for_machines(tmp_path: Path, monke
     assert (data["pages_used"], data["coherence_before"], data["coherence_after"]) == (2, 0.02, 0.71)
     assert data["seconds"] > 0
     assert data["parameters"] == calibration.parameters
+    assert data["symbols_beside_cameras"] == 0
+    assert "warning" not in text
     rows = {line[:32].strip(): line[32:].split() for line in text.splitlines()}
     assert rows["pipe angle, degree"][0] == "-0.6"
     assert rows["focal length, mm"] == ["20", "0.0008", "20"]

@@ -7,7 +7,7 @@ import pytest
 
 from optics.device import Geometry
 from optics.grid import field_grid
-from optics.registration.coherence import COHERENT_BRANCHES, page_coherence
+from optics.registration.coherence import COHERENT_BRANCHES, page_coherence, seen_share
 from optics.registration.parameters import NAMES, nominal
 from optics.registration.samplers import FieldSampler
 from optics.simulator import TrueOptics, resample, true_parameters
@@ -77,3 +77,13 @@ def test_mixed_branches_are_left_out() -> None:
 def test_no_light_has_no_coherence() -> None:
     dark = page_coherence(lambda places: np.zeros(places.shape[:-1]), TWIN, TRUTH, PROFILE, SYMBOLS)
     assert dark == 0
+
+
+def test_light_that_misses_a_camera_is_not_counted_as_seen() -> None:
+    assert seen_share(TWIN, TRUTH, PROFILE).min() > 0.9
+    away = TRUTH.copy()
+    away[NAMES.index("quadrature_shift_x_px")] += PROFILE.camera.columns_px / 2
+    seen = seen_share(TWIN, away, PROFILE)
+    assert 0.2 < np.mean(seen < 0.5) < 0.8
+    assert seen.min() < 0.1
+    assert seen.max() > 0.9
