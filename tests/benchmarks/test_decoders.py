@@ -82,7 +82,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     arguments += "".join(
         f" --arm {name}" for name in ("coherent", "refined", "oracle", "fast", "none", "oracle-refined")
     )
-    arguments += f" --published-channels 4 --published-steps 12 --levels 4 --trained {tmp_path / 'kept'} --keep"
+    arguments += f" --published-channels 4 --published-steps 12 --levels 16 --trained {tmp_path / 'kept'} --keep"
     arguments += f" --out {out}"
     first = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert first.exit_code == 0, first.output
@@ -91,7 +91,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     coherent, refined, oracle, fast, none, again = figures["outcomes"]
     assert (refined["arm"], refined["steps"]) == ("refined 1", 5)
     by_levels = [[figures["levels"] for figures in arm["by_levels"]] for arm in figures["outcomes"]]
-    assert by_levels == [[4], [4], [4], [4], [], [4]]
+    assert by_levels == [[16], [16], [16], [16], [], [16]]
     assert all(0 < arm["by_levels"][0]["symbol_error_rate"] <= 0.8 for arm in (coherent, refined, oracle))
     assert all(len(arm["validation_curve"]) > 0 for arm in figures["outcomes"])
     # the mean over all symbols lies between those of the zones

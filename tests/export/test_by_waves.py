@@ -76,13 +76,17 @@ def test_the_image_is_followed(made: tuple[Path, Path, float], small_device: lis
     decoder = Decoder.load(made[1])
     assert isinstance(tracker_for(decoder), ShiftTracker)
     with Recording.open(small_device[3]) as recording:
-        pair = recording.frames(0)
+        pair, symbols = recording.frames(0), recording.symbols(0)
+    assert symbols is not None
+    # the page's own dozen pilots would show it to a tenth of a pixel
+    mask = np.random.default_rng(0).random(symbols.shape) < 0.3
+    known = Pilots.of_symbols(mask, symbols, 256)
     by = (0.0, 0.3)  # rows, columns
     moved = [np.rint(ndimage.shift(f.astype(float), by, mode="nearest")) for f in (pair.in_phase, pair.quadrature)]
-    seen = decoder.decode(FramePair(*(frame.astype(np.uint8) for frame in moved)), 256)
-    plain = decoder.decode(pair, 256)
+    seen = decoder.decode(FramePair(*(frame.astype(np.uint8) for frame in moved)), 256, pilots=known)
+    plain = decoder.decode(pair, 256, pilots=known)
     shift = PhaseShift.of_decoder(decoder)
-    found, before = shift.estimate(seen), shift.estimate(plain)
+    found, before = shift.estimate(seen, known), shift.estimate(plain, known)
     assert found is not None
     assert before is not None
     np.testing.assert_allclose(found.shift_px - before.shift_px, (0.3, 0.0), atol=0.06)

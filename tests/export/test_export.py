@@ -29,8 +29,8 @@ from runtime.bundle import Bundle, write_bundle
 from runtime.decoder import Decoder
 from runtime.manifest import FIELD
 from runtime.ort import open_session
+from tests.export.untrained import untrained_decoder
 from tests.optics.small import small_profile
-from train.decoder import SymbolDecoder
 from train.fitting import Hyperparameters
 from train.run import GOLDEN, REFERENCES, WEIGHTS, Run, load_run
 from train.twin import RayTwin, TorchTwin
@@ -50,9 +50,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     turn = device.homodyne.turn_rad
     fitted = Registered(true_parameters(profile, device), np.ones(len(NAMES)), turn, 0.0, 0.5, 1.0, 0.5)
-    torch.manual_seed(0)
-    decoder = SymbolDecoder(profile, fitted.parameters, "coherent", CHOICES)
-    torch.save(decoder.state_dict(), folder / WEIGHTS)
+    torch.save(untrained_decoder(profile, fitted.parameters, CHOICES).state_dict(), folder / WEIGHTS)
     np.savez(folder / GOLDEN, in_phase=pair.in_phase, quadrature=pair.quadrature)
     np.savez(
         folder / REFERENCES,
