@@ -56,14 +56,18 @@ def branch_shares(positions: Real, branches: Sequence[str] = COHERENT_BRANCHES) 
 
     Args:
         positions: exit centroid over the pipe's width, (x, y') last, [N, 2].
-        branches: of them; the two mixed ones are each given all of their light.
+        branches: of them; the two mixed ones are given half of their light each.
 
     Returns:
-        [branches, N].
+        [branches, N]; those of all of `BRANCHES` add up to one.
     """
     even = np.clip(1 - np.abs(positions - 2 * np.round(positions / 2)), 0, 1)
     odd = np.clip(1 - np.abs(positions - (2 * np.floor(positions / 2) + 1)), 0, 1)
-    return np.stack([(odd if "x" in name else even)[:, 0] * (odd if "y" in name else even)[:, 1] for name in branches])
+    shares = []
+    for name in branches:
+        share = (odd if "x" in name else even)[:, 0] * (odd if "y" in name else even)[:, 1]
+        shares.append(share / 2 if name in ("xy", "yx") else share)
+    return np.stack(shares)
 
 
 def seen_share(twin: Twin, parameters: Real, profile: Profile) -> Real:
@@ -77,7 +81,7 @@ def seen_share(twin: Twin, parameters: Real, profile: Profile) -> Real:
     shares = branch_shares(rays.positions, BRANCHES)
     size = np.array([profile.camera.columns_px, profile.camera.rows_px])
     seen = np.zeros(shares.shape[1])
-    for share, places in zip(shares / shares.sum(axis=0), rays.places, strict=True):
+    for share, places in zip(shares, rays.places, strict=True):
         pixels = twin.pixels(parameters, places)
         seen += share * np.all((pixels > -0.5) & (pixels < size - 0.5), axis=(0, 2))
     return seen.reshape(profile.page_shape)
