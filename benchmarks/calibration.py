@@ -8,7 +8,7 @@ the true cameras and turn, the image's drift included. The cameras' relation is 
 wrong against the in-phase one, root mean square over the page: the field that is recovered from both depends on it. A
 foreign device comes from a simulator that shares nothing with this project; its true geometry has other parameters, so
 it has neither. An interrupted run goes on where it stopped: seeds that are in the JSON file are not computed again,
-failed ones are.
+failed ones are; a file of another format of runs (`train.run.FORMAT`) is refused.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from optics.registration.table import registration_coefficients
 from optics.simulator import Simulator, true_parameters
 from tests.system.foreign_device import ForeignDevice
 from train.field import FieldRecovery, TorchFieldSolver
+from train.run import FORMAT
 from train.twin import RayTwin, TorchTwin
 
 LEVELS = 256
@@ -224,7 +225,7 @@ def load(path: Path, settings: dict[str, object]) -> dict[int, Outcome]:
 @click.option("--json", "json_path", required=True, type=OutputFile())
 def main(profile_name: str, devices: int, first_seed: int, pages: int, foreign: bool, json_path: Path) -> None:
     """Calibrate drawn devices and compare with the truth."""
-    settings: dict[str, object] = {"profile": profile_name, "pages": pages, "foreign": foreign}
+    settings: dict[str, object] = {"format": FORMAT, "profile": profile_name, "pages": pages, "foreign": foreign}
     done = {seed: o for seed, o in load(json_path, settings).items() if o.failure is None}
     bench = Bench(load_profile(profile_name), pages)
     tqdm.write(HEADER)

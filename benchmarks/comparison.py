@@ -203,7 +203,8 @@ class Bench:
         refined = fit_refinements(folder, choices, material, extractor, prediction, first, key, devices=1)
         self.kept.keep(folder)
         at = folder / f"refinement-{choices.refinements}"
-        held_out, preparing = self.held_out(at / "features"), refined.seconds - refined.last.seconds
+        held_out = self.held_out(at / "features")
+        preparing = refined.seconds - sum(one.seconds for one in refined.trained)
         again = choices.of_refinement()
         drawn = again.drawn(self.profile.page_shape)
         arm = f"{name} {choices.refinements}"

@@ -23,7 +23,7 @@ from typing import Any
 
 import click
 
-from benchmarks.comparison import ARMS, HEADER, ORACLE, Bench, Outcome, recorded
+from benchmarks.comparison import ARMS, FAST, HEADER, ORACLE, Bench, Outcome, recorded
 from benchmarks.decoders_figure import draw, title
 from benchmarks.kept import TRAINED, Kept
 from benchmarks.levels import LEVEL_HEADER
@@ -160,7 +160,8 @@ def main(
                     runs += [partial(bench.published_arm, name, choices) for choices in widths]
                 else:
                     common = Hyperparameters(steps=steps, seed=seed, refinements=refinements)
-                    runs += [partial(bench.symbol_arm, name, size, common) for size in sizes]
+                    own = sizes[:1] if name == FAST else sizes  # whose size is fixed
+                    runs += [partial(bench.symbol_arm, name, size, common) for size in own]
             outcomes: list[Outcome] = []
             for run in runs:
                 outcomes = compared([*outcomes, run()])

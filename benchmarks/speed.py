@@ -2,7 +2,7 @@
 
     python -m benchmarks.speed --profile bench
 
-Weights are random: time does not depend on them. Ratios are over the coherent decoder.
+Untrained: time does not depend on weights. Ratios are over the decoder that is named first.
 """
 
 from __future__ import annotations

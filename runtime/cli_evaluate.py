@@ -16,9 +16,9 @@ from runtime.refused import refusal
 from runtime.shipped import DEFAULT, bundle_path
 from runtime.tracking import NoTracker, tracker_for
 
-_NOT_OF_THIS_DEVICE = (
-    "the bundle reads nothing right here: the recording may be of another device, its two cameras the other way round, "
-    "or its symbols of another number of levels"
+_WORTH_NOTHING = (
+    "by what the bundle believes, these pages carry nothing: the device may have drifted far (lightpage recalibrate), "
+    "be another one, have its cameras the other way round, or its symbols another number of levels"
 )
 
 
@@ -41,7 +41,7 @@ def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int |
         write_json(json_path, result.to_json())
     click.echo(describe(result))
     if result.figures.air_bits_per_symbol <= 0:
-        click.echo(f"lightpage: warning: {_NOT_OF_THIS_DEVICE}", err=True)
+        click.echo(f"lightpage: warning: {_WORTH_NOTHING}", err=True)
     if result.refused:
         raise refusal(f"recording {recording}", result.refused, count)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -38,12 +39,12 @@ def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_pa
     profile = load_profile(profile_name)
     start = time.perf_counter()
     with Recording.open(recording) as file, percent_bar() as progress:
-        calibration = calibrate_recording(file, profile, pages, progress)
+        calibration = calibrate_recording(file, profile, range(pages), progress)
     seconds = time.perf_counter() - start
     calibration.save(out)
     lost = int(np.sum(seen_share(TorchTwin(RayTwin(profile)), calibration.vector, profile) < 0.5))
     if json_path is not None:
-        write_json(json_path, figures(calibration, profile, seconds) | {"symbols_beside_cameras": lost})
+        write_json(json_path, figures(calibration, profile, seconds, lost))
     click.echo(table(calibration, profile))
     if lost:
         total = profile.page.columns * profile.page.rows
@@ -55,8 +56,10 @@ def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_pa
     )
 
 
-def calibrate_recording(recording: Recording, profile: Profile, pages: int, progress: Progress) -> Calibration:
-    """Calibrate from nominal with the first `pages` pages of a recording.
+def calibrate_recording(
+    recording: Recording, profile: Profile, pages: Sequence[int], progress: Progress
+) -> Calibration:
+    """Calibrate from nominal with some pages of a recording.
 
     Raises:
         RecordingError: no symbols, too few pages, or shapes that are not the profile's.
@@ -65,9 +68,10 @@ def calibrate_recording(recording: Recording, profile: Profile, pages: int, prog
     recording.check_against(profile)
     if others := recording.differences(profile):
         click.echo(f"lightpage: warning: recording {recording.path} says of its device: {'; '.join(others)}", err=True)
-    if recording.pages < pages:
-        raise RecordingError(f"recording {recording.path}", f"{recording.pages} pages", f"at least {pages} (--pages)")
-    known = known_pages(recording, profile, range(pages))
+    if recording.pages <= max(pages):
+        wanted = f"at least {max(pages) + 1} (--pages)"
+        raise RecordingError(f"recording {recording.path}", f"{recording.pages} pages", wanted)
+    known = known_pages(recording, profile, pages)
     registered = register(
         TorchTwin(RayTwin(profile)),
         TorchFieldSolver(FieldRecovery(profile)),
@@ -76,11 +80,11 @@ def calibrate_recording(recording: Recording, profile: Profile, pages: int, prog
         known,
         progress,
     )
-    return Calibration.from_registered(registered, profile, [recording.page_hash(page) for page in range(pages)])
+    return Calibration.from_registered(registered, profile, [recording.page_hash(page) for page in pages])
 
 
-def figures(calibration: Calibration, profile: Profile, seconds: float) -> dict[str, object]:
-    """The result under the names that other programs read."""
+def figures(calibration: Calibration, profile: Profile, seconds: float, lost: int) -> dict[str, object]:
+    """The result under the names that other programs read; `lost` symbols have most of their light beside a camera."""
     return {
         "angle_deg": calibration.angle_deg(profile),
         "pages_used": calibration.pages_used,
@@ -89,6 +93,7 @@ def figures(calibration: Calibration, profile: Profile, seconds: float) -> dict[
         "coherence_after": calibration.coherence_after,
         "turn_deg": float(np.rad2deg(calibration.turn_rad)),
         "parameters": calibration.parameters,
+        "symbols_beside_cameras": lost,
     }
 
 

@@ -25,6 +25,7 @@ from train.decoder import LOCALIZERS
 from train.features import FeatureExtractor
 from train.fitting import Hyperparameters
 from train.material import Material
+from train.processes import is_first_process
 from train.provenance import provenance
 from train.published.localizers import NAMES as PUBLISHED
 from train.run import (
@@ -34,7 +35,6 @@ from train.run import (
     Run,
     begin,
     check_begun,
-    is_first_process,
     load_run,
     save_arrays,
     save_weights,
@@ -43,6 +43,7 @@ from train.run import (
 from train.symbols import LIKENESS_PAGES, SymbolRecipe
 
 _FEWEST_PAGES = 6
+_RECORDED = "--recording (SHA-256 of its frames and symbols)"
 
 
 @click.command()
@@ -102,13 +103,13 @@ def train(
         references = recording.references()
         options = {
             "--profile": profile.to_toml(),
-            "--recording (SHA-256 of its frames)": _digest([*hashes.values(), hash_frames(references)]),
+            _RECORDED: _digest([*hashes.values(), hash_frames(references), _symbols_digest(recording, list(hashes))]),
             "--validation-share": validation_share,
             "--test-share": test_share,
             **recipe.options(),
         }
         check_begun(out, options)
-        calibration = _calibration(recording, profile_name, calibration_path, out)
+        calibration = _calibration(recording, profile, list(hashes)[:DEFAULT_PAGES], calibration_path, out)
         calibration.check_profile(profile)
         options["calibration"] = calibration.to_toml()
         features = localizer if localizer in LOCALIZERS else LOCALIZERS[0]
@@ -141,7 +142,7 @@ def train(
                 training=groups[0],
                 validation=groups[1],
                 pilot_mask=mask,
-                key=_digest([options[n] for n in ("--profile", "--recording (SHA-256 of its frames)", "calibration")]),
+                key=_digest([options[name] for name in ("--profile", _RECORDED, "calibration")]),
                 devices=devices or "auto",
             )
         )
@@ -208,15 +209,25 @@ def _usable(recording: Recording) -> dict[int, str]:
     return hashes
 
 
-def _calibration(recording: Recording, profile_name: str, path: Path | None, out: Path) -> Calibration:
-    """The calibration that was named, or was made for this run before, or is made now from the first pages."""
-    kept = out / "calibration.toml"
+def _symbols_digest(recording: Recording, pages: list[int]) -> str:
+    """Of what was written on these pages, of its levels, and of the recording's own pilots if it has any."""
+    digest = hashlib.sha256(str(recording.levels).encode())
+    for values in (*(recording.symbols(page) for page in pages), recording.pilots()):
+        digest.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def _calibration(recording: Recording, profile: Profile, pages: list[int], path: Path | None, out: Path) -> Calibration:
+    """The calibration that was named, or was made of these pages for this run before, or is made of them now."""
     if path is not None:
         return load_calibration(path)
+    kept = out / "calibration.toml"
     if kept.exists():
-        return load_calibration(kept)
+        calibration = load_calibration(kept)
+        if calibration.calibrated_pages == tuple(recording.page_hash(page) for page in pages):
+            return calibration
     with percent_bar() as progress:
-        calibration = calibrate_recording(recording, load_profile(profile_name), DEFAULT_PAGES, progress)
+        calibration = calibrate_recording(recording, profile, pages, progress)
     calibration.save(kept)
     return calibration
 

@@ -17,11 +17,14 @@ from tqdm import tqdm
 from optics.files import replace_text
 from train.features import PageFeatures, PageState
 from train.fitting import Page
+from train.processes import is_first_process
 
 _STATE = "state.json"
 _SHOWN = ("light", "positions", "belief", "phases")
 """Arrays of `PageFeatures`, in the order in which a page's item has them."""
 _PAGE_STATE = "page_states"
+_PATIENCE_S, _LOOK_S = 1800.0, 0.2
+"""How long a process waits for the next page of another, and how often it looks."""
 
 Maker = Callable[[int, tuple[float, float]], Iterator[PageFeatures]]
 """Makes the features from a page number on; told of the shift of the page before it."""
@@ -67,6 +70,8 @@ class FeatureStore(Dataset[Page]):
 def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
     """Make the features of `count` pages and keep them in `folder`, or go on with those that are there.
 
+    Of several processes the first makes them, and the others wait.
+
     Returns:
         Seconds that it took, all stretches together.
 
@@ -76,9 +81,14 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
         count: pages.
         make: makes them, from a page on.
         what: for the progress bar.
+
+    Raises:
+        TimeoutError: the first process has made no page for half an hour.
     """
     folder.mkdir(parents=True, exist_ok=True)
     key = f"{count} pages {key}"
+    if not is_first_process():
+        _wait(folder, key, count)
     done, shift, before = _kept(folder, key)
     if done >= count:
         return before
@@ -109,6 +119,17 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
             state = {"key": key, "done": number + 1, "shift_px": page.state.shift_px, "seconds": seconds}
             replace_text(folder / _STATE, json.dumps(state), "state of the features")
     return seconds
+
+
+def _wait(folder: Path, key: str, count: int) -> None:
+    """Until another process has made all pages, so long as it makes any."""
+    seen, since = -1, time.monotonic()
+    while (done := _kept(folder, key)[0]) < count:
+        if done != seen:
+            seen, since = done, time.monotonic()
+        if time.monotonic() - since > _PATIENCE_S:
+            raise TimeoutError(f"features in {folder}: {done} of {count} pages, and no more for {_PATIENCE_S:.0f} s")
+        time.sleep(_LOOK_S)
 
 
 def _kept(folder: Path, key: str) -> tuple[int, tuple[float, float], float]:

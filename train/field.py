@@ -185,7 +185,7 @@ class FieldRecovery(nn.Module):
             floor: see `Measured.pull`.
 
         Returns:
-            [2, ny, nx], inside the pipe's band; the mean over both equations, each weighted by what it tells.
+            [2, ny, nx], inside the pipe's band; the sum over both equations, each weighted by what it tells.
         """
         pull = measured.lit * measured.pull(field / measured.amplitude, floor)
         return torch.as_tensor(self.band(pull * measured.amplitude))

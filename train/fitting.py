@@ -6,7 +6,7 @@ import json
 import logging
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,6 +14,7 @@ from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, Generic, TypeVar
 
+import click
 import lightning as L
 import numpy as np
 import torch
@@ -36,6 +37,7 @@ from train.localizers.coherent import BICUBIC, CoherentLocalizer
 from train.loss import von_mises_nll
 from train.network import Refiner, SymbolUNet
 from train.parts import turned
+from train.processes import process_number
 from train.provenance import provenance
 
 CHECKPOINTS = "checkpoints"
@@ -50,8 +52,13 @@ LOOKS = 60
 """How often a run looks at its validation pages."""
 _REFINEMENT_STEPS = 0.25
 """Steps of a refinement's network over those of the first."""
-SCALE_BOUNDS = (-3.0, 3.0)
-"""Bounds of the logarithm of a factor that makes a decoder's claims honest."""
+_SCALE_BOUNDS = (-3.0, 3.0)
+"""Bounds of the logarithm of a factor that makes a decoder's claims honest: hardly trained ones were off by five."""
+_AT_A_BOUND = 1e-3
+_FEWEST_STEPS = 2
+"""That a learning rate can rise and fall in."""
+_SEEDS_APART = 1_000_003
+"""Of two processes of one run: further than any run has steps."""
 AVERAGED_SHARE = 0.05
 """Share of a run's steps over which its weights are averaged, exponentially: what is validated, kept and exported."""
 
@@ -112,7 +119,7 @@ class Hyperparameters:
 
     def of_refinement(self) -> Hyperparameters:
         """The choices for a refinement's network, which starts from a good belief and sees little light."""
-        steps = max(1, round(_REFINEMENT_STEPS * self.steps))
+        steps = max(_FEWEST_STEPS, round(_REFINEMENT_STEPS * self.steps))
         return replace(self, channels=max(1, self.channels * 2 // 3), blocks=1, levels=0, refinements=0, steps=steps)
 
 
@@ -199,9 +206,10 @@ class SymbolTraining(DecoderTraining[SymbolNetwork]):
         optimizer = torch.optim.AdamW(
             self.parameters(), lr=self.choices.learning_rate, weight_decay=self.choices.weight_decay
         )
-        warm_up = max(0.1, 2 / self.choices.steps)  # of less than two steps, the schedule divides by zero
+        steps = self.choices.steps
+        warm_up = min((steps + 1) / 2, max(0.1 * steps, 2)) / steps  # between one step and all, or it divides by zero
         schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, self.choices.learning_rate, total_steps=self.choices.steps, pct_start=warm_up
+            optimizer, self.choices.learning_rate, total_steps=steps, pct_start=warm_up
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
@@ -318,7 +326,7 @@ def fit_network(
     validation: Dataset[Page],
     *,
     kind: type[SymbolUNet] | type[Refiner] = SymbolUNet,
-    start: SymbolNetwork | None = None,
+    start: nn.Module | None = None,
     devices: int | str = "auto",
     progress: bool = True,
 ) -> Fitted[SymbolTraining]:
@@ -356,10 +364,10 @@ def fit_network(
 
 
 def seed_stretch(run: Path, seed: int) -> None:
-    """Seed everything for a run, or for its next stretch: that draws other pages and turns."""
+    """Seed everything for a run: its next stretch, and each of its processes, draw other pages and turns."""
     last = run / CHECKPOINTS / _LAST
     reached = int(_checkpoint(last)["global_step"]) if last.exists() else 0
-    L.seed_everything(seed + reached, verbose=False)
+    L.seed_everything(seed + reached + _SEEDS_APART * process_number(), verbose=False)
 
 
 def fit(
@@ -410,6 +418,7 @@ def fit(
             enable_progress_bar=progress,
             enable_model_summary=False,
             gradient_clip_val=1.0,
+            use_distributed_sampler=False,  # each process draws its own pages, and validates all
             num_sanity_val_steps=0,
             log_every_n_steps=10,
             default_root_dir=run,
@@ -480,8 +489,18 @@ def best_kappa_scale(module: DecoderTraining[Any], pages: Dataset[Page], mask: N
     p_all = torch.from_numpy(np.concatenate(outputs, axis=1))[None]
     truth_all = torch.from_numpy(np.concatenate(truths))[None]
 
-    def nll(log_scale: float) -> float:
-        return float(von_mises_nll(p_all * math.exp(log_scale), truth_all).mean())
+    return most_likely_factor(lambda factor: float(von_mises_nll(p_all * factor, truth_all).mean()))
 
-    found = optimize.minimize_scalar(nll, bounds=SCALE_BOUNDS, method="bounded")
-    return math.exp(float(found.x))
+
+def most_likely_factor(nll: Callable[[float], float]) -> float:
+    """Factor under which the truth is most likely; says so where the search ends at a bound.
+
+    Args:
+        nll: negative log-likelihood of the truth, by factor.
+    """
+    found = optimize.minimize_scalar(lambda log: nll(math.exp(log)), bounds=_SCALE_BOUNDS, method="bounded")
+    log_factor = float(found.x)
+    if min(log_factor - _SCALE_BOUNDS[0], _SCALE_BOUNDS[1] - log_factor) < _AT_A_BOUND:
+        what = f"claims would be more honest still beyond the factor {math.exp(log_factor):.3g}, where the search ends"
+        click.echo(f"lightpage: warning: {what}: is the decoder trained?", err=True)
+    return math.exp(log_factor)

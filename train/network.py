@@ -17,6 +17,8 @@ _KAPPA_UNIT = 100.0
 """What an output of one adds to p: with concentrations in the hundreds, the net need not learn large numbers."""
 _LOG_KAPPA_UNIT = 10.0
 """What an output of one adds to the logarithm of p's length: few steps are to make large factors."""
+_MOST_LOG_FACTOR = 15.0
+"""Of that factor: light unlike any that was trained on shall not make p infinite."""
 
 
 def with_page_coordinates(positions: Tensor, shape: tuple[int, ...], part: tuple[slice, slice]) -> Tensor:
@@ -102,7 +104,8 @@ def belief(outputs: Tensor, before: Tensor | float = 0.0) -> Tensor:
         outputs: of the network; zeros leave p as it was before.
         before: p of an earlier look, [N, 2, ny, nx].
     """
-    return torch.as_tensor(torch.exp(_LOG_KAPPA_UNIT * outputs[:, 2:]) * (before + _KAPPA_UNIT * outputs[:, :2]))
+    log_factor = torch.clamp(_LOG_KAPPA_UNIT * outputs[:, 2:], max=_MOST_LOG_FACTOR)
+    return torch.as_tensor(torch.exp(log_factor) * (before + _KAPPA_UNIT * outputs[:, :2]))
 
 
 class SymbolUNet(nn.Module):

@@ -49,13 +49,14 @@ class Patches(Dataset[Page]):
     def __init__(
         self, stores: Sequence[FeatureStore], mask: NDArray[np.bool_], side: int, rim: int, step: int = 1
     ) -> None:
-        if side < max(mask.shape) and side <= 2 * rim:
-            raise InvalidInputError("patch", f"{side} symbols", f"more than {2 * rim}, twice what the network sees")
         self._rim, self._step = rim, step
         self._places = [(store, index) for store in stores for index in range(len(store))]
         self._shape = mask.shape
         # the last place lies on the step too
         self._sides = tuple(min(count, side - (side - count) % step) for count in mask.shape)
+        if any(own < count and own <= 2 * rim for own, count in zip(self._sides, mask.shape, strict=True)):
+            wanted = f"at least {2 * rim + step}: more than twice what the network sees"
+            raise InvalidInputError("patch", f"{side} symbols", wanted)
         self._mask = torch.from_numpy(mask)
         self._each = int(np.prod([np.ceil(count / side) for count in mask.shape]))
 

@@ -8,9 +8,10 @@ Newton towards the most likely page; a small network takes it, for the waves are
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain, repeat
 from pathlib import Path
 
 import numpy as np
@@ -101,7 +102,7 @@ class Prediction(nn.Module):
 def expected_phasors(p: Tensor) -> Tensor:
     """Mean of exp(i phase) under von Mises beliefs, [2, ...] to [2, ...].
 
-    Its length, a ratio of Bessel functions, lies within 3% of kappa / (1/2 + sqrt(kappa^2 + 9/4)), one of the bounds of
+    Its length, a ratio of Bessel functions, lies within 5% of kappa / (1/2 + sqrt(kappa^2 + 9/4)), one of the bounds of
     Amos (Math. Comp. 28, 1974).
     """
     return p / (0.5 + torch.sqrt(p.square().sum(0, keepdim=True) + 2.25))
@@ -178,6 +179,7 @@ def fit_refinements(
     prediction: Prediction,
     first: Fitted[SymbolTraining],
     key: str,
+    starts: Iterable[nn.Module] = (),
     devices: int | str = "auto",
 ) -> Refined:
     """Train, or go on with, the refinements of a run, one behind the other.
@@ -189,12 +191,13 @@ def fit_refinements(
         extractor, prediction: of the device.
         first: the first look's training.
         key: everything that the first look's features depend on.
+        starts: networks whose weights the first of them begin with.
         devices: see `fit_network`.
     """
     looks, features, seconds = [first], material.features, 0.0
     count, seen = len(material.pages), material.training + material.validation
     chosen = choices.of_refinement()
-    for number in range(1, choices.refinements + 1):
+    for number, start in zip(range(1, choices.refinements + 1), chain(starts, repeat(None)), strict=False):
         make = partial(refined_pages, extractor, prediction, material, FeatureStore(features), looks[-1].module)
         at = folder / f"refinement-{number}"
         features = at / "features"
@@ -206,7 +209,9 @@ def fit_refinements(
         )
         mask, levels = first.module.pilot_mask, first.module.levels
         patches = training_pages([training], mask, chosen)
-        looks.append(fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, devices=devices))
+        looks.append(
+            fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, start=start, devices=devices)
+        )
         seconds += looks[-1].seconds
     return Refined(looks[1:], validation, seconds)
 

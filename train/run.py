@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, TypeVar
@@ -25,6 +26,7 @@ from optics.profile import Profile, parse_profile
 from optics.registration.calibration import Calibration, parse_calibration
 from train.decoder import SymbolDecoder
 from train.fitting import CHECKPOINTS, FITTED, Hyperparameters
+from train.processes import is_first_process
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.training import PublishedChoices
 
@@ -81,12 +83,9 @@ class Run:
 
     def save(self, folder: Path) -> None:
         """Write `run.json`, last of all, so that a folder with it is a finished run."""
-        replace_text(folder / DESCRIPTION, json.dumps(asdict(self), indent=2), "description of the run")
-
-
-def is_first_process() -> bool:
-    """Whether this is the process that a user started, and not one that Lightning started for a further device."""
-    return os.environ.get("LOCAL_RANK", "0") == "0"
+        replace_text(
+            folder / DESCRIPTION, json.dumps({"format": FORMAT, **asdict(self)}, indent=2), "description of the run"
+        )
 
 
 @contextmanager
@@ -145,12 +144,33 @@ def check_begun(folder: Path, options: dict[str, Any]) -> bool:
             wanted = f"a run that says in {BEGUN} what it was begun with, or another --out"
             raise InvalidInputError(f"run {folder}", "weights of unknown origin", wanted) from None
         return False
-    for name, value in {"format": FORMAT, **options}.items():
+    _check_format(folder, kept.get("format"))
+    for name, value in options.items():
         if kept.get(name) != value:
-            raise InvalidInputError(
-                f"run {folder}: {name}", value, f"{kept.get(name)!r}, with which it was begun, or another --out"
-            )
+            now, then = _where_they_differ(value, kept.get(name))
+            wanted = f"{then!r}, with which it was begun, or another --out"
+            raise InvalidInputError(f"run {folder}: {name}", now, wanted)
     return True
+
+
+def _check_format(folder: Path, found: object) -> None:
+    """Refuse a run of another version, whose networks or features are others."""
+    if found != FORMAT:
+        wanted = f"{FORMAT}, which this version makes: another --out, or the version that made it"
+        raise InvalidInputError(f"run {folder}: format", found, wanted)
+
+
+def _where_they_differ(now: object, then: object) -> tuple[object, object]:
+    """The first lines of two texts, or entries of two tables, that differ; other values as they are."""
+    if isinstance(now, str) and isinstance(then, str) and "\n" in now:
+        pairs = zip_longest(now.splitlines(), then.splitlines(), fillvalue="")
+        return next((pair for pair in pairs if pair[0] != pair[1]), (now, then))
+    if isinstance(now, dict) and isinstance(then, dict):
+        names = [*now, *(name for name in then if name not in now)]
+        name = next(name for name in names if now.get(name) != then.get(name))
+        inner = _where_they_differ(now.get(name), then.get(name))
+        return f"{name}: {inner[0]}", f"{name}: {inner[1]}"
+    return now, then
 
 
 def load_run(folder: Path) -> Run:
@@ -162,6 +182,7 @@ def load_run(folder: Path) -> Run:
     path = folder / DESCRIPTION
     try:
         data = json.loads(path.read_text())
+        found = data.pop("format", None)
         choices = data["hyperparameters"]
         if data["localizer"] in PUBLISHED:
             data["hyperparameters"] = PublishedChoices(**choices | {"channels": tuple(choices["channels"])})
@@ -169,9 +190,11 @@ def load_run(folder: Path) -> Run:
             data["hyperparameters"] = Hyperparameters(**choices)
         for name in ("trained_pages", "pages"):
             data[name] = tuple(data[name])
-        return Run(**data)
+        run = Run(**data)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise InvalidInputError(f"run {folder}", error, f"a finished training run with {DESCRIPTION}") from None
+    _check_format(folder, found)
+    return run
 
 
 def save_weights(weights: Mapping[str, Tensor], folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -13,12 +14,11 @@ from optics.errors import InvalidInputError
 from optics.grid import symbol_samples
 from optics.profile import Profile
 from optics.registration.known import known_pages
-from train.decoder import WAVE
+from train.decoder import WAVE, SymbolDecoder
 from train.feature_store import FeatureStore, fill
 from train.fitting import Fitted, Hyperparameters, SymbolTraining, best_kappa_scale, fit_network
 from train.known_light import Explained, explained
 from train.material import Material, Trained
-from train.network import SymbolUNet
 from train.patches import training_pages
 from train.refinement import Refined, RefinementPages, fit_prediction, fit_refinements
 from train.run import load_decoder, load_run
@@ -71,7 +71,7 @@ class SymbolRecipe:
         Raises:
             InvalidInputError: a start that is no finished run, or of another size.
         """
-        first = None if self.start is None else self._first_network(material.profile)
+        before = None if self.start is None else self._before(material.profile)
         known = [*material.training, *material.validation]
         features = material.out / "features"
         preparing = fill(
@@ -93,7 +93,7 @@ class SymbolRecipe:
             material.recording.levels,
             training,
             validation,
-            start=first,
+            start=None if before is None else before.network,
             devices=material.devices,
         )
         weights = {f"network.{name}": value for name, value in fitted.module.network.state_dict().items()}
@@ -104,6 +104,7 @@ class SymbolRecipe:
                 RefinementPages(material.recording, known, count, len(material.validation), features),
                 fitted,
                 known_light,
+                () if before is None else before.refiners,
                 weights,
             )
             seconds, last, validation = seconds + refined.seconds, refined.last, refined.validation
@@ -121,6 +122,7 @@ class SymbolRecipe:
         pages: RefinementPages,
         first: Fitted[SymbolTraining],
         known_light: list[Explained],
+        starts: Iterable[nn.Module],
         weights: dict[str, Tensor],
     ) -> Refined:
         """Trained refinements, which add what they have learnt to the weights."""
@@ -133,6 +135,7 @@ class SymbolRecipe:
             prediction,
             first,
             f"{material.key} {self.localizer} {self.choices.first_look}",
+            starts,
             material.devices,
         )
         for name, module in {
@@ -143,15 +146,16 @@ class SymbolRecipe:
         return refined
 
     def check_start(self, profile: Profile) -> None:
-        """Check that the run to start from, if any, has a network of this size.
+        """Check that the run to start from, if any, has networks of this size.
 
         Raises:
             InvalidInputError: see `train`.
         """
         if self.start is not None:
-            self._first_network(profile)
+            self._before(profile)
 
-    def _first_network(self, profile: Profile) -> SymbolUNet:
+    def _before(self, profile: Profile) -> SymbolDecoder:
+        """The decoder whose weights are begun with: those of its first look, and of as many refinements as it has."""
         assert self.start is not None
         run = load_run(self.start)
         size = (run.localizer, run.profile.page_shape, *_size(run.hyperparameters, run.profile))
@@ -160,7 +164,7 @@ class SymbolRecipe:
             raise InvalidInputError(
                 f"--start {self.start}: localizer, page, channels, blocks, levels, samples", size, f"{wanted}"
             )
-        return load_decoder(self.start, run).network
+        return load_decoder(self.start, run)
 
     def _explained(self, material: Material) -> list[Explained]:
         """Recorded pages against the wave model; none where nothing is made of it."""

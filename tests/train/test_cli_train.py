@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -19,13 +20,18 @@ from click.testing import CliRunner
 
 from optics.errors import CalibrationError, InvalidInputError
 from optics.page import pilot_mask
+from optics.profile import Profile
+from optics.progress import Progress
 from optics.recording import Recording
-from optics.registration.calibration import load_calibration
+from optics.registration.calibration import Calibration, load_calibration
 from tests.conftest import SMALL_PAGES
 from tests.optics.small import small_profile
+from train import cli_train
 from train.cli_train import _own_pilots, train
+from train.curves import curves_of
+from train.feature_store import FeatureStore
 from train.provenance import provenance
-from train.run import begin, sole_writer
+from train.run import FORMAT, begin, sole_writer
 
 SECONDS = 120
 
@@ -64,6 +70,18 @@ def test_recorded_and_synthetic_pages_are_trained_on_and_the_last_are_left(devic
     assert air == pytest.approx(described["validation_air"], abs=1e-3)
     with pytest.raises(InvalidInputError, match=r"channels, blocks, levels.*16"):
         run([*again, "--channels", "16", "--out", str(tmp_path / "other")])
+
+
+def test_a_run_begins_with_the_refinements_of_another_too(small_device: list[str], tmp_path: Path) -> None:
+    small = [*small_device, "--channels", "8", "--blocks", "1", "--synthetic-pages", "0"]
+    run([*small, "--steps", "60", "--out", str(tmp_path / "run")])
+    still = ["--learning-rate", "1e-9", "--steps", "10", "--start", str(tmp_path / "run")]
+    run([*small, *still, "--out", str(tmp_path / "again")])
+    before, after = (torch.load(tmp_path / name / "decoder.pt", weights_only=True) for name in ("run", "again"))
+    names = [name for name in before if name.startswith("refiners.")]
+    assert names
+    for name in names:
+        torch.testing.assert_close(after[name], before[name], rtol=0, atol=1e-5)
 
 
 def test_options_of_the_first_look_are_kept_and_those_that_do_nothing_refused(
@@ -159,14 +177,19 @@ def test_dark_pages_are_named_and_left_out(device: list[str], tmp_path: Path) ->
     assert json.loads((tmp_path / "run" / "run.json").read_text())["trained_pages"] == wanted
 
 
-def test_two_processes_train_one_run(device: list[str], tmp_path: Path) -> None:
+def test_two_processes_train_one_run_and_its_refinement(small_device: list[str], tmp_path: Path) -> None:
     out = tmp_path / "run"
-    arguments = [*device, "--steps", "60", "--synthetic-pages", "0", "--devices", "2", "--out", str(out)]
+    small = [*small_device, "--channels", "8", "--blocks", "1", "--synthetic-pages", "0"]
+    arguments = [*small, "--steps", "60", "--devices", "2", "--out", str(out)]
     command = [sys.executable, "-m", "runtime.cli", "train", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=2 * SECONDS)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("validation AIR") == 1
     assert json.loads((out / "run.json").read_text())["validation_air"] > 0.5
+    looks = curves_of(out)["val_air"]
+    assert len(looks) == 60  # as many as one process takes
+    kept = FeatureStore(out / "refinement-1" / "features")
+    assert all(bool(light.any()) for light, *_ in (kept[index] for index in range(len(kept))))
 
 
 def test_pilots_of_the_devices_own_are_found(
@@ -241,6 +264,55 @@ def test_weights_of_unknown_origin_are_not_taken_up(left: str, tmp_path: Path) -
     (tmp_path / left).mkdir()
     with pytest.raises(InvalidInputError, match="unknown origin"):
         begin(tmp_path, {"--steps": 60})
+
+
+def test_a_run_is_calibrated_on_its_first_usable_pages(
+    device: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[list[int]] = []
+
+    def found(recording: Recording, profile: Profile, pages: Sequence[int], progress: Progress) -> Calibration:
+        made.append(list(pages))
+        hashes = tuple(recording.page_hash(page) for page in pages)
+        return load_calibration(device[5]).model_copy(update={"calibrated_pages": hashes})
+
+    monkeypatch.setattr(cli_train, "calibrate_recording", found)
+    path = tmp_path / "R.h5"
+    shutil.copy(device[3], path)
+    with h5py.File(path, "r+") as file:
+        file["quadrature"][0] = 0
+    arguments = [*device[:3], str(path), *device[6:], "--steps", "10", "--synthetic-pages", "0"]
+    (tmp_path / "run").mkdir()
+    load_calibration(device[5]).save(tmp_path / "run" / "calibration.toml")  # of other pages: not taken
+    run([*arguments, "--out", str(tmp_path / "run")])
+    run([*arguments, "--out", str(tmp_path / "run")])
+    assert made == [[1, 2]]
+
+
+def test_a_run_does_not_go_on_with_other_symbols(device: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "R.h5"
+    shutil.copy(device[3], path)
+    arguments = [*device[:3], str(path), *device[4:], "--steps", "10", "--synthetic-pages", "0"]
+    run([*arguments, "--out", str(tmp_path / "run")])
+    with h5py.File(path, "r+") as file:
+        file["symbols"][3, 0, 0] ^= 1
+    with pytest.raises(InvalidInputError, match=r"--recording .*frames and symbols.*with which it was begun"):
+        run([*arguments, "--out", str(tmp_path / "run")])
+
+
+def test_a_run_of_another_version_is_named_as_such(tmp_path: Path) -> None:
+    begin(tmp_path, {"--steps": 60})
+    (tmp_path / "begun.json").write_text(json.dumps({"format": FORMAT - 1, "--steps": 60}))
+    with pytest.raises(InvalidInputError, match=f"format: got {FORMAT - 1}, wanted {FORMAT}, which this version"):
+        begin(tmp_path, {"--steps": 60})
+
+
+def test_what_differs_is_named_and_not_the_whole_of_it(tmp_path: Path) -> None:
+    begin(tmp_path, {"calibration": "a = 1\nb = 2\n", "device": {"sensor": {"full_well_e": 32, "noise": 1}}})
+    with pytest.raises(InvalidInputError, match="calibration: got b = 3, wanted 'b = 2', with which"):
+        begin(tmp_path, {"calibration": "a = 1\nb = 3\n"})
+    with pytest.raises(InvalidInputError, match="got sensor: full_well_e: 64, wanted 'sensor: full_well_e: 32'"):
+        begin(tmp_path, {"device": {"sensor": {"full_well_e": 64, "noise": 1}}})
 
 
 def test_without_git_there_is_no_commit_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from train import feature_store
 from train.feature_store import FeatureStore, fill
 from train.features import PageFeatures, PageState
 
@@ -56,6 +57,19 @@ def test_what_is_complete_is_not_made_again(tmp_path: Path) -> None:
     again = Pages()
     fill(tmp_path, "device", 3, again, "pages")
     assert again.made == []
+
+
+def test_further_processes_wait_for_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feature_store, "_PATIENCE_S", 0.5)
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    other = Pages()
+    with pytest.raises(TimeoutError, match="0 of 3 pages, and no more"):
+        fill(tmp_path, "device", 3, other, "pages")
+    monkeypatch.delenv("LOCAL_RANK")
+    fill(tmp_path, "device", 3, Pages(), "pages")
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    fill(tmp_path, "device", 3, other, "pages")
+    assert other.made == []
 
 
 @pytest.mark.parametrize(("key", "count"), [("another device", 3), ("device", 2), ("device", 4)])

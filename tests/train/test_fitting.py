@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from train.fitting import (
     decode_pages,
     fit_network,
     held_out_air,
+    most_likely_factor,
 )
 
 PAGE = (8, 12)
@@ -112,6 +114,13 @@ def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarra
         for value in (module.network.head.weight, module.network.head.bias):
             value[:2] *= 3
     assert best_kappa_scale(module, validation, mask) == pytest.approx(honest / 3, rel=0.02)
+
+
+def test_a_factor_at_the_end_of_the_search_is_said_to_be_there(capsys: pytest.CaptureFixture[str]) -> None:
+    assert most_likely_factor(lambda factor: (math.log(factor) - 1) ** 2) == pytest.approx(math.e, rel=1e-4)
+    assert capsys.readouterr().err == ""
+    most_likely_factor(lambda factor: -factor)
+    assert "more honest still beyond the factor 20" in capsys.readouterr().err
 
 
 def test_air_does_not_see_the_piston_and_leaves_pilots_out(mask: np.ndarray) -> None:

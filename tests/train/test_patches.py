@@ -13,7 +13,7 @@ from optics.errors import InvalidInputError
 from train.feature_store import FeatureStore, fill
 from train.features import PageFeatures, PageState
 from train.fitting import Hyperparameters, SymbolTraining
-from train.network import SymbolUNet, with_page_coordinates
+from train.network import SymbolUNet, reach, with_page_coordinates
 from train.patches import Patches, training_pages
 
 SHAPE = (30, 41)
@@ -67,8 +67,13 @@ def test_a_page_of_few_rows_is_cut_along_its_columns_alone(store: FeatureStore, 
 
 
 def test_patches_in_which_the_network_sees_no_symbol_whole_are_refused(store: FeatureStore, mask: np.ndarray) -> None:
-    with pytest.raises(InvalidInputError, match="patch: got 10 symbols, wanted more than 10"):
+    with pytest.raises(InvalidInputError, match="patch: got 10 symbols, wanted at least 11"):
         training_pages([store], mask, Hyperparameters(blocks=2, patch=10))
+    rim = reach(1, 1)
+    with pytest.raises(InvalidInputError, match=f"wanted at least {2 * rim + 2}"):  # cut to whole steps of two
+        training_pages([store], mask, Hyperparameters(blocks=1, levels=1, patch=2 * rim + 1))
+    smallest = training_pages([store], mask, Hyperparameters(blocks=1, levels=1, patch=2 * rim + 2))
+    assert all(torch.isfinite(smallest[index][-1]).any() for index in range(len(smallest)))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("blocks", "levels"), [(1, 0), (2, 0), (1, 1)])
@@ -92,8 +97,8 @@ def test_a_network_says_of_a_patch_what_it_says_of_the_page(
         assert not (asked & torch.from_numpy(mask)[at]).any()
         torch.testing.assert_close(phases[asked], whole_phases[at][asked])
         with torch.no_grad():
-            part = network(light[None].float(), where[None])[0]
-            page = network(whole_light[None].float(), whole_where[None])[0]
+            part = network.outputs(light[None].float(), where[None])[0]
+            page = network.outputs(whole_light[None].float(), whole_where[None])[0]
         torch.testing.assert_close(part[:, asked], page[:, *at][:, asked])
         asked_at |= {(row + int(r), column + int(c)) for r, c in asked.nonzero()}
     rows, columns = ({place[axis] for place in asked_at} for axis in (0, 1))

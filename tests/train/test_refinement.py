@@ -65,11 +65,11 @@ def unexplained(known: Known, believed: np.ndarray) -> np.ndarray:
     return (seen[0] + 1j * seen[1]) * np.exp(-1j * believed)
 
 
-@pytest.mark.parametrize("kappa", [0.0, 0.3, 1.0, 4.0, 30.0, 1e4])
-def test_expected_phasors_are_as_long_as_their_bessel_functions_say(kappa: float) -> None:
+def test_expected_phasors_are_as_long_as_their_bessel_functions_say() -> None:
+    kappa = np.concatenate([[0.0], np.geomspace(0.01, 1e4, 500)])
     expected = special.i1e(kappa) / special.i0e(kappa)
-    found = expected_phasors(torch.tensor([0.6 * kappa, 0.8 * kappa], dtype=torch.float64))
-    np.testing.assert_allclose(found, np.array([0.6, 0.8]) * expected, rtol=0.03)
+    found = expected_phasors(torch.from_numpy(np.stack([0.6 * kappa, 0.8 * kappa])))
+    np.testing.assert_allclose(found, np.array([[0.6], [0.8]]) * expected, rtol=0.05)
 
 
 def test_symbols_that_are_wrong_pull_towards_what_was_written(dim: Known) -> None:

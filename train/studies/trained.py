@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
-from scipy import optimize
 from torch import Tensor
 from torch.nn import functional
 
@@ -27,7 +26,7 @@ from optics.recording import Recording
 from optics.recording_job import RecordingJob
 from train.curves import curves_of
 from train.features import PageState
-from train.fitting import SCALE_BOUNDS, best_kappa_scale, decode_pages, without_piston
+from train.fitting import best_kappa_scale, decode_pages, most_likely_factor, without_piston
 from train.published.recipe import published_choices, train_published
 from train.published.training import (
     FramePages,
@@ -174,11 +173,9 @@ def _of_classes(
     classes, data = module.choices.classes, torch.from_numpy(~mask)
     known = list(_scored(module, validation, data))
 
-    def nll(log_scale: float) -> float:
-        pages = (functional.cross_entropy(math.exp(log_scale) * scores.T, symbols) for scores, symbols in known)
-        return float(sum(pages))
-
-    scale = math.exp(float(optimize.minimize_scalar(nll, bounds=SCALE_BOUNDS, method="bounded").x))
+    scale = most_likely_factor(
+        lambda factor: float(sum(functional.cross_entropy(factor * scores.T, symbols) for scores, symbols in known))
+    )
     rates, claims, beliefs, right = [], [], [], []
     for page, truth in _scored(module, unseen, data):
         log = torch.log_softmax(page.double() * scale, dim=0) / math.log(2)

@@ -90,6 +90,6 @@ def test_light_that_misses_a_camera_is_not_counted_as_seen() -> None:
     away = TRUTH.copy()
     away[NAMES.index("quadrature_shift_x_px")] += PROFILE.camera.columns_px / 2
     seen = seen_share(TWIN, away, PROFILE)
-    assert 0.2 < np.mean(seen < 0.5) < 0.8
+    assert np.mean(seen < 0.5) == pytest.approx(0.5, abs=0.02)  # the page lies in the middle of the camera
     assert seen.min() < 0.1
     assert seen.max() > 0.9
