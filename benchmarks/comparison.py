@@ -18,7 +18,7 @@ from benchmarks.decoders_figure import MAP
 from benchmarks.kept import CALIBRATION, Kept
 from benchmarks.levels import LevelFigures, level_figures
 from benchmarks.oracle import Oracle
-from optics.device import Device
+from optics.device import Device, Sensor
 from optics.measures import achievable_rate, measure
 from optics.page import pilot_mask
 from optics.profile import Profile
@@ -421,6 +421,13 @@ HEADER = (
 wall of the pipe, a wall of pair x, of pair y, or of both; AIR over the oracle's, and over that of the best published
 decoder; what validation AIR gained in the last fifth of the steps; minutes of features and of training, and pages it
 trained on a second, validation counted as time: of a kept arm, on the machine that trained it."""
+
+
+def light_name(device: Device, symbol_size_px: int, apart: str = "") -> str:
+    """Name of the folder of a light; `apart` says what else sets it apart."""
+    geometry, sensor = device.geometry, device.sensor
+    dimmed = "" if sensor.exposure_relative == Sensor().exposure_relative else f"-{sensor.exposure_relative:g}x"
+    return f"{geometry.pipe_angle_deg:g}deg-{sensor.full_well_e:g}e-{symbol_size_px}px{dimmed}{apart}"
 
 
 @contextmanager

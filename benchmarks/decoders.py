@@ -23,7 +23,7 @@ from typing import Any
 
 import click
 
-from benchmarks.comparison import ARMS, FAST, HEADER, ORACLE, Bench, Outcome, recorded
+from benchmarks.comparison import ARMS, FAST, HEADER, ORACLE, Bench, Outcome, light_name, recorded
 from benchmarks.decoders_figure import draw, title
 from benchmarks.kept import TRAINED, Kept
 from benchmarks.levels import LEVEL_HEADER
@@ -146,8 +146,7 @@ def main(
         }
         usual = ideal_device() if ideal else Device()
         device = usual.with_settings([f"{key}={value}" for key, value in settings.items()])
-        apart = ("" if exposure == Sensor().exposure_relative else f"-{exposure:g}x") + ("-ideal" if ideal else "")
-        folder = out / f"{angle_deg:g}deg-{full_well:g}e-{size_px}px{apart}"
+        folder = out / light_name(device, size_px, "-ideal" if ideal else "")
         kept = trained / Path(profile_name).stem / folder.name
         with recorded(profile, device, pages, seed, folder) as recording:
             bench = Bench.of(recording, profile, device, levels, seed, Kept(folder, kept, keeps))
