@@ -436,7 +436,7 @@ def fit(
         raise KeyboardInterrupt from None
     # the last steps are the quietest, and no look need have followed them
     rates = {}
-    for path in {last, Path(best.best_model_path or last)}:
+    for path in {last, folder / Path(best.best_model_path or last).name}:  # the run may have been moved meanwhile
         module.load_state_dict(_checkpoint(path)["state_dict"])
         decoded = decode_pages(module.float().eval(), validation)
         rates[path] = held_out_air(*decoded, module.pilot_mask, module.levels)

@@ -64,7 +64,8 @@ def test_it_learns_and_is_not_trained_twice(tmp_path: Path, mask: np.ndarray) ->
     assert (kept.validation_air, kept.seconds, kept.curves) == (first.validation_air, first.seconds, first.curves)
     assert kept.curves["val_air"][-1][1] == pytest.approx(first.validation_air, abs=0.1)
     torch.testing.assert_close(kept.module.network.state_dict(), first.module.network.state_dict())
-    (run / FITTED).unlink()  # interrupted after its last step
+    (run / FITTED).unlink()  # interrupted after its last step, and moved
+    run = run.rename(tmp_path / "moved")
     again = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
     assert again.validation_air == pytest.approx(first.validation_air, abs=1e-6)
     for one, other in zip(first.module.parameters(), again.module.parameters(), strict=True):
