@@ -78,5 +78,6 @@ def test_the_command_prints_the_parts_and_takes_up_what_is_there(out: Path, tmp_
     outcomes = json.loads((out / "ablation.json").read_text())["outcomes"]
     assert [outcome["arm"] for outcome in outcomes] == [NOTHING, POSITIONS]
     again = CliRunner().invoke(main, arguments, catch_exceptions=False)
-    assert "unit=page" not in again.output
+    assert "features without nothing" in first.output
+    assert "features without" not in again.output
     assert json.loads((out / "ablation.json").read_text())["outcomes"] == outcomes
