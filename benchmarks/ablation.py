@@ -29,13 +29,8 @@ from train.patches import training_pages
 from train.run import sole_writer
 
 NOTHING = "nothing"
-REFLECTIONS, POSITIONS, SIGNAL_POWER, DESCENT, LOW_PASS = (
-    "reflections",
-    "positions",
-    "signal-power",
-    "descent",
-    "low-pass",
-)
+REFLECTIONS, POSITIONS = "reflections", "positions"
+SIGNAL_POWER, DESCENT, LOW_PASS = "signal-power", "descent", "low-pass"
 PARTS = {
     NOTHING: "the whole decoder",
     REFLECTIONS: "light that was reflected on its way: only the direct branch is read",
