@@ -156,7 +156,7 @@ def check_begun(folder: Path, options: dict[str, Any]) -> bool:
 def _check_format(folder: Path, found: object) -> None:
     """Refuse a run of another version, whose networks or features are others."""
     if found != FORMAT:
-        wanted = f"{FORMAT}, which this version makes: another --out, or the version that made it"
+        wanted = f"{FORMAT}, which this version makes: train anew in another folder, or take the version that made it"
         raise InvalidInputError(f"run {folder}: format", found, wanted)
 
 
