@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.errors import CalibrationError
-from optics.grid import field_grid
+from optics.grid import field_grid, symbol_samples
 from optics.profile import Profile
 from optics.progress import Progress
 from optics.recording import FramePair
 from optics.registration.coherence import COHERENT_BRANCHES, page_coherence
 from optics.registration.fit import Fit, fit_parameters
 from optics.registration.parameters import PARAMETERS, indices, nominal
-from optics.registration.patches import Measurement, Patch, measure, middle_patches, patches, search_window
+from optics.registration.patches import Measurement, Patch, measure, middle_patches, patch_edge, patches, search_window
 from optics.registration.samplers import FieldSampler, FrameSampler
 from optics.registration.table import registration_coefficients
 from optics.registration.twin import FieldSolver, Twin
@@ -93,24 +93,24 @@ class _Stage:
     branches: tuple[str, ...] = ("direct",)
     middle_only: bool = False
     use_phase: bool = False
-    samples: int = 4
+    half_rate: bool = False
     wanted: str = _WANTED
 
 
 _SINGLE_CAMERA = (
-    _Stage("find the direct image", 50, 4, _CAMERA_GROUPS, middle_only=True, samples=2),
-    _Stage("follow it outwards", 24, 4, _SHAPE_GROUPS, samples=2),
+    _Stage("find the direct image", 50, 4, _CAMERA_GROUPS, middle_only=True, half_rate=True),
+    _Stage("follow it outwards", 24, 4, _SHAPE_GROUPS, half_rate=True),
     _Stage("settle the cameras", 6, 2, _SHAPE_GROUPS),
 )
 _COMPLEX = (
-    _Stage("find the reflections", 32, 4, _ALL_GROUPS, _REFLECTED, samples=2, wanted=_WANTED_REFLECTIONS),
+    _Stage("find the reflections", 32, 4, _ALL_GROUPS, _REFLECTED, half_rate=True, wanted=_WANTED_REFLECTIONS),
     _Stage("all branches, coarse", 8, 2, _ALL_GROUPS, COHERENT_BRANCHES),
     _Stage("all branches, fine", 3, 1, _ALL_GROUPS, COHERENT_BRANCHES),
 )
 _PHASES = (_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True),) * 2
 """Each round halves what is left of the error, since patches are measured about the current geometry; two bring it
 within reach of the waves."""
-_DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, samples=2),)
+_DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True),)
 """From an earlier calibration: the complex field is right from the start, so nothing is searched camera by camera."""
 _DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3}
 _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for parameter in PARAMETERS])
@@ -233,12 +233,13 @@ class _Registration:
         self.twin, self.solve_field, self.profile = twin, solve_field, profile
         self.references, self.pages, self.progress = references, pages, progress
         self.patches = patches(profile)
+        self._samples = symbol_samples(profile)
         if len(self.patches) < _FEWEST:
             rows, columns = profile.page_shape
             raise CalibrationError(
                 f"calibration, profile {profile.name}",
                 f"a page of {columns} x {rows} symbols, which makes {len(self.patches)} patches to look for",
-                f"at least {_FEWEST} patches of about 10 x 10 symbols",
+                f"at least {_FEWEST} patches of about {patch_edge(profile)} x {patch_edge(profile)} symbols",
             )
         self.grid = field_grid(profile)
         self.parameters = nominal()
@@ -370,7 +371,7 @@ class _Registration:
             page.symbols,
             stage.branches,
             window,
-            samples=stage.samples,
+            samples=max(1, self._samples // 2) if stage.half_rate else self._samples,
             cameras=cameras,
         )
 

@@ -16,8 +16,10 @@ Complex = NDArray[np.complexfloating]
 Sampler = Callable[[Real], NDArray[np.inexact]]
 """Camera-plane points [..., 2] (metres) to the measured signal there, real or complex."""
 
-_SLOPES = np.linspace(-2.4, 2.4, 17)
-"""Residual phase slopes that are tried, radians a symbol: page centre and lengths anywhere in the capture range."""
+_EDGE_SYMBOLS, _EDGE_PX = 10, 40
+"""Edge of a patch: symbols enough to know them from others, and modulator pixels enough to be seen in dim light."""
+_SLOPES = np.linspace(-24, 24, 17)
+"""Residual phase slopes tried, radians across a patch: page centre and lengths anywhere in the capture range."""
 _CARRIER_PROBE = 0.3
 """Reach of the finite difference that finds the carrier, samples."""
 
@@ -70,8 +72,14 @@ class Measurement:
     symbols: int
 
 
-def patches(profile: Profile, edge: int = 10) -> list[Patch]:
-    """Cut the page into patches of about `edge` x `edge` symbols that cover it."""
+def patch_edge(profile: Profile) -> int:
+    """About how many symbols a patch is wide and high."""
+    return max(_EDGE_SYMBOLS, round(_EDGE_PX / profile.page.symbol_size_px))
+
+
+def patches(profile: Profile) -> list[Patch]:
+    """Cut the page into patches of about `patch_edge` x `patch_edge` symbols that cover it."""
+    edge = patch_edge(profile)
     rows, columns = profile.page_shape
 
     def cuts(count: int) -> list[tuple[int, int]]:
@@ -115,7 +123,7 @@ def measure(
     symbols: Complex,
     branches: tuple[str, ...],
     window: Real,
-    samples: int = 4,
+    samples: int,
     cameras: tuple[int, ...] = (0, 1),
 ) -> list[Measurement]:
     """Find each branch of a patch within a window around where the twin puts it.
@@ -129,13 +137,14 @@ def measure(
         symbols: phasors exp(i theta) of the whole page, [ny, nx].
         branches: which branches to look for.
         window: trial shifts [K, 2], metres on the camera plane, a square lattice (see `search_window`).
-        samples: samples per symbol along each axis; four is the field's own rate, two serves a wide search.
+        samples: samples per symbol along each axis; the field's own rate (`symbol_samples`), or half of it in a wide
+            search.
         cameras: which cameras the sampler looks through, a label of the result.
     """
     known = symbols[patch.rows, patch.columns]
     rows, columns = known.shape
     pitch = profile.symbol_pitch_m / samples
-    slopes = _SLOPES / samples
+    slopes = _SLOPES / (patch_edge(profile) * samples)
     x = (np.arange(columns * samples) - (columns * samples - 1) / 2) * pitch + patch.centre_m[0]
     y = (np.arange(rows * samples) - (rows * samples - 1) / 2) * pitch + patch.centre_m[1]
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

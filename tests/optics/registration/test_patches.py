@@ -5,18 +5,39 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from optics.grid import symbol_samples
+from optics.profile import Profile, load_profile
 from optics.registration import patches as module
 from optics.registration.calibrate import SIGNIFICANT
 from optics.registration.parameters import nominal
-from optics.registration.patches import Measurement, Patch, Sampler, measure, middle_patches, patches, search_window
+from optics.registration.patches import (
+    Measurement,
+    Patch,
+    Sampler,
+    measure,
+    middle_patches,
+    patch_edge,
+    patches,
+    search_window,
+)
 from tests.optics.registration.flat_twin import FlatTwin, Picture
 from tests.optics.small import random_phases, small_profile
+
+
+def with_symbols_of(size_px: int, profile: Profile) -> Profile:
+    """The same page, cut into symbols of another size."""
+    page, ratio = profile.page, profile.page.symbol_size_px / size_px
+    cut = {"symbol_size_px": size_px, "columns": int(page.columns * ratio), "rows": int(page.rows * ratio)}
+    return profile.model_copy(update={"page": page.model_copy(update=cut)})
+
 
 PROFILE = small_profile()
 SYMBOLS = np.exp(1j * random_phases(PROFILE, 1))
 PITCH = PROFILE.symbol_pitch_m
 PIXEL = PROFILE.camera.pitch_m
 MIDDLE = patches(PROFILE)[5]
+FINE = with_symbols_of(2, PROFILE)
+FINE_SYMBOLS = np.exp(1j * random_phases(FINE, 1))
 
 
 def look(
@@ -26,16 +47,19 @@ def look(
     reach_px: float = 12,
     step_px: float = 3,
     ramp: tuple[float, float] = (0.0, 0.0),
+    profile: Profile = PROFILE,
 ) -> Measurement:
-    window = search_window(reach_px * PIXEL, step_px * PIXEL)
-    return measure(sampler, FlatTwin(PROFILE, ramp), nominal(), PROFILE, patch, symbols, ("direct",), window)[0]
+    twin, window = FlatTwin(profile, ramp), search_window(reach_px * PIXEL, step_px * PIXEL)
+    samples = symbol_samples(profile)
+    return measure(sampler, twin, nominal(), profile, patch, symbols, ("direct",), window, samples)[0]
 
 
 class TestCutting:
-    @pytest.mark.parametrize("edge", [7, 10, 100])
-    def test_patches_cover_the_page_once(self, edge: int) -> None:
-        seen = np.zeros(PROFILE.page_shape, int)
-        for patch in patches(PROFILE, edge):
+    @pytest.mark.parametrize("size_px", [1, 2, 4, 16])
+    def test_patches_cover_the_page_once(self, size_px: int) -> None:
+        profile = with_symbols_of(size_px, PROFILE)
+        seen = np.zeros(profile.page_shape, int)
+        for patch in patches(profile):
             seen[patch.rows, patch.columns] += 1
         assert (seen == 1).all()
 
@@ -47,10 +71,13 @@ class TestCutting:
             expected = (x[patch.columns].mean(), y[patch.rows].mean())
             assert patch.centre_m == pytest.approx(expected, abs=1e-12)
 
-    def test_they_are_about_as_large_as_asked(self) -> None:
-        for patch in patches(PROFILE, 10):
-            assert 8 <= patch.rows.stop - patch.rows.start <= 12
-            assert 8 <= patch.columns.stop - patch.columns.start <= 12
+    @pytest.mark.parametrize(("size_px", "edge"), [(1, 40), (2, 20), (4, 10), (16, 10)])
+    def test_they_hold_enough_symbols_and_enough_light(self, size_px: int, edge: int) -> None:
+        profile = with_symbols_of(size_px, load_profile("paper"))
+        assert patch_edge(profile) == edge
+        for patch in patches(profile):
+            assert 0.8 * edge <= patch.rows.stop - patch.rows.start <= 1.2 * edge
+            assert 0.8 * edge <= patch.columns.stop - patch.columns.start <= 1.2 * edge
 
     @pytest.mark.parametrize(
         ("columns", "rows", "count"), [(87, 56, 6), (60, 40, 8), (48, 32, 9), (44, 28, 6), (30, 30, 9), (20, 20, 4)]
@@ -91,6 +118,16 @@ class TestFinding:
         # the peak over slopes is read by a parabola, which on slopes 0.3 rad a symbol apart errs by up to 0.02
         assert found.slope * PITCH == pytest.approx(slope, abs=0.025)
         assert found.significance > 0.85 * found.symbols
+
+    def test_of_small_symbols_too(self) -> None:
+        """A ramp that the page's centre or a length makes is as steep on the page, whatever its symbols' size."""
+        steep = (-1.6 / PITCH, 1.1 / PITCH)
+        picture, patch = Picture(FINE, FINE_SYMBOLS, (4 * PIXEL, -5 * PIXEL), steep), patches(FINE)[5]
+        found = look(picture, patch, FINE_SYMBOLS, ramp=(0.0, 0.0), profile=FINE)
+        assert (found.pixels - found.read_at)[0] == pytest.approx([4, -5], abs=0.3)
+        assert found.slope * PITCH == pytest.approx([-1.6, 1.1], abs=0.03)
+        # two samples a symbol see the soft squares less evenly than four
+        assert found.significance > 0.8 * found.symbols > 300
 
     def test_shift_and_slope_are_found_together(self) -> None:
         found = look(Picture(PROFILE, SYMBOLS, (4 * PIXEL, -5 * PIXEL), (0.5 / PITCH, 0.7 / PITCH)))
@@ -141,6 +178,7 @@ class TestFinding:
             SYMBOLS,
             ("y", "direct"),
             window,
+            samples=4,
             cameras=(1,),
         )
         assert [(m.branch, m.cameras) for m in found] == [("y", (1,)), ("direct", (1,))]
@@ -160,10 +198,11 @@ class TestSignificance:
         assert np.mean(seen) == pytest.approx(1, abs=5 / np.sqrt(len(seen)))
 
     @pytest.mark.parametrize(("reach_px", "pages", "mistaken"), [(2, 18, 0.01), (24, 9, 0.05)])
+    @pytest.mark.parametrize(("profile", "samples"), [(PROFILE, 2), (FINE, 1)], ids=["4 px", "2 px"])
     def test_a_search_among_unrelated_symbols_rarely_passes_for_a_find(
-        self, reach_px: float, pages: int, mistaken: float
+        self, reach_px: float, pages: int, mistaken: float, profile: Profile, samples: int
     ) -> None:
-        seen = self._unrelated(reach_px, pages, samples=2)
+        seen = self._unrelated(reach_px, pages, samples, profile)
         assert np.mean(np.array(seen) > SIGNIFICANT) <= mistaken
         # the best of many trials, so above one
         assert np.mean(seen) > 4
@@ -179,13 +218,14 @@ class TestSignificance:
         assert np.isfinite([*found.pixels.ravel(), found.phase, *found.slope, *found.carrier]).all()
 
     @staticmethod
-    def _unrelated(reach_px: float, pages: int, samples: int = 4) -> list[float]:
-        picture, window = Picture(PROFILE, SYMBOLS), search_window(reach_px * PIXEL, 4 * PIXEL)
+    def _unrelated(reach_px: float, pages: int, samples: int = 4, profile: Profile = PROFILE) -> list[float]:
+        picture = Picture(profile, np.exp(1j * random_phases(profile, 1)))
+        window = search_window(reach_px * PIXEL, 4 * PIXEL)
         found = []
         for page in range(pages):
-            symbols = np.exp(1j * random_phases(PROFILE, 100 + page))
-            for patch in patches(PROFILE):
+            symbols = np.exp(1j * random_phases(profile, 100 + page))
+            for patch in patches(profile):
                 found += measure(
-                    picture, FlatTwin(PROFILE), nominal(), PROFILE, patch, symbols, ("direct",), window, samples
+                    picture, FlatTwin(profile), nominal(), profile, patch, symbols, ("direct",), window, samples
                 )
         return [m.significance for m in found]
