@@ -8,6 +8,7 @@ Interrupted, it goes on where it was; all lies in --out.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -20,6 +21,7 @@ from benchmarks.kept import TRAINED, Kept
 from optics.device import Device
 from optics.files import write_json
 from optics.profile import load_profile
+from runtime.cli import run
 from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
 from train.field import ROUNDS
@@ -35,7 +37,7 @@ PARTS = {
     NOTHING: "the whole decoder",
     REFLECTIONS: "light that was reflected on its way: only the direct branch is read",
     POSITIONS: "filters that depend on where a symbol lies (FiLM)",
-    SIGNAL_POWER: "the signal's own power in the field's recovery: its equations are taken as linear",
+    SIGNAL_POWER: "the signal's own power in the field's recovery, the descent with it: equations are linear",
     DESCENT: "the descent to the most likely field: the closed solution of both equations is taken",
     LOW_PASS: "the low-pass before frames are sampled",
 }
@@ -136,4 +138,4 @@ def main(
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(main, name="python -m benchmarks.ablation"))

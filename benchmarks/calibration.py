@@ -13,8 +13,10 @@ failed ones are; a file of another format of runs (`train.run.FORMAT`) is refuse
 
 from __future__ import annotations
 
+import hashlib
 import json
 import statistics
+import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass
@@ -39,6 +41,7 @@ from optics.registration.parameters import NAMES, as_dict, as_vector
 from optics.registration.samplers import FieldSampler
 from optics.registration.table import registration_coefficients
 from optics.simulator import Simulator, true_parameters
+from runtime.cli import run
 from tests.system.foreign_device import ForeignDevice
 from train.field import FieldRecovery, TorchFieldSolver
 from train.run import FORMAT
@@ -225,9 +228,11 @@ def load(path: Path, settings: dict[str, object]) -> dict[int, Outcome]:
 @click.option("--json", "json_path", required=True, type=OutputFile())
 def main(profile_name: str, devices: int, first_seed: int, pages: int, foreign: bool, json_path: Path) -> None:
     """Calibrate drawn devices and compare with the truth."""
-    settings: dict[str, object] = {"format": FORMAT, "profile": profile_name, "pages": pages, "foreign": foreign}
+    profile = load_profile(profile_name)
+    settings: dict[str, object] = {"format": FORMAT, "pages": pages, "foreign": foreign}
+    settings |= {"profile": profile_name, "profile_sha256": hashlib.sha256(profile.to_toml().encode()).hexdigest()}
     done = {seed: o for seed, o in load(json_path, settings).items() if o.failure is None}
-    bench = Bench(load_profile(profile_name), pages)
+    bench = Bench(profile, pages)
     tqdm.write(HEADER)
     seeds = range(first_seed, first_seed + devices)
     for seed in tqdm(seeds, unit="device"):
@@ -244,4 +249,4 @@ def main(profile_name: str, devices: int, first_seed: int, pages: int, foreign: 
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(main, name="python -m benchmarks.calibration"))

@@ -340,8 +340,8 @@ class Bench:
         rates = achievable_rate(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
         by_symbol[~self.mask] = rates.reshape(len(truth), -1).mean(axis=0)
         np.save(folder / MAP, by_symbol)
-        met = np.rint(exit_centroids(self.profile, self.fitted)).astype(bool)
-        groups = {name: by_symbol[~self.mask & (met[0] == x) & (met[1] == y)] for name, (x, y) in WALLS.items()}
+        zones = symbols_by_walls(self.profile, self.fitted)
+        groups = {name: by_symbol[~self.mask & there] for name, there in zones.items()}
         validated = trained.curves.get("val_air", [])
         return Outcome(
             kappa_scale=scale,
@@ -361,6 +361,12 @@ class Bench:
             training_seconds=trained.seconds,
             pages_per_second=drawn / trained.seconds,
         )
+
+
+def symbols_by_walls(profile: Profile, fitted: Calibration) -> dict[str, NDArray[np.bool_]]:
+    """Which symbols' light meets the walls of `WALLS`, bool [ny, nx] each."""
+    met = np.rint(exit_centroids(profile, fitted)).astype(bool)
+    return {name: (met[0] == x) & (met[1] == y) for name, (x, y) in WALLS.items()}
 
 
 def gained_at_the_end(curve: Curve, steps: int) -> float:

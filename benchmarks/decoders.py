@@ -14,6 +14,7 @@ ones too, are found from all of its symbols, for each arm alike. Interrupted, it
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
@@ -30,6 +31,7 @@ from benchmarks.levels import LEVEL_HEADER
 from optics.device import Device, Sensor, ideal_device
 from optics.files import write_json
 from optics.profile import load_profile
+from runtime.cli import run
 from train.fitting import Hyperparameters
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import published_choices
@@ -205,4 +207,4 @@ def compared(outcomes: list[Outcome]) -> list[Outcome]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(main, name="python -m benchmarks.decoders"))

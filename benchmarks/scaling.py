@@ -8,6 +8,7 @@ large tensor: from a hundred thousand symbols on that takes longer than the arit
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import numpy as np
 from benchmarks.speed import at_symbol_pitch, frames_of, seconds_of, session_of
 from optics.files import OutputFile, write_json
 from optics.profile import load_profile
+from runtime.cli import run
 from runtime.cpus import available_cpus
 from train.studies.scaling import enlarged
 
@@ -61,4 +63,4 @@ def main(
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(main, name="python -m benchmarks.scaling"))

@@ -7,6 +7,7 @@ Untrained: time does not depend on weights. Ratios are over the decoder that is 
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -32,6 +33,7 @@ from optics.recording import FramePair
 from optics.registration.parameters import nominal
 from optics.registration.table import sampling_table
 from runtime.built_in import GraphFile
+from runtime.cli import run
 from runtime.cpus import available_cpus
 from runtime.decoder import inputs_left
 from runtime.ort import Session, open_session
@@ -156,4 +158,4 @@ def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int |
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(main, name="python -m benchmarks.speed"))

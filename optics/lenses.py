@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.errors import InvalidInputError
+from optics.profile import Profile
 
 Real = NDArray[np.floating]
 
@@ -117,7 +118,12 @@ _THICK_WITHIN = 0.05
 """A prescription stands for lenses whose focal length is that close to its own."""
 
 
-def lens_of(focal_length_m: float) -> LensPrescription | None:
+def lens_of(profile: Profile) -> LensPrescription | None:
+    """The prescription of a device's real lenses, if there is one; none where they are ideal."""
+    return None if profile.ideal_lenses else lens_of_length(profile.lens.focal_length_m)
+
+
+def lens_of_length(focal_length_m: float) -> LensPrescription | None:
     """The prescription that a focal length suggests, if there is one."""
     suited = [lens for lens in LENSES.values() if abs(lens.effective_focal_m / focal_length_m - 1) < _THICK_WITHIN]
     return suited[0] if suited else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 from importlib import resources
@@ -63,8 +64,13 @@ class LensPath(Table):
         )
 
     def times(self, factor: float) -> LensPath:
-        """Of lenses so many times as large."""
-        return LensPath(**{name: factor * value for name, value in self.model_dump().items()})
+        """Of lenses so many times as large.
+
+        Raises:
+            ProfileError: a term that is more than a profile may state.
+        """
+        larger = {name: factor * value for name, value in self.model_dump().items()}
+        return validate(LensPath, larger, f"lens_path of lenses {factor:g} times as large")
 
 
 class Pipe(Table):
@@ -208,7 +214,8 @@ def to_toml(table: Table, without: tuple[str, ...] = ()) -> str:
 
 def _toml_value(value: object) -> str:
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        # a JSON string is a TOML one but for this character
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value)

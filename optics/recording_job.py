@@ -13,7 +13,7 @@ from optics.page import random_symbols
 from optics.profile import Profile, to_toml
 from optics.recording import RecordingWriter
 from optics.recording_writer import discard_partial, partial_path
-from optics.simulator import Simulator
+from optics.simulator import LIGHT, Simulator
 
 _SYMBOLS = 3
 """Random stream of the pages' symbols, beside those of the simulator."""
@@ -45,7 +45,7 @@ class RecordingJob:
             InvalidInputError: they are there and `force` is not given, they are being written, or the folder cannot be.
         """
         # references alone would not tell two devices apart: the pipe does not show in them
-        text = f"levels = {self.levels}\nseed = {self.seed}\ntruth = {str(self.truth).lower()}\n"
+        text = f"light = {LIGHT}\nlevels = {self.levels}\nseed = {self.seed}\ntruth = {str(self.truth).lower()}\n"
         text += f"{to_toml(self.device)}\n# profile\n{self.profile.to_toml()}"
         try:
             begun = self.settings.read_text("utf-8") if self.settings.exists() else None

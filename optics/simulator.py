@@ -21,6 +21,8 @@ from optics.waves import WaveChannel, WaveGeometry, cells_for
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
 
+LIGHT = 1
+"""Raised when the same device and pages give other frames: what an earlier version began is then not gone on with."""
 _CLIPPING_AMPLITUDE = 2.4
 """Signal amplitude over its root mean square that, in phase with the reference, just fills the well: about one sample
 in twenty thousand clips."""

@@ -115,17 +115,22 @@ def lightpage() -> None:
     """Decode phase pages read through a glass light-pipe, and keep the decoder calibrated to its device."""
 
 
-def run(group: click.Group, arguments: Sequence[str] | None = None) -> int:
+def run(command: click.Command, arguments: Sequence[str] | None = None, name: str = "lightpage") -> int:
     """Run a command line and return its exit status: 0, 2 for an error that was foreseen, 130 after Ctrl-C.
 
     An error that nobody foresaw is raised: its traceback is what helps to mend it.
+
+    Args:
+        command: what to run.
+        arguments: of it; those of this process if left out.
+        name: what it was started as.
     """
     meta: dict[str, object] = {}
     try:
         arguments = list(sys.argv[1:] if arguments is None else arguments)
-        with group.make_context("lightpage", arguments) as ctx:
+        with command.make_context(name, arguments) as ctx:
             meta = ctx.meta
-            group.invoke(ctx)
+            command.invoke(ctx)
     except click.exceptions.Exit as end:
         return end.exit_code
     except click.ClickException as error:

@@ -38,7 +38,7 @@ from train.loss import von_mises_nll
 from train.network import Refiner, SymbolUNet
 from train.parts import turned
 from train.processes import process_number
-from train.provenance import provenance
+from train.provenance import provenance_of
 
 CHECKPOINTS = "checkpoints"
 """Folder of a run's checkpoints."""
@@ -277,7 +277,7 @@ class Fitted(Generic[M]):
     def save(self, run: Path) -> None:
         """Keep it in the folder of its run, weights first: what is said to be finished is whole."""
         replace_file(run / FITTED_WEIGHTS, partial(torch.save, self.module.network.state_dict()), "weights")
-        kept = {"validation_air": self.validation_air, "seconds": self.seconds, "made_by": provenance()}
+        kept = {"validation_air": self.validation_air, "seconds": self.seconds, "made_by": provenance_of(run)}
         kept["curves"] = self.curves
         replace_text(run / FITTED, json.dumps(kept, indent=1) + "\n", "result of a training")
 
@@ -403,6 +403,7 @@ def fit(
     """
     if (before := finished(run, module)) is not None:
         return before
+    provenance_of(run)  # notes who begins it
     folder = run / CHECKPOINTS
     last = folder / _LAST
     best = ModelCheckpoint(folder, "best", monitor="val_air", mode="max")

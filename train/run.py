@@ -37,7 +37,8 @@ REFERENCES = "references.npz"
 GOLDEN = "golden.npz"
 FORMAT = 8
 """Of what a run keeps while it is made: raised when features, network or checkpoints of an earlier version would not go
-together with those of this one, or when the simulator's light changes, or which pages the comparison trains on."""
+together with those of this one, or when the simulator's light changes (as `optics.simulator.LIGHT` is then), or which
+pages the comparison trains on."""
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class Calibration(Table):
         coherence_before, coherence_after: of the known pages at nominal and at fitted geometry, 0 to 1.
         cost: mean squared normalised residual of the fit, about 1 when the twin explains the measurements.
         significant: share of the measured patches that were found, 0 to 1.
-        pages_used: known pages that were fitted on.
+        pages_used: known pages that were fitted on or judged by.
         calibrated_pages: their SHA-256 (`optics.recording.hash_frames`), so that no figure counts them as held out.
         parameters: fitted value of every parameter of `optics.registration.parameters`, in the unit of its name.
         deviations: their standard deviations, same names and units.

@@ -16,7 +16,7 @@ from optics.device import Device, load_device
 from optics.errors import InvalidInputError, ProfileError, RecordingError
 from optics.profile import Camera, PageLayout, load_profile
 from optics.recording import FramePair, Recording, RecordingWriter
-from optics.simulator import SimulatedPage, Simulator
+from optics.simulator import LIGHT, SimulatedPage, Simulator
 
 PAGES = 3
 
@@ -125,6 +125,10 @@ def test_pages_of_another_device_are_not_mixed_in(
         run(profile_file, out, *other)
     with pytest.raises(InvalidInputError, match="pages begun with other settings"):
         run(profile_file, out, "--no-truth")
+    with monkeypatch.context() as patch:
+        patch.setattr(optics.recording_job, "LIGHT", LIGHT + 1)
+        with pytest.raises(InvalidInputError, match="pages begun with other settings"):
+            run(profile_file, out)
     run(profile_file, out, *other, "--force", pages=1)
     with h5py.File(out) as file:
         assert "pipe_angle_deg = 0.5" in file["truth"].attrs["device"]

@@ -27,6 +27,12 @@ def test_a_name_with_quotes_and_backslashes_survives_the_round_trip() -> None:
     assert parse_profile(profile.to_toml()) == profile
 
 
+@pytest.mark.parametrize("name", ["two\nlines", "tab\t", "delete\x7f", "bell\x07", "Ger\u00e4t \U0001f4bd"])
+def test_a_name_of_any_characters_survives_it_too(name: str) -> None:
+    profile = load_profile("bench").model_copy(update={"name": name})
+    assert parse_profile(profile.to_toml()) == profile
+
+
 def test_bench_is_the_paper_device_at_a_quarter_of_its_size() -> None:
     bench, paper = load_profile("bench"), load_profile("paper")
     for pair in (

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import click
@@ -27,10 +27,11 @@ from optics.registration.calibration import Calibration, load_calibration
 from tests.conftest import SMALL_PAGES
 from tests.optics.small import small_profile
 from train import cli_train
+from train import provenance as origin
 from train.cli_train import _own_pilots, train
 from train.curves import curves_of
 from train.feature_store import FeatureStore
-from train.provenance import provenance
+from train.provenance import provenance, provenance_of
 from train.run import FORMAT, begin, sole_writer
 
 SECONDS = 120
@@ -315,8 +316,32 @@ def test_what_differs_is_named_and_not_the_whole_of_it(tmp_path: Path) -> None:
         begin(tmp_path, {"device": {"sensor": {"full_well_e": 64, "noise": 1}}})
 
 
+@pytest.fixture
+def asked_anew() -> Iterator[None]:
+    """The commit is asked for again in this test, and in those after it."""
+    origin._commit.cache_clear()
+    yield
+    origin._commit.cache_clear()
+
+
+@pytest.mark.usefixtures("asked_anew")
 def test_without_git_there_is_no_commit_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
+    assert provenance()["commit"] == ""
+
+
+@pytest.mark.usefixtures("asked_anew")
+def test_what_a_training_is_of_is_what_was_there_when_it_began(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = {"rev-parse": f"{Path(origin.__file__).parents[1]}\nabc", "status": ""}
+    monkeypatch.setattr(origin, "_git", lambda tree, command, *options: said[command])
+    first = provenance_of(tmp_path)
+    assert first["commit"] == "abc"
+    said |= {"rev-parse": said["rev-parse"] + "d", "status": " M train/fitting.py"}
+    assert provenance_of(tmp_path) == first  # another commit while it works
+    origin._commit.cache_clear()  # another process goes on with it
+    assert provenance_of(tmp_path) == first | {"commit": f"abcd{origin.CHANGED}", "begun_at_commit": "abc"}
+    said["rev-parse"] = "/elsewhere\nabc"
+    origin._commit.cache_clear()
     assert provenance()["commit"] == ""
 
 

@@ -34,7 +34,7 @@ def published_choices(localizer: str, profile: Profile, pages: int, batch: int |
     batch = PublishedChoices.batch if batch is None else batch
     steps = EPOCHS[samples] * -(-pages // batch)
     decay = PublishedChoices.decay if samples == 4 else 1.0
-    lens = None if localizer != "ray" or profile.ideal_lenses else lens_of(profile.lens.focal_length_m)
+    lens = lens_of(profile) if localizer == "ray" else None
     return PublishedChoices(steps=steps, batch=batch, decay=decay, lenses=lens.name if lens else PARAXIAL)
 
 

@@ -44,12 +44,10 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
     true = Device().geometry.pipe_angle_deg
     rows: list[Row] = []
     for case, result in zip(cases, results, strict=True):
-        fitted = float(result["angles"][-1, 1]) if len(result["angles"]) else float("nan")
         reference = "matched" if case["matched"] else "nearly flat"
         locked = first_step(result["training_curve"])
-        rows.append(
-            (case["localizer"], reference, fitted, true, locked, result["air"], result["own_mi"], result["steps"])
-        )
+        reached = (result[name] for name in ("air", "own_mi", "steps"))
+        rows.append((case["localizer"], reference, result["angle_deg"], true, locked, *reached))
     return rows
 
 

@@ -13,7 +13,7 @@ from optics.profile import load_profile
 from optics.progress import percent_bar
 from train.run import begin, sole_writer
 from train.studies import STUDIES
-from train.studies.study import Settings, aligned, measured
+from train.studies.study import RESULTS, Settings, aligned, measured
 
 _FULL = "paper"
 _RESULTS = "results"
@@ -69,7 +69,7 @@ def study(
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
     settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed, share, channels)
     context.with_resource(sole_writer(out))
-    begin(out, {"study": name, **settings.key()})
+    begin(out, {"study": name, "results": RESULTS, **settings.key(), **chosen.depends_on(settings)})
     results_folder = out / _RESULTS
     results_folder.mkdir(exist_ok=True)
     cases, results = chosen.cases(settings), []

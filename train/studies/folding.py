@@ -100,7 +100,8 @@ def _kept(profile: Profile, picture: Real, angle_deg: float) -> float:
     half = torch.tensor([profile.page_width_m, profile.page_height_m], dtype=torch.float64) / 2
     points = (places * half).reshape(-1, 2)
     traced = tracer_for(profile)(points, torch.deg2rad(torch.tensor(angle_deg, dtype=torch.float64)))
-    return float((torch.linalg.norm(traced.places - points, dim=1) < profile.symbol_pitch_m).double().mean())
+    stays = torch.linalg.norm(traced.places - points, dim=1) < profile.symbol_pitch_m
+    return float((stays & traced.valid).double().mean())
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:

@@ -23,9 +23,8 @@ def needed_width_m(profile: Profile, symbol_size_px: int) -> float:
 
 
 def apertures(profile: Profile) -> tuple[float, float]:
-    """Numerical aperture of the page's corner, and the largest that silica in air reflects totally."""
-    page = math.sin(math.atan(profile.corner_m / profile.lens.focal_length_m))
-    return page, math.sqrt(max(0.0, profile.pipe.refractive_index**2 - 1))
+    """Numerical aperture of the page's corner (sine condition), and the largest that the pipe reflects totally."""
+    return profile.corner_m / profile.lens.focal_length_m, math.sqrt(max(0.0, profile.pipe.refractive_index**2 - 1))
 
 
 def _cases(settings: Settings) -> list[Case]:
@@ -35,12 +34,10 @@ def _cases(settings: Settings) -> list[Case]:
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
     profile, size = settings.profile, case["size"]
     page, pipe = apertures(profile)
-    columns, rows = (
-        round(extent / (size * profile.slm.pitch_m)) for extent in (profile.page_width_m, profile.page_height_m)
-    )
+    cut = profile.with_symbols_of(size).page
     needed = needed_width_m(profile, size)
     return {
-        "symbols": columns * rows,
+        "symbols": cut.columns * cut.rows,
         "needed_mm": needed * 1e3,
         "width_mm": profile.pipe.width_m * 1e3,
         "page_aperture": page,

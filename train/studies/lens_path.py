@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from optics.lens_path import SeidelTerms
-from optics.lenses import LENSES, LensPrescription, lens_of
+from optics.lenses import LENSES, LensPrescription, lens_of_length
 from optics.profile import LensPath, Profile
 from optics.progress import Progress
 from train.published.rays import launched_path
@@ -51,7 +51,8 @@ def fitted_path(profile: Profile, lens: LensPrescription, seed: int = 0) -> Fitt
     ]
     columns = np.stack([*(_path(one, field, facet) for one in terms), np.ones(_RAYS)], axis=1)
     found = np.linalg.lstsq(columns, beyond, rcond=None)[0]
-    path = LensPath(**dict(zip(LensPath.model_fields, map(float, found), strict=False)))
+    terms_rad: dict[str, Any] = dict(zip(LensPath.model_fields, map(float, found), strict=False))
+    path = LensPath.model_construct(**terms_rad)  # unchecked: it may be more than a profile may state
     return FittedPath(path, float(beyond.std()), float((beyond - columns @ found).std()))
 
 
@@ -72,7 +73,7 @@ def _path(terms: SeidelTerms, field: Real, facet: Real) -> Real:
 
 
 def _cases(settings: Settings) -> list[Case]:
-    lens = lens_of(settings.profile.lens.focal_length_m)
+    lens = lens_of_length(settings.profile.lens.focal_length_m)
     return [{"name": lens.name if lens else "ideal"}]
 
 

@@ -25,8 +25,8 @@ _DRAWN = 9
 
 
 def tracer_for(profile: Profile) -> RayTracer:
-    """A tracer through the prescription that the profile's focal length suggests, or through ideal lenses."""
-    return RayTracer(profile, lens_of(profile.lens.focal_length_m))
+    """A tracer through the prescription of the profile's lenses, or through ideal ones."""
+    return RayTracer(profile, lens_of(profile))
 
 
 def _cases(settings: Settings) -> list[Case]:
@@ -71,12 +71,15 @@ def shared_with_others(places: NDArray[np.float64], zones: NDArray[np.int64], ce
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
     rows: list[Row] = []
     for case, result in zip(cases, results, strict=True):
-        zones, places = result["reflections"].reshape(-1, 2), result["places"].reshape(-1, 2)
-        step = float(np.ptp(result["places"][..., 0])) / result["places"].shape[1]
+        there = result["valid"].ravel()
+        zones, places = (result[name].reshape(-1, 2)[there] for name in ("reflections", "places"))
+        step = float(np.ptp(places[:, 0])) / result["places"].shape[1]
         shared = shared_with_others(places, zones, 2 * step)
         for x, y in np.unique(zones, axis=0):
             chosen = (zones == (x, y)).all(1)
-            rows.append((f"{case['angle_deg']:g}", int(x), int(y), float(chosen.mean()), float(shared[chosen].mean())))
+            share = float(chosen.sum() / len(there))
+            rows.append((f"{case['angle_deg']:g}", int(x), int(y), share, float(shared[chosen].mean())))
+        rows.append((f"{case['angle_deg']:g}", "lost", "", float(1 - there.mean()), float("nan")))
     return rows
 
 
@@ -93,7 +96,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
             axis.set_ylabel(f"{'xy'[component]}, mm")
             axis.set_title(f"{case['angle_deg']:g} degree: rays in {'xy'[component]}-z")
         for axis, component in ((row[2], 0), (row[3], 1)):
-            places = result["places"] * 1e3
+            places = np.where(result["valid"][..., None], result["places"] * 1e3, np.nan)
             axis.scatter(places[..., 0], places[..., 1], c=page[..., component], s=2, cmap="viridis")
             axis.set_aspect("equal")
             axis.invert_yaxis()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -26,8 +27,11 @@ from train.twin import RayTwin, TorchTwin
 
 _ENLARGED = (1, 2, 4, 8)
 """Linear sizes over the profile's: with bench, 5,000 to 312,000 symbols."""
+_MOST_SYMBOLS = 400_000
+"""Of the largest page."""
 _MOST_BYTES = 4 << 30
-"""A transmission matrix beyond that is not made but extrapolated."""
+"""A transmission matrix beyond that is not made: its time is extrapolated from one of that size."""
+_ENTRY_BYTES = 8
 _REPEATS = 3
 METHODS = ("matrix", "modes", "coherent")
 _EXPECTED = {"matrix": 2.0, "modes": 1.5, "coherent": 1.0}
@@ -59,10 +63,10 @@ def enlarged(profile: Profile, factor: int) -> Profile:
 
 
 def _matrix(profile: Profile) -> tuple[Callable[[], object], int]:
-    count = profile.page.columns * profile.page.rows
+    count = min(_symbols(profile), math.isqrt(_MOST_BYTES // _ENTRY_BYTES))
     matrix = torch.zeros(count, count, dtype=torch.complex64)
     light = torch.randn(count, dtype=torch.complex64)
-    return lambda: matrix @ light, matrix.nbytes
+    return lambda: matrix @ light, _ENTRY_BYTES * _symbols(profile) ** 2
 
 
 def _modes(profile: Profile) -> tuple[Callable[[], object], int]:
@@ -90,6 +94,10 @@ def _coherent(profile: Profile) -> tuple[Callable[[], object], int]:
     return decode, _bytes((*tensors.values(), *network.parameters()))
 
 
+def _symbols(profile: Profile) -> int:
+    return profile.page.columns * profile.page.rows
+
+
 def _bytes(tensors: Iterable[Tensor]) -> int:
     return sum(tensor.nbytes for tensor in tensors)
 
@@ -98,7 +106,9 @@ _MAKERS = {"matrix": _matrix, "modes": _modes, "coherent": _coherent}
 
 
 def _cases(settings: Settings) -> list[Case]:
-    factors = _ENLARGED[:2] if settings.quick else _ENLARGED
+    factors = [factor for factor in _ENLARGED if factor**2 * _symbols(settings.profile) <= _MOST_SYMBOLS] or [1]
+    if settings.quick:
+        factors = factors[:2]
     return [
         {"name": f"{method}-{factor}", "method": method, "factor": factor} for method in METHODS for factor in factors
     ]
@@ -106,9 +116,6 @@ def _cases(settings: Settings) -> list[Case]:
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
     profile = enlarged(settings.profile, case["factor"])
-    count = profile.page.columns * profile.page.rows
-    if case["method"] == "matrix" and 8 * count**2 > _MOST_BYTES:
-        return {"symbols": count, "seconds": None, "bytes": 8 * count**2}
     progress("prepare", 0.0)
     with torch.inference_mode():
         run, size = _MAKERS[case["method"]](profile)
@@ -119,33 +126,28 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
             start = time.perf_counter()
             run()
             seconds.append(time.perf_counter() - start)
-    return {"symbols": count, "seconds": min(seconds), "bytes": size}
+    larger = max(1.0, size / _MOST_BYTES) if case["method"] == "matrix" else 1.0
+    return {
+        "symbols": _symbols(profile),
+        "seconds": larger * min(seconds),
+        "bytes": size,
+        "how": "measured" if larger == 1 else "extrapolated",
+    }
 
 
-def _series(
-    cases: Sequence[Case], results: Sequence[Result], method: str
-) -> tuple[list[Result], list[float], list[bool]]:
-    """Results of a method, seconds, and whether they were measured: what does not fit goes on as its power says."""
-    chosen = [result for case, result in zip(cases, results, strict=True) if case["method"] == method]
-    last = next(result for result in reversed(chosen) if result["seconds"] is not None)
-    seconds = [
-        last["seconds"] * (result["symbols"] / last["symbols"]) ** _EXPECTED[method]
-        if result["seconds"] is None
-        else result["seconds"]
-        for result in chosen
-    ]
-    return chosen, seconds, [result["seconds"] is not None for result in chosen]
+def _of(method: str, cases: Sequence[Case], results: Sequence[Result]) -> list[Result]:
+    return [result for case, result in zip(cases, results, strict=True) if case["method"] == method]
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
     rows: list[Row] = []
     for method in METHODS:
-        chosen, seconds, measured = _series(cases, results, method)
-        first = seconds[0] / chosen[0]["symbols"]
-        for result, taken, real in zip(chosen, seconds, measured, strict=True):
-            each = taken / result["symbols"]
-            how = "measured" if real else "extrapolated"
-            rows.append((method, result["symbols"], taken, 1e6 * each, each / first, result["bytes"] / 1e6, how))
+        chosen = _of(method, cases, results)
+        first = chosen[0]["seconds"] / chosen[0]["symbols"]
+        for result in chosen:
+            taken, each = result["seconds"], result["seconds"] / result["symbols"]
+            size, how = result["bytes"] / 1e6, result["how"]
+            rows.append((method, result["symbols"], taken, 1e6 * each, each / first, size, how))
     return rows
 
 
@@ -153,13 +155,13 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     time_axis, memory_axis = figure.subplots(1, 2)
     for method, colour in zip(METHODS, ("tab:red", "tab:orange", "tab:blue"), strict=True):
-        chosen, seconds, measured = _series(cases, results, method)
-        symbols = [result["symbols"] for result in chosen]
+        chosen = _of(method, cases, results)
+        symbols, seconds = ([result[name] for result in chosen] for name in ("symbols", "seconds"))
         label = f"{method}: {_TIMED[method]}; power {_EXPECTED[method]:g} expected"
         time_axis.loglog(symbols, seconds, color=colour, label=label)
         for axis, values in ((time_axis, seconds), (memory_axis, [result["bytes"] / 1e6 for result in chosen])):
-            for x, y, real in zip(symbols, values, measured, strict=True):
-                axis.plot(x, y, "o", color=colour, fillstyle="full" if real else "none")
+            for x, y, result in zip(symbols, values, chosen, strict=True):
+                axis.plot(x, y, "o", color=colour, fillstyle="full" if result["how"] == "measured" else "none")
         memory_axis.loglog(symbols, [result["bytes"] / 1e6 for result in chosen], color=colour, label=method)
     time_axis.set_ylabel("seconds a page, in torch (open: extrapolated)")
     memory_axis.set_ylabel("what the decoder holds of the device, MB")

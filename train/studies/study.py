@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ from optics.profile import Profile
 from optics.progress import Progress
 from train.published.training import PublishedChoices
 
+RESULTS = 2
+"""Raised when results that were kept by an earlier version do not go together with those of this one."""
 Case = Mapping[str, Any]
 """What is varied, by name; `name` tells it from the others and names its files."""
 Result = Mapping[str, Any]
@@ -59,6 +61,7 @@ class Study:
         rows: of the table, from cases and results.
         plot: a picture of all results.
         trains: whether it trains networks, which takes hours without a GPU at full scale.
+        depends_on: what its results depend on beside the settings, by name, as JSON keeps it.
     """
 
     title: str
@@ -69,6 +72,7 @@ class Study:
     rows: Callable[[Sequence[Case], Sequence[Result]], list[Row]]
     plot: Callable[[Settings, Sequence[Case], Sequence[Result]], Figure]
     trains: bool = False
+    depends_on: Callable[[Settings], dict[str, Any]] = field(default=lambda settings: {})
 
 
 def measured(study: Study, settings: Settings, case: Case, folder: Path, progress: Progress) -> Result:

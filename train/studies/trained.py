@@ -80,7 +80,8 @@ def trained(
     Returns:
         air, own_mi: bits per data symbol; air_kB, own_mi_kB a page; ece; steps; the maps air_map, own_mi_map and
         error_map (mean magnitude of the phase error, radians), [ny, nx], NaN at pilots; training_curve and
-        validation_curve (AIR) and angles (pipe angle, degrees), [points, 2], step first. With classes, air_map,
+        validation_curve (AIR) and angles (pipe angle, degrees), [points, 2], step first; angle_deg of the decoder that
+        is judged, not a number where it has none. With classes, air_map,
         own_mi_map and ece are those of its beliefs in classes, and air_of_p is that of p.
     """
     profile, device, levels = light.profile, light.device, light.levels
@@ -114,6 +115,7 @@ def trained(
         if classes:
             of_classes = _of_classes(fitted.module, validation, unseen, mask)
             figures = {"air_of_p": _mean(figures["air_map"])} | figures | of_classes
+    angle = getattr(fitted.module.network.localizer, "angle", None)
     air, own, data = _mean(figures["air_map"]), _mean(figures["own_mi_map"]), int((~mask).sum())
     return {
         "air": air,
@@ -121,6 +123,7 @@ def trained(
         "air_kB": air * data / 8000,
         "own_mi_kB": own * data / 8000,
         "steps": choices.steps,
+        "angle_deg": float("nan") if angle is None else math.degrees(angle.item()),
         **figures,
         **_curves(work),
     }

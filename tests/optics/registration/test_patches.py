@@ -23,20 +23,12 @@ from optics.registration.patches import (
 from tests.optics.registration.flat_twin import FlatTwin, Picture
 from tests.optics.small import random_phases, small_profile
 
-
-def with_symbols_of(size_px: int, profile: Profile) -> Profile:
-    """The same page, cut into symbols of another size."""
-    page, ratio = profile.page, profile.page.symbol_size_px / size_px
-    cut = {"symbol_size_px": size_px, "columns": int(page.columns * ratio), "rows": int(page.rows * ratio)}
-    return profile.model_copy(update={"page": page.model_copy(update=cut)})
-
-
 PROFILE = small_profile()
 SYMBOLS = np.exp(1j * random_phases(PROFILE, 1))
 PITCH = PROFILE.symbol_pitch_m
 PIXEL = PROFILE.camera.pitch_m
 MIDDLE = patches(PROFILE)[5]
-FINE = with_symbols_of(2, PROFILE)
+FINE = PROFILE.with_symbols_of(2)
 FINE_SYMBOLS = np.exp(1j * random_phases(FINE, 1))
 
 
@@ -57,7 +49,7 @@ def look(
 class TestCutting:
     @pytest.mark.parametrize("size_px", [1, 2, 4, 16])
     def test_patches_cover_the_page_once(self, size_px: int) -> None:
-        profile = with_symbols_of(size_px, PROFILE)
+        profile = PROFILE.with_symbols_of(size_px)
         seen = np.zeros(profile.page_shape, int)
         for patch in patches(profile):
             seen[patch.rows, patch.columns] += 1
@@ -73,7 +65,7 @@ class TestCutting:
 
     @pytest.mark.parametrize(("size_px", "edge"), [(1, 40), (2, 20), (4, 10), (16, 10)])
     def test_they_hold_enough_symbols_and_enough_light(self, size_px: int, edge: int) -> None:
-        profile = with_symbols_of(size_px, load_profile("paper"))
+        profile = load_profile("paper").with_symbols_of(size_px)
         assert patch_edge(profile) == edge
         for patch in patches(profile):
             assert 0.8 * edge <= patch.rows.stop - patch.rows.start <= 1.2 * edge

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,13 +17,14 @@ from PIL import Image
 from torch.nn import functional
 
 from optics.device import Device
-from optics.errors import InvalidInputError
+from optics.errors import InvalidInputError, LightpageError, ProfileError
 from optics.lenses import LENSES
 from optics.profile import load_profile
 from optics.recording_job import RecordingJob
 from optics.simulator import TrueOptics
 from tests.optics.small import small_profile
 from train.published.training import PublishedChoices
+from train.run import begin
 from train.studies import (
     STUDIES,
     angle,
@@ -37,7 +40,7 @@ from train.studies import (
     symbol_size,
 )
 from train.studies.cli_study import study
-from train.studies.study import Settings, aligned, measured
+from train.studies.study import RESULTS, Settings, aligned, measured
 from train.studies.trained import _of_classes, chosen
 
 SMALL = small_profile()
@@ -59,9 +62,11 @@ def test_each_makes_a_table_and_a_picture_and_is_gone_on_with(name: str, tmp_pat
     assert str(written["header"][0]) in printed
     assert STUDIES[name].title in (out / "table.txt").read_text()
     with Image.open(out / "figure.png") as figure:
-        pixels = np.asarray(figure.convert("L"))
-    assert min(pixels.shape) > 200
-    assert pixels.std() > 5  # something is drawn
+        assert min(figure.size) > 200
+    settings = Settings(SMALL, quick=True)
+    cases = STUDIES[name].cases(settings)
+    results = [measured(STUDIES[name], settings, case, out / "results", lambda what, share: None) for case in cases]
+    assert all(axes.has_data() for axes in STUDIES[name].plot(settings, cases, results).axes)
     before = {path: path.stat().st_mtime_ns for path in (out / "results").iterdir()}
     run(*arguments)
     assert {path: path.stat().st_mtime_ns for path in (out / "results").iterdir()} == before
@@ -137,7 +142,8 @@ def test_a_square_pipe_lays_no_zone_on_another_and_a_sheared_one_does() -> None:
     for case in rays.STUDY.cases(settings):
         result = rays.STUDY.measure(settings, case, Path(), lambda what, share: None)
         for _, x, y, _, share in rays.STUDY.rows([case], [result]):
-            shared[case["angle_deg"], x, y] = share
+            if x != "lost":
+                shared[case["angle_deg"], x, y] = share
     assert max(share for (angle, _, _), share in shared.items() if angle == 0) == 0
     # the diagonal zones suffer most
     sheared = {zone: share for (angle, *zone_), share in shared.items() if angle != 0 for zone in [tuple(zone_)]}
@@ -191,6 +197,53 @@ def test_a_turned_pipe_costs_the_shipped_decoder_some_of_its_rate(tmp_path: Path
     assert 0.5 * rates[0] < rates[1] < rates[0] - 0.02
 
 
+def test_pages_that_are_refused_under_a_drift_carry_nothing() -> None:
+    evaluation = {"air_bits_per_symbol": 6.0, "pages": 3, "refused_pages": [{"page": 1}]}
+    assert drift.air_of_all_pages(evaluation) == 4.5
+
+
+def test_a_bundle_that_cannot_be_measured_is_told_and_no_earlier_figure_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Settings(load_profile("bench"), quick=True)
+    (tmp_path / "E.json").write_text(json.dumps({"air_bits_per_symbol": 6.5, "pages": 1, "refused_pages": []}))
+
+    def refused(command: list[str], **options: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess(command, 0 if "simulate" in command else 2, "", "error: bundle: damaged")
+
+    monkeypatch.setattr(drift.subprocess, "run", refused)
+    with pytest.raises(LightpageError, match="bundle: damaged"):
+        drift.STUDY.measure(settings, drift.STUDY.cases(settings)[1], tmp_path, lambda what, share: None)
+
+
+def test_a_study_of_the_shipped_bundle_does_not_go_on_with_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin(tmp_path, {"study": "drift", "results": RESULTS, **Settings(load_profile("bench")).key(), "bundle": "of old"})
+    with pytest.raises(InvalidInputError, match=r"bundle: got .*'of old', with which it was begun"):
+        run("drift", "--out", str(tmp_path))
+
+
+def test_rays_that_are_lost_count_in_no_zone(tmp_path: Path) -> None:
+    loses = SMALL.model_copy(update={"pipe": SMALL.pipe.model_copy(update={"refractive_index": 1.003})})
+    settings = Settings(loses, quick=True)
+    cases = rays.STUDY.cases(settings)
+    results = [rays.STUDY.measure(settings, case, tmp_path, lambda what, share: None) for case in cases]
+    for case, result in zip(cases, results, strict=True):
+        rows = [row for row in rays.STUDY.rows(cases, results) if row[0] == f"{case['angle_deg']:g}"]
+        lost = float(1 - result["valid"].mean())
+        assert lost > 0.005
+        assert (rows[-1][1], rows[-1][3]) == ("lost", pytest.approx(lost))
+        assert sum(row[3] for row in rows) == pytest.approx(1)
+
+
+def test_symbols_of_another_size_are_counted_whole(tmp_path: Path) -> None:
+    settings, study = Settings(load_profile("bench")), imaging_condition.STUDY
+    results = [study.measure(settings, case, tmp_path, lambda what, share: None) for case in study.cases(settings)]
+    # 348 x 224 modulator pixels
+    assert [result["symbols"] for result in results] == [348 * 224, 174 * 112, 87 * 56, 43 * 28, 21 * 14]
+
+
 def test_an_enlarged_device_has_the_same_zones() -> None:
     bench, large = load_profile("bench"), scaling.enlarged(load_profile("bench"), 2)
     assert large.page.columns * large.page.rows == 4 * bench.page.columns * bench.page.rows
@@ -198,15 +251,26 @@ def test_an_enlarged_device_has_the_same_zones() -> None:
     assert ratio[0] == pytest.approx(ratio[1])
 
 
-def test_a_matrix_that_does_not_fit_is_extrapolated_and_says_so() -> None:
-    cases = [{"name": str(n), "method": "matrix", "factor": n} for n in (1, 2)]
-    results = [{"symbols": 100, "seconds": 1.0, "bytes": 80_000}, {"symbols": 400, "seconds": None, "bytes": 1_280_000}]
-    others = [{"name": m, "method": m, "factor": 1} for m in ("modes", "coherent")]
-    other_results = [{"symbols": 100, "seconds": 1.0, "bytes": 1}] * 2
-    rows = scaling._rows([*cases, *others], [*results, *other_results])
-    assert rows[0][-1] == "measured"
-    assert rows[1][-1] == "extrapolated"
-    assert rows[1][2] == pytest.approx(16.0)
+def test_a_matrix_that_does_not_fit_is_extrapolated_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Settings(SMALL)
+    cases = [case for case in scaling.STUDY.cases(settings) if case["method"] == "matrix"][:2]
+    symbols = SMALL.page.columns * SMALL.page.rows
+    monkeypatch.setattr(scaling, "_MOST_BYTES", 8 * symbols**2)
+    monkeypatch.setattr(scaling.time, "perf_counter", itertools.count().__next__)  # whatever is timed takes a second
+    results = [scaling.STUDY.measure(settings, case, tmp_path, lambda what, share: None) for case in cases]
+    assert [result["how"] for result in results] == ["measured", "extrapolated"]
+    assert [result["seconds"] for result in results] == [1, 16]
+    assert [result["symbols"] for result in results] == [symbols, 4 * symbols]
+
+
+@pytest.mark.parametrize(("name", "largest"), [("bench", 8), ("paper", 2)])
+def test_devices_are_enlarged_to_some_three_hundred_thousand_symbols(name: str, largest: int) -> None:
+    cases = scaling.STUDY.cases(Settings(load_profile(name)))
+    assert max(case["factor"] for case in cases) == largest
+    with pytest.raises(ProfileError, match="lenses 16 times as large"):
+        scaling.enlarged(load_profile("paper"), 16)
 
 
 LIGHTS = {"angle": 2, "symbol-size": 2, "pipe-length": 2, "heads": 1}
@@ -255,6 +319,8 @@ def test_each_that_trains_makes_maps_of_every_case_and_each_light_once(
             assert np.isnan(maps["own_mi_map"]).any()  # pilots carry nothing
             assert len(maps["validation_curve"]) > 1
             assert (len(maps["angles"]) > 0) == (case.get("localizer") == "ray")
+            if len(maps["angles"]):
+                assert result["angle_deg"] == pytest.approx(maps["angles"][-1, 1], abs=0.01)
 
 
 def test_beliefs_in_classes_are_made_honest_before_they_are_judged() -> None:
