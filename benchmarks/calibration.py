@@ -2,6 +2,7 @@
 
     python -m benchmarks.calibration --devices 20 --first-seed 1000 --pages 2 --json F
     python -m benchmarks.calibration --devices 3 --foreign --json F
+    python -m benchmarks.calibration --symbol-size 2 --devices 3 --json F
 
 The coherence of the calibrated geometry is put in ratio to that of the true one (the oracle), fields recovered with
 the true cameras and turn, the image's drift included. The cameras' relation is how far the quadrature camera is placed
@@ -221,14 +222,31 @@ def load(path: Path, settings: dict[str, object]) -> dict[int, Outcome]:
 
 @click.command()
 @click.option("--profile", "profile_name", default="bench", show_default=True)
+@click.option(
+    "--symbol-size", type=click.IntRange(1, 64), help="Edge of a symbol, modulator pixels.  [default: the profile's]"
+)
 @click.option("--devices", default=20, show_default=True, type=click.IntRange(1))
 @click.option("--first-seed", default=1000, show_default=True, type=click.IntRange(0))
 @click.option("--pages", default=2, show_default=True, type=click.IntRange(1, 4), help="Known pages a device.")
 @click.option("--foreign", is_flag=True, help="Devices of the other simulator.")
 @click.option("--json", "json_path", required=True, type=OutputFile())
-def main(profile_name: str, devices: int, first_seed: int, pages: int, foreign: bool, json_path: Path) -> None:
+def main(
+    profile_name: str,
+    symbol_size: int | None,
+    devices: int,
+    first_seed: int,
+    pages: int,
+    foreign: bool,
+    json_path: Path,
+) -> None:
     """Calibrate drawn devices and compare with the truth."""
     profile = load_profile(profile_name)
+    if symbol_size is not None:
+        if foreign:
+            raise InvalidInputError(
+                "--symbol-size", f"{symbol_size} with --foreign", "one of them: its pages are its own"
+            )
+        profile = profile.with_symbols_of(symbol_size)
     settings: dict[str, object] = {"format": FORMAT, "pages": pages, "foreign": foreign}
     settings |= {"profile": profile_name, "profile_sha256": hashlib.sha256(profile.to_toml().encode()).hexdigest()}
     done = {seed: o for seed, o in load(json_path, settings).items() if o.failure is None}
