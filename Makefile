@@ -57,8 +57,12 @@ bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: th
 	    --levels 4 --levels 8 --levels 16 --out runs/bench-decoders/dim
 	$(COMPARE) --angle -0.6 --symbol-size 2 --pages 130 --steps 4000 --published-steps 1125 --arm mode --arm coherent \
 	    --arm refined --arm oracle --out runs/bench-decoders/small-symbols
+	$(COMPARE) --angle -0.6 --exposure 0.13 --symbol-size 2 --pages 130 --steps 3000 --arm coherent --arm refined \
+	    --arm oracle --out runs/bench-decoders/dim-small-symbols
 	$(COMPARE) --profile paper --angle -0.6 --angle 0 --pages 20 --steps 4000 --arm coherent --arm refined --arm oracle \
 	    --out runs/bench-decoders/full-size
+	$(COMPARE) --profile paper --angle -0.6 --symbol-size 2 --pages 12 --steps 4000 --arm coherent --arm refined \
+	    --arm oracle --out runs/bench-decoders/full-size-small-symbols
 
 # Exposures of 1 and 0.13: bright light, and about the dimmest in which two known pages still calibrate the device.
 train-decoders: $(STAMP)  ## every decoder in every light, trained as its authors did: days on two cores, resumed when run again
