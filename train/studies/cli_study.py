@@ -69,7 +69,7 @@ def study(
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
     settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed, share, channels)
     context.with_resource(sole_writer(out))
-    begin(out, {"study": name, "results": RESULTS, **settings.key(), **chosen.depends_on(settings)})
+    begin(out, {"study": name, "results": RESULTS, **settings.key()})
     results_folder = out / _RESULTS
     results_folder.mkdir(exist_ok=True)
     cases, results = chosen.cases(settings), []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import subprocess
 import sys
@@ -17,11 +16,10 @@ from scipy import ndimage, signal
 
 from optics.cameras import expose, resample
 from optics.device import Device
-from optics.errors import LightpageError
+from optics.errors import InvalidInputError, LightpageError
 from optics.profile import Profile
 from optics.progress import Progress
 from optics.simulator import TrueOptics
-from runtime.shipped import bundle_path
 from train.studies.study import Case, Result, Row, Settings, Study
 
 Real = NDArray[np.float64]
@@ -172,7 +170,8 @@ def _air(settings: Settings, case: Case, work: Path, progress: Progress) -> Resu
             said = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
             raise LightpageError(f"lightpage {name} {' '.join(arguments)}", said, "figures of a drifted device")
     recording.unlink()
-    return {"air": air_of_all_pages(json.loads(figures.read_text()))}
+    found = json.loads(figures.read_text())
+    return {"air": air_of_all_pages(found), "bundle": f"{found['bundle_version']} ({found['bundle']['golden_sha256']})"}
 
 
 def air_of_all_pages(evaluation: Mapping[str, Any]) -> float:
@@ -199,18 +198,16 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
     return _crosshairs(settings, progress) if case["name"] == "crosshairs" else _air(settings, case, work, progress)
 
 
-def _bundle(settings: Settings) -> dict[str, Any]:
-    """The shipped bundle, where it is asked."""
-    if settings.profile.name != _BUNDLED:
-        return {}
-    return {"bundle": hashlib.sha256(bundle_path(_BUNDLED).read_bytes()).hexdigest()}
-
-
 def _shares(cases: Sequence[Case], results: Sequence[Result]) -> dict[str, list[tuple[float, float]]]:
     """Amount and share of the AIR that is left, by what drifts."""
     airs = [(case, result["air"]) for case, result in zip(cases, results, strict=True) if "what" in case]
     if not airs:
         return {}
+    bundles = {result["bundle"] for result in results if "bundle" in result}
+    if len(bundles) > 1:
+        raise InvalidInputError(
+            "results of the study", f"of {', '.join(sorted(bundles))}", "of one bundle: another --out"
+        )
     before = airs[0][1]
     shares: dict[str, list[tuple[float, float]]] = {}
     for case, air in airs[1:]:
@@ -280,5 +277,4 @@ STUDY = Study(
     header=("what drifts", "by", "AIR left", f"recalibrate at ({_KEPT:.0%} left)"),
     rows=_rows,
     plot=_plot,
-    depends_on=_bundle,
 )

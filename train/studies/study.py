@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,6 @@ class Study:
         rows: of the table, from cases and results.
         plot: a picture of all results.
         trains: whether it trains networks, which takes hours without a GPU at full scale.
-        depends_on: what its results depend on beside the settings, by name, as JSON keeps it.
     """
 
     title: str
@@ -72,7 +71,6 @@ class Study:
     rows: Callable[[Sequence[Case], Sequence[Result]], list[Row]]
     plot: Callable[[Settings, Sequence[Case], Sequence[Result]], Figure]
     trains: bool = False
-    depends_on: Callable[[Settings], dict[str, Any]] = field(default=lambda settings: {})
 
 
 def measured(study: Study, settings: Settings, case: Case, folder: Path, progress: Progress) -> Result:

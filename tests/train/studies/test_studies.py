@@ -24,7 +24,6 @@ from optics.recording_job import RecordingJob
 from optics.simulator import TrueOptics
 from tests.optics.small import small_profile
 from train.published.training import PublishedChoices
-from train.run import begin
 from train.studies import (
     STUDIES,
     angle,
@@ -40,7 +39,7 @@ from train.studies import (
     symbol_size,
 )
 from train.studies.cli_study import study
-from train.studies.study import RESULTS, Settings, aligned, measured
+from train.studies.study import Settings, aligned, measured
 from train.studies.trained import _of_classes, chosen
 
 SMALL = small_profile()
@@ -216,12 +215,13 @@ def test_a_bundle_that_cannot_be_measured_is_told_and_no_earlier_figure_taken(
         drift.STUDY.measure(settings, drift.STUDY.cases(settings)[1], tmp_path, lambda what, share: None)
 
 
-def test_a_study_of_the_shipped_bundle_does_not_go_on_with_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begin(tmp_path, {"study": "drift", "results": RESULTS, **Settings(load_profile("bench")).key(), "bundle": "of old"})
-    with pytest.raises(InvalidInputError, match=r"bundle: got .*'of old', with which it was begun"):
-        run("drift", "--out", str(tmp_path))
+def test_figures_of_two_bundles_are_not_put_in_one_table() -> None:
+    cases = drift.STUDY.cases(Settings(load_profile("bench"), quick=True))
+    day = {"measured": np.zeros((4, 2)), "true": np.zeros((4, 2)), "hours": np.linspace(0, 24, 4)}
+    of_one = [day, {"air": 6.0, "bundle": "new"}, {"air": 3.0, "bundle": "new"}]
+    assert drift.STUDY.rows(cases, of_one)[-1][2] == 0.5
+    with pytest.raises(InvalidInputError, match="of new, old, wanted of one bundle"):
+        drift.STUDY.rows(cases, [*of_one[:2], {"air": 3.0, "bundle": "old"}])
 
 
 def test_rays_that_are_lost_count_in_no_zone(tmp_path: Path) -> None:
