@@ -35,7 +35,7 @@ demo: $(STAMP)  ## run the whole main job on a simulated device, into out/demo
 	$(BIN)/lightpage demo --out out/demo
 
 test: lint  ## lint, then every test
-	$(ONE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+	$(ONE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 lint: $(STAMP)  ## ruff, mypy --strict, hadolint
 	$(BIN)/ruff check .

@@ -73,7 +73,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     axis.set_xticks(SIZES_PX, [str(size) for size in SIZES_PX])
     axis.minorticks_off()
     axis.set_xlabel("symbol size, modulator pixels")
-    axis.set_ylabel("width of its first order, mm")
+    axis.set_ylabel("width of its first order at the pipe, mm")
     axis.legend()
     return figure
 

@@ -101,7 +101,8 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
             axis.set_aspect("equal")
             axis.invert_yaxis()
             axis.set_xlabel("x on the camera, mm")
-            axis.set_title(f"where rays land, coloured by {'xy'[component]} on the page")
+            axis.set_ylabel("y on the camera, mm")
+            axis.set_title(f"where they land, by {'xy'[component]} on the page")
     return figure
 
 
