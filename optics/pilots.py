@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import i0e
 
 from optics.errors import PageError
 from optics.page import pilot_mask, pilot_symbols, symbol_phases
@@ -13,6 +14,14 @@ from optics.profile import Profile
 
 _BELIEF = 20.0
 """Pilots that count for the decoder before any is seen: noise of 54 pilots then costs under 0.01 bit a symbol."""
+
+_SPOILT = 0.01
+"""Share of pilots that are expected to say nothing: a dead place of the modulator, a value that was not written."""
+_MOST_SPOILT = 0.05
+"""Where more of them contradict the rest, it is the device that has changed, and all of them count."""
+_ROUNDS = 10
+_MEDIAN_CHI2 = 0.4549
+"""Of the chi-squared distribution with one degree of freedom."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +89,8 @@ def estimate_piston(p: NDArray[np.floating], pilots: Pilots) -> Piston:
     Raises:
         PageError: the page has another shape than the pilots.
     """
-    if p.shape[1:] != pilots.mask.shape:
-        raise PageError("pilot positions", f"shape {pilots.mask.shape}", f"shape {p.shape[1:]}, as the page has")
-    at_pilots = p[0][pilots.mask].astype(np.float64) + 1j * p[1][pilots.mask]
-    total = np.sum(at_pilots * np.exp(-1j * pilots.phases))
-    weight = float(np.abs(at_pilots).sum())
+    errors = _errors(p, pilots)
+    total, weight = np.sum(errors), float(np.abs(errors).sum())
     return Piston(float(np.angle(total)), float(abs(total) / weight) if weight > 0 else 0.0)
 
 
@@ -103,10 +109,54 @@ def estimate_trust(p: NDArray[np.floating], pilots: Pilots, angle_rad: float) ->
 
     Args:
         p: (px, py), [2, ny, nx].
-        pilots: the known symbols of this page.
+        pilots: the known symbols of this page, those left out that are spoilt.
         angle_rad: the page's piston, as `estimate_piston` found it.
+
+    Raises:
+        PageError: the page has another shape than the pilots.
     """
-    x, y = p[0][pilots.mask].astype(np.float64), p[1][pilots.mask].astype(np.float64)
-    told = pilots.phases + angle_rad
-    missed = 2 * float(np.sum(np.hypot(x, y) - x * np.cos(told) - y * np.sin(told)))
-    return min(1.0, (_BELIEF + len(told) - 1) / (_BELIEF + missed))
+    missed = _missed(_errors(p, pilots), angle_rad)
+    return min(1.0, (_BELIEF + len(missed) - 1) / (_BELIEF + float(missed.sum())))
+
+
+def without_spoilt(p: NDArray[np.floating], pilots: Pilots) -> Pilots:
+    """The pilots less those few that contradict all others, as a dead place of the modulator does.
+
+    A pilot is left out where its error is more likely one of any size, `_SPOILT` of all pilots having such, than what
+    the concentration claimed there allows after the others have told how far claims may be believed.
+
+    Args:
+        p: (px, py), [2, ny, nx].
+        pilots: the known symbols of this page.
+
+    Raises:
+        PageError: the page has another shape than the pilots.
+    """
+    errors = _errors(p, pilots)
+    kappa, sound = np.abs(errors), np.ones(len(errors), bool)
+    for turn in range(_ROUNDS):
+        missed = _missed(errors, float(np.angle(errors[sound].sum())))
+        over_claim = float(np.mean(missed[sound]) if turn else np.median(missed) / _MEDIAN_CHI2)
+        trust = 1 / max(1.0, over_claim)
+        odds = np.log((1 - _SPOILT) / _SPOILT) - np.log(i0e(trust * kappa)) - trust * missed / 2
+        before, sound = sound, odds > 0
+        if np.array_equal(before, sound) or not sound.any():
+            break
+    if np.count_nonzero(~sound) > _MOST_SPOILT * len(sound):
+        return pilots
+    mask = pilots.mask.copy()
+    mask[pilots.mask] = sound
+    return Pilots(mask, pilots.phases[sound])
+
+
+def _errors(p: NDArray[np.floating], pilots: Pilots) -> NDArray[np.complex128]:
+    """Beliefs at the pilots, kappa exp(i error), complex [pilots], piston and all."""
+    if p.shape[1:] != pilots.mask.shape:
+        raise PageError("pilot positions", f"shape {pilots.mask.shape}", f"shape {p.shape[1:]}, as the page has")
+    at_pilots = p[0][pilots.mask].astype(np.float64) + 1j * p[1][pilots.mask]
+    return np.asarray(at_pilots * np.exp(-1j * pilots.phases), np.complex128)
+
+
+def _missed(errors: NDArray[np.complex128], angle_rad: float) -> NDArray[np.float64]:
+    """Twice kappa (1 - cos error) of each pilot, less the piston: chi-squared of one degree where claims are true."""
+    return np.asarray(2 * (np.abs(errors) - (errors * np.exp(-1j * angle_rad)).real), np.float64)

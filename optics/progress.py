@@ -1,10 +1,11 @@
-"""A progress bar in per cent, for work that tells of its steps."""
+"""What commands say on their way: a progress bar in per cent, and warnings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import click
 from tqdm import tqdm
 
 Progress = Callable[[str, float], None]
@@ -23,3 +24,8 @@ def percent_bar() -> Iterator[Progress]:
 
         yield progress
         progress("done", 1.0)
+
+
+def warn(what: str) -> None:
+    """Say on stderr what the user should know of work that goes on."""
+    click.echo(f"lightpage: warning: {what}", err=True)

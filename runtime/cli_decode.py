@@ -17,6 +17,7 @@ from optics.files import OutputFile, write_json
 from optics.measures import PageMeasures, measure
 from optics.page import pilot_symbols
 from optics.profile import parse_profile
+from optics.progress import warn
 from optics.recording import Recording
 from runtime.client import LightpageClient
 from runtime.convert import KnownPilots, RemotePage
@@ -80,7 +81,7 @@ def decode(
         write_json(json_path, data)
     click.echo(table(results))
     if doubtful := [result for result in results if result["pilot_coherence"] < LEAST_COHERENCE]:
-        click.echo(warning(doubtful), err=True)
+        warn(unknown_pistons(doubtful))
     if refused:
         raise refusal(thing, refused, count)
 
@@ -101,11 +102,11 @@ def page_report(page: RemotePage) -> dict[str, Any]:
     }
 
 
-def warning(doubtful: list[dict[str, Any]]) -> str:
+def unknown_pistons(doubtful: list[dict[str, Any]]) -> str:
     """What to think of pages whose pilots disagree."""
     pages = ", ".join(f"{result['page']} ({result['pilot_coherence']:.2f})" for result in doubtful)
     return (
-        f"lightpage: warning: pilots agree to less than {LEAST_COHERENCE:g} on page {pages}: the piston is unknown, "
+        f"pilots agree to less than {LEAST_COHERENCE:g} on page {pages}: the piston is unknown, "
         "and all symbols of such a page may be turned by the same amount"
     )
 

@@ -8,6 +8,7 @@ import click
 from tqdm import tqdm
 
 from optics.files import OutputFile, write_json
+from optics.progress import warn
 from optics.recording import Recording
 from runtime.decoder import Decoder
 from runtime.evaluation import Evaluation
@@ -41,7 +42,7 @@ def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int |
         write_json(json_path, result.to_json())
     click.echo(describe(result))
     if result.figures.air_bits_per_symbol <= 0:
-        click.echo(f"lightpage: warning: {_WORTH_NOTHING}", err=True)
+        warn(_WORTH_NOTHING)
     if result.refused:
         raise refusal(f"recording {recording}", result.refused, count)
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import click
 
-from optics.errors import InvalidInputError, RecordingError
+from optics.errors import InvalidInputError
 from optics.files import NewPath, OutputFile, write_json
-from optics.progress import percent_bar
+from optics.progress import percent_bar, warn
 from optics.recording import Recording
+from optics.registration.known import first_lit_pages
 from runtime.client import LightpageClient, Recalibrated
 from runtime.decoder import Decoder
 from runtime.evaluation import check_recording
@@ -98,9 +99,7 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
 def _read(decoder: Decoder, recording: str, pages: int) -> KnownPages:
     with Recording.open(recording) as file:
         check_recording(decoder, file)
-        if file.pages < pages:
-            raise RecordingError(f"recording {recording}", f"{file.pages} pages", f"at least {pages}")
-        return known_pages(file, range(pages))
+        return known_pages(file, first_lit_pages(file, pages, warn))
 
 
 @click.command()

@@ -15,7 +15,7 @@ from optics.errors import BundleError, FrameError, InvalidInputError
 from optics.grid import field_grid
 from optics.measures import decide_with_confidence
 from optics.page import MAX_LEVELS, check_levels
-from optics.pilots import Pilots, estimate_piston, estimate_trust, remove_piston
+from optics.pilots import Pilots, estimate_piston, estimate_trust, remove_piston, without_spoilt
 from optics.profile import Profile
 from optics.recording import FramePair
 from runtime.built_in import GraphFile
@@ -212,7 +212,8 @@ class Decoder:
             raise FrameError(
                 "frame pair",
                 f"frames that contradict each other (residual {residual:.3g})",
-                f"an in-phase and a quadrature frame of one shot, not swapped (residual up to {limit:.3g})",
+                f"an in-phase and a quadrature frame of one shot, not swapped, and cameras where they were calibrated "
+                f"(residual up to {limit:.3g}; where frames are right, recalibrate)",
             )
         return Inference(p, phase, concentration)
 
@@ -280,7 +281,7 @@ class Decoder:
 
     def settle(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
         """Piston, belief and decision: everything behind the graph, timings left at zero."""
-        pilots = pilots or self.pilots(levels)
+        pilots = without_spoilt(inference.p, pilots or self.pilots(levels))
         piston = estimate_piston(inference.p, pilots)
         trust = estimate_trust(inference.p, pilots, piston.angle_rad)
         phase = remove_piston(inference.phase, piston.angle_rad)

@@ -9,15 +9,14 @@ from pathlib import Path
 import click
 import numpy as np
 
-from optics.errors import RecordingError
 from optics.files import OutputFile, write_json
 from optics.profile import Profile, load_profile
-from optics.progress import Progress, percent_bar
+from optics.progress import Progress, percent_bar, warn
 from optics.recording import Recording
 from optics.registration.calibrate import calibrate as register
 from optics.registration.calibration import Calibration
 from optics.registration.coherence import seen_share
-from optics.registration.known import known_pages
+from optics.registration.known import first_lit_pages, known_pages
 from train.field import FieldRecovery, TorchFieldSolver
 from train.twin import RayTwin, TorchTwin
 
@@ -35,11 +34,12 @@ MAX_PAGES = 4
 )
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_path: Path | None) -> None:
-    """Find this device's geometry, from nominal, with the first pages of a recording."""
+    """Find this device's geometry, from nominal, with the first pages of a recording that show light."""
     profile = load_profile(profile_name)
     start = time.perf_counter()
     with Recording.open(recording) as file, percent_bar() as progress:
-        calibration = calibrate_recording(file, profile, range(pages), progress)
+        file.check_against(profile)
+        calibration = calibrate_recording(file, profile, first_lit_pages(file, pages, warn), progress)
     seconds = time.perf_counter() - start
     calibration.save(out)
     lost = int(np.sum(seen_share(TorchTwin(RayTwin(profile)), calibration.vector, profile) < 0.5))
@@ -49,7 +49,7 @@ def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_pa
     if lost:
         total = profile.page.columns * profile.page.rows
         what = f"{lost} of {total} symbols: most of their light misses a camera, so little of them can be read"
-        click.echo(f"lightpage: warning: {what}", err=True)
+        warn(what)
     click.echo(
         f"\ncoherence {calibration.coherence_before:.3f} -> {calibration.coherence_after:.3f}, "
         f"{calibration.pages_used} known pages, {seconds:.0f} s; written to {out}"
@@ -62,15 +62,12 @@ def calibrate_recording(
     """Calibrate from nominal with some pages of a recording.
 
     Raises:
-        RecordingError: no symbols, too few pages, or shapes that are not the profile's.
+        RecordingError: no symbols, no such page, or shapes that are not the profile's.
         CalibrationError: nothing within the capture range explains the frames.
     """
     recording.check_against(profile)
     if others := recording.differences(profile):
-        click.echo(f"lightpage: warning: recording {recording.path} says of its device: {'; '.join(others)}", err=True)
-    if recording.pages <= max(pages):
-        wanted = f"at least {max(pages) + 1} (--pages)"
-        raise RecordingError(f"recording {recording.path}", f"{recording.pages} pages", wanted)
+        warn(f"recording {recording.path} says of its device: {'; '.join(others)}")
     known = known_pages(recording, profile, pages)
     registered = register(
         TorchTwin(RayTwin(profile)),

@@ -10,15 +10,14 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from optics.errors import FrameError, InvalidInputError, RecordingError
+from optics.errors import InvalidInputError, RecordingError
 from optics.files import OutputFile, write_json
-from optics.frames import check_pair_light
 from optics.page import pilot_mask, pilot_symbols, symbol_phases
 from optics.profile import Profile, load_profile
-from optics.progress import percent_bar
+from optics.progress import percent_bar, warn
 from optics.recording import Recording, hash_frames
 from optics.registration.calibration import Calibration, load_calibration
-from optics.registration.known import known_pages
+from optics.registration.known import known_pages, lit_pages
 from train.choices import chosen_recipe, given_choices, with_choices
 from train.cli_calibrate import DEFAULT_PAGES, calibrate_recording
 from train.decoder import LOCALIZERS
@@ -197,16 +196,7 @@ def _tell(run: Run, folder: Path, json_path: Path | None) -> None:
 
 def _usable(recording: Recording) -> dict[int, str]:
     """Hashes of the pages that show light, by page; the others are named and left out."""
-    hashes = {}
-    for page in range(recording.pages):
-        pair = recording.frames(page)
-        try:
-            check_pair_light(f"recording {recording.path}, page {page}, ", pair, recording.bit_depth)
-        except FrameError as error:
-            click.echo(f"lightpage: warning: left out: {error}", err=True)
-        else:
-            hashes[page] = hash_frames(pair)
-    return hashes
+    return {page: hash_frames(pair) for page, pair in lit_pages(recording, warn)}
 
 
 def _symbols_digest(recording: Recording, pages: list[int]) -> str:

@@ -14,7 +14,6 @@ from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, Generic, TypeVar
 
-import click
 import lightning as L
 import numpy as np
 import torch
@@ -31,6 +30,7 @@ from optics.grid import GRID_STEP_PX, FieldGrid, field_grid
 from optics.measures import achievable_rate
 from optics.pilots import Pilots, estimate_piston
 from optics.profile import Profile
+from optics.progress import warn
 from train.curves import TENSORBOARD, Curve, curves_of, thinned
 from train.field import ROUNDS
 from train.localizers.coherent import BICUBIC, CoherentLocalizer
@@ -503,5 +503,5 @@ def most_likely_factor(nll: Callable[[float], float]) -> float:
     log_factor = float(found.x)
     if min(log_factor - _SCALE_BOUNDS[0], _SCALE_BOUNDS[1] - log_factor) < _AT_A_BOUND:
         what = f"claims would be more honest still beyond the factor {math.exp(log_factor):.3g}, where the search ends"
-        click.echo(f"lightpage: warning: {what}: is the decoder trained?", err=True)
+        warn(f"{what}: is the decoder trained?")
     return math.exp(log_factor)

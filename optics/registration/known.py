@@ -2,16 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
 
 import numpy as np
 
-from optics.errors import RecordingError
+from optics.errors import FrameError, RecordingError
 from optics.frames import check_pair_light
 from optics.page import symbol_phases
 from optics.profile import Profile
-from optics.recording import Recording
+from optics.recording import FramePair, Recording
 from optics.registration.calibrate import KnownPage
+
+
+def lit_pages(recording: Recording, left_out: Callable[[str], None]) -> Iterator[tuple[int, FramePair]]:
+    """Pages whose frames show light, in order, with their frames; `left_out` is told of each other as it is met.
+
+    Raises:
+        RecordingError: unreadable data.
+    """
+    for page in range(recording.pages):
+        pair = recording.frames(page)
+        try:
+            check_pair_light(f"recording {recording.path}, page {page}, ", pair, recording.bit_depth)
+        except FrameError as error:
+            left_out(f"left out: {error}")
+        else:
+            yield page, pair
+
+
+def first_lit_pages(recording: Recording, count: int, left_out: Callable[[str], None]) -> list[int]:
+    """The first so many pages whose frames show light.
+
+    Raises:
+        RecordingError: there are fewer, or unreadable data.
+    """
+    found = [page for page, _ in islice(lit_pages(recording, left_out), count)]
+    if len(found) < count:
+        dark = recording.pages - len(found)
+        came = f"{recording.pages} pages" + (f", {dark} of them black or saturated" if dark else "")
+        raise RecordingError(f"recording {recording.path}", came, f"at least {count} that show light (--pages)")
+    return found
 
 
 def known_pages(recording: Recording, profile: Profile, indices: Iterable[int]) -> list[KnownPage]:

@@ -20,6 +20,7 @@ from optics.device import Device
 from optics.errors import BundleError, InvalidInputError
 from optics.grid import field_grid
 from optics.page import pilot_mask, random_symbols
+from optics.recording import FramePair
 from optics.registration.calibrate import Registered
 from optics.registration.calibration import Calibration
 from optics.registration.parameters import NAMES, nominal
@@ -104,15 +105,19 @@ def test_the_bundle_says_what_torch_says(exported: tuple[Bundle, float, Path]) -
 
 
 def test_the_fields_own_graph_shows_the_decoders_field(
-    exported: tuple[Bundle, float, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported: tuple[Bundle, float, Path], run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bundle = exported[0]
     files = {name: data for name, data in bundle.files.items() if name != FIELD}
     without = Decoder.load(write_bundle(tmp_path / "without.zip", bundle.manifest, files))
     table = sampling_table(TorchTwin(RayTwin(small_profile())), nominal(), np.pi / 2, small_profile())
-    asked = bundle.golden.pair, bundle.golden.pair, table["registration"], table["homodyne"]
+    with np.load(run_folder / REFERENCES) as kept:
+        references = FramePair(kept["in_phase"], kept["quadrature"])
+    asked = bundle.golden.pair, references, table["registration"], table["homodyne"]
     field, left = Decoder.load(exported[2]).recover_field(*asked)
     expected, expected_left = without.recover_field(*asked)
+    assert np.sqrt(np.mean(np.abs(expected) ** 2)) > 0.1  # of the light that a symbol of full modulation brings
+    assert np.max(expected_left) > 1e-3
     np.testing.assert_allclose(field, expected, atol=1e-4)
     np.testing.assert_allclose(left, expected_left, atol=1e-4)
     # as a decoder that looks at the field more coarsely would have it

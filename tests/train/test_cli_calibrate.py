@@ -34,14 +34,20 @@ def run(recording: Path, out: Path, *more: str, profile: str = "bench") -> str:
     return result.output
 
 
-def flat_recording(path: Path, level: int, pages: int = 2, with_symbols: bool = True) -> Path:
-    """A bench recording whose frames are all one count."""
+def flat_recording(
+    path: Path, level: int, pages: int = 2, with_symbols: bool = True, dark: int = 0, reference: int | None = None
+) -> Path:
+    """A bench recording whose frames are all one count, behind some pages without light."""
     profile = load_profile("bench")
     symbols = np.random.default_rng(0).integers(0, 16, profile.page_shape, dtype=np.uint8)
-    frame = np.full(profile.frame_shape, level, dtype=np.uint8)
-    with RecordingWriter(path, profile, 16, 8, FramePair(frame, frame)) as writer:
-        for _ in range(pages):
-            writer.append(symbols if with_symbols else None, FramePair(frame, frame))
+
+    def pair(count: int) -> FramePair:
+        frame = np.full(profile.frame_shape, count, dtype=np.uint8)
+        return FramePair(frame, frame)
+
+    with RecordingWriter(path, profile, 16, 8, pair(level if reference is None else reference)) as writer:
+        for count in [0] * dark + [level] * pages:
+            writer.append(symbols if with_symbols else None, pair(count))
     return path
 
 
@@ -90,9 +96,22 @@ def test_symbols_that_were_not_written_find_nothing(bench_recording: Path, tmp_p
 
 @pytest.mark.parametrize(("level", "words"), [(0, "black"), (255, "saturated")])
 def test_black_and_saturated_frames_are_named(tmp_path: Path, level: int, words: str) -> None:
-    with pytest.raises(FrameError, match=f"in-phase frame: got {words}"):
-        run(flat_recording(tmp_path / "R.h5", level), tmp_path / "calibration.toml")
+    with pytest.raises(FrameError, match=f"reference, in-phase frame: got {words}"):
+        run(flat_recording(tmp_path / "R.h5", 100, reference=level), tmp_path / "calibration.toml")
+    with pytest.raises(RecordingError, match="got 2 pages, 2 of them black or saturated, wanted at least 2 that show"):
+        run(flat_recording(tmp_path / "R2.h5", level, reference=100), tmp_path / "calibration.toml")
     assert not (tmp_path / "calibration.toml").exists()
+
+
+def test_pages_without_light_are_named_and_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_registration(monkeypatch, REGISTERED)
+    path = flat_recording(tmp_path / "R.h5", 100, pages=2, dark=2)
+    text = run(path, tmp_path / "calibration.toml")
+    for page in (0, 1):
+        assert f"warning: left out: recording {path}, page {page}, in-phase frame: got black" in text
+    with Recording.open(path) as recording:
+        expected = tuple(recording.page_hash(page) for page in (2, 3))
+    assert load_calibration(tmp_path / "calibration.toml").calibrated_pages == expected
 
 
 def test_symbols_whose_light_misses_a_camera_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +147,7 @@ def test_the_table_is_for_people_and_the_json_for_machines(tmp_path: Path, monke
     ("pages", "with_symbols", "profile", "complaint"),
     [
         (2, False, "bench", "'symbols': got none"),
-        (1, True, "bench", r"1 pages, wanted at least 2 \(--pages\)"),
+        (1, True, "bench", r"1 pages, wanted at least 2 that show light \(--pages\)"),
         (2, True, "paper", r"912 x 1368 pixels, wanted 3648 x 5472 \(profile paper\)"),
     ],
 )
