@@ -62,16 +62,15 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         turn=earlier.turn_rad,
         progress=progress,
     )
-    if registered.coherence_after < LEAST_KEPT * earlier.coherence_after:
+    if registered.coherence_after < LEAST_KEPT * earlier.reference_coherence:
         raise CalibrationError(
             "re-fit, outcome",
             f"a coherence of {registered.coherence_after:.3f}",
-            f"at least {LEAST_KEPT:.0%} of the {earlier.coherence_after:.3f} when it was calibrated: this device, "
+            f"at least {LEAST_KEPT:.0%} of the {earlier.reference_coherence:.3f} when it was calibrated: this device, "
             "drifted a little; else calibrate anew",
         )
-    fitted = Calibration.from_registered(registered, profile, [hash_frames(pair) for pair in pages.pairs])
-    # Figures of later pages must not count any page that an earlier fit has seen.
-    fitted = fitted.model_copy(update={"calibrated_pages": (*earlier.calibrated_pages, *fitted.calibrated_pages)})
+    hashes = [hash_frames(pair) for pair in pages.pairs]
+    fitted = earlier.followed_by(Calibration.from_registered(registered, profile, hashes))
     table = {
         "reference_in_phase": references.in_phase,
         "reference_quadrature": references.quadrature,

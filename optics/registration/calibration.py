@@ -48,6 +48,7 @@ class Calibration(Table):
         profile_name: name of the nominal profile that the numbers deviate from.
         turn_rad: angle between the homodyne arms, radians: 90 degrees plus error, negative when Q is inverted.
         coherence_before, coherence_after: of the known pages at nominal and at fitted geometry, 0 to 1.
+        coherence_at_first: `coherence_after` of the calibration from nominal, where this is a re-fit that followed it.
         cost: mean squared normalised residual of the fit, about 1 when the twin explains the measurements.
         significant: share of the measured patches that were found, 0 to 1.
         pages_used: known pages that were fitted on or judged by.
@@ -61,6 +62,7 @@ class Calibration(Table):
     turn_rad: Finite
     coherence_before: Share
     coherence_after: Share
+    coherence_at_first: Share | None = None
     cost: NonNegative
     significant: Share
     pages_used: Count
@@ -94,6 +96,24 @@ class Calibration(Table):
             deviations=as_dict(registered.deviations),
         )
 
+    def followed_by(self, fitted: Self) -> Self:
+        """A re-fit that started here, with what it has to remember of this one.
+
+        It remembers the coherence at first, so that many small losses are not taken for none, and the pages of every
+        earlier fit, so that no figure counts one of them as held out.
+        """
+        return fitted.model_copy(
+            update={
+                "coherence_at_first": self.reference_coherence,
+                "calibrated_pages": (*self.calibrated_pages, *fitted.calibrated_pages),
+            }
+        )
+
+    @property
+    def reference_coherence(self) -> float:
+        """The coherence that later fits are measured by: that of the calibration from nominal."""
+        return self.coherence_after if self.coherence_at_first is None else self.coherence_at_first
+
     @property
     def vector(self) -> Real:
         """The fitted parameters as a ray twin takes them, [P]."""
@@ -116,7 +136,7 @@ class Calibration(Table):
 
     def to_toml(self) -> str:
         """The document as TOML text; `parse_calibration` reads it back to an equal calibration."""
-        return to_toml(self)
+        return to_toml(self, without=("coherence_at_first",) if self.coherence_at_first is None else ())
 
     def save(self, path: str | Path) -> None:
         """Write the document, replacing what is there in one step.

@@ -157,3 +157,17 @@ def test_a_page_too_small_to_be_found_is_refused_before_anything_is_searched() -
         match=r"profile bench: got a page of 20 x 24 symbols, which makes 4 patches to look for, wanted at least 5",
     ):
         calibrate(FlatTwin(profile), solve, profile, page.pair, [page])
+
+
+def test_a_re_fit_remembers_where_the_device_began(calibration: Calibration) -> None:
+    def later(coherence: float, page: str) -> Calibration:
+        update = {"coherence_after": coherence, "calibrated_pages": (page * 64,), "turn_rad": -1.5}
+        return calibration.model_copy(update=update)
+
+    assert calibration.reference_coherence == 0.8
+    assert "coherence_at_first" not in calibration.to_toml()
+    second = calibration.followed_by(later(0.75, "1"))
+    third = second.followed_by(later(0.7, "2"))
+    assert parse_calibration(third.to_toml()) == third
+    assert (third.coherence_after, third.reference_coherence, third.turn_rad) == (0.7, 0.8, -1.5)
+    assert third.calibrated_pages == (*HASHES, "1" * 64, "2" * 64)

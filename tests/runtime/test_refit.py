@@ -12,6 +12,9 @@ from optics.device import Device
 from optics.errors import RecalibrationRefusedError
 from optics.page import random_symbols
 from optics.simulator import Simulator
+from runtime import refit as module
+from runtime.bundle import Bundle
+from runtime.calibrated import calibration_of
 from runtime.decoder import Decoder
 from runtime.demo import LEVELS, drifted
 from runtime.recalibration import KnownPages, recalibrate
@@ -44,3 +47,13 @@ def test_a_device_that_is_another_and_not_drifted_is_refused(tmp_path: Path) -> 
     geometry = Device().geometry
     other = Device(geometry=geometry.model_copy(update={"pipe_angle_deg": geometry.pipe_angle_deg + 1}))
     refused(other, lambda written: [written[0], written[1]], "else calibrate anew", tmp_path)
+
+
+def test_small_losses_do_not_add_up_unseen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A re-fit that is as good as the one before is refused where the first calibration was much better than both."""
+
+    def late(bundle: Bundle) -> object:
+        return calibration_of(bundle).model_copy(update={"coherence_at_first": 1.0})
+
+    monkeypatch.setattr(module, "calibration_of", late)
+    refused(Device(), lambda written: [written[0], written[1]], "90% of the 1.000 when it was calibrated", tmp_path)
