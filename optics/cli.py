@@ -40,6 +40,8 @@ def simulate(
     """
     profile = load_profile(profile_name)
     device = (load_device(device_file) if device_file else Device()).with_settings(list(settings))
+    if out.is_dir():
+        raise InvalidInputError(f"--out {out}", "a folder", "a file")
     if out.exists() and not force:
         raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
     job = RecordingJob(profile, device, levels, seed, truth, out)

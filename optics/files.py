@@ -115,7 +115,8 @@ def check_outputs(context: click.Context) -> None:
             if param is other or not isinstance(param.type, NewPath | OutputFile):
                 continue
             if path.resolve() == there.resolve():
-                raise InvalidInputError(_option(path, param), f"what {other.opts[0]} names", "a file of its own")
+                named = other.opts[0] if isinstance(other, click.Option) else other.make_metavar(context)
+                raise InvalidInputError(_option(path, param), f"what {named} names", "a file of its own")
 
 
 def _option(path: Path, param: click.Parameter | None) -> str:

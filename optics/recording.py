@@ -64,8 +64,9 @@ class Recording:
                 file, the dataset or attribute, what came and what was wanted.
         """
         path = Path(path)
-        if not path.exists():
-            raise RecordingError(f"recording {path}", "no such file", "a readable, complete HDF5 file")
+        if not path.is_file():
+            came = "no regular file" if path.exists() else "no such file"
+            raise RecordingError(f"recording {path}", came, "a readable, complete HDF5 file")
         try:
             file = h5py.File(str(path), "r")
         except OSError as error:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from functools import wraps
 from importlib.metadata import EntryPoint, entry_points
-from typing import NoReturn
+from types import FrameType
+from typing import Any, NoReturn, Self
 
 import click
 
@@ -22,8 +25,8 @@ RESUME_KEY = "lightpage.resume"
 RESUME = "run the same command again; nothing half-written was left under a final name"
 
 EXIT_ERROR = 2
-EXIT_INTERRUPTED = 130
-"""128 + SIGINT, as shells have it."""
+EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
+"""128 + SIGINT, 128 + SIGTERM, as shells have it."""
 
 EXTRAS = {
     "train": frozenset({"torch", "torchmetrics", "lightning", "tensorboard", "jinja2", "onnx", "onnxscript"}),
@@ -116,7 +119,9 @@ def lightpage() -> None:
 
 
 def run(command: click.Command, arguments: Sequence[str] | None = None, name: str = "lightpage") -> int:
-    """Run a command line and return its exit status: 0, 2 for an error that was foreseen, 130 after Ctrl-C.
+    """Run a command line and return its exit status: 0, 2 for a foreseen error, 130 after Ctrl-C, 143 after SIGTERM.
+
+    SIGTERM ends a command as Ctrl-C does, so that it clears up behind itself.
 
     An error that nobody foresaw is raised: its traceback is what helps to mend it.
 
@@ -126,9 +131,10 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
         name: what it was started as.
     """
     meta: dict[str, object] = {}
+    termination = _Termination()
     try:
         arguments = list(sys.argv[1:] if arguments is None else arguments)
-        with command.make_context(name, arguments) as ctx:
+        with termination, command.make_context(name, arguments) as ctx:
             meta = ctx.meta
             command.invoke(ctx)
     except click.exceptions.Exit as end:
@@ -146,8 +152,29 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
         return _fail(LightpageError("memory", str(error) or "too little", "a machine or a device that fits the other"))
     except (KeyboardInterrupt, click.Abort):
         click.echo(f"\nlightpage: interrupted; {meta.get(RESUME_KEY, RESUME)}", err=True)
-        return EXIT_INTERRUPTED
+        return EXIT_TERMINATED if termination.came else EXIT_INTERRUPTED
     return 0
+
+
+class _Termination:
+    """While its block runs in the main thread, the first SIGTERM interrupts it; a second ends the process as usual."""
+
+    came = False
+
+    def __enter__(self) -> Self:
+        self._before: Any = None
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGTERM, self._interrupt)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGTERM, self._before)
+
+    def _interrupt(self, number: int, _: FrameType | None) -> NoReturn:
+        self.came = True
+        signal.signal(number, signal.SIG_DFL)
+        raise KeyboardInterrupt
 
 
 def _fail(error: LightpageError) -> int:

@@ -50,7 +50,8 @@ def decode(
     Pages that are refused are left out of the results, named, and make the exit status 2.
     """
     if (recording is None) == (not source):
-        raise InvalidInputError("options", "both or none", "either --recording or --source")
+        came = "both --recording and --source" if source else "neither --recording nor --source"
+        raise InvalidInputError("options", came, "one of them")
     results: list[dict[str, Any]] = []
     refused: list[RefusedPage] = []
     with ExitStack() as stack:

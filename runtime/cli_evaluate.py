@@ -19,7 +19,7 @@ from runtime.tracking import NoTracker, tracker_for
 
 _WORTH_NOTHING = (
     "by what the bundle believes, these pages carry nothing: the device may have drifted far (lightpage recalibrate), "
-    "be another one, have its cameras the other way round, or its symbols another number of levels"
+    "be another one, have its cameras the other way round, or its symbols another number of levels or other pages"
 )
 
 

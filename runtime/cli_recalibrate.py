@@ -54,7 +54,9 @@ def recalibrate(
         result: RecalibrationOutcome | Recalibrated = _remote(target, recording, pages)
     else:
         if not (bundle and recording and out):
-            raise InvalidInputError("options", "not all of them", "--bundle, --recording and --out, or --target")
+            given = {"--bundle": bundle, "--recording": recording, "--out": out}
+            lacking = ", ".join(name for name, value in given.items() if not value)
+            raise InvalidInputError("options", f"no {lacking}", f"{', '.join(given)}, or --target")
         result = _offline(bundle, recording, out, pages, version)
     data = summary(result, time.perf_counter() - start)
     if json_path is not None:

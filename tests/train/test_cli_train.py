@@ -123,7 +123,10 @@ def test_options_of_the_first_look_are_kept_and_those_that_do_nothing_refused(
         run([*small, *start])
 
 
-def test_ctrl_c_in_training_loses_nothing_and_the_same_command_goes_on(device: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_training_that_is_stopped_loses_nothing_and_the_same_command_goes_on(
+    kind: signal.Signals, status: int, device: list[str], tmp_path: Path
+) -> None:
     out, steps = (
         tmp_path / "run",
         360,
@@ -136,11 +139,11 @@ def test_ctrl_c_in_training_loses_nothing_and_the_same_command_goes_on(device: l
         end = time.monotonic() + SECONDS
         while not last.exists() and time.monotonic() < end and process.poll() is None:
             time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(kind)
         output, _ = process.communicate(timeout=SECONDS)
     finally:
         process.kill()
-    assert process.returncode == 130, output
+    assert process.returncode == status, output
     assert "run the same command again" in output
     assert not (out / "run.json").exists()
     reached = torch.load(last, map_location="cpu", weights_only=False)["global_step"]

@@ -109,7 +109,7 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
 
 
 def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) -> Figure:
-    figure = Figure(figsize=(15, 3.6 * len(cases)), layout="constrained")
+    figure = Figure(figsize=(15, 3.9 * len(cases)), layout="constrained")
     axes = figure.subplots(len(cases), 3, squeeze=False)
     for row, case, result in zip(axes, cases, results, strict=True):
         titles = ("on the modulator", f"on the cameras, by rays, {case['angle_deg']:g} degree", "the same, by waves")
