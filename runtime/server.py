@@ -10,6 +10,7 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from optics.errors import InvalidInputError
+from runtime.address import check_free
 from runtime.dataplane import DataPlane
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
@@ -62,7 +63,11 @@ class LightpageServer:
             InvalidInputError: the address cannot be listened on.
         """
         try:
+            check_free("address", self._address)
             self.port = self._server.add_insecure_port(self._address)
+        except InvalidInputError:
+            self._close_pools()
+            raise
         except RuntimeError as error:
             self._close_pools()
             raise InvalidInputError(f"address {self._address}", error, "a free HOST:PORT of this machine") from None

@@ -104,6 +104,8 @@ def table(calibration: Calibration, profile: Profile) -> str:
     }
     lines = [f"{'':<32}{'fitted':>12}   {'+-':<10}{'nominal':>10}"]
     for name, value in calibration.parameters.items():
+        if name not in calibration.fitted:
+            continue
         label, nominal, unit = shown.get(name, (name, 0.0, 1.0))
         factor = nominal if unit is None else unit
         fitted, deviation = nominal + factor * value, factor * calibration.deviations[name]

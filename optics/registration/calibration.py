@@ -115,6 +115,11 @@ class Calibration(Table):
         return self.coherence_after if self.coherence_at_first is None else self.coherence_at_first
 
     @property
+    def fitted(self) -> frozenset[str]:
+        """Names of the parameters that were fitted; the others, as the lenses' path where they are ideal, were held."""
+        return frozenset(name for name, deviation in self.deviations.items() if deviation > 0)
+
+    @property
     def vector(self) -> Real:
         """The fitted parameters as a ray twin takes them, [P]."""
         return as_vector(self.parameters)

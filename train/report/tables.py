@@ -73,6 +73,8 @@ def geometry(data: ReportData) -> list[tuple[str, list[Fitted]]]:
     """Fitted parameters by group, with heading."""
     groups: dict[str, list[Fitted]] = {}
     for parameter in PARAMETERS:
+        if parameter.name not in data.calibration.fitted:
+            continue
         groups.setdefault(parameter.group, []).append(_fitted(parameter, data))
     return [(GROUPS[group], rows) for group, rows in groups.items()]
 

@@ -109,7 +109,7 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
     return {
         "landed": landed,
         "spots": spots(landed, _SAME_SPOT * profile.pipe.width_m),
-        "spread_mm": spread * 1e3,
+        "spread_mm": round(spread * 1e3, 9),
         "aperture": float(np.abs(places).max() / profile.lens.focal_length_m),
     }
 
