@@ -6,7 +6,7 @@ concentration `kappa`. All figures are computed in float64. `levels` is M: symbo
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -156,8 +156,12 @@ def expected_calibration_error(
     confidence: NDArray[np.floating], correct: NDArray[np.bool_], bins: int = ECE_BINS
 ) -> float:
     """ECE: mean over symbols of |accuracy - mean confidence| of their bin; arguments and errors of `reliability`."""
-    found = reliability(confidence, correct, bins)
-    return sum(b.count * abs(b.accuracy - b.confidence) for b in found) / sum(b.count for b in found)
+    return calibration_error(reliability(confidence, correct, bins))
+
+
+def calibration_error(bins: Sequence[ConfidenceBin]) -> float:
+    """ECE of symbols in `bins`, at least one."""
+    return sum(b.count * abs(b.accuracy - b.confidence) for b in bins) / sum(b.count for b in bins)
 
 
 @dataclass(frozen=True)

@@ -9,20 +9,11 @@ from typing import Any
 import numpy as np
 
 from optics.errors import InvalidInputError, RecordingError
-from optics.measures import (
-    ConcentrationBin,
-    ConfidenceBin,
-    PageMeasures,
-    SymbolMaps,
-    concentration_calibration,
-    decide_with_confidence,
-    measure,
-    reliability,
-    symbol_maps,
-)
+from optics.measures import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps
 from optics.pilots import Pilots, estimate_piston
 from optics.recording import FramePair, Recording, hash_frames
-from runtime.decoder import Decoder
+from optics.tally import Tally
+from runtime.decoder import Decoder, Timings
 from runtime.frames import narrow
 from runtime.manifest import GOLDEN
 from runtime.refused import RefusedPage, refusal
@@ -144,45 +135,42 @@ def evaluate(
     own = recording.pilots()
     mask = decoder.bundle.pilot_mask if own is None else own
     data = ~mask
-    phases, concentrations, truths, timings = [], [], [], []
+    tally = Tally(levels, data, recording.pages)
+    timings: list[Timings] = []
     refused: list[RefusedPage] = []
     for index in range(recording.pages):
+        page = None
         try:
             frames, symbols = recording.frames(index), recording.symbols(index)
             if symbols is not None and not was_seen(decoder, frames, recording.bit_depth):
                 pair, pilots = narrow(frames, recording.bit_depth), Pilots.of_symbols(mask, symbols, levels)
                 page = decode_tracked(decoder, tracker, pair, levels, pilots)
-                phases.append(page.phase[data])
-                concentrations.append(page.concentration[data])
-                truths.append(symbols[data])
-                timings.append(page.timings)
         except InvalidInputError as error:
             refused.append(RefusedPage(index, str(error)))
+        if page is not None and symbols is not None:
+            tally.add(page.phase[data], page.concentration[data], symbols[data])
+            timings.append(page.timings)
         page_done()
-    if not truths and refused:
+    if not timings and refused:
         raise refusal(f"recording {recording.path}", refused, recording.pages)
-    if not truths:
+    if not timings:
         raise InvalidInputError(
             f"recording {recording.path}",
             f"{recording.pages} pages, all of them used to make {decoder.version}",
             "pages that the bundle has not seen",
         )
-    phase, concentration, truth = np.concatenate(phases), np.concatenate(concentrations), np.concatenate(truths)
-    decided, confidence = decide_with_confidence(phase, concentration, levels)
     return Evaluation(
         bundle_version=decoder.version,
-        figures=measure(phase, concentration, truth, levels),
-        pages=len(truths),
-        pages_left_out=recording.pages - len(truths) - len(refused),
+        figures=tally.figures(),
+        pages=len(timings),
+        pages_left_out=recording.pages - len(timings) - len(refused),
         symbols_per_page=int(np.count_nonzero(data)),
         seconds_per_page=float(np.median([t.total_s for t in timings])),
         inference_seconds_per_page=float(np.median([t.inference_s for t in timings])),
-        air_per_page=tuple(
-            measure(*page, levels).air_bits_per_symbol for page in zip(phases, concentrations, truths, strict=True)
-        ),
-        concentration_bins=tuple(concentration_calibration(phase, concentration, truth, levels)),
-        maps=symbol_maps(np.stack(phases), np.stack(concentrations), np.stack(truths), levels, data),
-        confidence_bins=tuple(reliability(confidence, decided == truth)),
+        air_per_page=tuple(page.air_bits_per_symbol for page in tally.pages),
+        concentration_bins=tuple(tally.concentration_bins()),
+        maps=tally.maps(),
+        confidence_bins=tuple(tally.confidence_bins()),
         bundle=_describe(decoder, levels),
         refused=tuple(refused),
     )
