@@ -31,10 +31,11 @@ from optics.recording_layout import (
     FramePair,
     frame_type,
     hash_frames,
+    page_hashes,
 )
 from optics.recording_writer import RecordingWriter
 
-__all__ = ["FramePair", "Recording", "RecordingWriter", "hash_frames"]
+__all__ = ["FramePair", "Recording", "RecordingWriter", "hash_frames", "page_hashes"]
 
 _SYMBOL_PAGES_AT_ONCE = 64
 """Pages of symbols checked in one read, so that opening a long recording stays small in memory."""
@@ -167,7 +168,7 @@ class Recording:
         return self._read("pilots", ()).astype(np.bool_) if "pilots" in self._file else None
 
     def page_hash(self, page: int) -> str:
-        """SHA-256 of one frame pair in hex, by which pages that were trained on are recognised.
+        """SHA-256 of one frame pair in hex, by which pages that were trained on are recognised; see `page_hashes`.
 
         Raises:
             RecordingError: no such page, or its data cannot be read.

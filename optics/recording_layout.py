@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,18 @@ def hash_frames(frames: FramePair) -> str:
         digest.update(f"{frame.dtype.name}{frame.shape}".encode())
         digest.update(little_endian.tobytes())
     return digest.hexdigest()
+
+
+def page_hashes(frames: FramePair) -> frozenset[str]:
+    """`hash_frames` of a pair in each type that its counts may be stored in: one page may go by any of them."""
+    forms = [_forms(frame) for frame in (frames.in_phase, frames.quadrature)]
+    return frozenset(hash_frames(FramePair(*pair)) for pair in product(*forms))
+
+
+def _forms(frame: NDArray[np.integer[Any]]) -> list[NDArray[np.integer[Any]]]:
+    """The frame in each type of a recording that holds its counts."""
+    highest = int(frame.max(initial=0))
+    return [frame.astype(kind, copy=False) for kind in (np.uint8, np.uint16) if highest <= np.iinfo(kind).max]
 
 
 def frame_type(bit_depth: int) -> np.dtype[np.unsignedinteger[Any]]:

@@ -11,7 +11,7 @@ import numpy as np
 from optics.errors import InvalidInputError, RecordingError
 from optics.measures import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps
 from optics.pilots import Pilots, estimate_piston
-from optics.recording import FramePair, Recording, hash_frames
+from optics.recording import FramePair, Recording, page_hashes
 from optics.tally import Tally
 from runtime.decoder import Decoder, Timings
 from runtime.frames import narrow
@@ -91,12 +91,11 @@ class Evaluation:
         }
 
 
-def was_seen(decoder: Decoder, frames: FramePair, bit_depth: int) -> bool:
-    """Whether the bundle was calibrated or trained on a page."""
+def was_seen(decoder: Decoder, frames: FramePair) -> bool:
+    """Whether the bundle was calibrated or trained on a page, whichever type its counts were stored in then."""
     manifest = decoder.bundle.manifest
     seen = {*manifest.calibrated_pages, *manifest.trained_pages}
-    # The same page may have been hashed in the camera's narrowest type, or as it lies in the file.
-    return bool(seen) and bool(seen & {hash_frames(frames), hash_frames(narrow(frames, bit_depth))})
+    return bool(seen) and not seen.isdisjoint(page_hashes(frames))
 
 
 def check_recording(decoder: Decoder, recording: Recording) -> None:
@@ -142,7 +141,7 @@ def evaluate(
         page = None
         try:
             frames, symbols = recording.frames(index), recording.symbols(index)
-            if symbols is not None and not was_seen(decoder, frames, recording.bit_depth):
+            if symbols is not None and not was_seen(decoder, frames):
                 pair, pilots = narrow(frames, recording.bit_depth), Pilots.of_symbols(mask, symbols, levels)
                 page = decode_tracked(decoder, tracker, pair, levels, pilots)
         except InvalidInputError as error:

@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 from optics.errors import InvalidInputError, RecordingError
 from optics.measures import concentration_calibration, decide_with_confidence, measure, reliability, symbol_maps
 from optics.page import MAX_LEVELS, MIN_LEVELS
-from optics.recording import FramePair, Recording
+from optics.recording import FramePair, Recording, page_hashes
 from train.curves import Curve, curves_of
 from train.feature_store import FeatureStore
 from train.features import PageState
@@ -150,7 +150,8 @@ def validation_pages(run: Run, recording: Recording) -> list[int]:
     wanted = run.trained_pages[run.pages[0] :]
     found: dict[str, int] = {}
     for page in range(recording.pages):
-        found.setdefault(recording.page_hash(page), page)
+        for page_hash in page_hashes(recording.frames(page)):
+            found.setdefault(page_hash, page)
         if all(page_hash in found for page_hash in wanted):
             return [found[page_hash] for page_hash in wanted]
     there = f"{sum(page_hash in found for page_hash in wanted)} of {len(wanted)} validation pages"

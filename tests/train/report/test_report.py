@@ -282,9 +282,17 @@ def test_levels_are_read_off_phases() -> None:
         levels_of(np.random.default_rng(0).uniform(0, 6, 100).astype(np.float32))
 
 
-def test_validation_pages_are_found_in_the_recording(coherent: Path, small_device: list[str]) -> None:
-    with Recording.open(small_device[3]) as recording:
-        assert validation_pages(load_run(coherent), recording) == [4, 5]
+def test_validation_pages_are_found_in_the_recording(coherent: Path, small_device: list[str], tmp_path: Path) -> None:
+    shutil.copy(small_device[3], wide := tmp_path / "wide.h5")
+    with h5py.File(wide, "r+") as file:
+        for name in ("in_phase", "quadrature"):
+            counts = file[name][()]
+            assert counts.dtype == np.uint8
+            del file[name]
+            file[name] = counts.astype(np.uint16)
+    for path in (small_device[3], wide):
+        with Recording.open(path) as recording:
+            assert validation_pages(load_run(coherent), recording) == [4, 5]
 
 
 def test_what_is_no_source_is_refused(
