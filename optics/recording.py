@@ -220,12 +220,14 @@ class Recording:
     def _attribute(self, name: str, default: object = None) -> Any:
         """A root attribute as a plain Python value."""
         value = self._file.attrs.get(name, default)
-        if isinstance(value, bytes):
-            value = value.decode("utf-8", "replace")
-        return value.item() if isinstance(value, (np.generic, np.ndarray)) and value.size == 1 else value
+        if isinstance(value, (np.generic, np.ndarray)) and value.size == 1:
+            value = value.item()
+        return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
     def _whole(self, name: str, default: int | None = None) -> int:
         value = self._attribute(name, default)
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)
         if isinstance(value, bool) or not isinstance(value, int):
             raise RecordingError(
                 self._thing(f"attribute '{name}'"), "none" if value is None else repr(value), "a whole number"

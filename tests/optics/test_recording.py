@@ -122,6 +122,20 @@ class TestReading:
         with Recording.open(foreign) as recording:
             assert recording.bit_depth == 12
 
+    @pytest.mark.parametrize("number", [float, np.float32, np.int64, lambda value: np.array([value], np.float64)])
+    @pytest.mark.parametrize("text", [str, str.encode, lambda value: np.array([value.encode()])])
+    def test_whole_numbers_may_come_as_floats_and_texts_as_arrays_of_bytes(
+        self, foreign: Path, number: Callable[[int], object], text: Callable[[str], object]
+    ) -> None:
+        with h5py.File(foreign, "r+") as file:
+            for name, value in {"version": 1, "camera_bit_depth": 12, "levels": LEVELS, "black_level": 7}.items():
+                file.attrs[name] = number(value)
+            file.attrs["format"], file.attrs["profile"] = text("lightpage-recording"), text("name = 'µ'")
+        with Recording.open(foreign) as recording:
+            assert (recording.levels, recording.bit_depth, recording.black_level) == (LEVELS, 12, 7)
+            assert all(type(n) is int for n in (recording.levels, recording.bit_depth, recording.black_level))
+            assert recording.profile_text == "name = 'µ'"
+
     def test_8_bit_counts_may_come_in_16_bit_words(self, foreign: Path) -> None:
         with h5py.File(foreign, "r+") as file:
             file.attrs["camera_bit_depth"] = 8
@@ -288,6 +302,12 @@ BAD = {
     "half a bit": (attribute("camera_bit_depth", 12.5), "attribute 'camera_bit_depth'", "12.5"),
     "1 level": (attribute("levels", 1), "attribute 'levels'", "1"),
     "257 levels": (attribute("levels", 257), "attribute 'levels'", "257"),
+    "half a level": (attribute("levels", 16.5), "attribute 'levels'", "16.5"),
+    "levels that are no number": (attribute("levels", np.nan), "attribute 'levels'", "nan"),
+    "infinitely many levels": (attribute("levels", np.inf), "attribute 'levels'", "inf"),
+    "levels that are true": (attribute("levels", True), "attribute 'levels'", "True"),
+    "several levels": (attribute("levels", [16.0, 16.0]), "attribute 'levels'", "array"),
+    "version of 1.5": (attribute("version", 1.5), "attribute 'version'", "1.5"),
     "levels below the symbols": (attribute("levels", 8), "dataset 'symbols'", "a symbol of 15"),
     "profile as a number": (attribute("profile", 3), "attribute 'profile'", "int"),
     "no in-phase": (without("in_phase"), "dataset 'in_phase'", "none"),
