@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,7 +23,8 @@ VERSION = 1
 class DecodedWriter:
     """Writes `symbols` uint8 and `confidence` float32, both [page, ny, nx], with `levels` and the model versions.
 
-    `pages` int64 [page] holds the pages' numbers: those that were refused are missing.
+    `pages` int64 [page] holds the pages' numbers: those that were refused are missing. Until it is complete, the file
+    lies beside `path` under a name of its own: a recording's writer keeps its pages at `<path>.partial`.
 
     Args:
         path: final name; replaced only when the `with` statement ends well.
@@ -34,9 +36,15 @@ class DecodedWriter:
 
     def __init__(self, path: str | Path, levels: int) -> None:
         self.path = Path(path)
-        self._partial = self.path.with_name(self.path.name + ".partial")
         try:
-            self._file = h5py.File(str(self._partial), "w")
+            descriptor, name = tempfile.mkstemp(prefix=f".{self.path.name}-", dir=self.path.parent)
+            os.close(descriptor)
+            self._partial = Path(name)
+            try:
+                self._file = h5py.File(name, "w")
+            except BaseException:
+                self._partial.unlink()
+                raise
         except OSError as error:
             raise InvalidInputError(f"output {self.path}", error, "a path that can be written") from None
         self._file.attrs.update({"format": FORMAT, "version": VERSION, "levels": levels})
@@ -69,6 +77,7 @@ class DecodedWriter:
                     self._file["model_versions"] = np.array(self._versions, dtype=h5py.string_dtype())
                     self._file["pages"] = np.array(self._pages, np.int64)
                     self._file.close()
+                    os.chmod(self._partial, 0o644)
                     os.replace(self._partial, self.path)
         finally:
             with suppress(OSError):

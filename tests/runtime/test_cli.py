@@ -357,11 +357,35 @@ def test_decode_sends_a_recording_and_keeps_the_symbols(
     with h5py.File(out) as file:
         assert file["symbols"].shape == file["confidence"].shape == (4, *toy.PAGE)
         assert (file["symbols"][()] == recording[1]).mean() > 0.9
-        assert file.attrs["levels"] == 16
+        assert dict(file.attrs) == {"format": "lightpage-decoded", "version": 1, "levels": 16}
+        assert set(file) == {"symbols", "confidence", "pages", "model_versions"}
+        assert file["pages"][()].tolist() == [0, 1, 2, 3]
+        assert file["model_versions"].asstr()[()].tolist() == ["toy-1"] * 4
+    assert out.stat().st_mode & 0o777 == 0o644
     pages = json.loads(report.read_text())["pages"]
     assert [page["page"] for page in pages] == [0, 1, 2, 3]
     assert all(0 < page["air_bits_per_symbol"] <= 4 and page["total_s"] > 0 for page in pages)
     assert "toy-1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("bad", [False, True])
+def test_decode_leaves_the_pages_of_an_interrupted_recording_of_that_name_alone(
+    bad: bool, service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    references = toy.ToyDevice().references()
+    begun = RecordingWriter(tmp_path / "out.h5", toy.PROFILE, 16, 8, references)
+    begun.append(None, references)
+    begun.abandon()
+    if bad:
+        with h5py.File(recording[0], "r+") as file:
+            file["quadrature"][...] = 0
+    where = ["--target", service.target, "--recording", recording[0]]
+    assert run(["decode", *where, "--out", tmp_path / "out.h5"]) == (2 if bad else 0)
+    written = [] if bad else ["out.h5"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [*written, "out.h5.partial", "r.h5"]
+    resumed = RecordingWriter.resume(tmp_path / "out.h5", toy.PROFILE, 16, 8, references)
+    assert resumed.pages == 1
+    resumed.abandon()
 
 
 def test_decode_goes_on_after_bad_pages_and_ends_with_their_names(
