@@ -7,6 +7,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,6 +18,8 @@ from optics.errors import InvalidInputError
 
 def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], thing: str = "file") -> None:
     """Have `write` fill a file, and replace what is at `path` by it in one step.
+
+    Content and name are on the disk when this returns: a power cut leaves the earlier file or the new one, whole.
 
     Args:
         path: final name, in a folder that exists.
@@ -32,13 +35,26 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], thing: 
         try:
             with os.fdopen(descriptor, "wb") as file:
                 write(file)
-            os.chmod(name, 0o644)
+                file.flush()
+                os.fchmod(file.fileno(), 0o644)
+                os.fsync(file.fileno())
             os.replace(name, path)
         except BaseException:
             os.unlink(name)
             raise
     except OSError as error:
         raise InvalidInputError(f"{thing} {path}", error, "a path that can be written") from None
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Write the names in `folder` to the disk where its file system can; the files themselves are whole without."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def replace_text(path: str | Path, text: str, thing: str = "file") -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
+import logging
 from collections.abc import Collection
-from contextlib import suppress
 from pathlib import Path
 
-from optics.errors import BundleError
+from optics.errors import BundleError, InvalidInputError
+from optics.files import replace_text
 from runtime.bundle import Bundle
 from runtime.manifest import MANIFEST, sha256
+
+_log = logging.getLogger(__name__)
 
 CURRENT = "current.json"
 
@@ -54,29 +56,42 @@ class ModelStore:
         return dropped
 
     def remember(self, path: Path | None) -> None:
-        """Note which bundle is in service, None standing for the base; survives a crash in the middle.
+        """Note which bundle is in service, None standing for the base; a crash or power cut leaves one note, whole.
 
         Raises:
             BundleError: the note cannot be written.
         """
         note = {"base": self._base, "bundle": path.name if path is not None else None}
-        temporary = self.folder / f".{CURRENT}.{os.getpid()}"
         try:
-            temporary.write_text(json.dumps(note), "utf-8")
-            os.replace(temporary, self.folder / CURRENT)
-        except OSError as error:
-            with suppress(OSError):
-                temporary.unlink()
-            raise BundleError(f"model store {self.folder}", error, "a folder that can be written") from None
+            replace_text(self.folder / CURRENT, json.dumps(note))
+        except InvalidInputError as error:
+            raise BundleError(f"model store {self.folder}", error.got, "a folder that can be written") from None
 
     def last(self) -> Path | None:
-        """The bundle that was in service when the program ended, if it came from the same base and is still here."""
+        """The bundle that was in service when the program ended, None standing for the base.
+
+        None too without a note or with another base's, and, with a warning, where the note or its bundle is lost.
+        """
+        try:
+            return self._noted()
+        except BundleError as error:
+            _log.warning("serving the base: %s", error)
+            return None
+
+    def _noted(self) -> Path | None:
+        thing = f"model store {self.folder}"
         try:
             note = json.loads((self.folder / CURRENT).read_text("utf-8"))
             name, base = note["bundle"], note["base"]
-        except (OSError, ValueError, KeyError, TypeError):
-            return None  # no note, or one that cannot be read: the base it is
-        if base != self._base or not isinstance(name, str) or Path(name).name != name or name == MANIFEST:
+        except FileNotFoundError:
             return None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise BundleError(f"{thing}: {CURRENT}", repr(error), "a note that can be read") from None
+        if base != self._base or name is None:
+            return None
+        if not isinstance(name, str) or Path(name).name != name or name == MANIFEST:
+            raise BundleError(f"{thing}: {CURRENT}", repr(name), "the name of a bundle")
         path = self.folder / name
-        return path if path.is_file() else None
+        if not path.is_file():
+            raise BundleError(f"{thing}: {name}", "no such file", "the bundle that was in service")
+        return path

@@ -184,7 +184,9 @@ def test_a_full_store_drops_its_oldest_bundles_but_none_that_is_held(decoder: De
     assert store.prune([paths[1]]) == []
 
 
-def test_the_store_remembers_what_was_in_service_for_its_own_base_only(decoder: Decoder, tmp_path: Path) -> None:
+def test_the_store_remembers_what_was_in_service_for_its_own_base_only(
+    decoder: Decoder, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     store = ModelStore(tmp_path / "store", decoder.bundle)
     assert store.last() is None
     path = toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1")
@@ -195,6 +197,28 @@ def test_the_store_remembers_what_was_in_service_for_its_own_base_only(decoder: 
     assert ModelStore(tmp_path / "store", other).last() is None
     store.remember(None)
     assert store.last() is None
-    for junk in (json.dumps({"bundle": "../../etc/passwd", "base": store._base}), "junk", "[]", '{"bundle": 3}'):
-        (tmp_path / "store" / CURRENT).write_text(junk)
+    assert not caplog.records
+    assert [file.name for file in store.folder.iterdir() if not file.name.endswith(".zip")] == [CURRENT]
+
+
+def test_the_store_says_why_the_base_is_served_where_its_note_or_bundle_is_lost(
+    decoder: Decoder, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = ModelStore(tmp_path / "store", decoder.bundle)
+    store.remember(store.path_of("toy-1+r1"))
+    note = store.folder / CURRENT
+    base = store._base
+    for content, why in (
+        (note.read_text(), "toy-1+r1.zip: got no such file, wanted the bundle that was in service"),
+        (json.dumps({"bundle": "../../etc/passwd", "base": base}), "got '../../etc/passwd', wanted the name"),
+        (json.dumps({"bundle": 3, "base": base}), "got 3, wanted the name"),
+        ("junk", "current.json: got JSONDecodeError"),
+        ("[]", "current.json: got TypeError"),
+        ('{"bundle": 3}', "current.json: got KeyError"),
+    ):
+        note.write_text(content)
+        caplog.clear()
         assert store.last() is None
+        assert [record.levelname for record in caplog.records] == ["WARNING"]
+        assert f"serving the base: model store {store.folder}: " in caplog.text
+        assert why in caplog.text

@@ -653,7 +653,7 @@ def test_a_change_of_model_that_cannot_be_noted_is_not_made(
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("runtime.store.os.replace", full)
+        patch.setattr("os.replace", full)
         with pytest.raises(BundleError, match="disk full"):
             service.client.rollback()
         assert service.client.describe().model.version == "toy-1+r1"
