@@ -149,10 +149,9 @@ class Recalibrator:
         model = plane.registry.current
         with own_fault():  # the pages are the service's own
             pages.check(model.decoder)
-        held = [m.version for m in plane.registry.models]
-        taken = [*held, *(plane.store.versions() if plane.store is not None else [])]
-        version = next_version(model.version, taken)
-        path = plane.store.path_of(version) if plane.store is not None else self._folder() / f"{version}.zip"
+        store = self._store()
+        version = next_version(model.version, [*(m.version for m in plane.registry.models), *store.versions()])
+        path = store.path_of(version)
         # Judged against what is in service now: the model with what its tracker has learnt.
         outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker.table())
         try:
@@ -161,8 +160,7 @@ class Recalibrator:
         except BaseException:
             path.unlink(missing_ok=True)
             raise
-        if plane.store is not None:
-            self._prune(plane.store)
+        self._prune(store)
         return outcome
 
     def _prune(self, store: ModelStore) -> None:
@@ -174,10 +172,13 @@ class Recalibrator:
             for path in dropped:
                 _log.info("model store %s: dropped %s", store.folder, path.name)
 
-    def _folder(self) -> Path:
+    def _store(self) -> ModelStore:
+        """The service's store; without one, a temporary folder that keeps no more than the models held."""
+        if self._plane.store is not None:
+            return self._plane.store
         if self._temporary is None:
             self._temporary = tempfile.TemporaryDirectory(prefix="lightpage-models-")
-        return Path(self._temporary.name)
+        return ModelStore(Path(self._temporary.name), self._plane.registry.current.decoder.bundle, kept=0)
 
     def _count(self, result: RecalibrationOutcome | BaseException) -> None:
         if isinstance(result, RecalibrationOutcome):

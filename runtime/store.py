@@ -26,13 +26,14 @@ class ModelStore:
     Args:
         folder: made if absent.
         base: the bundle that the operator gave; another base has its own memory.
+        kept: how many of the newest bundles `prune` leaves.
 
     Raises:
         BundleError: the folder cannot be made or written.
     """
 
-    def __init__(self, folder: Path, base: Bundle) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, base: Bundle, kept: int = KEPT_BUNDLES) -> None:
+        self.folder, self._kept = folder, kept
         self._base = sha256(base.manifest.to_json())
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -48,9 +49,9 @@ class ModelStore:
         return sorted(path.name.removesuffix(".zip") for path in self.folder.glob("*.zip"))
 
     def prune(self, held: Collection[Path]) -> list[Path]:
-        """Delete the oldest bundles beyond `KEPT_BUNDLES`, none of those `held`; returns what was deleted."""
+        """Delete all but the newest bundles and those `held`; returns what was deleted."""
         newest_first = sorted(self.folder.glob("*+r*.zip"), key=lambda path: path.stat().st_mtime_ns, reverse=True)
-        dropped = [path for path in newest_first[KEPT_BUNDLES:] if path not in held]
+        dropped = [path for path in newest_first[self._kept :] if path not in held]
         for path in dropped:
             path.unlink(missing_ok=True)
         return dropped

@@ -39,7 +39,7 @@ from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.recalibration import Fit, FitResult
 from runtime.recalibrator import Recalibrator
-from runtime.registry import ModelRegistry, TrackerFactory, no_tracker
+from runtime.registry import KEPT_MODELS, ModelRegistry, TrackerFactory, no_tracker
 from runtime.server import SERVICE, LightpageServer
 from runtime.sources import open_source
 from runtime.status import without_folders
@@ -472,6 +472,18 @@ def test_recalibration_over_the_endpoint_recovers_what_drift_cost_and_rollback_u
     assert air_of(service) < before - 0.8
     with pytest.raises(BundleError, match="earlier model"):
         service.client.rollback()
+
+
+def test_without_a_store_recalibration_goes_on_after_a_rollback_and_keeps_only_the_models_held(start: Start) -> None:
+    service = start()
+    assert service.client.recalibrate(count=2).model_version == "toy-1+r1"
+    assert service.client.rollback() == ("toy-1", "toy-1+r1")
+    versions = [service.client.recalibrate(count=2).model_version for _ in range(KEPT_MODELS + 1)]
+    assert versions == [f"toy-1+r{number}" for number in range(2, KEPT_MODELS + 3)]
+    kept = [model.decoder.bundle.path for model in service.plane.registry.models]
+    assert sorted(kept[0].parent.iterdir()) == sorted(kept)
+    service.recalibrator.close()
+    assert not kept[0].parent.exists()
 
 
 def test_recalibration_with_wrong_pilots_is_refused_and_the_old_model_stays(start: Start) -> None:
