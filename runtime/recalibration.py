@@ -63,7 +63,7 @@ class KnownPages:
         """Check everything against the device of `decoder`.
 
         Raises:
-            InvalidInputError: too few pages, or not as many symbols as frames.
+            InvalidInputError: too few pages, not as many symbols as frames, or the same page twice.
             FrameError: a bad frame.
             PageError: symbols of the wrong shape or range.
         """
@@ -77,6 +77,17 @@ class KnownPages:
         if self.references is not None:
             with named("reference: "):
                 decoder.check(self.references)
+        self._check_different()
+
+    def _check_different(self) -> None:
+        """A re-fit judged by a page that it was fitted on would praise itself."""
+        first: dict[str, int] = {}
+        for number, pair in enumerate(self.pairs):
+            earlier = first.setdefault(hash_frames(pair), number)
+            if earlier != number:
+                raise InvalidInputError(
+                    f"known page {number}", f"the frames of known page {earlier}", "pages that differ: one is judged by"
+                )
 
     def part(self, pages: slice) -> KnownPages:
         """Some of the pages, the rest as it is."""

@@ -144,6 +144,11 @@ def test_unusable_pages_are_named(decoder: Decoder, tmp_path: Path) -> None:
             FrameError,
             "shape",
         ),
+        (
+            KnownPages((*good.pairs[:2], good.pairs[1]), good.symbols, 16),
+            InvalidInputError,
+            "known page 2: got the frames of known page 1",
+        ),
     ]
     for pages, kind, named in cases:
         with pytest.raises(kind, match=named):

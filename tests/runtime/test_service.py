@@ -384,6 +384,18 @@ def test_a_damaged_page_of_the_source_is_the_services_own_fault(toy_zip: Path, t
         assert client.describe().source == "recording:source.h5"
 
 
+def test_a_re_fit_is_not_judged_by_the_page_that_it_was_fitted_on(toy_zip: Path, tmp_path: Path) -> None:
+    toy.write_toy_recording(path := tmp_path / "source.h5", toy.ToyDevice(DRIFTED), 16, 2)
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), open_source(f"recording:{path}"))
+    server = LightpageServer(plane, Recalibrator(plane, toy.fit_references))
+    with server, LightpageClient(server.target) as client:
+        with pytest.raises(InvalidInputError, match="known page 1: got the frames of known page 0"):
+            client.recalibrate(pages=[1, 1])
+        with pytest.raises(InvalidInputError, match="known page 2: got the frames of known page 0"):
+            client.recalibrate(count=3)  # more than the source has: it begins again with its first
+        assert client.recalibrate(pages=[1, 0]).pages_used == 2
+
+
 def test_a_damaged_recording_on_the_server_is_the_services_own_fault(start: Start, tmp_path: Path) -> None:
     service = start()
     path = tmp_path / "R.h5"
