@@ -69,8 +69,8 @@ class Recalibrator:
             BusyError: another recalibration runs.
             LimitError: more pages than the service takes.
             RecalibrationRefusedError: the new model would not be better; the old one stays.
-            SourceError: no source, or a damaged one.
-            InvalidInputError: pages without known symbols.
+            SourceError: no source, a damaged one, or one that does not know what was written.
+            InvalidInputError: no such pages, too few, or the same one twice.
         """
         source = self._plane.source
         self._check_count(len(pages) or count)
@@ -80,8 +80,8 @@ class Recalibrator:
     def from_recording(self, name: str, count: int, caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
         """Recalibrate with the first `count` pages (0: all) of a recording in the recordings folder.
 
-        Yields and raises as `from_source`, and `RecordingError` for another device's recording or too short a one; one
-        that is damaged or dark is the service's fault, as a source is.
+        Yields and raises as `from_source`, and `RecordingError` for another device's recording or too short a one,
+        `PageError` for one without symbols; one that is damaged or dark is the service's fault, as a source is.
         """
         path = self._path(name)
         self._check_count(count)
@@ -217,14 +217,14 @@ def read_known(source: FrameSource, pages: Sequence[int | None]) -> KnownPages:
     """Pages of a source with their symbols.
 
     Raises:
-        PageError: no such page, or the source does not know what was written.
-        SourceError: the source is damaged.
+        PageError: no such page.
+        SourceError: the source is damaged, or does not know what was written.
     """
     with own_fault():
         found, references = [source.read(page) for page in pages], source.references()
     symbols = [page.symbols for page in found if page.symbols is not None]
     if len(symbols) != len(found):
-        raise PageError(f"pages of {source.name}", "unknown symbols", "pages whose symbols are known")
+        raise SourceError(f"pages of {source.name}", "unknown symbols", "pages whose symbols are known")
     mask = found[0].pilot_mask if found else None
     return KnownPages(tuple(p.pair for p in found), tuple(symbols), source.levels, references, mask)
 

@@ -384,6 +384,28 @@ def test_a_damaged_page_of_the_source_is_the_services_own_fault(toy_zip: Path, t
         assert client.describe().source == "recording:source.h5"
 
 
+def test_pages_without_symbols_are_the_fault_of_who_named_them(start: Start, tmp_path: Path) -> None:
+    service = start()
+    honest = service.source.read
+
+    def unknown(page: int | None = None) -> object:
+        found = honest(page)
+        return type(found)(found.pair, found.page_index)
+
+    service.source.read = unknown  # type: ignore[method-assign,assignment]
+    toy.write_toy_recording(tmp_path / "plain.h5", toy.ToyDevice(DRIFTED), 16, 2)
+    with h5py.File(tmp_path / "plain.h5", "r+") as file:
+        del file["symbols"]
+    own = pb.RecalibrateRequest(source=pb.SourcePages(count=2))
+    named = pb.RecalibrateRequest(recording="plain.h5")
+    with grpc.insecure_channel(service.server.target) as channel:
+        stub = service.stub(channel)
+        code, text = status(lambda: list(stub.Recalibrate(own, timeout=20)))
+        assert (code, text.partition(":")[0]) == (grpc.StatusCode.FAILED_PRECONDITION, "pages of toy")
+        code, text = status(lambda: list(stub.Recalibrate(named, timeout=20)))
+        assert (code, text.partition(":")[0]) == (grpc.StatusCode.INVALID_ARGUMENT, "recording plain.h5")
+
+
 def test_a_re_fit_is_not_judged_by_the_page_that_it_was_fitted_on(toy_zip: Path, tmp_path: Path) -> None:
     toy.write_toy_recording(path := tmp_path / "source.h5", toy.ToyDevice(DRIFTED), 16, 2)
     plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), open_source(f"recording:{path}"))
