@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.errors import InvalidInputError, LightpageError, PageError
-from optics.page import MAX_LEVELS, symbol_phases
+from optics.page import MAX_LEVELS, check_levels, symbol_phases
 from optics.pilots import Pilots
 from runtime.dataplane import Answer, ReadAnswer
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -19,6 +19,7 @@ from runtime.registry import Model
 PIXEL_TYPES = {pb.PIXEL_TYPE_UINT8: "uint8", pb.PIXEL_TYPE_UINT16: "uint16"}
 PIXEL_CODES = {name: code for code, name in PIXEL_TYPES.items()}
 
+_CONFIDENCE_FORMATS = (pb.CONFIDENCE_FORMAT_UNSPECIFIED, pb.CONFIDENCE_FORMAT_FLOAT32, pb.CONFIDENCE_FORMAT_UINT8)
 _FLOAT = np.dtype("<f4")
 
 
@@ -71,13 +72,27 @@ def pilots_message(pilots: KnownPilots) -> pb.Pilots:
     return pb.Pilots(mask=pilots.mask.astype(np.uint8).tobytes(), values=values, levels=pilots.levels)
 
 
+def check_options(options: pb.DecodeOptions) -> None:
+    """Check what a caller asks for, before a frame is received or a page is read for it.
+
+    Raises:
+        PageError: an impossible level count; 0 stands for the default.
+        InvalidInputError: an unknown format of confidences.
+    """
+    if options.levels:
+        check_levels(options.levels)
+    if options.confidence_format not in _CONFIDENCE_FORMATS:
+        wanted = "CONFIDENCE_FORMAT_FLOAT32 or CONFIDENCE_FORMAT_UINT8"
+        raise InvalidInputError("confidence_format", options.confidence_format, wanted)
+
+
 def levels_of(options: pb.DecodeOptions) -> int:
     """The level count asked for, 256 by default."""
     return options.levels or MAX_LEVELS
 
 
 def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
-    """An answer as its message."""
+    """An answer as its message, for `options` that have been checked."""
     page = answer.page
     rows, columns = page.symbols.shape
     return pb.DecodeReply(
@@ -103,11 +118,9 @@ def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
 
 
 def _confidence_bytes(confidence: NDArray[np.float32], code: int) -> bytes:
-    if code in (pb.CONFIDENCE_FORMAT_UNSPECIFIED, pb.CONFIDENCE_FORMAT_FLOAT32):
-        return confidence.astype(_FLOAT).tobytes()
     if code == pb.CONFIDENCE_FORMAT_UINT8:
         return np.floor(confidence * 255).astype(np.uint8).tobytes()
-    raise InvalidInputError("confidence_format", code, "CONFIDENCE_FORMAT_FLOAT32 or CONFIDENCE_FORMAT_UINT8")
+    return confidence.astype(_FLOAT).tobytes()
 
 
 def read_reply(read: ReadAnswer, request: pb.ReadPageRequest) -> pb.ReadPageReply:

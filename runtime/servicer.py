@@ -15,6 +15,7 @@ from optics.errors import FrameError, InvalidInputError, LimitError
 from runtime.caller import Caller
 from runtime.convert import (
     PIXEL_CODES,
+    check_options,
     decode_reply,
     levels_of,
     model_message,
@@ -77,7 +78,10 @@ class LightpageServicer(pb_grpc.LightpageServicer):
         with self._call("DecodeFrames", context):
             with _stall_guard(context, receive_s):
                 header = _header(request_iterator)
+            check_options(header.options)
             caller, levels = _caller(context), levels_of(header.options)
+            page_shape = self._plane.registry.current.decoder.bundle.profile.page_shape
+            pilots = pilots_of(header.pilots, page_shape, levels) if header.HasField("pilots") else None
             shape = (header.rows_px, header.columns_px)
             with self._plane.receiving(shape, pixel_type(header.pixel_type), header.bit_depth, caller) as receiver:
                 with _stall_guard(context, receive_s):  # from here: waiting for the slot is not the client's doing
@@ -92,14 +96,13 @@ class LightpageServicer(pb_grpc.LightpageServicer):
                         receiver.add(part.chunk)
                 pair = receiver.pair()
                 received = time.perf_counter()
-                page_shape = self._plane.registry.current.decoder.bundle.profile.page_shape
-                pilots = pilots_of(header.pilots, page_shape, levels) if header.HasField("pilots") else None
                 answer = self._plane.decode(pair, levels, caller, pilots, start=start, received=received)
             return decode_reply(answer, header.options)
 
     def ReadPage(self, request: pb.ReadPageRequest, context: grpc.ServicerContext) -> pb.ReadPageReply:
         """Read a page from the source and decode it."""
         with self._call("ReadPage", context):
+            check_options(request.options)
             page = request.page if request.HasField("page") else None
             read = self._plane.read_page(page, request.options.levels or None, _caller(context))
             return read_reply(read, request)

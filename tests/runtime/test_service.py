@@ -224,9 +224,43 @@ def call_with(service: Running, parts: list[pb.DecodeFramesRequest]) -> tuple[gr
     return grpc.StatusCode.OK, ""
 
 
-def header(rows: int = toy.SHAPE[0], columns: int = toy.SHAPE[1], kind: int = pb.PIXEL_TYPE_UINT8) -> pb.DecodeHeader:
-    options = pb.DecodeOptions(levels=16)
-    return pb.DecodeHeader(rows_px=rows, columns_px=columns, pixel_type=kind, bit_depth=8, options=options)
+def header(
+    rows: int = toy.SHAPE[0],
+    columns: int = toy.SHAPE[1],
+    kind: int = pb.PIXEL_TYPE_UINT8,
+    options: pb.DecodeOptions | None = None,
+    pilots: pb.Pilots | None = None,
+) -> pb.DecodeHeader:
+    options = options or pb.DecodeOptions(levels=16)
+    return pb.DecodeHeader(
+        rows_px=rows, columns_px=columns, pixel_type=kind, bit_depth=8, options=options, pilots=pilots
+    )
+
+
+BAD_OPTIONS = (
+    (pb.DecodeOptions(levels=999), "levels"),
+    (pb.DecodeOptions(levels=1), "levels"),
+    (pb.DecodeOptions(levels=16, confidence_format=7), "confidence_format"),  # type: ignore[arg-type]
+)
+
+
+def test_bad_options_are_named_before_a_frame_is_sent(start: Start) -> None:
+    service = start()
+    begun = [(header(options=options), named) for options, named in BAD_OPTIONS]
+    for begin, named in [*begun, (header(pilots=pb.Pilots(mask=b"abc")), "pilots")]:
+        code, text = call_with(service, [pb.DecodeFramesRequest(header=begin)])
+        assert (code, text.partition(":")[0]) == (grpc.StatusCode.INVALID_ARGUMENT, named)
+
+
+def test_bad_options_take_no_page_from_the_source(start: Start) -> None:
+    service = start()
+    with grpc.insecure_channel(service.server.target) as channel:
+        stub = service.stub(channel)
+        for options, named in BAD_OPTIONS:
+            request = pb.ReadPageRequest(options=options)
+            code, text = status(lambda request=request: stub.ReadPage(request, timeout=20))  # type: ignore[misc]
+            assert (code, text.partition(":")[0]) == (grpc.StatusCode.INVALID_ARGUMENT, named)
+    assert service.client.read_page().page == 0
 
 
 def test_a_broken_stream_is_the_callers_fault_and_named(start: Start) -> None:
