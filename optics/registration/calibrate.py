@@ -134,13 +134,13 @@ def calibrate(
         profile: the nominal device.
         references: reference-only frames.
         pages: one to a few known pages; the first is fitted, all are judged by.
-        progress: told of every stage.
+        progress: told of every stage, and within it of every patch or derivative, so that it may stop the work soon.
 
     Raises:
         CalibrationError: nothing within the capture range explains the frames, or the page is too small to tell.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
-    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASES) + 4
+    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASES) + 5
     for stage in _SINGLE_CAMERA:
         work.single_camera(stage)
     work.estimate_turn()
@@ -176,7 +176,7 @@ def refine(
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
     work.parameters, work.turn = start.copy(), turn
-    work.total = len(_DRIFTED) + 1
+    work.total = len(_DRIFTED) + 2
     for stage in _DRIFTED:
         work.complex_field(stage, start, _DRIFT_SCALE)
     work.waves("waves", _ALL_GROUPS, start, _DRIFT_SCALE)
@@ -247,43 +247,38 @@ class _Registration:
         self.turn = np.pi / 2
         self.fit: Fit | None = None
         self.total = 1
-        self._done = 0
+        self._stage, self._done = "", 0
         self._pixel = profile.camera.pitch_m
         self._looked: list[Measurement] = []
         self._found: list[Measurement] = []
 
-    def _tell(self, what: str) -> None:
-        self.progress(what, self._done / self.total)
-        self._done += 1
+    def _begin(self, what: str) -> None:
+        """Tell of the next stage."""
+        self._stage, self._done = what, self._done + 1
+        self._tell(0.0)
+
+    def _tell(self, share: float) -> None:
+        """Tell what share of the present stage is behind."""
+        self.progress(self._stage, (self._done - 1 + share) / self.total)
 
     def single_camera(self, stage: _Stage, centre: Real | None = None) -> None:
         """Measure the direct branch on each camera by itself and fit places and slopes."""
-        self._tell(stage.name)
-        page, found = self.pages[0], list[Measurement]()
-        for camera, sampler in enumerate(self._frame_samplers(page)):
-            for patch in self._where(stage):
-                found += self._measure(sampler, stage, patch, page, (camera,))
-        self._fit(stage, found, centre)
+        self._begin(stage.name)
+        in_phase, quadrature = self._on_each_camera(stage)
+        self._fit(stage, in_phase + quadrature, centre)
 
     def complex_field(self, stage: _Stage, centre: Real | None = None, prior_scale: float | Real = 1.0) -> None:
         """Measure branches on the recovered field and fit."""
-        self._tell(stage.name)
-        page, found = self.pages[0], list[Measurement]()
-        sampler = FieldSampler(self._field(page)[0], self.grid)
-        for patch in self._where(stage):
-            found += self._measure(sampler, stage, patch, page, (0, 1))
-        self._fit(stage, found, centre, prior_scale)
+        self._begin(stage.name)
+        sampler = FieldSampler(self._field(self.pages[0])[0], self.grid)
+        self._fit(stage, self._measure(sampler, stage, (0, 1)), centre, prior_scale)
 
     def estimate_turn(self) -> None:
         """The angle between the arms, from the phases that the same known symbols show on either camera."""
-        self._tell("angle between the arms")
-        page, where = self.pages[0], _Stage("", 0, 1, (), COHERENT_BRANCHES)
-        seen = [
-            [m for patch in self.patches for m in self._measure(sampler, where, patch, page, (camera,))]
-            for camera, sampler in enumerate(self._frame_samplers(page))
-        ]
+        stage = _Stage("angle between the arms", 0, 1, (), COHERENT_BRANCHES)
+        self._begin(stage.name)
         total = 0j
-        for one, other in zip(*seen, strict=True):
+        for one, other in zip(*self._on_each_camera(stage), strict=True):
             if min(one.significance, other.significance) > SIGNIFICANT:
                 weight = 1 / (1 / one.significance + 1 / other.significance)
                 total += weight * np.exp(1j * (one.phase - other.phase))
@@ -297,17 +292,18 @@ class _Registration:
         self, what: str, groups: tuple[str, ...], centre: Real | None = None, prior_scale: float | Real = 1.0
     ) -> None:
         """Fit `groups` and the angle between the arms to the waves of the first page."""
-        self._tell(what)
+        self._begin(what)
         page = self.pages[0]
         fit = WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
-        found = fit.fit(self.parameters, self.turn, groups, centre, prior_scale)
+        found = fit.fit(self.parameters, self.turn, groups, centre, prior_scale, self._tell)
         self.parameters, self.deviations, self.turn = found.parameters, found.deviations, found.turn
 
     def result(self, before: Real) -> Registered:
         """Judge the outcome; `before` is the geometry that it is compared with."""
         if self.fit is None:
             raise CalibrationError("calibration", "no fit", "at least one stage")
-        after = float(np.mean([self._coherence(page, self.parameters) for page in self.pages]))
+        self._begin("coherence")
+        after = self._coherence(self.parameters)
         significant = len(self._found) / len(self._looked)
         reflected = {branch: self._share(branch) for branch in _REFLECTED}
         check_found(after, significant, self.pages[0].symbols.size, reflected)
@@ -315,7 +311,7 @@ class _Registration:
             parameters=self.parameters,
             deviations=self.deviations,
             turn=self.turn,
-            coherence_before=float(np.mean([self._coherence(page, before) for page in self.pages])),
+            coherence_before=self._coherence(before, 0.5),
             coherence_after=after,
             cost=self.fit.cost,
             significant=significant,
@@ -326,9 +322,14 @@ class _Registration:
         looked, found = (sum(m.branch == branch for m in part) for part in (self._looked, self._found))
         return found / looked if looked else 0.0
 
-    def _coherence(self, page: KnownPage, parameters: Real) -> float:
-        sampler = FieldSampler(self._field(page, parameters)[0], self.grid)
-        return page_coherence(sampler, self.twin, parameters, self.profile, page.symbols)
+    def _coherence(self, parameters: Real, begun: float = 0.0) -> float:
+        """Mean over the pages; takes half of the stage, of which the share `begun` is behind."""
+        found = []
+        for number, page in enumerate(self.pages):
+            self._tell(begun + number / len(self.pages) / 2)
+            sampler = FieldSampler(self._field(page, parameters)[0], self.grid)
+            found.append(page_coherence(sampler, self.twin, parameters, self.profile, page.symbols))
+        return float(np.mean(found))
 
     def _field(
         self, page: KnownPage, parameters: Real | None = None, turn: float | None = None
@@ -353,27 +354,41 @@ class _Registration:
             return self.patches
         return middle_patches(self.profile, self.patches, _FEWEST)
 
+    def _on_each_camera(self, stage: _Stage) -> list[list[Measurement]]:
+        """The first page's patches as either camera sees them by itself."""
+        return [
+            self._measure(sampler, stage, (camera,), camera / 2)
+            for camera, sampler in enumerate(self._frame_samplers(self.pages[0]))
+        ]
+
     def _measure(
-        self,
-        sampler: FrameSampler | FieldSampler,
-        stage: _Stage,
-        patch: Patch,
-        page: KnownPage,
-        cameras: tuple[int, ...],
+        self, sampler: FrameSampler | FieldSampler, stage: _Stage, cameras: tuple[int, ...], begun: float = 0.0
     ) -> list[Measurement]:
+        """The first page's patches as `sampler` sees them.
+
+        Args:
+            sampler: the field, or one camera's light.
+            stage: what to look for.
+            cameras: through which of the two; each takes half of the stage.
+            begun: share of the stage that is behind.
+        """
         window = search_window(stage.reach_px * self._pixel, stage.step_px * self._pixel)
-        return measure(
-            sampler,
-            self.twin,
-            self.parameters,
-            self.profile,
-            patch,
-            page.symbols,
-            stage.branches,
-            window,
-            samples=max(1, self._samples // 2) if stage.half_rate else self._samples,
-            cameras=cameras,
-        )
+        where, found = self._where(stage), list[Measurement]()
+        for number, patch in enumerate(where):
+            self._tell(begun + number / len(where) * len(cameras) / 2)
+            found += measure(
+                sampler,
+                self.twin,
+                self.parameters,
+                self.profile,
+                patch,
+                self.pages[0].symbols,
+                stage.branches,
+                window,
+                samples=max(1, self._samples // 2) if stage.half_rate else self._samples,
+                cameras=cameras,
+            )
+        return found
 
     def _fit(
         self, stage: _Stage, found: list[Measurement], centre: Real | None, prior_scale: float | Real = 1.0

@@ -7,7 +7,9 @@ the arms is, and what pipe and lenses are: more than patches of symbols do, sinc
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -137,6 +139,7 @@ class WaveFit:
         groups: tuple[str, ...],
         centre: Real | None = None,
         prior_scale: float | Real = 1.0,
+        progress: Callable[[float], None] = lambda share: None,
     ) -> WaveFitted:
         """Fit the parameters of `groups` and the angle between the arms.
 
@@ -147,6 +150,8 @@ class WaveFit:
                 phases instead.
             centre: [P] centre of the priors, nominal (zero) if None.
             prior_scale: factor on the priors' standard deviations, one for all or [P].
+            progress: told of every round and of every derivative, with the share of the most rounds that is behind,
+                0 to 1. It may raise to stop the work.
         """
         without_effect = _OF_REAL_LENSES if self._profile.ideal_lenses else ()
         of_light = [index for index in indices(*groups) if index not in (*_SEEN, *without_effect)]
@@ -158,8 +163,9 @@ class WaveFit:
         best = WaveFitted(start, np.zeros(len(PARAMETERS)), turn, np.inf)
         fall, whole = 1.0, False
         for number in range(_ROUNDS):
+            progress(number / _ROUNDS)
             if number % _CHORD == 0 and not (whole and fall < _NEARLY):
-                slopes = self._slopes(state, of_light, of_cameras)
+                slopes = self._slopes(state, of_light, of_cameras, partial(_within_round, progress, number))
             directions = _directions(state.light, bends="launch" not in groups)
             columns, left = self._equations(state, slopes, directions)
             residual = float(np.sqrt(np.mean(left**2)))
@@ -195,7 +201,9 @@ class WaveFit:
         found = np.linalg.lstsq(np.stack([columns.real, -columns.imag], axis=1), counts.ravel(), rcond=None)[0]
         return _State(parameters, turn, even * complex(*found))
 
-    def _slopes(self, state: _State, of_light: list[int], of_cameras: list[int]) -> _Slopes:
+    def _slopes(
+        self, state: _State, of_light: list[int], of_cameras: list[int], progress: Callable[[float], None]
+    ) -> _Slopes:
         def waves(parameters: Real, like: FittedWaves | None = None) -> FittedWaves:
             stride, accuracy = self._stride, _CHORD_ACCURACY
             return FittedWaves(
@@ -211,7 +219,8 @@ class WaveFit:
         by_term = np.stack([here.to_camera(page) for page in self._pages])
         page, field = np.tensordot(state.light, self._pages, 1), np.tensordot(state.light, by_term, 1)
         light, pixels = list[Complex](), list[Real]()
-        for index in of_light:
+        for number, index in enumerate(of_light):
+            progress(number / len(of_light))
             there, step = stepped(index)
             moved = waves(there, here)
             at_camera = index in _AT_CAMERA
@@ -279,6 +288,11 @@ class WaveFit:
             state.light + share * step[: len(directions)] @ directions,
         )
         return moved, share == 1
+
+
+def _within_round(progress: Callable[[float], None], number: int, share: float) -> None:
+    """Tell of a share of round `number`."""
+    progress((number + share) / _ROUNDS)
 
 
 def _directions(light: Complex, *, bends: bool) -> Complex:

@@ -112,6 +112,28 @@ def test_a_derivative_that_has_all_but_converged_serves_to_the_end(monkeypatch: 
     assert taken == [0]
 
 
+def test_a_fit_tells_of_every_round_and_derivative_and_ends_where_it_is_stopped() -> None:
+    class Stopped(Exception):
+        pass
+
+    device, told = Device(drift=Drift(shift_px=0)), list[float]()
+
+    def stop_in_the_derivative(share: float) -> None:
+        told.append(share)
+        if len(told) == 10:
+            raise Stopped
+
+    fit, start = seen_by(device, 1), true_parameters(PROFILE, device)
+    with pytest.raises(Stopped):
+        fit.fit(start, device.homodyne.turn_rad, EVERY, progress=stop_in_the_derivative)
+    assert 0 < told[-1] < 1 / wave_fit._ROUNDS  # in the first round, a derivative of every parameter of the light
+    shares = list[float]()
+    fit.fit(start, device.homodyne.turn_rad, ("in_phase", "angle"), progress=shares.append)
+    assert told == sorted(told)
+    assert shares == sorted(shares)
+    assert {0, 1 / wave_fit._ROUNDS} <= set(shares) <= {n / wave_fit._ROUNDS for n in range(wave_fit._ROUNDS)}
+
+
 def test_how_much_path_real_lenses_add_comes_back() -> None:
     index = NAMES.index("lens_path_relative")
     thick = PROFILE.model_copy(update={"lens_path": THICK.times(0.25)})  # a quarter as much takes a tenth of the time
