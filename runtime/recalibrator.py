@@ -28,6 +28,7 @@ from runtime.decoder import Decoder
 from runtime.errors import SourceError, StoppingError
 from runtime.evaluation import check_recording
 from runtime.frames import narrow
+from runtime.limits import GRACE_S
 from runtime.recalibration import Fit, KnownPages, RecalibrationOutcome, next_version, recalibrate
 from runtime.sources import FrameSource, own_fault
 from runtime.store import ModelStore
@@ -99,13 +100,21 @@ class Recalibrator:
 
         return self._run(read, caller)
 
-    def close(self) -> None:
-        """Stop a running recalibration at its next step and drop temporary bundles."""
+    def close(self, wait_s: float = GRACE_S) -> None:
+        """Stop a running recalibration at its next step, which is waited for at most `wait_s`; drop temporary bundles.
+
+        One that takes longer changes nothing any more; its temporary bundles are dropped when the process ends.
+        """
         self._stop.set()
-        with self._busy:  # the running one has ended
+        if not self._busy.acquire(timeout=wait_s):
+            _log.warning("recalibration: not stopped after %.1f s, left to itself", wait_s)
+            return
+        try:
             if self._temporary is not None:
                 self._temporary.cleanup()
                 self._temporary = None
+        finally:
+            self._busy.release()
 
     def _run(self, read: Callable[[], KnownPages], caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
         """Work in a thread of its own; one who stops iterating stops it at its next step."""

@@ -87,8 +87,9 @@ class LightpageServer:
     def stop(self, grace_s: float | None = None) -> None:
         """Say NOT_SERVING, take no new calls, let those in flight end within `grace_s`, then end the rest."""
         self._health.enter_graceful_shutdown()
-        stopped = self._server.stop(self._plane.limits.grace_s if grace_s is None else grace_s)
-        self._recalibrator.close()
+        grace_s = self._plane.limits.grace_s if grace_s is None else grace_s
+        stopped = self._server.stop(grace_s)
+        self._recalibrator.close(grace_s)
         stopped.wait()
         self._close_pools()
 

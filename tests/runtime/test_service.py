@@ -665,6 +665,27 @@ def test_a_recalibration_that_the_end_of_the_service_cuts_off_says_so(start: Sta
     assert service.plane.metrics.recalibrations.labels("dropped")._value.get() == 1
 
 
+def test_the_service_ends_in_time_beside_a_recalibration_that_does_not_stop(start: Start) -> None:
+    entered, go = threading.Event(), threading.Event()
+
+    def deaf(*arguments: object) -> FitResult:
+        entered.set()
+        go.wait(20)
+        return toy.fit_references(*arguments)  # type: ignore[arg-type]
+
+    service = start(fit=deaf)
+    with grpc.insecure_channel(service.server.target) as channel:
+        call = service.stub(channel).Recalibrate(pb.RecalibrateRequest(source=pb.SourcePages(count=2)), timeout=20)
+        assert next(call).progress.step
+        assert entered.wait(10)
+        begun = time.monotonic()
+        service.server.stop(0.5)
+        assert time.monotonic() - begun < 5
+    go.set()
+    assert wait_until(lambda: service.plane.metrics.recalibrations.labels("dropped")._value.get() == 1)
+    assert [model.version for model in service.plane.registry.models] == ["toy-1"]
+
+
 def test_a_second_recalibration_is_turned_away_and_the_first_ends_well(start: Start) -> None:
     fit = slow_fit()
     service = start(fit=fit)  # type: ignore[arg-type]
