@@ -12,7 +12,7 @@ from optics.files import NewPath, OutputFile, write_json
 from optics.progress import percent_bar, warn
 from optics.recording import Recording
 from optics.registration.known import first_lit_pages
-from runtime.client import LightpageClient, Recalibrated
+from runtime.client import RECALIBRATION_S, LightpageClient, Recalibrated
 from runtime.decoder import Decoder
 from runtime.evaluation import check_recording
 from runtime.manifest import check_version
@@ -31,6 +31,13 @@ DEFAULT_PAGES = 2
 @click.option("--out", type=NewPath(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
 @click.option("--target", metavar="HOST:PORT", help="Recalibrate this running service instead of a bundle.")
 @click.option("--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(2), help="Known pages to use.")
+@click.option(
+    "--timeout",
+    "timeout_s",
+    type=click.FloatRange(0, min_open=True),
+    show_default=f"{RECALIBRATION_S:.0f}",
+    help="With --target: seconds to wait for the result.",
+)
 @click.option("--version", help="Offline: version of the new bundle; by default the next one.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the result to this file.")
 def recalibrate(
@@ -39,6 +46,7 @@ def recalibrate(
     out: Path | None,
     target: str | None,
     pages: int,
+    timeout_s: float | None,
     version: str | None,
     json_path: Path | None,
 ) -> None:
@@ -51,8 +59,10 @@ def recalibrate(
     if target is not None:
         if bundle or out or version is not None:
             raise InvalidInputError("--target", "with --bundle, --out or --version", "either a service or a bundle")
-        result: RecalibrationOutcome | Recalibrated = _remote(target, recording, pages)
+        result: RecalibrationOutcome | Recalibrated = _remote(target, recording, pages, timeout_s)
     else:
+        if timeout_s is not None:
+            raise InvalidInputError("--timeout", "without --target", "a service to wait for")
         if not (bundle and recording and out):
             given = {"--bundle": bundle, "--recording": recording, "--out": out}
             lacking = ", ".join(name for name, value in given.items() if not value)
@@ -81,9 +91,10 @@ def summary(result: RecalibrationOutcome | Recalibrated, seconds: float) -> dict
     }
 
 
-def _remote(target: str, recording: str | None, pages: int) -> Recalibrated:
+def _remote(target: str, recording: str | None, pages: int, timeout_s: float | None) -> Recalibrated:
+    timeout_s = RECALIBRATION_S if timeout_s is None else timeout_s
     with LightpageClient(target) as client, percent_bar() as progress:
-        return client.recalibrate(count=pages, recording=recording, progress=progress)
+        return client.recalibrate(count=pages, recording=recording, progress=progress, timeout_s=timeout_s)
 
 
 def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> RecalibrationOutcome:

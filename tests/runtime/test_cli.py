@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint
@@ -479,6 +480,26 @@ def test_recalibrate_asks_a_service_for_as_many_pages_of_a_recording_as_it_is_to
         where = ["--target", server.target, "--recording", "known.h5"]
         assert run(["recalibrate", *where, "--pages", "3", "--json", report]) == 0
     assert json.loads(report.read_text())["pages_used"] == 3
+
+
+def test_recalibrate_waits_for_a_service_as_long_as_it_is_told(
+    toy_zip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    go = threading.Event()
+
+    def waits(*arguments: object) -> object:
+        go.wait(20)
+        return toy.fit_references(*arguments)  # type: ignore[arg-type]
+
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), toy.ToySource(toy.ToyDevice()))
+    with LightpageServer(plane, Recalibrator(plane, waits)) as server:  # type: ignore[arg-type]
+        arguments = ["recalibrate", "--target", server.target, "--timeout"]
+        assert run([*arguments, "0.5"]) == 2
+        assert "DEADLINE_EXCEEDED" in capsys.readouterr().err
+        assert run([*arguments, "0"]) == 2
+        go.set()
+    assert run(["recalibrate", "--bundle", toy_zip, "--timeout", "5"]) == 2
+    assert "--timeout: got without --target" in capsys.readouterr().err
 
 
 def test_an_interrupted_decode_leaves_nothing_half_written(
