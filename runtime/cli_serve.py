@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from optics.errors import BundleError, InvalidInputError
+from optics.errors import BundleError, CalibrationError, InvalidInputError
 from runtime.address import check_address
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
@@ -120,13 +120,13 @@ def stop_signals() -> Iterator[Callable[[], None]]:
 
 
 def _resume(registry: ModelRegistry, store: ModelStore, threads: int | None) -> None:
-    """Put the model back in service that was recalibrated from this bundle before a restart."""
+    """Put the model back in service that was recalibrated from this bundle before a restart, if it can be used."""
     path = store.last()
     if path is None:
         return
     try:
         registry.swap(Decoder.load(path, threads))
-    except BundleError as error:
+    except (BundleError, CalibrationError) as error:
         _log.warning("serving %s as it was given: %s", registry.current.version, error)
 
 

@@ -78,7 +78,8 @@ class ModelRegistry:
             note: called with the new model before it is in service; what it raises leaves the old one there.
 
         Raises:
-            BundleError: the decoder is for another device, or its version is held already.
+            BundleError: the decoder is for another device, its version is held already, or it cannot be tracked.
+            CalibrationError: its tracker needs a calibration that the bundle does not hold.
             RecalibrationRefusedError: `expected` is no longer current.
         """
         model = Model(decoder, self._make_tracker(decoder))

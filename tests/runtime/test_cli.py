@@ -20,10 +20,12 @@ import h5py
 import numpy as np
 import pytest
 
+from optics.errors import CalibrationError
 from optics.recording import FramePair, Recording, RecordingWriter
 from runtime import cli, cli_recalibrate
 from runtime.bundle import Bundle
 from runtime.cli import RESUME_KEY, LazyGroup, lightpage
+from runtime.cli_serve import _resume
 from runtime.client import LightpageClient
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
@@ -31,6 +33,8 @@ from runtime.recalibrator import Recalibrator
 from runtime.registry import ModelRegistry
 from runtime.server import LightpageServer
 from runtime.sources import open_source
+from runtime.store import ModelStore
+from runtime.tracking import NoTracker
 from tests.runtime import toy
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -629,8 +633,6 @@ def test_a_signal_is_never_missed_whenever_it_comes() -> None:
 
 
 def test_a_restarted_service_uses_the_model_that_was_in_service(toy_zip: Path, tmp_path: Path) -> None:
-    from runtime.store import ModelStore
-
     store = ModelStore(tmp_path / "store", Bundle.open(toy_zip))
     store.remember(toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1"))
     served = Served("--bundle", toy_zip, "--store", tmp_path / "store")
@@ -643,6 +645,21 @@ def test_a_restarted_service_uses_the_model_that_was_in_service(toy_zip: Path, t
         served.process.kill()
         served.process.wait()
     assert store.last() is None
+
+
+def test_a_stored_model_whose_calibration_is_bad_leaves_the_base_in_service(
+    decoder: Decoder, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def tracker(made: Decoder) -> NoTracker:
+        if made is not decoder:
+            raise CalibrationError("bundle toy-1+r1: calibration", "no table", "a calibration document")
+        return NoTracker()
+
+    store, registry = ModelStore(tmp_path / "store", decoder.bundle), ModelRegistry(decoder, tracker)
+    store.remember(toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1"))
+    _resume(registry, store, 1)
+    assert [model.version for model in registry.models] == ["toy-1"]
+    assert "serving toy-1 as it was given: bundle toy-1+r1: calibration" in caplog.text
 
 
 def test_serve_refuses_a_damaged_bundle_in_one_line(toy_zip: Path, tmp_path: Path) -> None:
