@@ -109,7 +109,11 @@ class LightpageClient:
         self._channel.close()
 
     def describe(self) -> Description:
-        """What the service is now."""
+        """What the service is now.
+
+        Raises:
+            LightpageError: no answer.
+        """
         reply: pb.DescribeReply = self._unary(self._stub.Describe, pb.DescribeRequest())
         self._description = Description(
             service_version=reply.service_version,
@@ -151,6 +155,8 @@ class LightpageClient:
 
         Raises:
             FrameError: frames that cannot be sent, or that the service refuses.
+            PageError: an impossible level count, or pilots that do not fit the page.
+            SlotsTakenError: the service had no free slot until the deadline.
         """
         if bit_depth is None:
             bit_depth = (self._description or self.describe()).bit_depth
@@ -183,7 +189,13 @@ class LightpageClient:
         want_written: bool = False,
         quantised: bool = False,
     ) -> RemotePage:
-        """Have the service read a page from its source; None stands for the next page and the source's levels."""
+        """Have the service read a page from its source; None stands for the next page and the source's levels.
+
+        Raises:
+            SourceError: the service has no source, or one that is damaged or dark.
+            PageError: no such page, or an impossible level count.
+            SlotsTakenError: the service had no free slot until the deadline.
+        """
         request = pb.ReadPageRequest(
             options=_options(levels or 0, want_concentration, want_phase, quantised), want_written=want_written
         )
@@ -208,6 +220,11 @@ class LightpageClient:
         Raises:
             RecalibrationRefusedError: the new model would not be better; the old one stays.
             BusyError: another recalibration runs.
+            LimitError: more pages than the service takes.
+            InvalidInputError: no such pages or recording, too few pages, the same one twice, or unknown symbols.
+            SourceError: the service has no source or recordings, or damaged ones, or no symbols of its own pages.
+            StoppingError: the service is being stopped.
+            BundleError: the new model cannot be written or noted; the old one stays.
         """
         request = pb.RecalibrateRequest()
         if recording is not None:
@@ -231,12 +248,20 @@ class LightpageClient:
         return result
 
     def rollback(self) -> tuple[str, str]:
-        """Go back to the model before; returns the versions (now current, dropped)."""
+        """Go back to the model before; returns the versions (now current, dropped).
+
+        Raises:
+            BundleError: there is none, or the change cannot be noted in the service's store; then nothing changes.
+        """
         reply: pb.RollbackReply = self._unary(self._stub.Rollback, pb.RollbackRequest())
         return reply.model_version, reply.previous_version
 
     def models(self) -> list[ModelInfo]:
-        """All models that the service holds, the oldest first."""
+        """All models that the service holds, the oldest first.
+
+        Raises:
+            LightpageError: no answer.
+        """
         reply: pb.ListModelsReply = self._unary(self._stub.ListModels, pb.ListModelsRequest())
         return [_model(model) for model in reply.models]
 
