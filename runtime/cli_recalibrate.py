@@ -18,7 +18,7 @@ from runtime.evaluation import check_recording
 from runtime.manifest import check_version
 from runtime.recalibration import KnownPages, RecalibrationOutcome, next_version
 from runtime.recalibration import recalibrate as recalibrate_bundle
-from runtime.recalibrator import known_pages
+from runtime.recalibrator import read_recorded
 from runtime.refit import refit
 from runtime.shipped import bundle_path
 
@@ -112,7 +112,7 @@ def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | 
 def _read(decoder: Decoder, recording: str, pages: int) -> KnownPages:
     with Recording.open(recording) as file:
         check_recording(decoder, file)
-        return known_pages(file, first_lit_pages(file, pages, warn))
+        return read_recorded(file, first_lit_pages(file, pages, warn))
 
 
 @click.command()

@@ -96,7 +96,7 @@ class Recalibrator:
                     raise RecordingError(f"recording {name}", f"{recording.pages} pages", f"at least {count}")
                 self._check_count(count or recording.pages)
                 with own_fault():
-                    return known_pages(recording, range(count or recording.pages))
+                    return read_recorded(recording, range(count or recording.pages))
 
         return self._run(read, caller)
 
@@ -238,7 +238,7 @@ def read_known(source: FrameSource, pages: Sequence[int | None]) -> KnownPages:
     return KnownPages(tuple(p.pair for p in found), tuple(symbols), source.levels, references, mask)
 
 
-def known_pages(recording: Recording, pages: Sequence[int] | None = None) -> KnownPages:
+def read_recorded(recording: Recording, pages: Sequence[int] | None = None) -> KnownPages:
     """Pages of a recording with their symbols, all of them by default.
 
     Raises:
