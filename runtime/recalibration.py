@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Protocol
@@ -169,7 +170,7 @@ def recalibrate(
         out: a new path, a zip where it ends in .zip.
         version: version of the new bundle.
         fit: how to fit.
-        progress: told of every step.
+        progress: told of every step, and within it of every page.
         table: tensors that the model in service is fed now, as its tracker has them; the bundle's own by default.
 
     Raises:
@@ -182,16 +183,16 @@ def recalibrate(
     pages.check(decoder)
     fitted_count = min(FIT_PAGES, len(pages.pairs) - 1)
     fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))
-    progress("measure the model in service", 0.0)
     try:
-        before = fmean(_air(decoder, held_back, table))
+        before = fmean(_air(decoder, held_back, partial(_within, progress, "measure the model in service", 0.0), table))
     except FrameError:
         before = -math.inf  # any model that takes the frames is better
     try:
         result = fit(decoder.bundle, fitted, lambda step, share: progress(step, 0.05 + 0.85 * share), decoder)
-        progress("judge by the held-back pages", 0.9)
+        judging = partial(_within, progress, "judge by the held-back pages", 0.9)
+        judging(0.0)
         refitted = decoder.with_table(result.table)
-        rates = _air(refitted, held_back)
+        rates = _air(refitted, held_back, judging)
     except (CalibrationError, FrameError) as error:
         raise RecalibrationRefusedError(error.thing, error.got, error.wanted) from error
     after = fmean(rates)
@@ -220,11 +221,19 @@ def next_version(version: str, taken: Sequence[str] = ()) -> str:
     return f"{base}+r{last + 1}"
 
 
-def _air(decoder: Decoder, pages: KnownPages, table: Table | None = None) -> list[float]:
+def _within(progress: Progress, step: str, start: float, share: float) -> None:
+    """Tell of a share of a step that takes a twentieth of the work."""
+    progress(step, start + 0.05 * share)
+
+
+def _air(
+    decoder: Decoder, pages: KnownPages, progress: Callable[[float], None], table: Table | None = None
+) -> list[float]:
     """AIR over the data symbols of each page, bits per symbol; `FrameError` where the model refuses the frames."""
     mask = decoder.bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
-    data, rates = ~mask, []
+    data, rates = ~mask, list[float]()
     for pair, symbols in zip(pages.pairs, pages.symbols, strict=True):
+        progress(len(rates) / len(pages.pairs))
         page = decoder.decode(pair, pages.levels, table, Pilots.of_symbols(mask, symbols, pages.levels))
         figures = measure(page.phase[data], page.concentration[data], symbols[data], pages.levels)
         rates.append(figures.air_bits_per_symbol)

@@ -8,6 +8,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from optics.errors import (
@@ -76,7 +77,7 @@ class Recalibrator:
         source = self._plane.source
         self._check_count(len(pages) or count)
         wanted: list[int | None] = list(pages) or [None] * count
-        return self._run(lambda: read_known(source, wanted), caller)
+        return self._run(lambda heard: read_known(source, wanted, heard), caller)
 
     def from_recording(self, name: str, count: int, caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
         """Recalibrate with the first `count` pages (0: all) of a recording in the recordings folder.
@@ -87,7 +88,7 @@ class Recalibrator:
         path = self._path(name)
         self._check_count(count)
 
-        def read() -> KnownPages:
+        def read(heard: Callable[[], None]) -> KnownPages:
             with own_fault():
                 opened = Recording.open(path)
             with opened as recording:
@@ -96,7 +97,7 @@ class Recalibrator:
                     raise RecordingError(f"recording {name}", f"{recording.pages} pages", f"at least {count}")
                 self._check_count(count or recording.pages)
                 with own_fault():
-                    return read_recorded(recording, range(count or recording.pages))
+                    return read_recorded(recording, range(count or recording.pages), heard)
 
         return self._run(read, caller)
 
@@ -116,8 +117,13 @@ class Recalibrator:
         finally:
             self._busy.release()
 
-    def _run(self, read: Callable[[], KnownPages], caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
-        """Work in a thread of its own; one who stops iterating stops it at its next step."""
+    def _run(
+        self, read: Callable[[Callable[[], None]], KnownPages], caller: Caller
+    ) -> Iterator[Step | RecalibrationOutcome]:
+        """Work in a thread of its own; one who stops iterating stops it at its next step.
+
+        `read` reads the pages, and calls what it is given before each.
+        """
         if not self._busy.acquire(blocking=False):
             raise BusyError("recalibration", "one that is running", "one at a time; try again when it has ended")
         steps: queue.SimpleQueue[Step | RecalibrationOutcome | BaseException] = queue.SimpleQueue()
@@ -132,8 +138,9 @@ class Recalibrator:
 
         def work() -> None:
             try:
-                progress("read the pages", 0.0)
-                result: RecalibrationOutcome | BaseException = self._work(read(), progress)
+                heard = partial(progress, "read the pages", 0.0)
+                heard()
+                result: RecalibrationOutcome | BaseException = self._work(read(heard), progress)
             except BaseException as error:
                 result = error
             finally:
@@ -222,37 +229,56 @@ class Recalibrator:
         return path
 
 
-def read_known(source: FrameSource, pages: Sequence[int | None]) -> KnownPages:
+def _nothing() -> None:
+    """Nobody listens."""
+
+
+def read_known(source: FrameSource, pages: Sequence[int | None], heard: Callable[[], None] = _nothing) -> KnownPages:
     """Pages of a source with their symbols.
+
+    Args:
+        source: where they come from.
+        pages: their numbers, None for the next one.
+        heard: called before each page; it may raise to stop.
 
     Raises:
         PageError: no such page.
         SourceError: the source is damaged, or does not know what was written.
     """
+    found = []
     with own_fault():
-        found, references = [source.read(page) for page in pages], source.references()
-    symbols = [page.symbols for page in found if page.symbols is not None]
+        for page in pages:
+            heard()
+            found.append(source.read(page))
+        references = source.references()
+    symbols = [read.symbols for read in found if read.symbols is not None]
     if len(symbols) != len(found):
         raise SourceError(f"pages of {source.name}", "unknown symbols", "pages whose symbols are known")
     mask = found[0].pilot_mask if found else None
     return KnownPages(tuple(p.pair for p in found), tuple(symbols), source.levels, references, mask)
 
 
-def read_recorded(recording: Recording, pages: Sequence[int] | None = None) -> KnownPages:
-    """Pages of a recording with their symbols, all of them by default.
+def read_recorded(recording: Recording, pages: Sequence[int], heard: Callable[[], None] = _nothing) -> KnownPages:
+    """Pages of a recording with their symbols.
+
+    Args:
+        recording: where they are.
+        pages: their numbers.
+        heard: called before each page; it may raise to stop.
 
     Raises:
         RecordingError: unreadable.
         PageError: the recording holds no symbols.
     """
-    indices = range(recording.pages) if pages is None else pages
-    symbols = [found for index in indices if (found := recording.symbols(index)) is not None]
-    if len(symbols) != len(indices):
+    symbols = [found for index in pages if (found := recording.symbols(index)) is not None]
+    if len(symbols) != len(pages):
         raise PageError(f"recording {recording.path}", "no symbols", "a recording with known symbols")
-    bits = recording.bit_depth
-    pairs = tuple(narrow(recording.frames(index), bits) for index in indices)
+    bits, pairs = recording.bit_depth, []
+    for index in pages:
+        heard()
+        pairs.append(narrow(recording.frames(index), bits))
     references = narrow(recording.references(), bits)
-    return KnownPages(pairs, tuple(symbols), recording.levels, references, recording.pilots())
+    return KnownPages(tuple(pairs), tuple(symbols), recording.levels, references, recording.pilots())
 
 
 def _follow(

@@ -132,6 +132,18 @@ def test_no_step_is_told_once_the_bundle_is_written(decoder: Decoder, tmp_path: 
     assert steps[-1] == "write the new bundle"
 
 
+def test_every_page_that_is_judged_by_is_told_of_before_and_after_the_fit(decoder: Decoder, tmp_path: Path) -> None:
+    told: dict[str, list[float]] = {}
+
+    def step(name: str, share: float) -> None:
+        told.setdefault(name, []).append(share)
+
+    recalibrate(decoder, known(count=5), tmp_path / "n.zip", "toy-1+r1", toy.fit_references, step)
+    before, after = told["measure the model in service"], told["judge by the held-back pages"]
+    assert before == pytest.approx([0, 0.0125, 0.025, 0.0375])
+    assert sorted(set(after)) == pytest.approx([0.9, 0.9125, 0.925, 0.9375])
+
+
 def test_unusable_pages_are_named(decoder: Decoder, tmp_path: Path) -> None:
     good, out = known(), tmp_path / "n.zip"
     cases: list[tuple[KnownPages, type[Exception], str]] = [

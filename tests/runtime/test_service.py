@@ -665,6 +665,22 @@ def test_a_recalibration_that_the_end_of_the_service_cuts_off_says_so(start: Sta
     assert service.plane.metrics.recalibrations.labels("dropped")._value.get() == 1
 
 
+def test_a_recalibration_that_is_stopped_reads_and_decodes_no_more_pages(start: Start) -> None:
+    service, read = start(), list[int]()
+    honest = service.source.read
+
+    def leaving(page: int | None = None) -> object:
+        read.append(len(read))
+        if len(read) == 2:
+            service.recalibrator._stop.set()
+        return honest(page)
+
+    service.source.read = leaving  # type: ignore[method-assign,assignment]
+    with pytest.raises(StoppingError):
+        service.client.recalibrate(count=5)
+    assert read == [0, 1]
+
+
 def test_the_service_ends_in_time_beside_a_recalibration_that_does_not_stop(start: Start) -> None:
     entered, go = threading.Event(), threading.Event()
 
