@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import click
@@ -25,7 +26,7 @@ from runtime.decoded import DecodedWriter
 from runtime.errors import SourceError
 from runtime.frames import narrow
 from runtime.phase_shift import LEAST_COHERENCE
-from runtime.refused import RefusedPage, refusal
+from runtime.refused import WORTH_NOTHING, RefusedPage, refusal
 
 
 @click.command()
@@ -81,6 +82,9 @@ def decode(
         data = {"target": target, "levels": levels, "pages": results, "refused_pages": [asdict(r) for r in refused]}
         write_json(json_path, data)
     click.echo(table(results))
+    rates = [rate for result in results if (rate := result["air_bits_per_symbol"]) is not None]
+    if rates and fmean(rates) <= 0:
+        warn(WORTH_NOTHING)
     if doubtful := [result for result in results if result["pilot_coherence"] < LEAST_COHERENCE]:
         warn(unknown_pistons(doubtful))
     if refused:
@@ -153,7 +157,9 @@ def _sent(client: LightpageClient, file: Recording, count: int, levels: int) -> 
     description = client.describe()
     own = file.pilots()
     mask = description.pilot_mask if own is None else own
-    pattern = pilot_symbols(parse_profile(description.profile_toml, "profile of the service"), file.levels)
+    profile = parse_profile(description.profile_toml, "profile of the service")
+    file.check_against(profile)
+    pattern = pilot_symbols(profile, file.levels)
     fixed = description.pilot_phases is not None and np.array_equal(mask, description.pilot_mask)
     for index in range(count):
         try:

@@ -13,14 +13,9 @@ from optics.recording import Recording
 from runtime.decoder import Decoder
 from runtime.evaluation import Evaluation
 from runtime.evaluation import evaluate as evaluate_recording
-from runtime.refused import refusal
+from runtime.refused import WORTH_NOTHING, refusal
 from runtime.shipped import DEFAULT, bundle_path
 from runtime.tracking import NoTracker, tracker_for
-
-_WORTH_NOTHING = (
-    "by what the bundle believes, these pages carry nothing: the device may have drifted far (lightpage recalibrate), "
-    "be another one, have its cameras the other way round, or its symbols another number of levels or other pages"
-)
 
 
 @click.command()
@@ -42,7 +37,7 @@ def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int |
         write_json(json_path, result.to_json())
     click.echo(describe(result))
     if result.figures.air_bits_per_symbol <= 0:
-        warn(_WORTH_NOTHING)
+        warn(WORTH_NOTHING)
     if result.refused:
         raise refusal(f"recording {recording}", result.refused, count)
 

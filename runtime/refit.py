@@ -30,7 +30,7 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
 
     Args:
         bundle: whose calibration and twin.
-        pages: known pages; the first finds the geometry, all of them judge it.
+        pages: known pages; the first finds the geometry, the coherences are the mean of all.
         progress: told of every stage.
         decoder: the bundle's, whose graph recovers the field.
 

@@ -10,6 +10,12 @@ from optics.errors import InvalidInputError
 _TOLD = 5
 """Pages named in the error; the JSON file has all of them."""
 
+WORTH_NOTHING = (
+    "by what the bundle believes, these pages carry nothing: the device may have drifted far (lightpage recalibrate), "
+    "be another one, have its cameras the other way round, or its symbols another number of levels or other pages"
+)
+"""Said of pages on which what is right in a decoder's claims adds up to nothing."""
+
 
 @dataclass(frozen=True)
 class RefusedPage:

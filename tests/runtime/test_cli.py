@@ -56,6 +56,12 @@ def plainly_interrupted() -> None:
 
 
 @click.command()
+def terminated() -> None:
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(5)
+
+
+@click.command()
 def needs_torch() -> None:
     raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
@@ -103,6 +109,13 @@ def test_ctrl_c_ends_with_130_and_says_how_to_go_on(capsys: pytest.CaptureFixtur
     assert "interrupted; call it with --resume" in capsys.readouterr().err
     assert run(["x"], group_of(x=f"{HERE}:plainly_interrupted")) == 130
     assert "run the same command again" in capsys.readouterr().err
+
+
+def test_sigterm_interrupts_too_and_is_told_apart(capsys: pytest.CaptureFixture[str]) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    assert run(["x"], group_of(x=f"{HERE}:terminated")) == 143
+    assert "interrupted; run the same command again" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_too_little_memory_is_an_error_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -426,6 +439,22 @@ def test_decode_names_pages_that_a_recording_does_not_have(
     assert "got 4 pages, wanted at least 9" in capsys.readouterr().err
 
 
+def test_decode_warns_of_symbols_that_are_not_the_pages_and_refuses_those_of_another_page_shape(
+    service: LightpageServer, recording: tuple[Path, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ["decode", "--target", service.target, "--recording", recording[0]]
+    with h5py.File(recording[0], "r+") as file:
+        symbols = file["symbols"][()]
+        file["symbols"][...] = np.random.default_rng(0).permutation(symbols.ravel()).reshape(symbols.shape)
+    assert run(where) == 0
+    assert "warning: by what the bundle believes, these pages carry nothing" in capsys.readouterr().err
+    with h5py.File(recording[0], "r+") as file:
+        del file["symbols"]
+        file["symbols"] = symbols[:, 1:]
+    assert run(where) == 2
+    assert f"pages of {symbols.shape[1] - 1} x {symbols.shape[2]} symbols, wanted" in capsys.readouterr().err
+
+
 def test_decode_reads_the_services_source(service: LightpageServer, tmp_path: Path) -> None:
     report = tmp_path / "d.json"
     assert run(["decode", "--target", service.target, "--source", "--pages", "3", "--json", report]) == 0
@@ -553,7 +582,7 @@ def test_a_command_without_a_service_or_a_choice_says_so(
     assert run(["decode", "--target", "127.0.0.1:9", "--recording", recording[0]]) == 2
     assert "no connection" in capsys.readouterr().err
     assert run(["decode", "--target", "127.0.0.1:9"]) == 2
-    assert "either --recording or --source" in capsys.readouterr().err
+    assert "neither --recording nor --source, wanted one of them" in capsys.readouterr().err
     assert run(["recalibrate", "--bundle", toy_zip]) == 2
     assert "--out" in capsys.readouterr().err
 
