@@ -73,9 +73,9 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     figure.colorbar(shown, ax=[axis for row in axes for axis in row], label="own-MI, bit/symbol", shrink=0.8)
     axis = figure.add_subplot(grid[-1, :])
     for localizer, colour in zip(LOCALIZERS, ("tab:red", "tab:blue"), strict=True):
-        for key, style in (("own_mi_kB", "o-"), ("air_kB", "s:")):
+        for key, what, style in (("own_mi_kB", "own-MI", "o-"), ("air_kB", "AIR", "s:")):
             values = [by_case[localizer, length][key] for length in lengths]
-            axis.plot(lengths, values, style, color=colour, label=f"{localizer}, {key.removesuffix('_kB')}")
+            axis.plot(lengths, values, style, color=colour, label=f"{localizer}, {what}")
     axis.set_xlabel("length of the full-size pipe, mm")
     axis.set_ylabel("kB a page")
     axis.legend()
