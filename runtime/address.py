@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import socket
 
@@ -39,7 +40,8 @@ def check_free(name: str, address: str) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as gRPC does: a port just left is free
             probe.bind(where)
             probe.listen(1)
-    except OSError as error:
-        raise InvalidInputError(
-            f"{name} {address}", error.strerror or error, "a free HOST:PORT of this machine"
-        ) from None
+    except (OSError, UnicodeError) as error:
+        code, text = getattr(error, "errno", None), getattr(error, "strerror", None)
+        if code == errno.EAFNOSUPPORT:
+            return  # without IPv6, gRPC takes [::] for 0.0.0.0
+        raise InvalidInputError(f"{name} {address}", text or error, "a free HOST:PORT of this machine") from None

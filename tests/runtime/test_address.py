@@ -37,3 +37,5 @@ def test_why_an_address_cannot_be_listened_at_is_said() -> None:
     check_free("address", address)
     with pytest.raises(InvalidInputError, match=r"address nohost\.invalid:50: got .*(known|resolution)"):
         check_free("address", "nohost.invalid:50")
+    with pytest.raises(InvalidInputError, match=r"address a+:50: got .*label"):
+        check_free("address", f"{'a' * 64}:50")
