@@ -26,6 +26,7 @@ from train.feature_store import FeatureStore, fill
 from train.features import FeatureExtractor, PageFeatures
 from train.field import ROUNDS
 from train.fitting import Hyperparameters, fit_network
+from train.memory import keep_freed_memory
 from train.network import SymbolUNet
 from train.patches import training_pages
 from train.run import sole_writer
@@ -116,6 +117,7 @@ def main(
     out: Path,
 ) -> None:
     """Leave out one part at a time, and print what is left of the AIR."""
+    keep_freed_memory()
     profile = load_profile(profile_name)
     click.get_current_context().with_resource(sole_writer(out))
     device = Device().with_settings([f"geometry.pipe_angle_deg={angle_deg}", f"sensor.full_well_e={full_well}"])

@@ -33,6 +33,7 @@ from optics.files import write_json
 from optics.profile import load_profile
 from runtime.cli import run
 from train.fitting import Hyperparameters
+from train.memory import keep_freed_memory
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import published_choices
 from train.run import sole_writer
@@ -135,6 +136,7 @@ def main(
     out: Path,
 ) -> None:
     """Train every arm on the same pages, light by light, and print what it says of held-out ones."""
+    keep_freed_memory()
     nominal = load_profile(profile_name)
     click.get_current_context().with_resource(sole_writer(out))
     lights: list[dict[str, Any]] = []

@@ -177,26 +177,6 @@ class ConcentrationBin:
     """Mean cosine of the phase error."""
 
 
-def concentration_calibration(
-    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int, bins: int = 10
-) -> list[ConcentrationBin]:
-    """Promise and outcome in `bins` bins of equal count, ordered by concentration; empty bins are left out."""
-    m, phase, k, s = _checked(mu, kappa, symbols, levels)
-    order = np.argsort(k, axis=None, kind="stable")
-    cosine, ranked = np.cos(s * (2 * np.pi / m) - phase).ravel()[order], k.ravel()[order]
-    return [
-        ConcentrationBin(
-            float(ranked[part[0]]),
-            float(ranked[part[-1]]),
-            part.size,
-            float(mean_resultant(ranked[part]).mean()),
-            float(cosine[part].mean()),
-        )
-        for part in np.array_split(np.arange(ranked.size), bins)
-        if part.size
-    ]
-
-
 @dataclass(frozen=True)
 class PageMeasures:
     """The figures of one set of symbols whose truth is known."""

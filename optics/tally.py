@@ -106,7 +106,7 @@ class Tally:
         ]
 
     def concentration_bins(self, bins: int = 10) -> list[ConcentrationBin]:
-        """What `concentration_calibration` says of the symbols of all pages."""
+        """Promise and outcome in bins of equal count, ordered by concentration; empty bins are left out."""
         keys = self._keys[: self._count]
         keys.sort()
         return [self._concentration_bin(part) for part in np.array_split(keys, bins) if part.size]

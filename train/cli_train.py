@@ -24,6 +24,7 @@ from train.decoder import LOCALIZERS
 from train.features import FeatureExtractor
 from train.fitting import Hyperparameters
 from train.material import Material
+from train.memory import keep_freed_memory
 from train.processes import is_first_process
 from train.provenance import provenance
 from train.published.localizers import NAMES as PUBLISHED
@@ -87,6 +88,7 @@ def train(
     **chosen: Any,
 ) -> None:
     """Train a decoder on known pages; the last pages of the recording stay unseen for `lightpage evaluate`."""
+    keep_freed_memory()
     given = given_choices(localizer, chosen)
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"

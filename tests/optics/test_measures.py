@@ -151,16 +151,6 @@ def test_maps_average_to_the_figures_of_the_page() -> None:
         measures.symbol_maps(mu[:, 1:], kappa[:, 1:], symbols[:, 1:], 64, data)
 
 
-def test_honest_concentrations_keep_their_promise_in_every_bin_and_doubled_ones_do_not() -> None:
-    kappa = np.random.default_rng(6).gamma(2.0, 5.0, 100_000)
-    symbols, mu = drawn_page(64, kappa, 7)
-    honest = measures.concentration_calibration(mu, kappa, symbols, 64)
-    assert len(honest) == 10
-    assert max(abs(b.observed - b.promised) for b in honest) < 0.02
-    doubled = measures.concentration_calibration(mu, 2 * kappa, symbols, 64)
-    assert max(b.promised - b.observed for b in doubled) > 0.1
-
-
 def test_confidence_lies_between_a_guess_and_certainty() -> None:
     _, confidence = measures.decide_with_confidence(np.zeros(3), np.array([0.0, 3.0, 1e12]), 4)
     assert confidence.dtype == np.float32

@@ -6,6 +6,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from scipy.special import i0e, i1e
 
 from optics import measures
 from optics.errors import PageError
@@ -16,7 +17,6 @@ from optics.tally import Tally
 def test_pages_one_by_one_give_the_figures_of_all_at_once(levels: int) -> None:
     rng = np.random.default_rng(levels)
     data = rng.random((9, 11)) > 0.2
-    # few different concentrations: bins of equal count part symbols that tie
     kappa = rng.choice([0, 0.5, 4, 4.25, 60, 1e12], (5, np.count_nonzero(data))).astype(np.float32)
     symbols = rng.integers(levels, size=kappa.shape).astype(np.uint8)
     mu = (symbols * 2 * np.pi / levels + 0.3 * rng.standard_normal(kappa.shape)).astype(np.float32)
@@ -38,11 +38,32 @@ def test_pages_one_by_one_give_the_figures_of_all_at_once(levels: int) -> None:
         tally.confidence_bins(), measures.reliability(confidence, decided == symbols), strict=True
     ):
         assert asdict(claims) == pytest.approx(asdict(wanted_claims), rel=1e-12)
-    for promises, wanted_promises in zip(
-        tally.concentration_bins(), measures.concentration_calibration(mu, kappa, symbols, levels), strict=True
-    ):
-        # half a float32 step of a cosine
-        assert asdict(promises) == pytest.approx(asdict(wanted_promises), rel=1e-12, abs=2**-25)
+
+
+def test_bins_of_equal_count_hold_the_symbols_in_order_of_concentration() -> None:
+    tally = Tally(16, np.ones((2, 5), bool), pages=3)
+    kappa, symbols = np.random.default_rng(1).permutation(np.arange(1, 31.0)).reshape(3, 10), np.zeros(10, int)
+    for page in kappa:
+        tally.add(1 / page, page, symbols)
+    bins = tally.concentration_bins(bins=4)
+    assert [(b.low, b.high, b.count) for b in bins] == [(1, 8, 8), (9, 16, 8), (17, 23, 7), (24, 30, 7)]
+    for part in bins:
+        ranked = np.arange(part.low, part.high + 1)
+        assert part.promised == pytest.approx(np.mean(i1e(ranked) / i0e(ranked)))
+        assert part.observed == pytest.approx(np.mean(np.cos(1 / ranked)))
+    assert [b.count for b in tally.concentration_bins(bins=31)] == [1] * 30
+
+
+def test_honest_concentrations_keep_their_promise_in_every_bin_and_doubled_ones_do_not() -> None:
+    rng = np.random.default_rng(6)
+    kappa = rng.gamma(2.0, 5.0, 100_000)
+    symbols, errors = rng.integers(64, size=kappa.size), rng.vonmises(0, kappa)
+    honest, doubled = Tally(64, np.ones((250, 400), bool), 1), Tally(64, np.ones((250, 400), bool), 1)
+    honest.add(symbols * 2 * np.pi / 64 + errors, kappa, symbols)
+    doubled.add(symbols * 2 * np.pi / 64 + errors, 2 * kappa, symbols)
+    assert len(honest.concentration_bins()) == 10
+    assert max(abs(b.observed - b.promised) for b in honest.concentration_bins()) < 0.02
+    assert max(b.promised - b.observed for b in doubled.concentration_bins()) > 0.1
 
 
 def test_no_page_has_no_figures() -> None:

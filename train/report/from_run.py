@@ -15,9 +15,9 @@ from torch import nn
 from torch.utils.data import Dataset
 
 from optics.errors import InvalidInputError, RecordingError
-from optics.measures import concentration_calibration, decide_with_confidence, measure, reliability, symbol_maps
 from optics.page import MAX_LEVELS, MIN_LEVELS
 from optics.recording import FramePair, Recording, page_hashes
+from optics.tally import Tally
 from train.curves import Curve, curves_of
 from train.feature_store import FeatureStore
 from train.features import PageState
@@ -60,8 +60,9 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
     p = np.stack([without_piston(run.kappa_scale * o, t, mask) for o, t in zip(outputs, phases, strict=True)])
     symbols = np.rint(phases[:, ~mask] * (levels / (2 * np.pi))).astype(np.int64) % levels
     phase, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])[:, ~mask]
-    mu = phase[:, ~mask]
-    decided, confidence = decide_with_confidence(mu, kappa, levels)
+    tally = Tally(levels, ~mask, len(p))
+    for page in zip(phase[:, ~mask], kappa, symbols, strict=True):
+        tally.add(*page)
     golden = load_arrays(folder / GOLDEN)
     return ReportData(
         title=f"Training run on {run.profile.name}",
@@ -72,10 +73,10 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
         profile=run.profile,
         calibration=run.calibration,
         rays=_rays(run, module),
-        measures=measure(mu, kappa, symbols, levels),
-        maps=symbol_maps(mu, kappa, symbols, levels, ~mask),
-        confidence_bins=reliability(confidence, decided == symbols),
-        concentration_bins=concentration_calibration(mu, kappa, symbols, levels),
+        measures=tally.figures(),
+        maps=tally.maps(),
+        confidence_bins=tally.confidence_bins(),
+        concentration_bins=tally.concentration_bins(),
         curves=_curves(folder, run) or "There are no curves: the run did not keep them for every look.",
         golden=Golden(FramePair(golden["in_phase"], golden["quadrature"]), phase[0]),
     )

@@ -11,6 +11,7 @@ from optics.errors import InvalidInputError
 from optics.files import OutputFile, replace_file, replace_text, write_json
 from optics.profile import load_profile
 from optics.progress import percent_bar
+from train.memory import keep_freed_memory
 from train.run import begin, sole_writer
 from train.studies import STUDIES
 from train.studies.study import RESULTS, Settings, aligned, measured
@@ -55,6 +56,7 @@ def study(
     json_path: Path | None,
 ) -> None:
     """Measure the cases of study NAME, write OUT/table.txt, OUT/figure.png and OUT/study.json, and print the table."""
+    keep_freed_memory()
     if full and profile_name is not None:
         raise InvalidInputError("--full", f"--profile {profile_name} beside it", "one of them")
     chosen = STUDIES[name]
