@@ -35,19 +35,28 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], thing: 
         try:
             with os.fdopen(descriptor, "wb") as file:
                 write(file)
-                file.flush()
                 os.fchmod(file.fileno(), 0o644)
-                os.fsync(file.fileno())
-            os.replace(name, path)
+            move_into_place(name, path)
         except BaseException:
-            os.unlink(name)
+            Path(name).unlink(missing_ok=True)
             raise
     except OSError as error:
         raise InvalidInputError(f"{thing} {path}", error, "a path that can be written") from None
-    _sync_folder(path.parent)
 
 
-def _sync_folder(folder: Path) -> None:
+def move_into_place(made: str | Path, path: Path) -> None:
+    """Give a file that is closed its final name, replacing what has it; both are on the disk when this returns.
+
+    Raises:
+        OSError: the system does not let it.
+    """
+    with open(made, "rb") as file:
+        os.fsync(file.fileno())
+    os.replace(made, path)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
     """Write the names in `folder` to the disk where its file system can; the files themselves are whole without."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)

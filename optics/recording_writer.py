@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from optics.errors import PageError, RecordingError
+from optics.files import move_into_place
 from optics.page import check_levels, check_symbols
 from optics.profile import Profile
 from optics.recording_layout import FORMAT, FRAMES, MAX_BIT_DEPTH, MIN_BIT_DEPTH, VERSION, FramePair, frame_type
@@ -175,7 +175,7 @@ class RecordingWriter:
             if "pages_complete" in self._file.attrs:
                 del self._file.attrs["pages_complete"]
             self._file.close()
-            os.replace(self._partial, self.path)
+            move_into_place(self._partial, self.path)
         except OSError as error:
             raise RecordingError(self._thing, error, "a file that can be completed") from None
 

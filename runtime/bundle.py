@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.errors import BundleError, ProfileError
+from optics.files import sync_folder
 from optics.page import pilot_mask
 from optics.profile import Profile, parse_profile
 from optics.recording import FramePair
@@ -200,7 +201,7 @@ def npz(**arrays: NDArray[Any]) -> bytes:
 
 
 def write_bundle(path: str | Path, manifest: Manifest, files: Mapping[str, bytes]) -> Path:
-    """Write a bundle in one step: whoever looks sees all of it or nothing.
+    """Write a bundle in one step: whoever looks sees all of it or nothing. It is on the disk when this returns.
 
     Args:
         path: a zip where it ends in .zip, else a folder; must not exist.
@@ -239,7 +240,9 @@ def write_bundle(path: str | Path, manifest: Manifest, files: Mapping[str, bytes
             folder.mkdir()
             for name, data in contents.items():
                 _write_file(folder / name, data)
+            sync_folder(folder)
             os.rename(folder, path)
+        sync_folder(path.parent)
     except OSError as error:
         raise BundleError(thing, error, "a new path that can be written") from None
     finally:

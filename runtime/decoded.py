@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 
 from optics.errors import InvalidInputError
+from optics.files import move_into_place
 from runtime.convert import RemotePage
 
 FORMAT = "lightpage-decoded"
@@ -78,7 +79,7 @@ class DecodedWriter:
                     self._file["pages"] = np.array(self._pages, np.int64)
                     self._file.close()
                     os.chmod(self._partial, 0o644)
-                    os.replace(self._partial, self.path)
+                    move_into_place(self._partial, self.path)
         finally:
             with suppress(OSError):
                 self._file.close()

@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint, Timer
+from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint, Timer, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from scipy import optimize
@@ -414,7 +414,7 @@ def fit(
             max_steps=steps,
             precision=precision,  # type: ignore[arg-type]
             logger=TensorBoardLogger(str(run), name="", version=TENSORBOARD),
-            callbacks=[*callbacks, best, timer, newest],
+            callbacks=[*callbacks, best, timer, newest, *([_Bar()] if progress else [])],
             devices=devices,
             enable_progress_bar=progress,
             enable_model_summary=False,
@@ -448,6 +448,13 @@ def fit(
         fitted = replace(fitted, curves={name: thinned(curve, _KEPT_POINTS) for name, curve in curves_of(run).items()})
         fitted.save(run)
     return fitted
+
+
+class _Bar(TQDMProgressBar):
+    """Lightning's, without the version of the log: there is one."""
+
+    def get_metrics(self, trainer: L.Trainer, pl_module: L.LightningModule) -> dict[str, Any]:
+        return {name: value for name, value in super().get_metrics(trainer, pl_module).items() if name != "v_num"}
 
 
 @contextmanager

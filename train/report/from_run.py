@@ -66,7 +66,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
     golden = load_arrays(folder / GOLDEN)
     return ReportData(
         title=f"Training run on {run.profile.name}",
-        pages=f"All figures are of the {len(p)} validation pages of this run. No weights were fitted to them, but "
+        pages=f"All figures are of the validation pages of this run ({len(p)}). No weights were fitted to them, but "
         "which weights were kept and how their concentrations are scaled was chosen by them: they are no held-out "
         "test. For that, make the report of an evaluation.",
         facts=_facts(run, decodable.parameters),
