@@ -19,7 +19,7 @@ from benchmarks.kept import CALIBRATION, Kept
 from benchmarks.levels import LevelFigures, level_figures
 from benchmarks.oracle import Oracle
 from optics.device import Device, Sensor
-from optics.measures import achievable_rate, measure
+from optics.measures import achievable_rate, measure, own_information
 from optics.page import pilot_mask
 from optics.profile import Profile
 from optics.progress import percent_bar
@@ -353,6 +353,7 @@ class Bench:
             steps=steps,
             air=figures.air_bits_per_symbol,
             own_mi=figures.own_mi_bits_per_symbol,
+            own_mi_unscaled=float(own_information(np.arctan2(py, px), np.hypot(px, py) / scale, LEVELS).mean()),
             page_kB=figures.air_bits_per_symbol * int((~self.mask).sum()) / 8000,
             by_walls={name: float(air.mean()) if air.size else float("nan") for name, air in groups.items()},
             validation_air=trained.validation_air,
@@ -380,10 +381,12 @@ def gained_at_the_end(curve: Curve, steps: int) -> float:
 class Outcome:
     """What one arm reached with a network of one size.
 
-    Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor that made
-    its claims honest, `looks` how often it looks, `by_levels` what it is worth among fewer levels, `by_walls` the AIR
-    of the symbols whose light meets the walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by
-    step; `benchmarks.decoders.compared` tells `over_oracle` and `over_published`.
+    Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor on its
+    concentrations that the validation pages ask for, `own_mi_unscaled` what it claims without, `looks` how often it
+    looks, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light meets the
+    walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by step. The size is that of the
+    first look's network, steps, times and curves are those of the last look, which goes on from the ones before.
+    `benchmarks.decoders.compared` tells `over_oracle` and `over_published`.
     """
 
     run: str
@@ -392,6 +395,7 @@ class Outcome:
     steps: int
     air: float
     own_mi: float
+    own_mi_unscaled: float
     page_kB: float
     by_walls: dict[str, float]
     validation_air: float
@@ -423,10 +427,12 @@ HEADER = (
     + "".join(f"{name:>7} " for name in WALLS)
     + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8} {'features':>9} {'training':>8} {'pages/s':>7}"
 )
-"""Held-out pages, bits a symbol and kB a page; what own-MI claims beyond the AIR; AIR where a symbol's light meets no
-wall of the pipe, a wall of pair x, of pair y, or of both; AIR over the oracle's, and over that of the best published
-decoder; what validation AIR gained in the last fifth of the steps; minutes of features and of training, and pages it
-trained on a second, validation counted as time: of a kept arm, on the machine that trained it."""
+"""Held-out pages, bits a symbol and kB a page; own-MI and what it claims beyond the AIR, concentrations multiplied by
+one factor that the validation pages ask for; AIR where a symbol's light meets no wall of the pipe, a wall of pair x,
+of pair y, or of both; AIR over the oracle's, and over that of the best published decoder; of the last look alone, as
+its steps: what validation AIR gained in the last fifth of them, minutes of features and of training, and pages it
+trained on a second, validation counted as time: of a kept arm, on the machine that trained it. The network's size is
+the first look's."""
 
 
 def light_name(device: Device, symbol_size_px: int, apart: str = "") -> str:

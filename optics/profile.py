@@ -196,6 +196,10 @@ class Profile(Table):
         cut = self.model_copy(update={"page": page.model_copy(update=update)})
         return cut.model_copy(update={"lens_path": self.lens_path.at(cut.corner_m / self.corner_m)})
 
+    def with_ideal_lenses(self) -> Profile:
+        """The same device with lenses that have no path beyond the ideal one."""
+        return self.model_copy(update={"lens_path": LensPath()})
+
     def to_toml(self) -> str:
         """The profile as TOML text, which `parse_profile` reads back to an equal one; ideal lenses are left out."""
         return to_toml(self, without=("lens_path",) if self.ideal_lenses else ())

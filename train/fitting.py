@@ -34,7 +34,7 @@ from optics.progress import warn
 from train.curves import TENSORBOARD, Curve, curves_of, thinned
 from train.field import ROUNDS
 from train.localizers.coherent import BICUBIC, CoherentLocalizer
-from train.loss import von_mises_nll
+from train.loss import training_rate, von_mises_nll
 from train.network import Refiner, SymbolUNet
 from train.parts import turned
 from train.processes import process_number
@@ -155,7 +155,8 @@ class DecoderTraining(L.LightningModule, Generic[N]):
         asked = torch.isfinite(phases)
         loss = von_mises_nll(p, torch.where(asked, phases, 0.0))[asked].mean()
         self.log("train_nll", loss, prog_bar=True)
-        self.log("train_air", air_of_nll(loss), prog_bar=True)
+        rate = training_rate(p.movedim(1, 0)[:, asked], phases[asked], self.levels)
+        self.log("train_air", rate, prog_bar=True)
         return loss
 
     def validation_step(self, batch: Page, index: int) -> None:
@@ -217,11 +218,6 @@ class SymbolTraining(DecoderTraining[SymbolNetwork]):
 def _turned(parts: Tensor, by: Tensor) -> Tensor:
     """Real parts and then imaginary parts [N, 2 C, ny, nx], turned by an angle [N, 1, 1] each."""
     return torch.cat(list(turned(torch.stack(parts.chunk(2, dim=1)), by[:, None])), dim=1)
-
-
-def air_of_nll(nll: Tensor) -> Tensor:
-    """AIR in bits per symbol of phases drawn evenly, from the mean negative log-likelihood in nats."""
-    return math.log2(2 * math.pi) - nll.detach() / math.log(2)
 
 
 def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> float:
@@ -494,10 +490,13 @@ def best_kappa_scale(module: DecoderTraining[Any], pages: Dataset[Page], mask: N
     for p, truth in zip(*decode_pages(module, pages), strict=True):
         outputs.append(without_piston(p, truth, mask)[:, ~mask])
         truths.append(truth[~mask])
-    p_all = torch.from_numpy(np.concatenate(outputs, axis=1))[None]
-    truth_all = torch.from_numpy(np.concatenate(truths))[None]
+    return honest_factor(np.concatenate(outputs, axis=1), np.concatenate(truths))
 
-    return most_likely_factor(lambda factor: float(von_mises_nll(p_all * factor, truth_all).mean()))
+
+def honest_factor(p: NDArray[np.float32], phases: NDArray[np.float32]) -> float:
+    """Factor on p [2, N] under which the true phases [N] are most likely."""
+    shown, asked = torch.from_numpy(p)[None], torch.from_numpy(phases)[None]
+    return most_likely_factor(lambda factor: float(von_mises_nll(shown * factor, asked).mean()))
 
 
 def most_likely_factor(nll: Callable[[float], float]) -> float:

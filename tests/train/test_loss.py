@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from scipy import stats
 
-from train.loss import von_mises_nll
+from optics.measures import achievable_rate
+from train.loss import training_rate, von_mises_nll
 
 
 def test_it_is_the_density_that_scipy_has() -> None:
@@ -32,3 +34,16 @@ def test_it_is_convex_in_p() -> None:
     theta = torch.rand(500, 1, generator=generator, dtype=torch.float64) * 6
     middle = von_mises_nll((a + b) / 2, theta)
     assert torch.all(middle <= (von_mises_nll(a, theta) + von_mises_nll(b, theta)) / 2 + 1e-4)
+
+
+@pytest.mark.parametrize("levels", [2, 16, 64, 256])
+def test_the_rate_in_training_is_that_of_the_symbols_whatever_the_piston(levels: int) -> None:
+    rng = np.random.default_rng(levels)
+    symbols, kappa = rng.integers(levels, size=4000), rng.gamma(2.0, 60.0, 4000)
+    mu = symbols * 2 * np.pi / levels + rng.vonmises(0, kappa)
+    wanted = achievable_rate(mu, kappa, symbols, levels).mean()
+    for piston in (0.0, 2.1):
+        p = torch.from_numpy(kappa * np.stack([np.cos(mu + piston), np.sin(mu + piston)]))
+        phases = torch.from_numpy(symbols * 2 * np.pi / levels + piston)
+        assert float(training_rate(p, phases, levels)) == pytest.approx(wanted, abs=2e-3)
+    assert wanted < np.log2(levels)

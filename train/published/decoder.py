@@ -107,11 +107,13 @@ def p_of_classes(logits: Tensor) -> Tensor:
     al., 2005).
     """
     levels = logits.shape[1]
-    belief = torch.softmax(logits.float(), dim=1)
     angles = torch.arange(levels, device=logits.device) * (2 * math.pi / levels)
-    mean = torch.stack([torch.einsum("nmyx,m->nyx", belief, wave(angles)) for wave in (torch.cos, torch.sin)], dim=1)
-    squared = mean.square().sum(1, keepdim=True)
-    return torch.as_tensor(mean * (2 - squared) / (1 - squared).clamp(min=1e-5))
+    with torch.autocast(logits.device.type, enabled=False):  # of a sure belief 1 - R^2 would be rounding
+        belief = torch.softmax(logits.float(), dim=1)
+        parts = [torch.einsum("nmyx,m->nyx", belief, wave(angles)) for wave in (torch.cos, torch.sin)]
+        mean = torch.stack(parts, dim=1)
+        squared = mean.square().sum(1, keepdim=True)
+        return torch.as_tensor(mean * (2 - squared) / (1 - squared).clamp(min=1e-5))
 
 
 def sample_pair(frames: Tensor, references: Tensor, grid: Tensor, shift_px: Tensor) -> tuple[Tensor, Tensor]:

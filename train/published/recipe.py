@@ -24,6 +24,10 @@ from train.published.unet import samples_for
 EPOCHS = {4: 50, 8: 30, 16: 15}
 """Passes over the training pages, by samples per symbol and axis (table 1)."""
 
+_OPTIONS = {name: f"--{name}" for name in ("channels", "steps", "batch", "lenses", "seed", "precision")}
+_OPTIONS["decoder_rate"] = "--learning-rate"
+"""Choices that the command line has an option for."""
+
 
 def published_choices(localizer: str, profile: Profile, pages: int, batch: int | None = None) -> PublishedChoices:
     """The authors' hyperparameters for a device's symbols and so many training pages; `batch` in place of two.
@@ -51,9 +55,9 @@ class PublishedRecipe:
     choices: PublishedChoices
 
     def options(self) -> dict[str, object]:
-        """Everything that a run must go on with, by the names of the command line."""
-        chosen = asdict(self.choices) | {"channels": list(self.choices.channels)}
-        return {"--localizer": self.localizer, **{f"--{name.replace('_', '-')}": v for name, v in chosen.items()}}
+        """Everything that a run must go on with, under the names of the command line where it has one."""
+        chosen = {_OPTIONS.get(name, name): value for name, value in asdict(self.choices).items()}
+        return {"--localizer": self.localizer, **chosen, "--channels": self.choices.channels[0]}
 
     def train(self, material: Material) -> Trained:
         """Train, or go on with, the run; raises KeyboardInterrupt after Ctrl-C, with nothing lost."""

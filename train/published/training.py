@@ -18,7 +18,7 @@ from optics.page import symbol_phases
 from optics.recording import Recording
 from train.features import PageState
 from train.fitting import DecoderTraining, Page
-from train.published.decoder import PublishedDecoder
+from train.published.decoder import PARAXIAL, PublishedDecoder
 from train.published.localizers import RayLocalizer
 
 WARM_UP = 0.02
@@ -54,7 +54,7 @@ class PublishedChoices:
     affine_rate: float = 2e-4
     angle_rate: float = 1e-4
     decay: float = 0.5
-    lenses: str = "paraxial"
+    lenses: str = PARAXIAL
     seed: int = 0
     precision: str = "bf16-mixed"
     classes: int = 0
@@ -72,7 +72,7 @@ class FramePages(Dataset[Page]):
     """
 
     def __init__(self, recording: Recording, pages: Sequence[int], states: Sequence[PageState]) -> None:
-        self.recording, self._pages, self._states = recording, pages, states
+        self.recording, self._pages, self.states = recording, pages, states
 
     def __len__(self) -> int:
         """Pages."""
@@ -80,7 +80,7 @@ class FramePages(Dataset[Page]):
 
     def __getitem__(self, index: int) -> Page:
         """One page."""
-        page, state = self._pages[index], self._states[index]
+        page, state = self._pages[index], self.states[index]
         pair, symbols = self.recording.frames(page), self.recording.symbols(page)
         assert symbols is not None
         phases = symbol_phases(symbols, self.recording.levels).astype(np.float32)

@@ -16,8 +16,7 @@ from optics.device import Device
 from optics.profile import Profile
 from optics.progress import Progress
 from optics.simulator import TrueOptics
-from train.published.localizers import page_places
-from train.studies.rays import tracer_for
+from train.studies.rays import half_page, traced_page
 from train.studies.study import Case, Result, Row, Settings, Study
 
 Real = NDArray[np.float64]
@@ -28,7 +27,7 @@ _LOOKS = 16
 """Pages of random phases whose light is averaged: one alone would show speckle."""
 
 
-def test_picture(shape: tuple[int, int]) -> Real:
+def lettered_picture(shape: tuple[int, int]) -> Real:
     """A picture without any symmetry, so that every mirrored piece shows: letters on a ramp, [rows, columns], 0..1."""
     rows, columns = shape
     figure = Figure(figsize=(columns / 100, rows / 100), dpi=100)
@@ -47,12 +46,9 @@ def test_picture(shape: tuple[int, int]) -> Real:
 
 def folded_by_rays(profile: Profile, picture: Real, angle_deg: float) -> Real:
     """The picture as rays carry it to the cameras: brightness piles up where they land together; same shape."""
-    places = page_places((picture.shape[0], picture.shape[1]))
-    half = torch.tensor([profile.page_width_m, profile.page_height_m], dtype=torch.float64) / 2
-    angle = torch.deg2rad(torch.tensor(angle_deg, dtype=torch.float64))
-    traced = tracer_for(profile)((places * half).reshape(-1, 2), angle)
-    landed = (traced.places / half).numpy()
     rows, columns = picture.shape
+    _, traced = traced_page(profile, (rows, columns), angle_deg)
+    landed = (traced.places / half_page(profile)).numpy()
     edges = [(np.arange(count + 2 * _BORDER + 1) - _BORDER) * 2 / count - 1 for count in (rows, columns)]
     weight = np.where(traced.valid.numpy(), picture.ravel(), 0)
     image, _, _ = np.histogram2d(landed[:, 1], landed[:, 0], bins=edges, weights=weight)
@@ -83,23 +79,21 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
     profile = settings.profile
     rows, columns = profile.page_shape
     scale = 2 if settings.quick else 4
-    picture = test_picture((scale * rows, scale * columns))
+    shape = scale * rows, scale * columns
+    picture = lettered_picture(shape)
     looks = 2 if settings.quick else _LOOKS
     waves = folded_by_waves(profile, picture, case["angle_deg"], looks, settings.seed, progress)
     return {
         "picture": picture,
         "rays": folded_by_rays(profile, picture, case["angle_deg"]),
         "waves": waves,
-        "kept": float(_kept(profile, picture, case["angle_deg"])),
+        "kept": _kept(profile, shape, case["angle_deg"]),
     }
 
 
-def _kept(profile: Profile, picture: Real, angle_deg: float) -> float:
+def _kept(profile: Profile, shape: tuple[int, int], angle_deg: float) -> float:
     """Share of the page whose light lands where it would without a pipe, to a symbol."""
-    places = page_places((picture.shape[0], picture.shape[1]))
-    half = torch.tensor([profile.page_width_m, profile.page_height_m], dtype=torch.float64) / 2
-    points = (places * half).reshape(-1, 2)
-    traced = tracer_for(profile)(points, torch.deg2rad(torch.tensor(angle_deg, dtype=torch.float64)))
+    points, traced = traced_page(profile, shape, angle_deg)
     stays = torch.linalg.norm(traced.places - points, dim=1) < profile.symbol_pitch_m
     return float((stays & traced.valid).double().mean())
 

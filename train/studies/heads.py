@@ -27,10 +27,10 @@ def _cases(settings: Settings) -> list[Case]:
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    # classes ask for a piston that stands still, and a square pipe lets the mode localizer do all that it can
-    light = Light(f"light-{case['levels']}", settings.profile, ideal_device(), case["levels"])
+    # classes ask for a piston that is known, and a square pipe lets the mode localizer do all that it can
+    light = Light(f"light-{case['levels']}", settings.profile.with_ideal_lenses(), ideal_device(), case["levels"])
     classes = case["levels"] if case["head"] == "classes" else 0
-    return trained(settings, light, "mode", work, progress, classes=classes)
+    return trained(settings, light, "mode", work, progress, knows_piston=True, classes=classes)
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:

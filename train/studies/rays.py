@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from torch import Tensor
 
 from optics.lenses import lens_of
 from optics.profile import Profile
 from optics.progress import Progress
 from train.published.localizers import page_places
-from train.published.rays import RayTracer
+from train.published.rays import RayTracer, Traced
 from train.studies.study import Case, Result, Row, Settings, Study
 
 ANGLES_DEG = (0.0, -0.6)
@@ -29,25 +30,34 @@ def tracer_for(profile: Profile) -> RayTracer:
     return RayTracer(profile, lens_of(profile))
 
 
+def half_page(profile: Profile) -> Tensor:
+    """Half width and half height of the page, metres, [2] float64."""
+    return torch.tensor([profile.page_width_m, profile.page_height_m], dtype=torch.float64) / 2
+
+
+def traced_page(profile: Profile, shape: tuple[int, int], angle_deg: float) -> tuple[Tensor, Traced]:
+    """Places over the whole page, metres [rows columns, 2] in row order, and where rays from them land."""
+    points = (page_places(shape) * half_page(profile)).reshape(-1, 2)
+    return points, tracer_for(profile)(points, torch.deg2rad(torch.tensor(angle_deg, dtype=torch.float64)))
+
+
 def _cases(settings: Settings) -> list[Case]:
     return [{"name": f"{angle:+.1f}-degree", "angle_deg": angle} for angle in ANGLES_DEG]
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
     profile = settings.profile
-    half = torch.tensor([profile.page_width_m, profile.page_height_m], dtype=torch.float64) / 2
-    places = page_places(_QUICK_GRID if settings.quick else _GRID)
-    angle = torch.deg2rad(torch.tensor(case["angle_deg"], dtype=torch.float64))
-    tracer = tracer_for(profile)
+    shape = _QUICK_GRID if settings.quick else _GRID
     progress("trace the page", 0.0)
-    traced = tracer((places * half).reshape(-1, 2), angle)
+    _, traced = traced_page(profile, shape, case["angle_deg"])
     line = torch.linspace(-1, 1, _DRAWN, dtype=torch.float64)
     zero = torch.zeros_like(line)
-    along = [torch.stack(pair, dim=-1) * half for pair in ((line, zero), (zero, line))]
+    along = [torch.stack(pair, dim=-1) * half_page(profile) for pair in ((line, zero), (zero, line))]
+    tracer, angle = tracer_for(profile), torch.deg2rad(torch.tensor(case["angle_deg"], dtype=torch.float64))
     return {
-        "places": traced.places.reshape(places.shape).numpy(),
-        "valid": traced.valid.reshape(places.shape[:2]).numpy(),
-        "reflections": traced.reflections.reshape(places.shape).numpy(),
+        "places": traced.places.reshape(*shape, 2).numpy(),
+        "valid": traced.valid.reshape(shape).numpy(),
+        "reflections": traced.reflections.reshape(*shape, 2).numpy(),
         "path_x": tracer.path(along[0], angle).numpy(),
         "path_y": tracer.path(along[1], angle).numpy(),
     }
@@ -107,7 +117,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
 
 
 STUDY = Study(
-    title="where rays go, and which zones lie on top of themselves",
+    title="where rays go, and which zones lie on top of each other",
     source="figure 4A and 4D",
     cases=_cases,
     measure=_measure,

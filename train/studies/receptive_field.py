@@ -23,16 +23,21 @@ _CHANNELS = (4, 8)
 
 def field_of_layers() -> list[int]:
     """Samples along an axis that each layer at sample pitch sees, the U left out: what its table lists."""
-    torch.manual_seed(0)
-    network = PublishedUNet(4, _CHANNELS)
+    network = _network(4)
     layers = [network.first, *network.head, network.last]
     return [_seen_by(partial(_path, layers[:depth]), _SIDE) for depth in range(1, len(layers) + 1)]
 
 
 def field_of_network(samples: int) -> int:
     """Samples along an axis that the whole network sees, its U with it."""
-    torch.manual_seed(0)
-    return _seen_by(PublishedUNet(samples, _CHANNELS), _WHOLE_SIDE * samples // 4)
+    return _seen_by(_network(samples), _WHOLE_SIDE * samples // 4)
+
+
+def _network(samples: int) -> PublishedUNet:
+    """With weights that are the same whenever they are drawn."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return PublishedUNet(samples, _CHANNELS)
 
 
 def _path(layers: Sequence[torch.nn.Module], image: torch.Tensor) -> torch.Tensor:
@@ -43,7 +48,7 @@ def _path(layers: Sequence[torch.nn.Module], image: torch.Tensor) -> torch.Tenso
 
 
 def _seen_by(network: Callable[[torch.Tensor], torch.Tensor], side: int) -> int:
-    image = torch.randn(1, 4, side, side, requires_grad=True)
+    image = torch.randn(1, 4, side, side, generator=torch.Generator().manual_seed(0)).requires_grad_()
     output = network(image)
     output[0, :, output.shape[-2] // 2, output.shape[-1] // 2].sum().backward()  # type: ignore[no-untyped-call]
     assert image.grad is not None

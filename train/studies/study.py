@@ -16,7 +16,7 @@ from optics.profile import Profile
 from optics.progress import Progress
 from train.published.training import PublishedChoices
 
-RESULTS = 2
+RESULTS = 3
 """Raised when results that were kept by an earlier version do not go together with those of this one."""
 Case = Mapping[str, Any]
 """What is varied, by name; `name` tells it from the others and names its files."""

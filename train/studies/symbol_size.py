@@ -66,11 +66,11 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
         axis.set_ylabel("kB a page")
         axis.set_title(title)
         axis.legend()
-    finest = by_case["ray", 4 if 4 in sizes else sizes[-1]]
-    entropy = np.log2(2 * np.pi) - finest["own_mi_map"]
+    shown_ray = by_case["ray", 4 if 4 in sizes else sizes[-1]]
+    entropy = np.log2(2 * np.pi) - shown_ray["own_mi_map"]
     for axis, image, title in (
         (axes[2, 0], entropy, "ray: entropy that it claims, bit"),
-        (axes[2, 1], finest["error_map"], "ray: error that it makes, rad"),
+        (axes[2, 1], shown_ray["error_map"], "ray: error that it makes, rad"),
     ):
         shown = axis.imshow(image, cmap="magma")
         axis.set_title(title)

@@ -26,7 +26,8 @@ from optics.recording import Recording
 from optics.recording_job import RecordingJob
 from train.curves import curves_of
 from train.features import PageState
-from train.fitting import best_kappa_scale, decode_pages, most_likely_factor, without_piston
+from train.fitting import decode_pages, honest_factor, most_likely_factor, without_piston
+from train.parts import turned
 from train.published.recipe import published_choices, train_published
 from train.published.training import (
     FramePages,
@@ -62,7 +63,14 @@ class Light:
 
 
 def trained(
-    settings: Settings, light: Light, localizer: str, work: Path, progress: Progress, *, classes: int = 0
+    settings: Settings,
+    light: Light,
+    localizer: str,
+    work: Path,
+    progress: Progress,
+    *,
+    knows_piston: bool = False,
+    **changes: Any,
 ) -> Result:
     """What a published decoder reaches on held-out pages of a simulated device, trained as its authors did.
 
@@ -75,7 +83,9 @@ def trained(
         localizer: none, mode or ray.
         work: folder of the case.
         progress: told of the steps.
-        classes: see `PublishedChoices`.
+        knows_piston: whether a page's piston is told when the decoder is judged too, as classes need it; else pilots
+            show it.
+        changes: to `PublishedChoices`, where the study asks for others than the authors'.
 
     Returns:
         air, own_mi: bits per data symbol; air_kB, own_mi_kB a page; ece; steps; the maps air_map, own_mi_map and
@@ -96,7 +106,7 @@ def trained(
         job.run(pages)
     held = max(2, round(_HELD_SHARE * pages))
     first, second = pages - 2 * held, pages - held
-    choices = chosen(settings, localizer, profile, first, classes)
+    choices = chosen(settings, localizer, profile, first, **changes)
     mask = pilot_mask(profile)
     begin(work, asdict(choices) | {"channels": list(choices.channels), "localizer": localizer})
     with Recording.open(path) as recording:
@@ -109,10 +119,11 @@ def trained(
         fitted = train_published(
             work, localizer, choices, profile, turn, mask, training, validation, callbacks=[tell], progress=False
         )
-        scale = best_kappa_scale(fitted.module, validation, mask)
-        p, phases = decode_pages(fitted.module, unseen)
-        figures = _of_p(p * scale, phases, mask, levels)
-        if classes:
+        p, phases = _beliefs(fitted.module, validation, mask, knows_piston)
+        scale = honest_factor(p.reshape(2, -1), phases.ravel())
+        p, phases = _beliefs(fitted.module, unseen, mask, knows_piston)
+        figures = _of_p(scale * p, phases, mask, levels)
+        if choices.classes:
             of_classes = _of_classes(fitted.module, validation, unseen, mask)
             figures = {"air_of_p": _mean(figures["air_map"])} | figures | of_classes
     angle = getattr(fitted.module.network.localizer, "angle", None)
@@ -129,9 +140,9 @@ def trained(
     }
 
 
-def chosen(settings: Settings, localizer: str, profile: Profile, pages: int, classes: int = 0) -> PublishedChoices:
+def chosen(settings: Settings, localizer: str, profile: Profile, pages: int, **changes: Any) -> PublishedChoices:
     """The authors' choices for a device's symbols and so many training pages, as far as the study goes with them."""
-    choices = replace(published_choices(localizer, profile, pages), seed=settings.seed, classes=classes)
+    choices = replace(published_choices(localizer, profile, pages), seed=settings.seed, **changes)
     if settings.quick:
         choices = replace(choices, **_QUICK)  # type: ignore[arg-type]
     else:
@@ -159,11 +170,25 @@ def _mean(values: NDArray[np.float32]) -> float:
     return float(np.nanmean(values))
 
 
+def _beliefs(
+    module: PublishedTraining, pages: FramePages, mask: NDArray[np.bool_], knows_piston: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """p [2, pages, N] of the data symbols, the piston taken off, and their true phases [pages, N]."""
+
+    def still(p: NDArray[np.float32], phases: NDArray[np.float32], state: PageState) -> NDArray[np.float32]:
+        if knows_piston:
+            return np.asarray(turned(torch.from_numpy(p), -state.piston_rad).numpy())
+        return without_piston(p, phases, mask)
+
+    decoded = decode_pages(module, pages)
+    p = [still(*page)[:, ~mask] for page in zip(*decoded, pages.states, strict=True)]
+    return np.stack(p, axis=1), decoded[1][:, ~mask]
+
+
 def _of_p(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> dict[str, Any]:
-    """What von Mises beliefs carry, claim and miss, as means over the pages, symbol by symbol; and their ECE."""
-    px, py = np.stack([without_piston(*page, mask)[:, ~mask] for page in zip(p, phases, strict=True)], axis=1)
-    mu, kappa = np.arctan2(py, px), np.hypot(px, py)
-    symbols = np.rint(phases[:, ~mask] * (levels / (2 * np.pi))).astype(np.int64) % levels
+    """What von Mises beliefs [2, pages, N] carry, claim and miss, as means over the pages by symbol; their ECE."""
+    mu, kappa = np.arctan2(p[1], p[0]), np.hypot(p[0], p[1])
+    symbols = np.rint(phases * (levels / (2 * np.pi))).astype(np.int64) % levels
     maps = symbol_maps(mu, kappa, symbols, levels, ~mask)
     figures = measure(mu, kappa, symbols, levels)
     return {"air_map": maps.air, "own_mi_map": maps.own_mi, "error_map": maps.error_rad, "ece": figures.ece}

@@ -7,7 +7,7 @@ import json
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,13 +16,16 @@ from click.testing import CliRunner
 from PIL import Image
 from torch.nn import functional
 
-from optics.device import Device
+from optics.device import Device, ideal_device
 from optics.errors import InvalidInputError, LightpageError, ProfileError
 from optics.lenses import LENSES
 from optics.profile import load_profile
 from optics.recording_job import RecordingJob
 from optics.simulator import TrueOptics
 from tests.optics.small import small_profile
+from train.features import PageState
+from train.published.decoder import PARAXIAL
+from train.published.recipe import published_choices
 from train.published.training import PublishedChoices
 from train.studies import (
     STUDIES,
@@ -30,6 +33,7 @@ from train.studies import (
     cross_section,
     drift,
     folding,
+    heads,
     imaging_condition,
     lens_path,
     pipe_length,
@@ -40,7 +44,7 @@ from train.studies import (
 )
 from train.studies.cli_study import study
 from train.studies.study import Settings, aligned, measured
-from train.studies.trained import _of_classes, chosen
+from train.studies.trained import Light, _beliefs, _of_classes, chosen
 
 SMALL = small_profile()
 
@@ -152,7 +156,7 @@ def test_a_square_pipe_lays_no_zone_on_another_and_a_sheared_one_does() -> None:
 
 def test_the_middle_of_a_picture_stays_and_its_neighbours_are_mirrored() -> None:
     bench = load_profile("bench")
-    picture = folding.test_picture((112, 174))
+    picture = folding.lettered_picture((112, 174))
     folded = folding.folded_by_rays(bench, picture, 0.0)
     assert folded.sum() == pytest.approx(picture.sum())  # rays are neither lost nor added
     border = folding._BORDER
@@ -321,6 +325,7 @@ def test_each_that_trains_makes_maps_of_every_case_and_each_light_once(
             assert (len(maps["angles"]) > 0) == (case.get("localizer") == "ray")
             if len(maps["angles"]):
                 assert result["angle_deg"] == pytest.approx(maps["angles"][-1, 1], abs=0.01)
+                assert bool(maps["angles"][:, 1].any()) == (name != "pipe-length")  # whose pipes are known to be square
 
 
 def test_beliefs_in_classes_are_made_honest_before_they_are_judged() -> None:
@@ -374,6 +379,38 @@ def test_a_smaller_device_has_a_shorter_pipe_with_as_many_walls() -> None:
     assert pipe_length.scaled_length_m(paper, 75) == pytest.approx(0.075)
     assert pipe_length.scaled_length_m(bench, 75) == pytest.approx(0.01875, rel=0.01)
     assert pipe_length.LENGTHS_MM[-1] == 400
+
+
+@pytest.mark.parametrize("study", [heads, pipe_length])
+def test_square_pipes_without_defects_have_ideal_lenses_too(study: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Light, dict[str, object]]] = []
+    monkeypatch.setattr(
+        study, "trained", lambda settings, light, localizer, *_, **changes: asked.append((light, changes))
+    )
+    settings = Settings(load_profile("paper"))
+    for case in study.STUDY.cases(settings):
+        study.STUDY.measure(settings, case, Path(), lambda what, share: None)
+    assert {light.profile.ideal_lenses for light, _ in asked} == {True}
+    assert all(light.device == ideal_device() for light, _ in asked)
+    assert {published_choices("ray", light.profile, 450).lenses for light, _ in asked} == {PARAXIAL}
+    if study is heads:  # classes know the piston, so the other head must
+        assert {changes["knows_piston"] for _, changes in asked} == {True}
+
+
+def test_a_known_piston_is_taken_off_as_it_is_and_not_as_pilots_show_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, shape = np.random.default_rng(0), (20, 30)
+    mask = np.zeros(shape, dtype=bool)
+    mask[::7, ::7] = True
+    phases = rng.uniform(0, 2 * np.pi, (2, *shape)).astype(np.float32)
+    seen = np.where(mask, 0.4, 0.0) + phases  # the pilots are misread, all in the same way
+    states = [PageState((0.0, 0.0), piston) for piston in (0.7, -2.0)]
+    turned = seen + np.array([state.piston_rad for state in states])[:, None, None]
+    p = np.stack([np.cos(turned), np.sin(turned)], axis=1).astype(np.float32)
+    monkeypatch.setattr("train.studies.trained.decode_pages", lambda *_: (p, phases))
+    for knows_piston, left in ((True, 0.0), (False, -0.4)):
+        found, truth = _beliefs(None, SimpleNamespace(states=states), mask, knows_piston)  # type: ignore[arg-type]
+        off = np.angle((found[0] + 1j * found[1]) * np.exp(-1j * truth))
+        np.testing.assert_allclose(off, np.full((2, np.count_nonzero(~mask)), left), atol=1e-4)
 
 
 def test_symbols_of_another_size_cover_the_same_page() -> None:
