@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from pickle import UnpicklingError
+from statistics import fmean
 from typing import Any, Generic, TypeVar
 
 import lightning as L
@@ -144,7 +145,7 @@ class DecoderTraining(L.LightningModule, Generic[N]):
         super().__init__()
         self.network = network
         self.pilot_mask, self.levels = pilot_mask, levels
-        self._seen: list[tuple[Tensor, Tensor]] = []
+        self._rates: list[float] = []
 
     def forward(self, *page: Tensor) -> Tensor:
         """A batch of pages to p [N, 2, ny, nx]."""
@@ -159,17 +160,20 @@ class DecoderTraining(L.LightningModule, Generic[N]):
         self.log("train_air", rate, prog_bar=True)
         return loss
 
+    def rate(self, batch: Page) -> float:
+        """AIR of held-out pages, bits per data symbol, piston taken off by the pilots as the runtime does it."""
+        p, phases = self(*batch[:-1]).float().cpu().numpy(), batch[-1].cpu().numpy()
+        return held_out_air(p, phases, self.pilot_mask, self.levels)
+
     def validation_step(self, batch: Page, index: int) -> None:
-        """Collect what the network says of held-out pages."""
-        self._seen.append((self(*batch[:-1]).float().cpu(), batch[-1].cpu()))
+        """Judge a held-out page."""
+        self._rates.append(self.rate(batch))
 
     def on_validation_epoch_end(self) -> None:
-        """AIR of the held-out pages, piston taken off by the pilots as the runtime does it."""
-        p = torch.cat([seen[0] for seen in self._seen]).numpy()
-        phases = torch.cat([seen[1] for seen in self._seen]).numpy()
-        self._seen.clear()
+        """AIR of the held-out pages."""
+        air = fmean(self._rates)
+        self._rates.clear()
         # each of several processes has seen as many pages as the others
-        air = held_out_air(p, phases, self.pilot_mask, self.levels)
         self.log("val_air", air, prog_bar=True, sync_dist=True)
 
 
@@ -435,8 +439,9 @@ def fit(
     rates = {}
     for path in {last, folder / Path(best.best_model_path or last).name}:  # the run may have been moved meanwhile
         module.load_state_dict(_checkpoint(path)["state_dict"])
-        decoded = decode_pages(module.float().eval(), validation)
-        rates[path] = held_out_air(*decoded, module.pilot_mask, module.levels)
+        module.float().eval()
+        with torch.no_grad():
+            rates[path] = fmean(module.rate(page) for page in DataLoader(validation, batch_size=1))
     chosen = max(rates, key=lambda path: rates[path])
     module.load_state_dict(_checkpoint(chosen)["state_dict"])
     fitted = Fitted(module, rates[chosen], timer.time_elapsed(), {})

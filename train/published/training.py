@@ -149,6 +149,17 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
         self.log("train_air", math.log2(self.choices.classes) - loss.detach() / math.log(2))
         return loss
 
+    def rate(self, batch: Page) -> float:
+        """AIR of held-out pages, bits per data symbol: of beliefs in classes, which know the piston, if it has them."""
+        if not self.choices.classes:
+            return super().rate(batch)
+        frames, state, phases = batch
+        scores = self.network.scores(frames, state[:, :2]).float().cpu()
+        truth = nearest_class(phases + state[:, 2, None, None], self.choices.classes).cpu()
+        data = torch.from_numpy(~self.pilot_mask)
+        nats = functional.cross_entropy(scores[:, :, data], truth[:, data])
+        return math.log2(self.choices.classes) - float(nats) / math.log(2)
+
     def configure_optimizers(self) -> Any:
         """Adam; all rates warm up, the decoder's falls towards the end."""
         choices, localizer = self.choices, self.network.localizer

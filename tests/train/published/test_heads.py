@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch.nn import functional
 
 from tests.train.published.test_training import module
 from train.published.decoder import p_of_classes
@@ -46,6 +47,20 @@ def test_the_nearest_class_goes_round() -> None:
     phases = torch.tensor([0.0, 2 * math.pi - 0.01, math.pi, -math.pi / 2])
     assert nearest_class(phases, 4).tolist() == [0, 0, 2, 3]
     assert nearest_class(torch.tensor([math.nan]), 4).tolist() == [NOT_ASKED]
+
+
+def test_classes_are_judged_by_what_they_say_of_the_data_with_the_piston_known() -> None:
+    made = module("none", PublishedChoices(channels=(4, 8), classes=4))
+    rng = np.random.default_rng(0)
+    symbols = torch.from_numpy(rng.integers(4, size=(2, 28, 44)))
+    scores = 3.0 * functional.one_hot(symbols, 4).movedim(-1, 1).float()
+    scores[:, :, torch.from_numpy(made.pilot_mask)] = 0
+    made.network.scores = lambda frames, shift: scores  # type: ignore[method-assign]
+    piston = torch.tensor([math.pi / 2, -math.pi])
+    phases = symbols * (math.pi / 2) - piston[:, None, None]
+    state = torch.stack([torch.zeros(2), torch.zeros(2), piston], dim=1)
+    right = 3 - math.log(math.exp(3) + 3)
+    assert made.rate((torch.zeros(2, 2, 8, 8), state, phases)) == pytest.approx(2 + right / math.log(2), rel=1e-5)
 
 
 def test_classes_are_learned_by_cross_entropy() -> None:
