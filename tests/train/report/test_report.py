@@ -112,7 +112,7 @@ def test_a_run_at_symbol_pitch(coherent: Path, tmp_path: Path) -> None:
     check_whole(text, seen)
     counts = {name: len(pictures) for name, pictures in seen.pictures.items()}
     assert counts == {"maps": 4, "honesty": 2, "training": 2, "page": 3, "rays": 4}
-    assert "2 validation pages" in text
+    assert "the validation pages of this run (2)" in text
     assert "8 channels, 1 blocks" in text
 
 
