@@ -2,8 +2,7 @@
 
     python -m benchmarks.scaling
 
-`lightpage study scaling` compares it with other decoders, all in torch, which asks the system for new memory for every
-large tensor: from a hundred thousand symbols on that takes longer than the arithmetic. The runtime keeps its memory.
+`lightpage study scaling` compares it with other decoders, all in torch.
 """
 
 from __future__ import annotations

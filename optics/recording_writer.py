@@ -260,7 +260,8 @@ class RecordingWriter:
                 return False
             raise RecordingError(f"recording {self._partial}", error, "a file that can be read and written") from None
         try:
-            pages = int(file.attrs["pages_complete"])
+            # Without its count a file was interrupted while it was completed: all of its pages are there.
+            pages = int(file.attrs.get("pages_complete", file[FRAMES[0]].shape[0]))
             same = (
                 all(file.attrs[name] == value for name, value in self._header().items())
                 and all(np.array_equal(file[name][()], value) for name, value in fixed.items())

@@ -28,7 +28,7 @@ from torch.utils.data import DataLoader, Dataset, RandomSampler
 from optics.errors import InvalidInputError
 from optics.files import replace_file, replace_text
 from optics.grid import GRID_STEP_PX, FieldGrid, field_grid
-from optics.measures import achievable_rate
+from optics.measures import achievable_rate, decide
 from optics.pilots import Pilots, estimate_piston
 from optics.profile import Profile
 from optics.progress import warn
@@ -236,8 +236,7 @@ def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDAr
     rates = []
     for page, truth in zip(p, phases, strict=True):
         px, py = without_piston(page, truth, mask)[:, ~mask]
-        true_level = np.rint(truth[~mask] * (levels / (2 * np.pi))).astype(np.int64) % levels
-        air = achievable_rate(np.arctan2(py, px), np.hypot(px, py), true_level.astype(np.uint8), levels)
+        air = achievable_rate(np.arctan2(py, px), np.hypot(px, py), decide(truth[~mask], levels), levels)
         rates.append(float(np.mean(air)))
     return float(np.mean(rates))
 

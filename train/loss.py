@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from optics.measures import achievable_rate
 
 
 def von_mises_nll(p: Tensor, phases: Tensor) -> Tensor:
@@ -23,26 +26,14 @@ def von_mises_nll(p: Tensor, phases: Tensor) -> Tensor:
     return math.log(2 * math.pi) + torch.log(torch.special.i0e(concentration)) + concentration - along
 
 
-FEW_LEVELS = 64
-"""Up to so many, a belief in phases may be narrower than a level; of more, the sum over levels is the integral."""
-
-
-def training_rate(p: Tensor, phases: Tensor, levels: int) -> Tensor:
+def training_rate(p: Tensor, phases: Tensor, levels: int) -> float:
     """AIR in bits per symbol of levels that a piston may have turned, so that the true one lies at `phases`.
-
-    log2 M less the mean of log2 sum_k exp(p.(e(phase + 2 pi k / M) - e(phase))), e the unit vector at an angle. Of more
-    than `FEW_LEVELS` the sum is M I0(|p|), to exp(-M^2 / 2 |p|) of it.
 
     Args:
         p: (px, py), [2, N].
         phases: true phases [N], radians.
         levels: M.
     """
-    p = p.detach().float()
-    if levels > FEW_LEVELS:
-        return math.log2(2 * math.pi) - von_mises_nll(p[None], phases[None]).mean() / math.log(2)
-    cos, sin = torch.cos(phases), torch.sin(phases)
-    along, across = p[0] * cos + p[1] * sin, p[1] * cos - p[0] * sin
-    steps = torch.arange(levels, device=p.device)[:, None] * (2 * math.pi / levels)
-    others = torch.logsumexp(along * torch.cos(steps) + across * torch.sin(steps), dim=0)
-    return math.log2(levels) - (others - along).mean() / math.log(2)
+    px, py = p.detach().float().cpu().numpy()
+    error = np.arctan2(py, px) - phases.cpu().numpy()
+    return float(achievable_rate(error, np.hypot(px, py), np.zeros(error.shape, np.uint8), levels).mean())

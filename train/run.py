@@ -146,6 +146,10 @@ def check_begun(folder: Path, options: dict[str, Any]) -> bool:
             raise InvalidInputError(f"run {folder}", "weights of unknown origin", wanted) from None
         return False
     _check_format(folder, kept.get("format"))
+    unknown = [name for name, value in options.items() if name not in kept and value is not None]
+    if unknown:
+        wanted = "the version that began the run, or another --out"
+        raise InvalidInputError(f"run {folder}", f"one that was begun without {', '.join(unknown)}", wanted)
     for name, value in options.items():
         if kept.get(name) != value:
             now, then = _where_they_differ(value, kept.get(name))

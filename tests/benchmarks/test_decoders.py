@@ -114,6 +114,9 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     assert by_levels == [[16], [16], [16], [16], [], [16]]
     assert all(0 < arm["by_levels"][0]["symbol_error_rate"] <= 0.8 for arm in (coherent, refined, oracle))
     assert all(len(arm["validation_curve"]) > 0 for arm in figures["outcomes"])
+    # who is made less sure claims less than before, and who is made surer more
+    for arm in figures["outcomes"]:
+        assert np.sign(arm["own_mi_unscaled"] - arm["own_mi"]) == np.sign(1 - arm["kappa_scale"]) != 0
     # the mean over all symbols is that of the zones, weighted by their symbols
     data = ~pilot_mask(PROFILE)
     shares = {name: (zone & data).sum() / data.sum() for name, zone in zones_of(Device()).items()}

@@ -614,6 +614,28 @@ class TestInterruption:
         ) as writer:
             assert writer.pages == 0
 
+    def test_pages_outlive_an_interruption_while_the_file_is_completed(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        path, profile = tmp_path / "own.h5", small_profile()
+
+        def interrupt(made: Path, final: Path) -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr("optics.recording_writer.move_into_place", interrupt)
+            writer = RecordingWriter(path, profile, LEVELS, 12, random_frames(100))
+            for page in range(3):
+                writer.append(None, random_frames(page))
+            with pytest.raises(KeyboardInterrupt):
+                writer.commit()
+        with RecordingWriter.resume(path, profile, LEVELS, 12, random_frames(100)) as writer:
+            assert writer.pages == 3
+            writer.append(None, random_frames(3))
+        with Recording.open(path) as recording:
+            assert recording.pages == 4
+            assert np.array_equal(recording.frames(2).in_phase, random_frames(2).in_phase)
+
     def test_without_a_partial_file_resuming_starts_anew(self, tmp_path: Path) -> None:
         path = tmp_path / "own.h5"
         with RecordingWriter.resume(path, small_profile(), LEVELS, 12, random_frames(100)) as writer:

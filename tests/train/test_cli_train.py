@@ -361,3 +361,5 @@ def test_a_run_does_not_go_on_with_other_options(tmp_path: Path) -> None:
     begin(tmp_path, options)
     with pytest.raises(InvalidInputError, match=r"--channels.*16.*8, with which it was begun"):
         begin(tmp_path, options | {"--channels": 16})
+    with pytest.raises(InvalidInputError, match=r"begun without --rate, wanted the version that began the run"):
+        begin(tmp_path, options | {"--channels": [8, 16], "--rate": 0.1})

@@ -15,6 +15,7 @@ from torch import nn
 from torch.utils.data import Dataset
 
 from optics.errors import InvalidInputError, RecordingError
+from optics.measures import decide
 from optics.page import MAX_LEVELS, MIN_LEVELS
 from optics.recording import FramePair, Recording, page_hashes
 from optics.tally import Tally
@@ -58,7 +59,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
         outputs, phases = decode_pages(module.eval(), decodable.pages)
     levels = levels_of(phases)
     p = np.stack([without_piston(run.kappa_scale * o, t, mask) for o, t in zip(outputs, phases, strict=True)])
-    symbols = np.rint(phases[:, ~mask] * (levels / (2 * np.pi))).astype(np.int64) % levels
+    symbols = decide(phases[:, ~mask], levels)
     phase, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])[:, ~mask]
     tally = Tally(levels, ~mask, len(p))
     for page in zip(phase[:, ~mask], kappa, symbols, strict=True):

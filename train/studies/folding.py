@@ -45,7 +45,11 @@ def lettered_picture(shape: tuple[int, int]) -> Real:
 
 
 def folded_by_rays(profile: Profile, picture: Real, angle_deg: float) -> Real:
-    """The picture as rays carry it to the cameras: brightness piles up where they land together; same shape."""
+    """The picture as rays carry it to the cameras: brightness piles up where they land together.
+
+    Returns:
+        [rows + 2 _BORDER, columns + 2 _BORDER]: the page's own place in the middle.
+    """
     rows, columns = picture.shape
     _, traced = traced_page(profile, (rows, columns), angle_deg)
     landed = (traced.places / half_page(profile)).numpy()

@@ -7,10 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from optics.errors import InvalidInputError
 from optics.files import replace_file, replace_text
 from optics.profile import Profile
 from optics.progress import Progress
@@ -74,7 +76,11 @@ class Study:
 
 
 def measured(study: Study, settings: Settings, case: Case, folder: Path, progress: Progress) -> Result:
-    """The result of a case, kept in `folder` under the case's name; measured if it is not there."""
+    """The result of a case, kept in `folder` under the case's name; measured if it is not there.
+
+    Raises:
+        InvalidInputError: a result that is there and damaged.
+    """
     path = folder / f"{case['name']}.json"
     if path.exists():
         return _load(path)
@@ -108,9 +114,13 @@ def _save(path: Path, result: Result) -> None:
 
 
 def _load(path: Path) -> Result:
-    with np.load(_arrays(path)) as arrays:
-        kept: dict[str, Any] = json.loads(path.read_text())
-        return kept | dict(arrays)
+    try:
+        with np.load(_arrays(path)) as arrays:
+            kept: dict[str, Any] = json.loads(path.read_text())
+            return kept | dict(arrays)
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        wanted = "a whole one with its arrays; without it the case is measured again"
+        raise InvalidInputError(f"result {path}", error, wanted) from None
 
 
 def _arrays(path: Path) -> Path:

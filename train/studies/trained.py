@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from optics.device import Device
-from optics.measures import expected_calibration_error, measure, symbol_maps
+from optics.measures import decide, expected_calibration_error, measure, symbol_maps
 from optics.page import pilot_mask
 from optics.profile import Profile
 from optics.progress import Progress
@@ -173,11 +173,17 @@ def _mean(values: NDArray[np.float32]) -> float:
 def _beliefs(
     module: PublishedTraining, pages: FramePages, mask: NDArray[np.bool_], knows_piston: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """p [2, pages, N] of the data symbols, the piston taken off, and their true phases [pages, N]."""
+    """p [2, pages, N] of the data symbols, the piston taken off, and their true phases [pages, N].
+
+    What classes learn of a piston is the class that is nearest to it.
+    """
+    classes = module.choices.classes
 
     def still(p: NDArray[np.float32], phases: NDArray[np.float32], state: PageState) -> NDArray[np.float32]:
         if knows_piston:
-            return np.asarray(turned(torch.from_numpy(p), -state.piston_rad).numpy())
+            step = 2 * np.pi / classes if classes else 0.0
+            piston = step * round(state.piston_rad / step) if step else state.piston_rad
+            return np.asarray(turned(torch.from_numpy(p), -piston).numpy())
         return without_piston(p, phases, mask)
 
     decoded = decode_pages(module, pages)
@@ -188,7 +194,7 @@ def _beliefs(
 def _of_p(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> dict[str, Any]:
     """What von Mises beliefs [2, pages, N] carry, claim and miss, as means over the pages by symbol; their ECE."""
     mu, kappa = np.arctan2(p[1], p[0]), np.hypot(p[0], p[1])
-    symbols = np.rint(phases * (levels / (2 * np.pi))).astype(np.int64) % levels
+    symbols = decide(phases, levels)
     maps = symbol_maps(mu, kappa, symbols, levels, ~mask)
     figures = measure(mu, kappa, symbols, levels)
     return {"air_map": maps.air, "own_mi_map": maps.own_mi, "error_map": maps.error_rad, "ece": figures.ece}

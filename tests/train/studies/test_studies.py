@@ -96,6 +96,9 @@ def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) 
     assert told == ["trace"]
     np.testing.assert_array_equal(first["landed"], again["landed"])
     assert first["spots"] == again["spots"] == 1
+    (tmp_path / "square-diagonal.npz").unlink()
+    with pytest.raises(InvalidInputError, match=r"square-diagonal\.json.*wanted a whole one with its arrays"):
+        measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: told.append(what))
 
 
 def test_a_table_lines_up() -> None:
@@ -407,10 +410,13 @@ def test_a_known_piston_is_taken_off_as_it_is_and_not_as_pilots_show_it(monkeypa
     turned = seen + np.array([state.piston_rad for state in states])[:, None, None]
     p = np.stack([np.cos(turned), np.sin(turned)], axis=1).astype(np.float32)
     monkeypatch.setattr("train.studies.trained.decode_pages", lambda *_: (p, phases))
-    for knows_piston, left in ((True, 0.0), (False, -0.4)):
-        found, truth = _beliefs(None, SimpleNamespace(states=states), mask, knows_piston)  # type: ignore[arg-type]
+    step = 2 * np.pi / 16  # classes learn the nearest one to a piston, and with it what is left over
+    left_over = (0.7 - 2 * step, -2.0 + 5 * step)
+    for knows_piston, classes, left in ((True, 0, (0.0, 0.0)), (False, 0, (-0.4, -0.4)), (True, 16, left_over)):
+        module = SimpleNamespace(choices=SimpleNamespace(classes=classes))
+        found, truth = _beliefs(module, SimpleNamespace(states=states), mask, knows_piston)  # type: ignore[arg-type]
         off = np.angle((found[0] + 1j * found[1]) * np.exp(-1j * truth))
-        np.testing.assert_allclose(off, np.full((2, np.count_nonzero(~mask)), left), atol=1e-4)
+        np.testing.assert_allclose(off, np.broadcast_to(np.array(left)[:, None], off.shape), atol=1e-4)
 
 
 def test_symbols_of_another_size_cover_the_same_page() -> None:
