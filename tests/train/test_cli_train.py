@@ -241,10 +241,20 @@ def test_a_calibration_of_a_device_with_another_angle_is_refused(device: list[st
         run([*device[:5], str(tmp_path / "C.toml"), *device[6:], "--steps", "60", "--out", str(tmp_path / "run")])
 
 
-def test_other_options_are_refused_before_a_calibration_is_made(device: list[str], tmp_path: Path) -> None:
-    begin(tmp_path, {"--steps": 60})
-    with pytest.raises(InvalidInputError, match=r"with which it was begun, or another --out"):
-        run([*device[:4], *device[6:], "--steps", "70", "--out", str(tmp_path)])
+def test_other_options_are_refused_before_a_calibration_is_made(
+    device: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    arguments = [*device[:4], *device[6:], "--out", str(tmp_path)]
+    with monkeypatch.context() as patch:
+        patch.setattr("train.cli_train.check_begun", begin)
+        patch.setattr("train.cli_train._calibration", interrupt)
+        with pytest.raises(click.Abort):
+            run([*arguments, "--steps", "60"])
+    with pytest.raises(InvalidInputError, match=r"--steps: got 70, wanted 60, with which it was begun"):
+        run([*arguments, "--steps", "70"])
     assert [path.name for path in tmp_path.iterdir()] == ["begun.json"]
 
 
