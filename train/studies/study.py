@@ -7,16 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from optics.errors import InvalidInputError
-from optics.files import replace_file, replace_text
+from optics.files import replace_text
 from optics.profile import Profile
 from optics.progress import Progress
 from train.published.training import PublishedChoices
+from train.run import load_arrays, save_arrays
 
 RESULTS = 3
 """Raised when results that were kept by an earlier version do not go together with those of this one."""
@@ -109,18 +109,17 @@ def _save(path: Path, result: Result) -> None:
     """Arrays beside the rest, and first: a result that is there is whole."""
     arrays = {name: value for name, value in result.items() if isinstance(value, np.ndarray)}
     rest = {name: value for name, value in result.items() if name not in arrays}
-    replace_file(_arrays(path), lambda file: np.savez_compressed(file, **arrays), "arrays of a study")  # type: ignore[arg-type]
+    save_arrays(_arrays(path), arrays)
     replace_text(path, json.dumps(rest, indent=1), "result of a study")
 
 
 def _load(path: Path) -> Result:
     try:
-        with np.load(_arrays(path)) as arrays:
-            kept: dict[str, Any] = json.loads(path.read_text())
-            return kept | dict(arrays)
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        wanted = "a whole one with its arrays; without it the case is measured again"
+        kept: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        wanted = "a whole one, or none: then the case is measured again"
         raise InvalidInputError(f"result {path}", error, wanted) from None
+    return kept | load_arrays(_arrays(path))
 
 
 def _arrays(path: Path) -> Path:

@@ -181,8 +181,8 @@ def _beliefs(
 
     def still(p: NDArray[np.float32], phases: NDArray[np.float32], state: PageState) -> NDArray[np.float32]:
         if knows_piston:
-            step = 2 * np.pi / classes if classes else 0.0
-            piston = step * round(state.piston_rad / step) if step else state.piston_rad
+            known = np.array(state.piston_rad)
+            piston = float(decide(known, classes)) * 2 * np.pi / classes if classes else state.piston_rad
             return np.asarray(turned(torch.from_numpy(p), -piston).numpy())
         return without_piston(p, phases, mask)
 

@@ -97,7 +97,10 @@ def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) 
     np.testing.assert_array_equal(first["landed"], again["landed"])
     assert first["spots"] == again["spots"] == 1
     (tmp_path / "square-diagonal.npz").unlink()
-    with pytest.raises(InvalidInputError, match=r"square-diagonal\.json.*wanted a whole one with its arrays"):
+    with pytest.raises(InvalidInputError, match=r"arrays .*square-diagonal\.npz"):
+        measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: told.append(what))
+    (tmp_path / "square-diagonal.json").write_text("{")
+    with pytest.raises(InvalidInputError, match=r"result .*square-diagonal\.json.*wanted a whole one"):
         measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: told.append(what))
 
 
