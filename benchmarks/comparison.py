@@ -19,7 +19,7 @@ from benchmarks.kept import CALIBRATION, Kept
 from benchmarks.levels import LevelFigures, level_figures
 from benchmarks.oracle import Oracle
 from optics.device import Device, Sensor
-from optics.measures import achievable_rate, measure, own_information
+from optics.measures import achievable_rate, measure, own_information, page_kilobytes
 from optics.page import pilot_mask
 from optics.profile import Profile
 from optics.progress import percent_bar
@@ -75,6 +75,8 @@ WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
 CALIBRATED = 2
 HELD_OUT_SHARE = 0.05
 LAST_SHARE = 0.2
+SETTLED_BITS = 0.02
+"""A decoder whose validation AIR gains as much in that last share of its steps has not learnt what it could."""
 LEVEL_PAGES = 4
 """Of each number of levels, and as many as are calibrated on: thirty thousand symbols on the bench device."""
 
@@ -343,6 +345,7 @@ class Bench:
         zones = symbols_by_walls(self.profile, self.fitted)
         groups = {name: by_symbol[~self.mask & there] for name, there in zones.items()}
         validated = trained.curves.get("val_air", [])
+        data = int((~self.mask).sum())
         return Outcome(
             kappa_scale=scale,
             validation_curve=validated,
@@ -354,7 +357,8 @@ class Bench:
             air=figures.air_bits_per_symbol,
             own_mi=figures.own_mi_bits_per_symbol,
             own_mi_unscaled=float(own_information(np.arctan2(py, px), np.hypot(px, py) / scale, LEVELS).mean()),
-            page_kB=figures.air_bits_per_symbol * int((~self.mask).sum()) / 8000,
+            page_kB=page_kilobytes(figures.air_bits_per_symbol, data),
+            own_mi_kB=page_kilobytes(figures.own_mi_bits_per_symbol, data),
             by_walls={name: float(air.mean()) if air.size else float("nan") for name, air in groups.items()},
             validation_air=trained.validation_air,
             gained_in_last_fifth=gained_at_the_end(validated, steps),
@@ -397,6 +401,7 @@ class Outcome:
     own_mi: float
     own_mi_unscaled: float
     page_kB: float
+    own_mi_kB: float
     by_walls: dict[str, float]
     validation_air: float
     gained_in_last_fifth: float
@@ -411,28 +416,39 @@ class Outcome:
     over_published: float | None = None
     by_levels: list[LevelFigures] = field(default_factory=list)
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether more steps would hardly have helped; False if that was not seen."""
+        return self.gained_in_last_fifth < SETTLED_BITS
+
     def line(self) -> str:
         over = ["" if ratio is None else f"{ratio:.3f}" for ratio in (self.over_oracle, self.over_published)]
         walls = "".join(f"{self.by_walls[name]:>7.3f} " for name in WALLS)
         return (
             f"{self.arm:<16} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} "
-            f"{self.own_mi - self.air:>7.3f} {self.page_kB:>6.2f} {walls}{over[0]:>10} {over[1]:>10} "
-            f"{self.gained_in_last_fifth:>8.3f} {self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f} "
-            f"{self.pages_per_second:>7.2f}"
+            f"{self.own_mi - self.air:>7.3f} {self.page_kB:>6.2f} {self.own_mi_kB:>6.2f} "
+            f"{walls}{over[0]:>10} {over[1]:>10} "
+            f"{self.gained_in_last_fifth:>8.3f}{' ' if self.is_settled else UNSETTLED} "
+            f"{self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f} {self.pages_per_second:>7.2f}"
         )
 
 
 HEADER = (
-    f"{'arm':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} "
+    f"{'arm':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} {'own-kB':>6} "
     + "".join(f"{name:>7} " for name in WALLS)
-    + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8} {'features':>9} {'training':>8} {'pages/s':>7}"
+    + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8}  {'features':>9} {'training':>8} {'pages/s':>7}"
 )
 """Held-out pages, bits a symbol and kB a page; own-MI and what it claims beyond the AIR, concentrations multiplied by
 one factor that the validation pages ask for; AIR where a symbol's light meets no wall of the pipe, a wall of pair x,
 of pair y, or of both; AIR over the oracle's, and over that of the best published decoder; of the last look alone, as
-its steps: what validation AIR gained in the last fifth of them, minutes of features and of training, and pages it
-trained on a second, validation counted as time: of a kept arm, on the machine that trained it. The network's size is
-the first look's."""
+its steps: what validation AIR gained in the last fifth of them (`FOOTNOTE`), minutes of features and of training, and
+pages it trained on a second, validation counted as time: of a kept arm, on the machine that trained it. The network's
+size is the first look's."""
+UNSETTLED = "*"
+FOOTNOTE = (
+    f"{UNSETTLED} still learning: validation AIR gained {SETTLED_BITS} bit or more in the last {LAST_SHARE:.0%} of the"
+    " steps; no comparison with it counts yet"
+)
 
 
 def light_name(device: Device, symbol_size_px: int, apart: str = "") -> str:

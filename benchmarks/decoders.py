@@ -25,7 +25,7 @@ from typing import Any
 
 import click
 
-from benchmarks.comparison import ARMS, FAST, HEADER, ORACLE, Bench, Outcome, light_name, recorded
+from benchmarks.comparison import ARMS, FAST, FOOTNOTE, HEADER, ORACLE, Bench, Outcome, light_name, recorded
 from benchmarks.decoders_figure import draw, title
 from benchmarks.kept import TRAINED, Kept
 from benchmarks.levels import LEVEL_HEADER
@@ -184,6 +184,8 @@ def main(
         lights.append(light)
         click.echo(f"\n{title(light)}")
         click.echo("\n".join([HEADER, *(outcome.line() for outcome in outcomes)]))
+        if not all(outcome.is_settled for outcome in outcomes):
+            click.echo(FOOTNOTE)
         if levels:
             lines = [figures.line(o.arm, o.size) for o in outcomes for figures in o.by_levels]
             click.echo("\n".join([LEVEL_HEADER, *lines]))

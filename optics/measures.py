@@ -47,6 +47,11 @@ def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], level
     return np.asarray(np.log2(m) - (log_partition + k * away) / np.log(2))
 
 
+def page_kilobytes(bits_per_symbol: float, data_symbols: int) -> float:
+    """What a page of so many data symbols carries, kilobytes of 8000 bits."""
+    return bits_per_symbol * data_symbols / 8000
+
+
 def decide(mu: NDArray[np.floating], levels: int) -> NDArray[np.uint8]:
     """The level nearest to each phase `mu` (radians, any winding); same shape, uint8."""
     check_levels(levels)

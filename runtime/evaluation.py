@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from optics.errors import InvalidInputError, RecordingError
-from optics.measures import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps
+from optics.measures import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps, page_kilobytes
 from optics.pilots import Pilots, estimate_piston
 from optics.recording import FramePair, Recording, page_hashes
 from optics.tally import Tally
@@ -61,8 +61,8 @@ class Evaluation:
 
     @property
     def page_kb(self) -> float:
-        """What a page carries: AIR times data symbols, kilobytes of 8000 bits."""
-        return self.figures.air_bits_per_symbol * self.symbols_per_page / 8000
+        """What a page carries, by its AIR."""
+        return page_kilobytes(self.figures.air_bits_per_symbol, self.symbols_per_page)
 
     def to_json(self) -> dict[str, Any]:
         """The figures under the names that other programs read."""

@@ -250,8 +250,7 @@ def without_piston(p: NDArray[np.float32], phases: NDArray[np.float32], mask: ND
         mask: pilots, bool [ny, nx].
     """
     turn = estimate_piston(p, Pilots(mask, phases[mask].astype(np.float64))).angle_rad
-    cos, sin = np.cos(turn), np.sin(turn)
-    return np.asarray(np.stack([p[0] * cos + p[1] * sin, p[1] * cos - p[0] * sin]), dtype=np.float32)
+    return np.asarray(turned(torch.tensor(p), -turn).numpy(), dtype=np.float32)
 
 
 M = TypeVar("M", bound=DecoderTraining[Any])

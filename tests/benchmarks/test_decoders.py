@@ -16,7 +16,7 @@ import pytest
 from click.testing import CliRunner
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from benchmarks.comparison import gained_at_the_end, symbols_by_walls
+from benchmarks.comparison import HEADER, WALLS, Outcome, gained_at_the_end, symbols_by_walls
 from benchmarks.decoders import main
 from benchmarks.kept import Kept
 from benchmarks.oracle import Oracle
@@ -91,6 +91,35 @@ def test_the_gain_at_the_end_is_read_from_the_run(tmp_path: Path) -> None:
     assert gained_at_the_end(curve, 100) == pytest.approx(0.1, abs=1e-5)
 
 
+def test_an_arm_that_still_learns_is_marked() -> None:
+    outcome = Outcome(
+        run="mode",
+        arm="mode",
+        size="32/64",
+        steps=100,
+        air=3.0,
+        own_mi=3.1,
+        own_mi_unscaled=3.2,
+        page_kB=1.5,
+        own_mi_kB=1.55,
+        by_walls=dict.fromkeys(WALLS, 3.0),
+        validation_air=3.0,
+        gained_in_last_fifth=0.019,
+        preparing_seconds=60.0,
+        training_seconds=60.0,
+        pages_per_second=1.0,
+        kappa_scale=1.0,
+        training_curve=[],
+        validation_curve=[],
+    )
+    assert outcome.is_settled
+    assert len(outcome.line()) == len(HEADER)
+    for gained in (0.02, float("nan")):
+        learning = replace(outcome, gained_in_last_fifth=gained)
+        assert not learning.is_settled
+        assert learning.line() == outcome.line().replace("0.019 ", f"{gained:>5.3f}*")
+
+
 def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path) -> None:
     profile = tmp_path / "small.toml"
     profile.write_text(PROFILE.to_toml())
@@ -124,6 +153,8 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
         assert arm["air"] == pytest.approx(sum(share * arm["by_walls"][name] for name, share in shares.items()))
     assert "no wall" in first.output
     assert len(coherent["training_curve"]) > 0
+    for arm in figures["outcomes"]:
+        assert arm["own_mi_kB"] == pytest.approx(arm["own_mi"] * data.sum() / 8000)
     assert (out / "figure.png").stat().st_size > 10_000
     assert (coherent["arm"], oracle["arm"], oracle["over_oracle"]) == ("coherent", "oracle", 1)
     assert coherent["over_oracle"] == pytest.approx(coherent["air"] / oracle["air"])

@@ -146,7 +146,7 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
         loss = functional.cross_entropy(
             scores.float(), nearest_class(asked, self.choices.classes), ignore_index=NOT_ASKED
         )
-        self.log("train_air", math.log2(self.choices.classes) - loss.detach() / math.log(2))
+        self.log("train_air", rate_of_classes(loss.detach(), self.choices.classes))
         return loss
 
     def rate(self, batch: Page) -> float:
@@ -158,7 +158,7 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
         truth = nearest_class(phases + state[:, 2, None, None], self.choices.classes).cpu()
         data = torch.from_numpy(~self.pilot_mask)
         nats = functional.cross_entropy(scores[:, :, data], truth[:, data])
-        return math.log2(self.choices.classes) - float(nats) / math.log(2)
+        return float(rate_of_classes(nats, self.choices.classes))
 
     def configure_optimizers(self) -> Any:
         """Adam; all rates warm up, the decoder's falls towards the end."""
@@ -186,6 +186,11 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
     def configure_gradient_clipping(self, *_: Any, **__: Any) -> None:
         """The U-Net's gradient, as one vector."""
         nn.utils.clip_grad_norm_(self.network.unet.parameters(), LARGEST_GRADIENT)
+
+
+def rate_of_classes(nats: Tensor, classes: int) -> Tensor:
+    """Bits that are known of a symbol of so many levels, by the cross-entropy that is left of it."""
+    return math.log2(classes) - nats / math.log(2)
 
 
 def nearest_class(phases: Tensor, classes: int) -> Tensor:

@@ -42,7 +42,6 @@ class PublishedUNet(nn.Module):
         if samples not in HEAD_STRIDES:
             raise InvalidInputError("samples per symbol", samples, f"one of {', '.join(map(str, HEAD_STRIDES))}")
         high, low = channels
-        self.samples = samples
         self.first = _convolution(INPUTS, high)
         self.down = nn.ModuleList(_convolution(high if level == 0 else low, low, 2) for level in range(LEVELS))
         self.up = nn.ModuleList(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.lenses import LensPrescription
-from optics.measures import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps
+from optics.measures import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps, page_kilobytes
 from optics.profile import Profile
 from optics.recording import FramePair
 from optics.registration.calibration import Calibration
@@ -82,8 +82,8 @@ class ReportData:
 
     @property
     def page_kb(self) -> float:
-        """What a page carries: AIR times data symbols, kilobytes of 8000 bits."""
-        return self.measures.air_bits_per_symbol * int(np.count_nonzero(self.data)) / 8000
+        """What a page carries, by its AIR."""
+        return page_kilobytes(self.measures.air_bits_per_symbol, int(np.count_nonzero(self.data)))
 
 
 def exit_centroids(profile: Profile, calibration: Calibration) -> Real:

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from optics.device import Device
-from optics.measures import decide, expected_calibration_error, measure, symbol_maps
+from optics.measures import decide, expected_calibration_error, measure, page_kilobytes, symbol_maps
 from optics.page import pilot_mask
 from optics.profile import Profile
 from optics.progress import Progress
@@ -34,6 +34,7 @@ from train.published.training import (
     PublishedChoices,
     PublishedTraining,
     nearest_class,
+    rate_of_classes,
 )
 from train.run import begin
 from train.studies.study import Result, Settings
@@ -131,8 +132,8 @@ def trained(
     return {
         "air": air,
         "own_mi": own,
-        "air_kB": air * data / 8000,
-        "own_mi_kB": own * data / 8000,
+        "air_kB": page_kilobytes(air, data),
+        "own_mi_kB": page_kilobytes(own, data),
         "steps": choices.steps,
         "angle_deg": float("nan") if angle is None else math.degrees(angle.item()),
         **figures,
@@ -212,10 +213,10 @@ def _of_classes(
     )
     rates, claims, beliefs, right = [], [], [], []
     for page, truth in _scored(module, unseen, data):
-        log = torch.log_softmax(page.double() * scale, dim=0) / math.log(2)
-        rates.append((math.log2(classes) + log.gather(0, truth[None])[0]).numpy())
-        claims.append((math.log2(classes) + (log.exp2() * log).sum(0)).numpy())
-        confidence, decided = log.exp2().max(0)
+        log = torch.log_softmax(page.double() * scale, dim=0)
+        rates.append(rate_of_classes(-log.gather(0, truth[None])[0], classes).numpy())
+        claims.append(rate_of_classes(-(log.exp() * log).sum(0), classes).numpy())
+        confidence, decided = log.exp().max(0)
         beliefs.append(confidence.numpy())
         right.append((decided == truth).numpy())
     return {

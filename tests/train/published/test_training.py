@@ -77,13 +77,28 @@ def test_the_gradient_of_the_network_alone_is_clipped() -> None:
 def test_the_authors_choices() -> None:
     paper = small_profile()
     assert published_choices("mode", paper, 450) == PublishedChoices()
-    coarse = paper.model_copy(update={"page": paper.page.model_copy(update={"symbol_size_px": 16})})
-    chosen = published_choices("ray", coarse, 450)
-    assert (chosen.steps, chosen.decay) == (15 * 225, 1.0)
+    for size_px, epochs, decay in ((2, 50, 0.5), (8, 30, 1.0), (16, 15, 1.0)):
+        page = paper.page.model_copy(update={"symbol_size_px": size_px})
+        chosen = published_choices("ray", paper.model_copy(update={"page": page}), 450)
+        assert (chosen.steps, chosen.decay) == (epochs * 225, decay)
     assert published_choices("ray", load_profile("paper"), 450).lenses == "AC508-080-A"  # its lenses are real
     thick = paper.model_copy(update={"lens_path": THICK})
     assert published_choices("ray", thick, 450).lenses == "paraxial"  # of no known lens
     assert published_choices("mode", load_profile("paper"), 450) == PublishedChoices()  # which traces none
+
+
+@pytest.mark.parametrize("localizer", ["none", "mode", "ray"])
+def test_the_network_gets_two_images_and_the_places_they_stand_for(localizer: str) -> None:
+    made = module(localizer, PublishedChoices(channels=(4, 8)))
+    given: list[torch.Tensor] = []
+    made.network.unet.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0]))
+    frames = 100 + 10 * torch.rand(1, 2, *small_profile().frame_shape)
+    made(frames, torch.zeros(1, 3))
+    images, across, down = given[0][0, :2], given[0][0, 2], given[0][0, 3]
+    rows, columns = across.shape
+    assert torch.allclose(across, ((torch.arange(columns) + 0.5) / columns * 2 - 1).expand(rows, columns))
+    assert torch.allclose(down, ((torch.arange(rows) + 0.5) / rows * 2 - 1)[:, None].expand(rows, columns))
+    assert all(image.std() > 0.1 for image in images)
 
 
 @pytest.mark.parametrize("classes", [0, 4])

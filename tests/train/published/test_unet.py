@@ -23,6 +23,11 @@ def test_table_1_of_samples_and_no_others() -> None:
         PublishedUNet(5)
 
 
+def test_the_head_comes_down_to_symbols_as_published() -> None:
+    strides = {samples: tuple(layer.stride[0] for layer in PublishedUNet(samples).head) for samples in (4, 8, 16)}
+    assert strides == {4: (1, 1, 2, 1, 2), 8: (1, 1, 2, 2, 2), 16: (1, 2, 2, 2, 2)}
+
+
 def test_the_whole_network_sees_further_than_that() -> None:
     torch.manual_seed(0)
     image = torch.randn(1, 4, 256, 256, requires_grad=True)
