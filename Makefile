@@ -63,11 +63,16 @@ bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: th
 	    --out runs/bench-decoders/full-size
 	$(COMPARE) --profile paper --angle -0.6 --symbol-size 2 --pages 12 --steps 4000 --arm coherent --arm refined \
 	    --arm oracle --out runs/bench-decoders/full-size-small-symbols
+	$(COMPARE) --ideal --angle 0 --angle -0.6 --arm mode --published-steps 1125 --out runs/bench-decoders/ideal
+	$(BIN)/python -m benchmarks.speed --decoder fast --decoder coherent --decoder refined --decoder "ray 32/64" \
+	    --decoder "ray 64/128"
+	$(BIN)/python -m benchmarks.scaling
 
 # Exposures of 1 and 0.13: bright light, and about the dimmest in which two known pages still calibrate the device.
-train-decoders: $(STAMP)  ## every decoder in every light, trained as its authors did: days on two cores, resumed when run again
+train-decoders: $(STAMP)  ## every decoder in every light at quarter scale, trained anew: days on two cores, resumed when run again
 	$(COMPARE) --angle 0 --angle -0.6 --exposure 1 --exposure 0.13 \
-	    --symbol-size 4 --symbol-size 2 --pages 500 --levels 4 --levels 8 --levels 16 --out runs/train-decoders
+	    --symbol-size 4 --symbol-size 2 --pages 500 --levels 4 --levels 8 --levels 16 --trained runs/train-decoders/kept --keep \
+	    --out runs/train-decoders
 
 bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 	$(BIN)/lightpage bench

@@ -18,7 +18,7 @@ from optics.progress import Progress
 from train.published.training import PublishedChoices
 from train.run import load_arrays, save_arrays
 
-RESULTS = 3
+RESULTS = 4
 """Raised when results that were kept by an earlier version do not go together with those of this one."""
 Case = Mapping[str, Any]
 """What is varied, by name; `name` tells it from the others and names its files."""

@@ -182,6 +182,10 @@ def test_crosshairs_tell_a_shift_of_the_image() -> None:
     assert result["measured"].shape == result["true"].shape == (6, 2)
     assert np.abs(result["measured"] - result["true"]).max() < 0.1
     assert np.linalg.norm(result["true"], axis=1).max() > 0.5
+    # crosshairs that are found each with an error of its own are farther from the start than their mean
+    of_mean = np.linalg.norm(result["measured"], axis=1)
+    assert (result["distance"] >= of_mean).all()
+    np.testing.assert_allclose(result["distance"], of_mean, atol=0.2)
 
 
 def test_the_ground_between_crosshairs_is_dark() -> None:
@@ -227,7 +231,8 @@ def test_a_bundle_that_cannot_be_measured_is_told_and_no_earlier_figure_taken(
 
 def test_figures_of_two_bundles_are_not_put_in_one_table() -> None:
     cases = drift.STUDY.cases(Settings(load_profile("bench"), quick=True))
-    day = {"measured": np.zeros((4, 2)), "true": np.zeros((4, 2)), "hours": np.linspace(0, 24, 4)}
+    still = np.zeros((4, 2))
+    day = {"measured": still, "true": still, "distance": still[:, 0], "hours": np.linspace(0, 24, 4)}
     of_one = [day, {"air": 6.0, "bundle": "new"}, {"air": 3.0, "bundle": "new"}]
     assert drift.STUDY.rows(cases, of_one)[-1][2] == 0.5
     with pytest.raises(InvalidInputError, match="of new, old, wanted of one bundle"):
