@@ -19,7 +19,7 @@ from torch import nn
 from benchmarks.comparison import HEADER, LEVELS, Bench, Outcome, light_name, recorded
 from benchmarks.kept import TRAINED, Kept
 from optics.device import Device
-from optics.files import write_json
+from optics.files import OutputFolder, write_json
 from optics.profile import load_profile
 from runtime.cli import run
 from train.feature_store import FeatureStore, fill
@@ -105,7 +105,7 @@ def without(part: str, bench: Bench, choices: Hyperparameters) -> Outcome:
 @click.option("--steps", type=click.IntRange(10), default=1500, show_default=True)
 @click.option("--part", "parts", type=click.Choice(list(PARTS)), multiple=True, default=list(PARTS), show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=5000, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for all of it, ablation.json too.")
+@click.option("--out", type=OutputFolder(), required=True, help="Folder for all of it, ablation.json too.")
 def main(
     profile_name: str,
     angle_deg: float,

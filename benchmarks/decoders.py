@@ -30,7 +30,7 @@ from benchmarks.decoders_figure import draw, title
 from benchmarks.kept import TRAINED, Kept
 from benchmarks.levels import LEVEL_HEADER
 from optics.device import Device, Sensor, ideal_device
-from optics.files import write_json
+from optics.files import OutputFolder, write_json
 from optics.profile import load_profile
 from runtime.cli import run
 from train.fitting import Hyperparameters
@@ -46,7 +46,7 @@ class Size(click.ParamType[str]):
     name = "channels x blocks x levels"
 
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        if not re.fullmatch(r"[1-9]\d*x[1-9]\d*x\d", value):
+        if not re.fullmatch(r"[1-9]\d{0,3}x[1-9]\d?x[0-4]", value):
             self.fail(f"{value!r}: wanted CHANNELSxBLOCKSxLEVELS, as {DEFAULT_SIZE}", param, ctx)
         return value
 
@@ -115,7 +115,7 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
     help="Folder of arms that are trained already.",
 )
 @click.option("--keep", "keeps", is_flag=True, help="Keep what is trained in that folder.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for features, runs, figures.json.")
+@click.option("--out", type=OutputFolder(), required=True, help="Folder for features, runs, figures.json.")
 def main(
     profile_name: str,
     angles_deg: tuple[float, ...],

@@ -127,6 +127,25 @@ class OutputFile(click.ParamType[Path]):
         return path
 
 
+class OutputFolder(click.ParamType[Path]):
+    """An option that names the folder that a command works in, there or yet to be made."""
+
+    name = "folder"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path.
+
+        Raises:
+            InvalidInputError: it is empty, or something else than a folder.
+        """
+        path = Path(value)
+        if not str(value):
+            raise InvalidInputError(param.opts[0] if param is not None else "path", "an empty name", "a folder")
+        if path.exists() and not path.is_dir():
+            raise InvalidInputError(_option(path, param), "a file", "a folder")
+        return path
+
+
 def check_outputs(context: click.Context) -> None:
     """Check that no option of a command names for writing what another one names.
 

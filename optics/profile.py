@@ -15,13 +15,16 @@ from pydantic_core import ErrorDetails
 from optics.errors import ProfileError
 from optics.lens_path import SeidelTerms
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
+"""Of a part of the device, metres."""
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Radians = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]
 """Of a term of a lens's path: more would take more memory to compute with than there is."""
 Count = Annotated[int, Field(gt=0)]
 Side = Annotated[int, Field(gt=0, le=30_000)]
 """Pixels along one side of a sensor: the largest that are made have some twenty thousand."""
+
+_MOST_REFLECTIONS = 100
 
 SHIPPED = ("bench", "paper")
 
@@ -38,13 +41,13 @@ T = TypeVar("T", bound=Table)
 class Light(Table):
     """The laser."""
 
-    wavelength_m: Positive
+    wavelength_m: Length
 
 
 class Lens(Table):
     """The launch and the de-launch lens, both in a 2f arrangement."""
 
-    focal_length_m: Positive
+    focal_length_m: Length
 
 
 class LensPath(Table):
@@ -77,8 +80,8 @@ class LensPath(Table):
 class Pipe(Table):
     """The light-pipe: a glass prism whose cross-section is a rhombus of height `width_m`, sheared by `angle_deg`."""
 
-    length_m: Positive
-    width_m: Positive
+    length_m: Length
+    width_m: Length
     refractive_index: Annotated[float, Field(ge=1, le=4)]
     angle_deg: Annotated[float, Field(ge=-5, le=5)] = 0.0
 
@@ -86,7 +89,7 @@ class Pipe(Table):
 class Slm(Table):
     """The spatial light modulator."""
 
-    pitch_m: Positive
+    pitch_m: Length
 
 
 class PageLayout(Table):
@@ -104,7 +107,7 @@ class Camera(Table):
 
     columns_px: Side
     rows_px: Side
-    pitch_m: Positive
+    pitch_m: Length
 
 
 class Profile(Table):
@@ -127,6 +130,12 @@ class Profile(Table):
             raise ValueError(
                 f"page.columns, page.rows: the page's edge enters at {numerical_aperture:.2f} of the focal length, "
                 "wanted below 0.5"
+            )
+        reflections = numerical_aperture * self.pipe.length_m / (self.pipe.refractive_index * self.pipe.width_m)
+        if reflections > _MOST_REFLECTIONS:
+            raise ValueError(
+                f"pipe.length_m, pipe.width_m: light of the page's edge meets a wall {reflections:.3g} times, "
+                f"wanted at most {_MOST_REFLECTIONS}"
             )
         return self
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from optics.errors import InvalidInputError
-from optics.files import OutputFile, write_json
+from optics.files import OutputFile, OutputFolder, write_json
 from optics.progress import percent_bar
 from runtime.demo import AIR_LEVELS, LEVELS, DemoResult, run_demo
 from runtime.shipped import DEFAULT, bundle_path
@@ -16,9 +16,7 @@ from runtime.shipped import DEFAULT, bundle_path
 
 @click.command()
 @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
-@click.option(
-    "--out", default="out/demo", show_default=True, type=click.Path(file_okay=False, path_type=Path), help="Folder."
-)
+@click.option("--out", default="out/demo", show_default=True, type=OutputFolder(), help="Folder.")
 @click.option("--pages", default=3, show_default=True, type=click.IntRange(1, 100), help="Pages in each state.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of what is written.")
 @click.option("--json", "json_path", type=OutputFile(), help="Also write the figures to this file.")

@@ -9,6 +9,7 @@ import click
 
 from optics.errors import InvalidInputError
 from optics.files import NewPath, OutputFile, write_json
+from optics.options import FiniteRange
 from optics.progress import percent_bar, warn
 from optics.recording import Recording
 from optics.registration.known import first_lit_pages
@@ -34,7 +35,7 @@ DEFAULT_PAGES = 2
 @click.option(
     "--timeout",
     "timeout_s",
-    type=click.FloatRange(0, min_open=True),
+    type=FiniteRange(0, min_open=True),
     show_default=f"{RECALIBRATION_S:.0f}",
     help="With --target: seconds to wait for the result.",
 )

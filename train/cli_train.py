@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optics.errors import InvalidInputError, RecordingError
-from optics.files import OutputFile, write_json
+from optics.files import OutputFile, OutputFolder, write_json
+from optics.options import FiniteRange
 from optics.page import pilot_mask, pilot_symbols, symbol_phases
 from optics.profile import Profile, load_profile
 from optics.progress import percent_bar, warn
@@ -56,18 +57,16 @@ _RECORDED = "--recording (SHA-256 of its frames and symbols)"
     show_default=True,
     help="none, mode and ray are the published decoders: their network and way of training.",
 )
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="Folder of the run; resumed if it is there."
-)
+@click.option("--out", required=True, type=OutputFolder(), help="Folder of the run; resumed if it is there.")
 @click.option("--calibration", "calibration_path", type=click.Path(path_type=Path), help="Made here if left out.")
 @click.option(
     "--validation-share",
-    type=click.FloatRange(0.01, 0.5),
+    type=FiniteRange(0.01, 0.5),
     default=0.08,
     show_default=True,
     help="Share of the pages that training is judged by.",
 )
-@click.option("--test-share", type=click.FloatRange(0, 0.5), default=0.08, show_default=True, help="Left for evaluate.")
+@click.option("--test-share", type=FiniteRange(0, 0.5), default=0.08, show_default=True, help="Left for evaluate.")
 @with_choices
 @click.option(
     "--devices",

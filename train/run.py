@@ -140,11 +140,16 @@ def check_begun(folder: Path, options: dict[str, Any]) -> bool:
     """
     try:
         kept = json.loads((folder / BEGUN).read_text())
-    except (OSError, ValueError):
+        if not isinstance(kept, dict):
+            raise ValueError("no table of options")
+    except FileNotFoundError:
         if (folder / CHECKPOINTS).exists() or (folder / FITTED).exists():
             wanted = f"a run that says in {BEGUN} what it was begun with, or another --out"
             raise InvalidInputError(f"run {folder}", "weights of unknown origin", wanted) from None
         return False
+    except (OSError, ValueError) as error:
+        wanted = "the JSON that was written when the work began, or another --out"
+        raise InvalidInputError(f"run {folder}: {BEGUN}", error, wanted) from None
     _check_format(folder, kept.get("format"))
     unknown = [name for name, value in options.items() if name not in kept and value is not None]
     if unknown:

@@ -81,6 +81,8 @@ def test_the_image_of_the_page_fits_on_the_camera(name: str) -> None:
         ("[light]", "[lamp]", "lamp"),
         ("[light]", "[lamp]", "light"),
         ("columns = 87", "columns = 100000", "page.columns"),
+        ("length_m = 0.01875", "length_m = 1e300", "pipe.length_m"),
+        ("length_m = 0.01875", "length_m = 50.0", "pipe.length_m, pipe.width_m: .* wall .* times"),
     ],
 )
 def test_a_bad_profile_is_refused_and_the_key_named(bench_text: str, old: str, new: str, key: str) -> None:

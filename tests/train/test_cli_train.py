@@ -264,6 +264,8 @@ def test_options_that_cannot_be_are_named(device: list[str], tmp_path: Path) -> 
         run([*device, "--out", str(tmp_path / "file")])
     with pytest.raises(InvalidInputError, match=r"--learning-rate.*nan"):
         run([*device, "--learning-rate", "nan", "--out", str(tmp_path / "run")])
+    with pytest.raises(click.BadParameter, match="nan is not a finite number"):
+        run([*device, "--test-share", "nan", "--out", str(tmp_path / "run")])
     with pytest.raises(click.BadParameter, match="bf16-mixed"):
         run([*device, "--precision", "foo", "--out", str(tmp_path / "run")])
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from optics.errors import InvalidInputError
 from optics.measures import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps
+from optics.page import MAX_LEVELS, MIN_LEVELS
 from optics.pilots import remove_piston
 from optics.profile import parse_profile
 from optics.recording import FramePair
@@ -21,13 +23,16 @@ from optics.registration.calibration import parse_calibration
 from train.report.data import Golden, Rays, ReportData, how_long
 
 Rows = list[list[float | None]]
+Bits = Annotated[float, Field(le=math.log2(MAX_LEVELS) + 1e-6)]
+"""An AIR may be as negative as a decoder is sure of what is wrong."""
+Share = Annotated[float, Field(ge=0, le=1)]
 
 _GOLDEN = "golden.npz"
 _NAMED_PROBLEMS = 3
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True)
+    model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
 
 
 class _Maps(_Part):
@@ -51,18 +56,18 @@ class _Evaluation(_Part):
     """The keys of the JSON that a report is made of."""
 
     bundle_version: str
-    pages: int
-    pages_left_out: int
-    symbols_per_page: int
-    levels: int
-    air_bits_per_symbol: float
-    own_mi_bits_per_symbol: float
-    gmi_bits_per_symbol: float | None
-    symbol_error_rate: float
-    ece: float
-    seconds_per_page: float
-    concentration_bins: list[ConcentrationBin]
-    confidence_bins: list[ConfidenceBin]
+    pages: Annotated[int, Field(gt=0)]
+    pages_left_out: Annotated[int, Field(ge=0)]
+    symbols_per_page: Annotated[int, Field(gt=0)]
+    levels: Annotated[int, Field(ge=MIN_LEVELS, le=MAX_LEVELS)]
+    air_bits_per_symbol: Bits
+    own_mi_bits_per_symbol: Bits
+    gmi_bits_per_symbol: Bits | None
+    symbol_error_rate: Share
+    ece: Share
+    seconds_per_page: Annotated[float, Field(ge=0)]
+    concentration_bins: Annotated[list[ConcentrationBin], Field(min_length=1)]
+    confidence_bins: Annotated[list[ConfidenceBin], Field(min_length=1)]
     maps: _Maps
     bundle: _Bundle
     refused_pages: list[dict[str, Any]]

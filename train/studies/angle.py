@@ -66,7 +66,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     for number, (axis, case, result) in enumerate(zip(maps, cases, results, strict=True)):
         name = f"{case['localizer']}, matched reference" if case["matched"] else case["localizer"]
         if len(result["angles"]):
-            angles.plot(*result["angles"].T, color=f"C{number}", label=name)
+            angles.plot(*result["angles"].T, ".-", markersize=3, color=f"C{number}", label=name)
         rates.plot(*result["training_curve"].T, color=f"C{number}", linewidth=0.8, alpha=0.6)
         rates.plot(*result["validation_curve"].T, "o-", color=f"C{number}", markersize=3, label=name)
         shown = axis.imshow(result["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
@@ -75,7 +75,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     angles.axhline(Device().geometry.pipe_angle_deg, color="k", linestyle="--", label="true")
     angles.set_ylabel("fitted pipe angle, degrees")
     rates.set_ylabel("AIR, bit/symbol; thin: pages trained on")
-    rates.set_ylim(bottom=-1)
+    rates.set_ylim(-1, max(1.0, rates.get_ylim()[1]))
     for axis in (angles, rates):
         axis.set_xlabel("step")
         axis.legend()

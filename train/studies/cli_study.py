@@ -8,11 +8,12 @@ import click
 import torch
 
 from optics.errors import InvalidInputError
-from optics.files import OutputFile, replace_file, replace_text, write_json
+from optics.files import OutputFile, OutputFolder, replace_file, replace_text, write_json
+from optics.options import FiniteRange
 from optics.profile import load_profile
 from optics.progress import percent_bar
 from train.memory import keep_freed_memory
-from train.run import begin, sole_writer
+from train.run import BEGUN, begin, sole_writer
 from train.studies import STUDIES
 from train.studies.study import RESULTS, Settings, aligned, measured
 
@@ -22,15 +23,13 @@ _RESULTS = "results"
 
 @click.command(epilog="\n\n".join(f"{name}: {study.title} ({study.source})" for name, study in STUDIES.items()))
 @click.argument("name", type=click.Choice(list(STUDIES)))
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="Folder of the study; gone on with if it is there."
-)
+@click.option("--out", required=True, type=OutputFolder(), help="Folder of the study; gone on with if it is there.")
 @click.option("--profile", "profile_name", help="Shipped profile or TOML file.  [default: bench]")
 @click.option("--quick", is_flag=True, help="Few and small cases, to see that it works.")
 @click.option("--full", is_flag=True, help=f"At full scale, profile {_FULL}; what trains needs a GPU there.")
 @click.option(
     "--share",
-    type=click.FloatRange(min=0, max=1, min_open=True),
+    type=FiniteRange(min=0.001, max=1),
     default=1.0,
     show_default=True,
     help="Of the steps that the authors trained for, where a study trains: the whole takes hours for each case.",
@@ -71,8 +70,13 @@ def study(
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
     settings = Settings(load_profile(_FULL if full else profile_name or "bench"), quick, seed, share, channels)
     context.with_resource(sole_writer(out))
-    begin(out, {"study": name, "results": RESULTS, **settings.key()})
     results_folder = out / _RESULTS
+    if results_folder.exists() and not results_folder.is_dir():
+        raise InvalidInputError(f"study {out}: {_RESULTS}", "a file", "a folder, or another --out")
+    if results_folder.exists() and not (out / BEGUN).exists():
+        wanted = f"a study that says in {BEGUN} what it was begun with, or another --out"
+        raise InvalidInputError(f"study {out}", "results of unknown origin", wanted)
+    begin(out, {"study": name, "results": RESULTS, **settings.key()})
     results_folder.mkdir(exist_ok=True)
     cases, results = chosen.cases(settings), []
     with percent_bar() as progress:

@@ -122,12 +122,13 @@ def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:
 
 
 def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) -> Figure:
-    figure = Figure(figsize=(14, 6), layout="constrained")
+    figure = Figure(figsize=(14, 6.7), layout="constrained")
     axes = figure.subplots(2, len(_POINTS), sharex=True, sharey=True)
+    reach = 1.1e3 * max(float(np.abs(result["landed"]).max()) for result in results)
     for axis, case, result in zip(axes.ravel(), cases, results, strict=True):
         axis.plot(*(result["landed"].T * 1e3), ".", markersize=3)
         axis.set_title(f"{case['shape']}, {case['point']}")
-        axis.set_aspect("equal")
+        axis.set(aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))
         axis.grid(alpha=0.3)
     for axis in axes[-1]:
         axis.set_xlabel("x on the camera, mm")

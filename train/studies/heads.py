@@ -61,7 +61,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     figure.colorbar(shown, ax=list(axes[:-1]), label="AIR, bit/symbol", shrink=0.8)
     axes[-1].set_xlabel("step")
     axes[-1].set_ylabel("AIR on the pages trained on, bit/symbol")
-    axes[-1].set_ylim(bottom=-1)
+    axes[-1].set_ylim(-1, max(1.0, axes[-1].get_ylim()[1]))
     axes[-1].legend()
     return figure
 

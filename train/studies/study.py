@@ -110,16 +110,17 @@ def _save(path: Path, result: Result) -> None:
     arrays = {name: value for name, value in result.items() if isinstance(value, np.ndarray)}
     rest = {name: value for name, value in result.items() if name not in arrays}
     save_arrays(_arrays(path), arrays)
-    replace_text(path, json.dumps(rest, indent=1), "result of a study")
+    replace_text(path, json.dumps({"values": rest, "arrays": list(arrays)}, indent=1), "result of a study")
 
 
 def _load(path: Path) -> Result:
     try:
-        kept: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        wanted = "a whole one, or none: then the case is measured again"
+        kept = json.loads(path.read_text())
+        arrays = load_arrays(_arrays(path))
+        return dict(kept["values"]) | {name: arrays[name] for name in kept["arrays"]}
+    except (OSError, ValueError, TypeError, KeyError, InvalidInputError) as error:
+        wanted = "a whole one with its arrays; where it is removed, the case is measured again"
         raise InvalidInputError(f"result {path}", error, wanted) from None
-    return kept | load_arrays(_arrays(path))
 
 
 def _arrays(path: Path) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import math
 import re
 import shutil
 from html.parser import HTMLParser
@@ -305,11 +306,15 @@ def test_what_is_no_source_is_refused(
     found = json.loads(evaluation.read_text())
     found["maps"]["air"] = found["maps"]["air"][:-1]
     (tmp_path / "short.json").write_text(json.dumps(found))
+    bad = {"confidence_bins": [], "pages": -1, "air_bits_per_symbol": 1e308, "ece": math.nan}
+    for name, value in bad.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(json.loads(evaluation.read_text()) | {name: value}))
     for source, named in (
         (tmp_path / "unfinished", r"unfinished: got .*wanted a finished training run"),
         (tmp_path / "notes.txt", r"notes.txt: got .*Invalid JSON.*wanted a finished training run, or the JSON"),
         (tmp_path / "other.json", r"other.json: got pages_left_out \(Field required\).* more, wanted"),
         (tmp_path / "short.json", r"maps: got 27 rows of \[44\] symbols, wanted 28 rows of 44"),
+        *((tmp_path / f"{name}.json", rf"{name}\.json: got {name} \(.*wanted a finished training run") for name in bad),
         (ray, r"--recording: got none, wanted the recording of the run.*ray"),
     ):
         with pytest.raises(InvalidInputError, match=named):

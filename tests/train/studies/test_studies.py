@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import click
 import numpy as np
 import pytest
 import torch
@@ -80,6 +82,10 @@ def test_each_makes_a_table_and_a_picture_and_is_gone_on_with(name: str, tmp_pat
 def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"--full.*--profile"):
         run("rays", "--full", "--profile", "bench", "--out", str(tmp_path / "out"))
+    with pytest.raises(InvalidInputError, match="--out: got an empty name, wanted a folder"):
+        run("rays", "--out", "")
+    with pytest.raises(click.BadParameter, match="nan is not a finite number"):
+        run("heads", "--share", "nan", "--out", str(tmp_path / "out"))
     with pytest.raises(InvalidInputError, match=r"--share.*trains nothing"):
         run("rays", "--share", "0.5", "--out", str(tmp_path / "out"))
     with pytest.raises(InvalidInputError, match=r"--channels.*trains nothing"):
@@ -99,9 +105,31 @@ def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) 
     (tmp_path / "square-diagonal.npz").unlink()
     with pytest.raises(InvalidInputError, match=r"arrays .*square-diagonal\.npz"):
         measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: told.append(what))
-    (tmp_path / "square-diagonal.json").write_text("{")
-    with pytest.raises(InvalidInputError, match=r"result .*square-diagonal\.json.*wanted a whole one"):
-        measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: told.append(what))
+    for damaged in ("{", "{}", "[1]", '{"values": {}, "arrays": ["landed"]}'):
+        (tmp_path / "square-diagonal.json").write_text(damaged)
+        with pytest.raises(InvalidInputError, match=r"result .*square-diagonal\.json.*wanted a whole one"):
+            measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: told.append(what))
+
+
+def test_results_of_unknown_origin_are_not_taken_for_these(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL.to_toml())
+    out = tmp_path / "out"
+    arguments = ("imaging-condition", "--quick", "--profile", str(tmp_path / "small.toml"), "--out", str(out))
+    run(*arguments)
+    begun = (out / "begun.json").read_text()
+    (out / "begun.json").unlink()
+    with pytest.raises(InvalidInputError, match=r"study .*out: got results of unknown origin"):
+        run(*arguments, "--seed", "9")
+    for damaged in ("garbage", "[]"):
+        (out / "begun.json").write_text(damaged)
+        with pytest.raises(InvalidInputError, match=r"begun\.json: got .*wanted the JSON"):
+            run(*arguments)
+    (out / "begun.json").write_text(begun)
+    run(*arguments)
+    shutil.rmtree(out / "results")
+    (out / "results").write_text("")
+    with pytest.raises(InvalidInputError, match=r"results: got a file, wanted a folder"):
+        run(*arguments)
 
 
 def test_a_table_lines_up() -> None:
@@ -329,7 +357,7 @@ def test_each_that_trains_makes_maps_of_every_case_and_each_light_once(
     assert len(written["rows"]) == len(cases)
     for case in cases:
         with np.load(out / "results" / f"{case['name']}.npz") as maps:
-            result = json.loads((out / "results" / f"{case['name']}.json").read_text())
+            result = json.loads((out / "results" / f"{case['name']}.json").read_text())["values"]
             assert float(np.nanmean(maps["air_map"])) == pytest.approx(result["air"], abs=1e-3)
             assert np.isnan(maps["own_mi_map"]).any()  # pilots carry nothing
             assert len(maps["validation_curve"]) > 1
