@@ -63,13 +63,14 @@ Real = NDArray[np.float64]
 LEVELS = 256
 ORACLE = "oracle"
 REFINED = "refined"
+WAVE_REFINED = "wave-refined"
 ORACLE_REFINED = "oracle-refined"
-FIRST_LOOKS = {REFINED: "coherent", ORACLE_REFINED: ORACLE}
+FIRST_LOOKS = {REFINED: "coherent", WAVE_REFINED: "wave", ORACLE_REFINED: ORACLE}
 """Arms that look again, and the arm whose first look they share."""
 FAST = "fast"
 HURRIED = Hyperparameters(channels=48, field_rounds=0, binning=2, field_step=3, samples=3, interpolation=BILINEAR)
 """A coherent decoder for when time counts more than the last half bit."""
-ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, ORACLE, ORACLE_REFINED)
+ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, WAVE_REFINED, ORACLE, ORACLE_REFINED)
 WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
 """Whether a symbol's light meets walls of a pair, as the columns of the table say it."""
 CALIBRATED = 2

@@ -3,13 +3,13 @@
     python -m benchmarks.decoders --angle -0.6 --out runs/decoders
     python -m benchmarks.decoders --arm coherent --size 64x2x0 --size 96x2x1 --steps 1500 --out runs/decoders
 
-Coherent, wave and oracle share network, steps and seeds; refined is coherent, and then looks again, as oracle-refined
-is the oracle; fast is coherent with less of everything. The oracle knows the simulated truth: geometry, cameras,
-reference; the signal's own power is taken off its frames; then the wave adjoint and the same network. None, mode and
-ray are the published decoders, with their own network and training. Image shift and piston of every page, held-out
-ones too, are found from all of its symbols, for each arm alike, but a figure's piston from pilots. Interrupted, it
-goes on where it was; all lies in --out. What was trained on the same light before and kept (--keep) is only measured
-again.
+Coherent, wave and oracle share network, steps and seeds; refined is coherent, and then looks again, as wave-refined is
+wave and oracle-refined the oracle; fast is coherent with less of everything. The oracle knows the simulated truth:
+geometry, cameras, reference; the signal's own power is taken off its frames; then the wave adjoint and the same
+network. None, mode and ray are the published decoders, with their own network and training. Image shift and piston of
+every page, held-out ones too, are found from all of its symbols, for each arm alike, but a figure's piston from pilots.
+Interrupted, it goes on where it was; all lies in --out. What was trained on the same light before and kept (--keep) is
+only measured again.
 """
 
 from __future__ import annotations
