@@ -64,8 +64,8 @@ bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: th
 	$(COMPARE) --profile paper --angle -0.6 --symbol-size 2 --pages 12 --steps 4000 --arm coherent --arm refined \
 	    --arm oracle --out runs/bench-decoders/full-size-small-symbols
 	$(COMPARE) --ideal --angle 0 --angle -0.6 --arm mode --published-steps 1125 --out runs/bench-decoders/ideal
-	$(BIN)/python -m benchmarks.speed --decoder fast --decoder coherent --decoder refined --decoder "ray 32/64" \
-	    --decoder "ray 64/128"
+	$(BIN)/python -m benchmarks.speed --decoder fast --decoder coherent --decoder wave --decoder refined \
+	    --decoder "ray 32/64" --decoder "ray 64/128"
 	$(BIN)/python -m benchmarks.scaling
 
 # Exposures of 1 and 0.13: bright light, and about the dimmest in which two known pages still calibrate the device.

@@ -129,7 +129,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     calibration_of(Device()).save(light / "calibration.toml")
     arguments = f"--profile {profile} --pages 12 --steps 20 --size 8x1x0"
     arguments += "".join(
-        f" --arm {name}" for name in ("coherent", "refined", "oracle", "fast", "none", "oracle-refined")
+        f" --arm {name}" for name in ("coherent", "refined", "oracle", "fast", "none", "oracle-refined", "wave-refined")
     )
     arguments += f" --published-channels 4 --published-steps 12 --levels 16 --trained {tmp_path / 'kept'} --keep"
     arguments += f" --out {out}"
@@ -137,10 +137,10 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     assert first.exit_code == 0, first.output
     assert "-0.6 degree, full well 32 e-, exposure 1, symbols of 4x4 pixels" in first.output
     (figures,) = json.loads((out / "figures.json").read_text())["lights"]
-    coherent, refined, oracle, fast, none, again = figures["outcomes"]
+    coherent, refined, oracle, fast, none, again, by_waves = figures["outcomes"]
     assert (refined["arm"], refined["steps"]) == ("refined 1", 5)
     by_levels = [[figures["levels"] for figures in arm["by_levels"]] for arm in figures["outcomes"]]
-    assert by_levels == [[16], [16], [16], [16], [], [16]]
+    assert by_levels == [[16], [16], [16], [16], [], [16], [16]]
     assert all(0 < arm["by_levels"][0]["symbol_error_rate"] <= 0.8 for arm in (coherent, refined, oracle))
     assert all(len(arm["validation_curve"]) > 0 for arm in figures["outcomes"])
     # who is made less sure claims less than before, and who is made surer more
@@ -166,6 +166,11 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     # who looks twice is compared with an oracle that does
     assert (again["arm"], again["looks"], again["steps"], again["over_oracle"]) == ("oracle-refined 1", 2, 5, 1)
     assert refined["over_oracle"] == pytest.approx(refined["air"] / again["air"])
+    assert (by_waves["arm"], by_waves["looks"], by_waves["run"]) == (
+        "wave-refined 1",
+        2,
+        f"{light.name}/wave/8x1x0-20/refinement-1",
+    )
     assert first.output.count("of theirs") == len(figures["outcomes"]) + 1  # as soon as an arm is there, and in the end
     assert figures["angle_error_deg"] == pytest.approx(0, abs=1e-9)
     again = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
@@ -177,7 +182,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     elsewhere = tmp_path / "elsewhere"
     arguments = arguments.replace(f"--out {out}", f"--out {elsewhere}")
     measured = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
-    assert measured.output.count("trained before: ") == 4  # refined goes on from coherent
+    assert measured.output.count("trained before: ") == 5  # refined goes on from coherent
     assert not list(elsewhere.rglob("checkpoints"))
     outcomes = json.loads((elsewhere / "figures.json").read_text())["lights"][0]["outcomes"]
     for one, other in zip(outcomes, figures["outcomes"], strict=True):
