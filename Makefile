@@ -49,9 +49,9 @@ format: $(STAMP)  ## let ruff put the code in order
 
 # What was trained is kept and only measured, which takes hours on two cores, most of them for the full-size page.
 COMPARE := $(BIN)/python -m benchmarks.decoders
-LOOKS := --arm coherent --arm refined --arm oracle --arm oracle-refined
+LOOKS := --arm wave --arm wave-refined --arm coherent --arm refined --arm oracle --arm oracle-refined
 bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: the table of what is kept, resumed when run again
-	$(COMPARE) --angle -0.6 --arm mode --arm fast --arm wave --arm wave-refined $(LOOKS) --out runs/bench-decoders/sheared
+	$(COMPARE) --angle -0.6 --arm mode --arm fast $(LOOKS) --out runs/bench-decoders/sheared
 	$(COMPARE) --angle 0 $(LOOKS) --out runs/bench-decoders/square
 	$(COMPARE) --angle -0.6 --exposure 0.13 --steps 3000 --arm coherent --arm refined --arm oracle \
 	    --levels 4 --levels 8 --levels 16 --out runs/bench-decoders/dim
