@@ -51,7 +51,7 @@ format: $(STAMP)  ## let ruff put the code in order
 COMPARE := $(BIN)/python -m benchmarks.decoders
 LOOKS := --arm wave --arm wave-refined --arm coherent --arm refined --arm oracle --arm oracle-refined
 bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: the table of what is kept, resumed when run again
-	$(COMPARE) --angle -0.6 --arm mode --arm fast $(LOOKS) --out runs/bench-decoders/sheared
+	$(COMPARE) --angle -0.6 --arm ray --arm mode --arm fast $(LOOKS) --out runs/bench-decoders/sheared
 	$(COMPARE) --angle 0 --arm mode $(LOOKS) --out runs/bench-decoders/square
 	$(COMPARE) --angle -0.6 --exposure 0.13 --steps 3000 --arm coherent --arm refined --arm oracle \
 	    --levels 4 --levels 8 --levels 16 --out runs/bench-decoders/dim
