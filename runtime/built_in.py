@@ -9,6 +9,7 @@ from collections.abc import Collection
 
 import numpy as np
 from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
 
 from optics.errors import BundleError
 from runtime.bundle import Table
@@ -17,6 +18,8 @@ from runtime.pb.lightpage.onnx import graph_pb2 as pb
 
 _DTYPES = {1: "float32", 2: "uint8", 4: "uint16", 6: "int32", 7: "int64", 11: "float64"}
 """numpy's names of ONNX's element types."""
+_LISTS = {"float32": "float_data", "int64": "int64_data", "float64": "double_data"}
+"""Where values lie that are not stored as bytes, by type; those of all other types share a list."""
 _DEFAULTS_FROM = 4
 """Version of ONNX's representation from which an input may have a default; before, weights are listed as inputs too."""
 
@@ -50,6 +53,22 @@ class GraphFile:
             for tensor in whole.graph.initializer
             if tensor.name in fed
         }
+
+    def default(self, name: str) -> NDArray[np.generic]:
+        """The default of a table input, read-only.
+
+        Args:
+            name: one of `table_inputs`.
+        """
+        graph = pb.Model.FromString(self._model).graph
+        tensor = next(tensor for tensor in graph.initializer if tensor.name == name)
+        port = self.table_inputs[name]
+        dtype = np.dtype(port.dtype)
+        if tensor.raw_data:
+            values = np.frombuffer(tensor.raw_data, dtype.newbyteorder("<")).astype(dtype, copy=False)
+        else:
+            values = np.array(getattr(tensor, _LISTS.get(port.dtype, "int32_data")), dtype)
+        return values.reshape([int(size) for size in tensor.dims])
 
     def built_in(self, table: Table, fed: Collection[str]) -> bytes:
         """The model without table inputs but those `fed`.

@@ -23,10 +23,10 @@ from optics.recording import Recording
 from runtime.client import LightpageClient
 from runtime.convert import KnownPilots, RemotePage
 from runtime.decoded import DecodedWriter
-from runtime.errors import SourceError
+from runtime.errors import LostPageError, SourceError
 from runtime.frames import narrow
-from runtime.phase_shift import LEAST_COHERENCE
-from runtime.refused import WORTH_NOTHING, RefusedPage, refusal
+from runtime.image_drift import LEAST_COHERENCE
+from runtime.refused import WORTH_NOTHING, RefusedPage, refusal, unconfirmed
 
 
 @click.command()
@@ -48,7 +48,8 @@ def decode(
 ) -> None:
     """Decode a recording, or pages of the service's source.
 
-    Pages that are refused are left out of the results, named, and make the exit status 2.
+    Pages that are refused, or whose pilots do not confirm the result, are left out of the results, named, and make the
+    exit status 2.
     """
     if (recording is None) == (not source):
         came = "both --recording and --source" if source else "neither --recording nor --source"
@@ -80,11 +81,14 @@ def decode(
             raise refusal(thing, refused, count)
     if json_path is not None:
         data = {"target": target, "levels": levels, "pages": results, "refused_pages": [asdict(r) for r in refused]}
+        data["pages_unconfirmed"] = unconfirmed(refused)
         write_json(json_path, data)
     click.echo(table(results))
     rates = [rate for result in results if (rate := result["air_bits_per_symbol"]) is not None]
     if rates and fmean(rates) <= 0:
         warn(WORTH_NOTHING)
+    if due := [result for result in results if result["recalibration_due"]]:
+        warn(drifted(due))
     if doubtful := [result for result in results if result["pilot_coherence"] < LEAST_COHERENCE]:
         warn(unknown_pistons(doubtful))
     if refused:
@@ -101,10 +105,23 @@ def page_report(page: RemotePage) -> dict[str, Any]:
         "piston_rad": page.piston_rad,
         "pilot_coherence": page.pilot_coherence,
         "pilot_trust": page.pilot_trust,
+        "claimed_bits": page.claimed_bits,
+        "confirmed_bits": page.confirmed_bits,
+        "recalibration_due": page.recalibration_due,
+        "image": None if page.image is None else asdict(page.image),
         "air_bits_per_symbol": figures.air_bits_per_symbol if figures is not None else None,
         "symbol_error_rate": figures.symbol_error_rate if figures is not None else None,
         **asdict(page.timings),
     }
+
+
+def drifted(due: list[dict[str, Any]]) -> str:
+    """What to think of pages that confirm less than they would on the device as it was calibrated."""
+    claimed, confirmed = (fmean(result[name] for result in due) for name in ("claimed_bits", "confirmed_bits"))
+    return (
+        f"the pilots of {len(due)} pages confirm {confirmed:.2f} of the {claimed:.2f} bits a symbol that are claimed: "
+        "the device has changed since it was calibrated (lightpage recalibrate)"
+    )
 
 
 def unknown_pistons(doubtful: list[dict[str, Any]]) -> str:
@@ -147,8 +164,8 @@ def _read(client: LightpageClient, count: int, levels: int) -> Iterator[RemotePa
     for _ in range(count):
         try:
             page = client.read_page(levels=levels, want_phase=known, want_concentration=known, want_written=known)
-        except (InvalidInputError, SourceError) as error:
-            yield RefusedPage(None, str(error))
+        except (InvalidInputError, LostPageError, SourceError) as error:
+            yield RefusedPage.of(None, error)
         else:
             yield page
 
@@ -175,7 +192,7 @@ def _sent(client: LightpageClient, file: Recording, count: int, levels: int) -> 
                 want_phase=known,
                 want_concentration=known,
             )
-        except InvalidInputError as error:
-            yield RefusedPage(index, str(error))
+        except (InvalidInputError, LostPageError) as error:
+            yield RefusedPage.of(index, error)
         else:
             yield replace(page, page=index, written=symbols if known else None, pilot_mask=mask)

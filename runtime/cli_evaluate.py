@@ -13,7 +13,7 @@ from optics.recording import Recording
 from runtime.decoder import Decoder
 from runtime.evaluation import Evaluation
 from runtime.evaluation import evaluate as evaluate_recording
-from runtime.refused import WORTH_NOTHING, refusal
+from runtime.refused import WORTH_NOTHING, refusal, unconfirmed
 from runtime.shipped import DEFAULT, bundle_path
 from runtime.tracking import NoTracker, tracker_for
 
@@ -27,11 +27,12 @@ from runtime.tracking import NoTracker, tracker_for
 def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int | None, tracking: bool) -> None:
     """Measure a bundle on the pages of a recording that it has not seen.
 
-    Pages that cannot be decoded are left out of the figures, named, and make the exit status 2.
+    Pages that cannot be decoded, or whose pilots do not confirm the result, are left out of the figures, named, and
+    make the exit status 2.
     """
     decoder = Decoder.load(bundle_path(bundle), threads)
     with Recording.open(recording) as pages, tqdm(total=pages.pages, unit="page", desc="evaluate") as bar:
-        tracker = tracker_for(decoder) if tracking else NoTracker()
+        tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
         count, result = pages.pages, evaluate_recording(decoder, pages, tracker, bar.update)
     if json_path is not None:
         write_json(json_path, result.to_json())
@@ -45,12 +46,13 @@ def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int |
 def describe(result: Evaluation) -> str:
     """The figures as a table for people."""
     figures = result.figures
-    gmi = figures.gmi_bits_per_symbol
+    gmi, lost = figures.gmi_bits_per_symbol, unconfirmed(result.refused)
     rows = [
         ("bundle", result.bundle_version),
         ("pages", f"{result.pages} of {figures.levels} levels"),
         ("left out", f"{result.pages_left_out} that the bundle was calibrated or trained on"),
-        ("refused", f"{len(result.refused)} that cannot be decoded"),
+        ("refused", f"{len(result.refused) - lost} that cannot be decoded"),
+        ("not confirmed", f"{lost} whose pilots do not bear out what is claimed"),
         ("data symbols a page", f"{result.symbols_per_page}"),
         ("AIR", f"{figures.air_bits_per_symbol:.3f} bit/symbol"),
         ("own MI", f"{figures.own_mi_bits_per_symbol:.3f} bit/symbol"),

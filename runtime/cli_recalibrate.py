@@ -89,6 +89,9 @@ def summary(result: RecalibrationOutcome | Recalibrated, seconds: float) -> dict
         "coherence_after": report.coherence_after,
         "air_before": result.air_before,
         "air_after": result.air_after,
+        "pages_lost_before": result.pages_lost_before,
+        "image_shift_x_px": None if report.image is None else report.image.shift_x_px,
+        "image_shift_y_px": None if report.image is None else report.image.shift_y_px,
     }
 
 

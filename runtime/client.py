@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from optics.errors import FrameError, LightpageError
 from optics.recording import FramePair
 from runtime.address import check_address
-from runtime.convert import PIXEL_CODES, PIXEL_TYPES, KnownPilots, RemotePage, pilots_message, remote_page
+from runtime.convert import PIXEL_CODES, PIXEL_TYPES, KnownPilots, RemotePage, image_of, pilots_message, remote_page
+from runtime.decoder import ImagePosition
 from runtime.limits import CHUNK_BYTES, REPLY_BYTES
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
@@ -71,6 +72,8 @@ class Recalibrated:
     coherence_before: float | None
     coherence_after: float | None
     seconds: float
+    pages_lost_before: int = 0
+    image: ImagePosition | None = None
 
 
 class LightpageClient:
@@ -304,4 +307,6 @@ def _recalibrated(result: pb.RecalibrationResult) -> Recalibrated:
         coherence_before=optional("coherence_before"),
         coherence_after=optional("coherence_after"),
         seconds=result.seconds,
+        pages_lost_before=result.pages_lost_before,
+        image=image_of(result.image) if result.HasField("image") else None,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from optics.errors import InvalidInputError, LightpageError, PageError
 from optics.page import MAX_LEVELS, check_levels, symbol_phases
 from optics.pilots import Pilots
 from runtime.dataplane import Answer, ReadAnswer
+from runtime.decoder import ImagePosition
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration import RecalibrationOutcome
 from runtime.registry import Model
@@ -107,6 +108,10 @@ def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
         piston_rad=page.piston_rad,
         pilot_coherence=page.pilot_coherence,
         pilot_trust=page.pilot_trust,
+        claimed_bits=page.check.claimed_bits,
+        confirmed_bits=page.check.confirmed_bits,
+        recalibration_due=page.check.recalibration_due,
+        image=None if page.image is None else image_message(page.image),
         model_version=answer.model_version,
         timings=pb.Timings(
             receive_s=answer.receive_s,
@@ -115,6 +120,16 @@ def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
             total_s=answer.total_s,
         ),
     )
+
+
+def image_message(image: ImagePosition) -> pb.ImagePosition:
+    """An image's position as its message."""
+    return pb.ImagePosition(**asdict(image))
+
+
+def image_of(message: pb.ImagePosition) -> ImagePosition:
+    """A message as an image's position."""
+    return ImagePosition(**{field.name: getattr(message, field.name) for field in fields(ImagePosition)})
 
 
 def _confidence_bytes(confidence: NDArray[np.float32], code: int) -> bytes:
@@ -156,6 +171,8 @@ def result_message(outcome: RecalibrationOutcome) -> pb.RecalibrationResult:
         coherence_before=outcome.report.coherence_before,
         coherence_after=outcome.report.coherence_after,
         seconds=outcome.seconds,
+        pages_lost_before=outcome.pages_lost_before,
+        image=None if outcome.report.image is None else image_message(outcome.report.image),
     )
 
 
@@ -182,6 +199,9 @@ class RemotePage:
         piston_rad: what was removed.
         pilot_coherence: agreement of the pilots, 0..1.
         pilot_trust: share of the claimed concentration that they bear out, 0..1; in the fields above already.
+        claimed_bits, confirmed_bits: information per pilot that is claimed, and that the pilots confirm.
+        recalibration_due: whether they confirm less than on a device that is as it was calibrated.
+        image: where the image lay, or None where the service does not follow it.
         model_version: which model decoded it.
         timings: seconds in the service.
         page: number of the page in the source, or None where the caller sent the frames.
@@ -202,6 +222,10 @@ class RemotePage:
     written: NDArray[np.uint8] | None = None
     pilot_mask: NDArray[np.bool_] | None = None
     pilot_trust: float = 1.0
+    claimed_bits: float = 0.0
+    confirmed_bits: float = 0.0
+    recalibration_due: bool = False
+    image: ImagePosition | None = None
 
 
 def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> RemotePage:
@@ -225,6 +249,10 @@ def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> 
         piston_rad=reply.piston_rad,
         pilot_coherence=reply.pilot_coherence,
         pilot_trust=reply.pilot_trust,
+        claimed_bits=reply.claimed_bits,
+        confirmed_bits=reply.confirmed_bits,
+        recalibration_due=reply.recalibration_due,
+        image=image_of(reply.image) if reply.HasField("image") else None,
         model_version=reply.model_version,
         timings=RemoteTimings(
             reply.timings.receive_s, reply.timings.decode_s, reply.timings.inference_s, reply.timings.total_s

@@ -16,14 +16,13 @@ from optics.pilots import Pilots
 from optics.recording import FramePair
 from runtime.caller import Caller
 from runtime.decoder import DecodedPage, Decoder
-from runtime.errors import SlotsTakenError, SourceError
+from runtime.errors import LostPageError, SlotsTakenError, SourceError
 from runtime.limits import Limits
 from runtime.metrics import ServiceMetrics
 from runtime.receiver import PairReceiver
 from runtime.registry import Model, ModelRegistry
 from runtime.sources import FrameSource, SourcePage, own_fault
 from runtime.store import ModelStore
-from runtime.tracking import decode_tracked
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,7 @@ class DataPlane:
         Raises:
             SlotsTakenError: no slot until the caller's time is up.
             CallerLeft: the caller has gone.
-            FrameError, PageError: see `Decoder.decode`.
+            UnconfirmedPageError, FrameError, PageError: see `Tracker.decode`.
         """
         now = time.perf_counter()
         start = now if start is None else start
@@ -148,8 +147,7 @@ class DataPlane:
             caller.check()
             # Taken once: a swap in the meantime changes the next request, not this one.
             model = self.registry.current
-            page = self._decode(model, pair, levels, pilots)
-        self.metrics.page(page, model.version)
+            page = self._decode(model, pair, levels, pilots, "frame pair")
         return Answer(page, model.version, received - start, time.perf_counter() - start)
 
     def read_page(self, page: int | None, levels: int | None, caller: Caller) -> ReadAnswer:
@@ -175,9 +173,9 @@ class DataPlane:
                 pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
             else:
                 pilots = model.decoder.pilots(source.levels, mask)
-            with own_fault(f"page {found.page_index} of {source.name}: "):
-                decoded = self._decode(model, found.pair, levels, pilots)
-        self.metrics.page(decoded, model.version)
+            thing = f"page {found.page_index} of {source.name}"
+            with own_fault(f"{thing}: "):
+                decoded = self._decode(model, found.pair, levels, pilots, thing)
         answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start)
         return ReadAnswer(answer, found, mask)
 
@@ -208,9 +206,15 @@ class DataPlane:
     def _mask(found: SourcePage, decoder: Decoder) -> NDArray[np.bool_]:
         return decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
 
-    @staticmethod
-    def _decode(model: Model, pair: FramePair, levels: int, pilots: Pilots | None) -> DecodedPage:
-        return decode_tracked(model.decoder, model.tracker, pair, levels, pilots)
+    def _decode(self, model: Model, pair: FramePair, levels: int, pilots: Pilots | None, thing: str) -> DecodedPage:
+        """Decode with a model that was taken once, and count the page, which an error calls `thing`."""
+        try:
+            page = model.tracker.decode(pair, levels, pilots)
+        except LostPageError as error:
+            self.metrics.lost(error.reason)
+            raise error.about(thing) from None
+        self.metrics.page(page, model.version)
+        return page
 
     @contextmanager
     def _slot(self, slots: threading.BoundedSemaphore, what: str, caller: Caller) -> Iterator[None]:

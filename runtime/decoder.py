@@ -7,6 +7,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from optics.errors import BundleError, FrameError, InvalidInputError
 from optics.grid import field_grid
 from optics.measures import decide_with_confidence
 from optics.page import MAX_LEVELS, check_levels
-from optics.pilots import Pilots, estimate_piston, estimate_trust, remove_piston, without_spoilt
+from optics.pilots import PilotCheck, Pilots, read_pilots, remove_piston
 from optics.profile import Profile
 from optics.recording import FramePair
 from runtime.built_in import GraphFile
@@ -49,19 +50,53 @@ class Inference:
     phase: NDArray[np.float32]
     concentration: NDArray[np.float32]
 
+    def turned(self, by: NDArray[np.floating]) -> Inference:
+        """The same with `by` (radians [ny, nx]) added to the phases."""
+        phase = (self.phase + by).astype(np.float32)
+        p = self.concentration * np.stack([np.cos(phase), np.sin(phase)])
+        return Inference(p, phase, self.concentration)
+
 
 @dataclass(frozen=True)
 class Timings:
-    """Wall-clock seconds of one decode."""
+    """Wall-clock seconds of one page, every attempt at it counted.
+
+    Attributes:
+        check_s: checks of the frames.
+        inference_s: runs of the graph.
+        decision_s: piston, tracking and decision.
+        search_s: looking for the image.
+    """
 
     check_s: float
     inference_s: float
     decision_s: float
+    search_s: float = 0.0
 
     @property
     def total_s(self) -> float:
         """All of it."""
-        return self.check_s + self.inference_s + self.decision_s
+        return self.check_s + self.inference_s + self.decision_s + self.search_s
+
+
+@dataclass(frozen=True)
+class ImagePosition:
+    """Where the image of a page lay on the cameras.
+
+    Attributes:
+        shift_x_px, shift_y_px: against where calibration saw it, camera pixels, on both cameras.
+        tilt_x_rad, tilt_y_rad: of the signal against the reference since calibration, radians at the right and lower
+            edge of the page's image.
+        searched: whether it was looked for.
+        found: whether the search found it; False where none was made.
+    """
+
+    shift_x_px: float
+    shift_y_px: float
+    tilt_x_rad: float = 0.0
+    tilt_y_rad: float = 0.0
+    searched: bool = False
+    found: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,7 +112,9 @@ class DecodedPage:
         piston_rad: what was removed.
         pilot_coherence: how far the pilots agree on it, 0..1.
         pilot_trust: share of the network's claimed concentration that they bear out, 0..1; low after a drift.
+        check: information that is claimed of the pilots, and what of it they confirm.
         timings: seconds.
+        image: where the image was looked at, None where it is not followed.
     """
 
     symbols: NDArray[np.uint8]
@@ -88,7 +125,9 @@ class DecodedPage:
     piston_rad: float
     pilot_coherence: float
     pilot_trust: float
+    check: PilotCheck
     timings: Timings
+    image: ImagePosition | None = None
 
 
 class Decoder:
@@ -107,7 +146,7 @@ class Decoder:
         self.bundle, self.threads = bundle, threads
         self._thing = f"{bundle.thing}: {DECODER}"
         graph = GraphFile(bundle.files[DECODER], self._thing)
-        self._ports = graph.table_inputs
+        self._graph, self._ports = graph, graph.table_inputs
         if set(self._ports) != set(bundle.manifest.table_inputs):
             wanted = sorted(bundle.manifest.table_inputs)
             raise BundleError(f"{self._thing}: table inputs", sorted(self._ports), wanted)
@@ -132,8 +171,39 @@ class Decoder:
         """
         self.check_table(table)
         other = copy(self)
-        other._build_in(GraphFile(self.bundle.files[DECODER], self._thing), {**self._table, **table})
+        other._build_in(self._graph, {**self._table, **table})
         return other
+
+    def of_bundle(self, bundle: Bundle) -> Decoder:
+        """This decoder with the table of a bundle of the same graphs, whose golden page is not looked at.
+
+        Raises:
+            BundleError: its table does not fit.
+        """
+        other = copy(self)
+        other.bundle = bundle
+        other._build_in(self._graph, {**self._table, **other._checked_defaults(bundle.table)})
+        return other
+
+    def table_value(self, name: str) -> NDArray[Any]:
+        """A tensor of the table as this decoder decodes with it.
+
+        Raises:
+            InvalidInputError: no such tensor.
+        """
+        if name not in self._ports:
+            raise InvalidInputError("table", repr(name), f"one of {sorted(self._ports)}")
+        return self._table[name] if name in self._table else self._graph.default(name)
+
+    @property
+    def references(self) -> FramePair:
+        """The reference-only frames that this decoder decodes with.
+
+        Raises:
+            InvalidInputError: its table holds none.
+        """
+        in_phase, quadrature = (self.table_value(f"reference_{name}") for name in ("in_phase", "quadrature"))
+        return FramePair(in_phase, quadrature)
 
     @property
     def version(self) -> str:
@@ -250,6 +320,11 @@ class Decoder:
             )
         return np.asarray(real + 1j * imaginary, np.complex64), left
 
+    @property
+    def shows_field(self) -> bool:
+        """Whether `recover_field` can work, on the grid that registration measures on."""
+        return FIELD in self.bundle.files
+
     @cached_property
     def _field_session(self) -> Session:
         """The field's own graph, which does no more than is asked for; without one, the decoder's, all of it fed."""
@@ -276,16 +351,14 @@ class Decoder:
         checked = time.perf_counter()
         inference = self.infer(pair, table)
         inferred = time.perf_counter()
-        page = self.settle(inference, levels, pilots)
+        page = self.post_process(inference, levels, pilots)
         return replace(page, timings=Timings(checked - start, inferred - checked, time.perf_counter() - inferred))
 
-    def settle(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
-        """Piston, belief and decision: everything behind the graph, timings left at zero."""
-        pilots = without_spoilt(inference.p, pilots or self.pilots(levels))
-        piston = estimate_piston(inference.p, pilots)
-        trust = estimate_trust(inference.p, pilots, piston.angle_rad)
-        phase = remove_piston(inference.phase, piston.angle_rad)
-        concentration = inference.concentration * np.float32(trust)
+    def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        """Piston, trust and decision: everything behind the graph, timings left at zero."""
+        reading = read_pilots(inference.p, pilots or self.pilots(levels))
+        phase = remove_piston(inference.phase, reading.piston.angle_rad)
+        concentration = inference.concentration * np.float32(reading.trust)
         symbols, confidence = decide_with_confidence(phase, concentration, levels)
         return DecodedPage(
             symbols=symbols,
@@ -293,26 +366,12 @@ class Decoder:
             concentration=concentration,
             phase=phase,
             levels=levels,
-            piston_rad=piston.angle_rad,
-            pilot_coherence=piston.coherence,
-            pilot_trust=trust,
+            piston_rad=reading.piston.angle_rad,
+            pilot_coherence=reading.piston.coherence,
+            pilot_trust=reading.trust,
+            check=reading.check,
             timings=Timings(0.0, 0.0, 0.0),
         )
-
-    def settle_again(self, page: DecodedPage, bend: NDArray[np.floating], pilots: Pilots | None = None) -> DecodedPage:
-        """The page with `bend` (radians [ny, nx]) added to its phases, settled by the same pilots; timings stay.
-
-        Args:
-            page: what `decode` or `settle` made of it.
-            bend: what is known by now of how its phases are off.
-            pilots: as for `decode`.
-        """
-        concentration = page.concentration / np.float32(page.pilot_trust)
-        phase = (page.phase + bend).astype(np.float32)
-        p = concentration * np.stack([np.cos(phase), np.sin(phase)])
-        again = self.settle(Inference(p, phase, concentration), page.levels, pilots)
-        piston = float(remove_piston(np.asarray(page.piston_rad), -again.piston_rad))
-        return replace(again, piston_rad=piston, timings=page.timings)
 
     def _build_in(self, graph: GraphFile, table: Table) -> None:
         """Open the graph with this table, which was checked."""

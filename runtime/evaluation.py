@@ -14,10 +14,11 @@ from optics.pilots import Pilots, estimate_piston
 from optics.recording import FramePair, Recording, page_hashes
 from optics.tally import Tally
 from runtime.decoder import Decoder, Timings
+from runtime.errors import LostPageError
 from runtime.frames import narrow
 from runtime.manifest import GOLDEN
-from runtime.refused import RefusedPage, refusal
-from runtime.tracking import Tracker, decode_tracked
+from runtime.refused import RefusedPage, refusal, unconfirmed
+from runtime.tracking import Tracker
 
 PageDone = Callable[[], object]
 
@@ -42,7 +43,7 @@ class Evaluation:
         maps: means over the pages at every place of the page.
         confidence_bins: what confidences claim against what was right.
         bundle: what made the bundle and where it lay, as JSON can keep it.
-        refused: pages that could not be decoded; no figure counts them.
+        refused: pages that could not be decoded, or were not confirmed; no figure counts them.
     """
 
     bundle_version: str
@@ -87,6 +88,7 @@ class Evaluation:
             "confidence_bins": [asdict(part) for part in self.confidence_bins],
             "maps": {name: page.round(_MAP_DECIMALS).tolist() for name, page in vars(self.maps).items()},
             "bundle": self.bundle,
+            "pages_unconfirmed": unconfirmed(self.refused),
             "refused_pages": [asdict(page) for page in self.refused],
         }
 
@@ -143,9 +145,9 @@ def evaluate(
             frames, symbols = recording.frames(index), recording.symbols(index)
             if symbols is not None and not was_seen(decoder, frames):
                 pair, pilots = narrow(frames, recording.bit_depth), Pilots.of_symbols(mask, symbols, levels)
-                page = decode_tracked(decoder, tracker, pair, levels, pilots)
-        except InvalidInputError as error:
-            refused.append(RefusedPage(index, str(error)))
+                page = tracker.decode(pair, levels, pilots)
+        except (InvalidInputError, LostPageError) as error:
+            refused.append(RefusedPage.of(index, error))
         if page is not None and symbols is not None:
             tally.add(page.phase[data], page.concentration[data], symbols[data])
             timings.append(page.timings)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
 
 from runtime.decoder import DecodedPage
+from runtime.errors import Reason
 
 if TYPE_CHECKING:
     from threading import Thread
@@ -30,6 +31,11 @@ class ServiceMetrics:
         self.piston = Gauge("lightpage_piston_radians", "Piston of the last page.", registry=own)
         self.pilots = Gauge("lightpage_pilot_coherence", "Agreement of the last pilots, 0..1.", registry=own)
         self.trust = Gauge("lightpage_pilot_trust", "Claim that the last pilots bear out, 0..1.", registry=own)
+        self.share = Gauge("lightpage_pilot_share", "Claimed information that the last pilots confirm.", registry=own)
+        self.due = Gauge("lightpage_recalibration_due", "1 where they confirm too little of it.", registry=own)
+        self.lost_pages = Counter("lightpage_pages_lost", "Pages not given out.", ["reason"], registry=own)
+        self.searches = Counter("lightpage_image_searches", "Pages searched for.", ["found"], registry=own)
+        self.image = Gauge("lightpage_image_shift_px", "Of the last page since calibration.", ["axis"], registry=own)
         self.recalibrations = Counter("lightpage_recalibrations", "By their end.", ["result"], registry=own)
         self.model = Gauge("lightpage_model_info", "1 for the model in service.", ["version"], registry=own)
 
@@ -42,6 +48,19 @@ class ServiceMetrics:
         self.piston.set(page.piston_rad)
         self.pilots.set(page.pilot_coherence)
         self.trust.set(page.pilot_trust)
+        self.share.set(page.check.share)
+        self.due.set(page.check.recalibration_due)
+        if (image := page.image) is not None:
+            self.image.labels("x").set(image.shift_x_px)
+            self.image.labels("y").set(image.shift_y_px)
+            if image.searched:
+                self.searches.labels(str(image.found).lower()).inc()
+
+    def lost(self, reason: Reason) -> None:
+        """Count a page that was not given out, which is a sign of drift too."""
+        self.lost_pages.labels(reason.value).inc()
+        self.share.set(0.0)
+        self.due.set(1)
 
     def in_service(self, version: str) -> None:
         """Say which model decodes now."""

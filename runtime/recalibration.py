@@ -6,7 +6,8 @@ import math
 import re
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -23,9 +24,11 @@ from optics.pilots import Pilots
 from optics.progress import Progress
 from optics.recording import FramePair, hash_frames
 from runtime.bundle import Bundle, Table, npz, write_bundle
-from runtime.decoder import Decoder
+from runtime.decoder import Decoder, ImagePosition
+from runtime.errors import UnconfirmedPageError
 from runtime.frames import named
 from runtime.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
+from runtime.tracking import Tracker, tracker_for
 
 _RECALIBRATED = re.compile(r"(.*)\+r(\d+)")
 
@@ -104,12 +107,14 @@ class FitReport:
         coherence_before: of the pages with the old geometry, 0..1.
         coherence_after: with the new one.
         details: further numbers for people.
+        image: where the image was found before the fit, against the earlier calibration.
     """
 
     angle_deg: float | None = None
     coherence_before: float | None = None
     coherence_after: float | None = None
     details: dict[str, float] = field(default_factory=dict)
+    image: ImagePosition | None = None
 
 
 @dataclass(frozen=True)
@@ -140,7 +145,10 @@ class Fit(Protocol):
 
 @dataclass(frozen=True)
 class RecalibrationOutcome:
-    """A new bundle and why it is better."""
+    """A new bundle and why it is better: AIR in bits per symbol on held-back pages, decoded as the service does it.
+
+    `pages_lost_before` of these pages were not confirmed, or refused, by the earlier model.
+    """
 
     path: Path
     version: str
@@ -148,6 +156,7 @@ class RecalibrationOutcome:
     report: FitReport
     air_before: float
     air_after: float
+    pages_lost_before: int
     pages_used: int
     pages_held_back: int
     seconds: float
@@ -160,7 +169,7 @@ def recalibrate(
     version: str,
     fit: Fit,
     progress: Progress,
-    table: Table | None = None,
+    tracker: Tracker | None = None,
 ) -> RecalibrationOutcome:
     """Fit on the first pages, judge on the others, and write a new bundle to `out` if it is not worse.
 
@@ -171,7 +180,8 @@ def recalibrate(
         version: version of the new bundle.
         fit: how to fit.
         progress: told of every step, and within it of every page.
-        table: tensors that the model in service is fed now, as its tracker has them; the bundle's own by default.
+        tracker: follows the image for the model in service. It is forked, so learns nothing here. By default one that
+            has seen no page yet.
 
     Raises:
         RecalibrationRefusedError: the pages do not fit, or the new model would decode the held-back pages worse.
@@ -183,23 +193,29 @@ def recalibrate(
     pages.check(decoder)
     fitted_count = min(FIT_PAGES, len(pages.pairs) - 1)
     fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))
-    try:
-        before = fmean(_air(decoder, held_back, partial(_within, progress, "measure the model in service", 0.0), table))
-    except FrameError:
-        before = -math.inf  # any model that takes the frames is better
+    tracker = tracker_for(decoder) if tracker is None else tracker
+    measuring = partial(_within, progress, "measure the model in service", 0.0)
+    before, lost_before = -math.inf, len(held_back.pairs)  # of a model that refuses the frames: any other is better
+    with suppress(FrameError):
+        rates, lost_before = _air(tracker.fork(), decoder.bundle, held_back, measuring)
+        before = fmean(rates)
     try:
         result = fit(decoder.bundle, fitted, lambda step, share: progress(step, 0.05 + 0.85 * share), decoder)
         judging = partial(_within, progress, "judge by the held-back pages", 0.9)
         judging(0.0)
-        refitted = decoder.with_table(result.table)
-        rates = _air(refitted, held_back, judging)
+        refitted = decoder.of_bundle(_refitted(decoder.bundle, result))
+        rates, lost = _air(tracker.refitted(refitted), decoder.bundle, held_back, judging)
     except (CalibrationError, FrameError) as error:
         raise RecalibrationRefusedError(error.thing, error.got, error.wanted) from error
     after = fmean(rates)
-    _judge(before, rates, pages.levels)
+    _judge(before, rates, lost, pages.levels)
     progress("write the new bundle", 0.95)
-    files, manifest = _new_contents(refitted, held_back.pairs[0], pages, result, version, before, after)
-    write_bundle(out, manifest, files)
+    golden, bundle = held_back.pairs[0], refitted.bundle
+    files = {
+        **bundle.files,
+        GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=refitted.infer(golden).p),
+    }
+    write_bundle(out, _new_manifest(bundle.manifest, pages, version, before, after), files)
     return RecalibrationOutcome(
         path=out,
         version=version,
@@ -207,6 +223,7 @@ def recalibrate(
         report=result.report,
         air_before=before,
         air_after=after,
+        pages_lost_before=lost_before,
         pages_used=len(pages.pairs),
         pages_held_back=len(held_back.pairs),
         seconds=time.perf_counter() - start,
@@ -227,20 +244,29 @@ def _within(progress: Progress, step: str, start: float, share: float) -> None:
 
 
 def _air(
-    decoder: Decoder, pages: KnownPages, progress: Callable[[float], None], table: Table | None = None
-) -> list[float]:
-    """AIR over the data symbols of each page, bits per symbol; `FrameError` where the model refuses the frames."""
-    mask = decoder.bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
-    data, rates = ~mask, list[float]()
+    tracker: Tracker, bundle: Bundle, pages: KnownPages, progress: Callable[[float], None]
+) -> tuple[list[float], int]:
+    """AIR over the data symbols of each page, bits per symbol, and how many of the pages were not confirmed.
+
+    Raises:
+        FrameError: the model refuses the frames.
+    """
+    mask = bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
+    data, rates, lost = ~mask, list[float](), 0
     for pair, symbols in zip(pages.pairs, pages.symbols, strict=True):
         progress(len(rates) / len(pages.pairs))
-        page = decoder.decode(pair, pages.levels, table, Pilots.of_symbols(mask, symbols, pages.levels))
+        try:
+            page = tracker.decode(pair, pages.levels, Pilots.of_symbols(mask, symbols, pages.levels))
+        except UnconfirmedPageError as error:
+            if error.page is None:
+                raise
+            page, lost = error.page, lost + 1
         figures = measure(page.phase[data], page.concentration[data], symbols[data], pages.levels)
         rates.append(figures.air_bits_per_symbol)
-    return rates
+    return rates, lost
 
 
-def _judge(before: float, rates: list[float], levels: int) -> None:
+def _judge(before: float, rates: list[float], lost: int, levels: int) -> None:
     """Each page must show its symbols, whatever the others do, and all together more of them than before."""
     least, worst, after = MIN_AIR_SHARE * math.log2(levels), min(rates), fmean(rates)
     if not worst >= least:
@@ -248,6 +274,12 @@ def _judge(before: float, rates: list[float], levels: int) -> None:
             "re-fitted geometry",
             f"an AIR of {worst:.3f} bit/symbol on one of the held-back pages",
             f"at least {least:.3f}: the page does not match its symbols",
+        )
+    if lost:
+        raise RecalibrationRefusedError(
+            "re-fitted geometry",
+            f"{lost} of {len(rates)} held-back pages whose pilots do not confirm what is claimed",
+            "pages of this device, as its decoder was trained: else calibrate and train anew",
         )
     if after < before - TOLERATED_LOSS_BITS:
         raise RecalibrationRefusedError(
@@ -257,34 +289,24 @@ def _judge(before: float, rates: list[float], levels: int) -> None:
         )
 
 
-def _new_contents(
-    decoder: Decoder,
-    golden: FramePair,
-    pages: KnownPages,
-    result: FitResult,
-    version: str,
-    before: float,
-    after: float,
-) -> tuple[dict[str, bytes], Manifest]:
-    """Files and manifest of the new bundle: the same graphs, the re-fitted decoder's table, and its golden page."""
-    bundle = decoder.bundle
-    p = decoder.infer(golden).p
-    files = {
-        **bundle.files,
-        TABLE: npz(**{**bundle.table, **result.table}),
-        GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=p),
-    }
+def _refitted(bundle: Bundle, result: FitResult) -> Bundle:
+    """The bundle with the re-fitted table and calibration, in memory; its golden page is still the earlier one's."""
+    files = {**bundle.files, TABLE: npz(**{**bundle.table, **result.table})}
+    manifest = bundle.manifest.model_copy(update={"calibration": result.calibration_toml})
+    return replace(bundle, manifest=manifest, files=files)
+
+
+def _new_manifest(manifest: Manifest, pages: KnownPages, version: str, before: float, after: float) -> Manifest:
+    """The manifest of a re-fitted bundle."""
     figures = {"recalibration_air_bits_per_symbol": after, "recalibration_pages": len(pages.pairs)}
     if math.isfinite(before):
         figures["recalibration_air_bits_per_symbol_before"] = before
-    manifest = bundle.manifest.model_copy(
+    return manifest.model_copy(
         update={
             "version": version,
             "created": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-            "calibration": result.calibration_toml,
-            "metrics": {**bundle.manifest.metrics, **figures},
-            "calibrated_pages": (*bundle.manifest.calibrated_pages, *map(hash_frames, pages.pairs)),
-            "provenance": Provenance(command=f"recalibrate from {bundle.version}"),
+            "metrics": {**manifest.metrics, **figures},
+            "calibrated_pages": (*manifest.calibrated_pages, *map(hash_frames, pages.pairs)),
+            "provenance": Provenance(command=f"recalibrate from {manifest.version}"),
         }
     )
-    return files, manifest

@@ -169,7 +169,7 @@ class Recalibrator:
         version = next_version(model.version, [*(m.version for m in plane.registry.models), *store.versions()])
         path = store.path_of(version)
         # Judged against what is in service now: the model with what its tracker has learnt.
-        outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker.table())
+        outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker)
         try:
             progress("put the new model in service", 1.0)
             plane.adopt(Decoder(Bundle.open(path), model.decoder.threads), expected=model)

@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optics.errors import BundleError, CalibrationError
 from optics.page import symbol_phases
+from optics.pilots import Pilots
 from optics.progress import Progress
 from optics.recording import FramePair, hash_frames
 from optics.registration.calibrate import LEAST_KEPT, KnownPage, refine
 from optics.registration.calibration import Calibration
+from optics.registration.parameters import NAMES
 from optics.registration.table import sampling_table
 from runtime.bundle import Bundle
 from runtime.calibrated import calibration_of
-from runtime.decoder import Decoder
+from runtime.decoder import Decoder, ImagePosition
+from runtime.image_search import BundleSearch
 from runtime.recalibration import FitReport, FitResult, KnownPages
 from runtime.twin import OnnxTwin
 
+Real = NDArray[np.float64]
+
 _REFITTED = frozenset({"places", "parameters"})
 """Inputs that a re-fitted geometry is fed to, by one of which a decoder knows it."""
+_SEARCHED_SYMBOLS = 300
+"""Known symbols by which the image is looked for: enough in any light that can be calibrated in, and soon done."""
 _TWIN_THREADS = 1
 """The twin traces few points at a time; a second thread would only spin."""
 
 
 def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> FitResult:
-    """Fit on `pages`, starting from the bundle's calibration.
+    """Fit on `pages`, starting from the bundle's calibration, moved to where their image is found.
 
     The table holds the re-traced geometry and the reference frames that it was fitted with.
 
@@ -48,6 +56,9 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
     if references is None:
         raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
     twin = OnnxTwin(bundle, _TWIN_THREADS)
+    progress("find the image", 0.0)
+    image = _find(decoder, pages, references)
+    start = moved_cameras(earlier.vector, image)
     known = [
         KnownPage(pair, np.exp(1j * symbol_phases(symbols, pages.levels)))
         for pair, symbols in zip(pages.pairs, pages.symbols, strict=True)
@@ -58,7 +69,7 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         profile,
         references,
         known,
-        start=earlier.vector,
+        start=start,
         turn=earlier.turn_rad,
         progress=progress,
     )
@@ -83,9 +94,33 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
             angle_deg=fitted.angle_deg(profile),
             coherence_before=fitted.coherence_before,
             coherence_after=fitted.coherence_after,
+            image=image,
             details={"turn_deg": float(np.rad2deg(fitted.turn_rad)), "cost": fitted.cost},
         ),
     )
+
+
+def _find(decoder: Decoder, pages: KnownPages, references: FramePair) -> ImagePosition | None:
+    """Where the image of the first page lies against the earlier calibration; None where the search does not find it.
+
+    All symbols are known here, and an even share of them stands for all.
+    """
+    symbols, mask = pages.symbols[0], np.zeros(pages.symbols[0].size, bool)
+    mask[:: max(1, mask.size // _SEARCHED_SYMBOLS)] = True
+    pilots = Pilots.of_symbols(mask.reshape(symbols.shape), symbols, pages.levels)
+    found = BundleSearch(decoder).find(pages.pairs[0], pilots, references=references)
+    x, y = map(float, found.shift_px)
+    return ImagePosition(x, y, searched=True, found=True) if found.found else None
+
+
+def moved_cameras(parameters: Real, image: ImagePosition | None) -> Real:
+    """A device's parameters [P] with both cameras where the image was found."""
+    moved = parameters.copy()
+    if image is not None:
+        for camera in ("in_phase", "quadrature"):
+            moved[NAMES.index(f"{camera}_shift_x_px")] += image.shift_x_px
+            moved[NAMES.index(f"{camera}_shift_y_px")] += image.shift_y_px
+    return moved
 
 
 def _kept_references(bundle: Bundle) -> FramePair | None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
-from optics.errors import InvalidInputError
+from optics.errors import InvalidInputError, LightpageError
+from runtime.errors import LostPageError
 
 _TOLD = 5
 """Pages named in the error; the JSON file has all of them."""
@@ -19,10 +21,27 @@ WORTH_NOTHING = (
 
 @dataclass(frozen=True)
 class RefusedPage:
-    """A page that could not be decoded, and why; its number is None where only the service knows it."""
+    """A page that was not given out.
+
+    Attributes:
+        page: its number, None where only the service knows it.
+        reason: why, for people.
+        unconfirmed: whether it was decoded, and its pilots did not bear out the result.
+    """
 
     page: int | None
     reason: str
+    unconfirmed: bool = False
+
+    @classmethod
+    def of(cls, page: int | None, error: LightpageError) -> Self:
+        """The page that an error is about."""
+        return cls(page, str(error), isinstance(error, LostPageError))
+
+
+def unconfirmed(refused: Sequence[RefusedPage]) -> int:
+    """How many of the pages were decoded and not confirmed."""
+    return sum(page.unconfirmed for page in refused)
 
 
 def refusal(thing: str, refused: Sequence[RefusedPage], pages: int) -> InvalidInputError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from optics.errors import BundleError, RecalibrationRefusedError
 from runtime.decoder import Decoder
@@ -23,8 +23,8 @@ def no_note(model: Model) -> None:
 
 
 def no_tracker(decoder: Decoder) -> Tracker:
-    """A tracker that leaves every page as it is."""
-    return NoTracker()
+    """A tracker that follows nothing."""
+    return NoTracker(decoder)
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Model:
     """A loaded decoder with the tracker that belongs to it."""
 
     decoder: Decoder
-    tracker: Tracker = field(default_factory=NoTracker)
+    tracker: Tracker
 
     @property
     def version(self) -> str:

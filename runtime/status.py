@@ -19,7 +19,7 @@ from optics.errors import (
 )
 from runtime import errors as service_errors
 from runtime.caller import CallerLeft
-from runtime.errors import SlotsTakenError, SourceError, StoppingError
+from runtime.errors import LostPageError, Reason, SlotsTakenError, SourceError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 DETAIL_KEY = "lightpage-error-bin"
@@ -27,6 +27,7 @@ DETAIL_KEY = "lightpage-error-bin"
 _CODES: tuple[tuple[type[BaseException], grpc.StatusCode], ...] = (
     (InvalidInputError, grpc.StatusCode.INVALID_ARGUMENT),
     (LimitError, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    (LostPageError, grpc.StatusCode.DATA_LOSS),
     (SlotsTakenError, grpc.StatusCode.RESOURCE_EXHAUSTED),
     (BusyError, grpc.StatusCode.ABORTED),
     (SourceError, grpc.StatusCode.FAILED_PRECONDITION),
@@ -42,6 +43,12 @@ _BY_NAME: dict[str, type[LightpageError]] = {
     name: kind
     for name, kind in {**vars(errors), **vars(service_errors)}.items()
     if isinstance(kind, type) and issubclass(kind, LightpageError)
+}
+
+_REASONS = {
+    Reason.UNSPECIFIED: pb.LOSS_REASON_UNSPECIFIED,
+    Reason.PILOTS_DISAGREE: pb.LOSS_REASON_PILOTS_DISAGREE,
+    Reason.IMAGE_NOT_FOUND: pb.LOSS_REASON_IMAGE_NOT_FOUND,
 }
 
 _FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")
@@ -71,6 +78,9 @@ def abort(context: grpc.ServicerContext, error: BaseException) -> None:
     if isinstance(error, LightpageError):
         thing, got, wanted = (without_folders(text)[:1000] for text in (error.thing, error.got, error.wanted))
         detail = pb.ErrorDetail(kind=type(error).__name__, thing=thing, got=got, wanted=wanted)
+        if isinstance(error, LostPageError):
+            detail.reason = _REASONS[error.reason]
+            detail.recalibration_due = error.recalibration_due
         context.set_trailing_metadata(((DETAIL_KEY, detail.SerializeToString()),))
         context.abort(code, f"{thing}: got {got}, wanted {wanted}"[:2000])
     context.abort(code, f"{type(error).__name__} in the service; its log says more")
@@ -82,7 +92,10 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
     for key, value in call.trailing_metadata() or ():
         if key == DETAIL_KEY:
             detail = pb.ErrorDetail.FromString(value)
-            return _BY_NAME.get(detail.kind, LightpageError)(detail.thing, detail.got, detail.wanted)
+            kind, told = _BY_NAME.get(detail.kind, LightpageError), (detail.thing, detail.got, detail.wanted)
+            if issubclass(kind, LostPageError):
+                return kind(*told, _reason(detail.reason), detail.recalibration_due)
+            return kind(*told)
     code, text = call.code(), call.details() or "no details"
     thing = f"service at {target}"
     if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
@@ -90,3 +103,8 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
     if code == grpc.StatusCode.UNAVAILABLE:
         return LightpageError(thing, f"no connection ({text})", "a running Lightpage service at this address")
     return LightpageError(thing, f"{code.name}: {text}", "an answer")
+
+
+def _reason(code: pb.LossReason) -> Reason:
+    """A reason from the wire; one that this version does not know is unspecified."""
+    return next((reason for reason, known in _REASONS.items() if known == code), Reason.UNSPECIFIED)

@@ -1,218 +1,420 @@
-"""Follows the slow shift of the cameras from page to page, so that small drift needs no recalibration."""
+"""Follows the image from page to page and finds it again, and gives no page out that its pilots do not confirm."""
 
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
+import time
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from optics.pilots import Pilots
+from optics.page import check_levels
+from optics.pilots import LEAST_CONFIRMED_SHARE, PilotCheck, Pilots, read_pilots
 from optics.recording import FramePair
+from optics.registration.image_search import REACH_PX, FoundImage
+from optics.registration.parameters import NAMES
+from optics.registration.table import sampling_table, shifted
 from runtime.bundle import Table
-from runtime.decoder import DecodedPage, Decoder
-from runtime.phase_shift import PhaseShift
+from runtime.calibrated import calibration_of
+from runtime.decoder import DecodedPage, Decoder, ImagePosition, Inference, Timings
+from runtime.errors import Reason, UnconfirmedPageError
+from runtime.image_drift import SHIFT, TILT, DriftModel, default_registration
+from runtime.image_search import BundleSearch, PageSearch
+from runtime.twin import OnnxTwin
+
+Real = NDArray[np.float64]
 
 JUMP_PX = 0.1
 """Shift from one page to the next that noise (0.03 px on a bench page's pilots) and slow drift do not explain."""
 
-ATTEMPTS = 3
-"""Most decodes of one page: a jump is read to a tenth of itself, so two corrections settle any."""
+ATTEMPTS = 4
+"""Most decodes of one page: a search, and then corrections to a tenth of what is left each."""
 
-WALK_PX = 0.02
-"""Standard deviation of the image's movement from one page to the next, per axis."""
+WALK = np.array([0.02, 0.02, 0.001, 0.001])
+"""Standard deviation of the drift from one page to the next."""
+
+WIDEST = np.array([3.0, 3.0, 0.03, 0.03])
+"""Standard deviation of a jump, as far as phases can show it."""
+
+SEARCH_ERROR_PX = 0.15
+"""Standard deviation of a found image's place, three times what it is on a bench page's 54 pilots."""
+
+TILT_PER_PX = 0.006
+"""Standard deviation of the tilt that comes with a shift, radians a camera pixel: half of what the most curved
+reference in the capture range gives."""
+
+START_TILT = 0.01
+"""Standard deviation of the tilt of a device that was not looked at for long, radians."""
+
+RETRACE_RAD = 0.015
+"""Tilt from which the table is traced again: branches of one symbol then differ by twice as much, which the network
+takes for noise; below, turning the decoded phases costs less than 0.02 bit."""
+
+PLAIN_DEVIATIONS = 4.0
+"""A shift of so many standard deviations is there, however large they are: the further off a page is, the less exactly
+it says by how much, until it has been decoded where it lies."""
+
+LARGEST_ERROR_PX = 0.15
+"""Standard deviation of the estimate, per axis, above which a page is left out unless its shift is plain to see."""
+
+NEARBY_PX = 0.3
+"""A search that ends so near to where the page was decoded has found nothing new."""
+
+FRUITLESS = 0.9
+"""Share of what the pilots confirmed when a search found nothing new, below which another one may."""
 
 
 @dataclass(frozen=True)
-class Shift:
-    """Movement of the image on both cameras since calibration, camera pixels; y grows with the row index."""
-
-    x_px: float = 0.0
-    y_px: float = 0.0
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A remaining shift with its standard deviation per axis, camera pixels."""
-
-    shift: Shift
-    error_px: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Lesson:
-    """What a page taught.
+class ImageState:
+    """What a page is decoded with.
 
     Attributes:
-        rest: what is believed of how far the image lay from where the page's table looked for it.
-        again: whether that is a jump, so that decoding the page again with the new table pays.
+        drift: estimate since calibration, [4], see `runtime.image_drift`.
+        covariance: of the drift of the next page about it, [4, 4].
+        decoder: whose table holds `traced_tilt` of it.
+        table: tensors that are fed for the page.
+        traced_tilt: [2].
+        settled: whether the last page was confirmed here. Until then the image is looked for first.
+        fruitless: share that the pilots confirmed when a search last found nothing new here, else 1.
     """
 
-    rest: Shift = field(default_factory=Shift)
-    again: bool = False
+    drift: Real
+    covariance: Real
+    decoder: Decoder
+    table: Table
+    traced_tilt: Real
+    settled: bool = False
+    fruitless: float = 1.0
+
+    @property
+    def untraced(self) -> Real:
+        """Drift that the table does not hold, [4]."""
+        return np.concatenate([np.zeros(2), self.drift[TILT] - self.traced_tilt])
 
 
-class ShiftReader(Protocol):
-    """Reads shift from decoded pages, and says what it does to tables and to phases."""
+class DriftTables(Protocol):
+    """Applies drift to the tables of a decoder."""
 
-    def measure(self, page: DecodedPage, pilots: Pilots | None) -> Measured | None:
-        """How far the image still lies from where the page's table looked for it; None where it does not show."""
+    def shifted(self, shift_px: Real) -> Table:
+        """Tensors to feed for an image `shift_px` (x, y) from where calibration saw it; empty for no shift."""
 
-    def move(self, shift: Shift) -> Table:
-        """The tensors that are fed instead of the bundle's under a total shift; empty for no change."""
-
-    def bend(self, shift: Shift) -> NDArray[np.float64]:
-        """What to add to the phases [ny, nx] of a page whose table was `shift` off, radians."""
+    def traced(self, tilt_rad: Real) -> Decoder:
+        """The decoder with the table of a device whose signal is tilted so against the reference."""
 
 
 class Tracker(Protocol):
-    """What the service asks of a tracker; calls come from many threads."""
+    """Decodes the pages of one device in their order; calls come from many threads."""
 
-    def table(self) -> Table:
-        """Tensors for the next page, empty for the bundle's own."""
+    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        """Decode a page.
 
-    def update(self, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> Lesson:
-        """Learn from a decoded page and the table that it was decoded with.
+        Args:
+            pair, levels, pilots: as for `Decoder.decode`.
 
-        `pilots` are the page's known symbols where they differ from the device's.
+        Raises:
+            UnconfirmedPageError: the page's pilots do not bear out what the decoder claims of it.
+            FrameError, PageError, InvalidInputError: see `Decoder.decode`.
         """
 
-    def bend(self, rest: Shift) -> NDArray[np.float64] | None:
-        """What to add to the phases of a page whose table was `rest` off, None for nothing."""
+    def fork(self) -> Tracker:
+        """Another one that has learnt the same, and learns on its own from there."""
+
+    def refitted(self, decoder: Decoder) -> Tracker:
+        """A new one for the decoder of a re-fitted bundle of the same device.
+
+        Raises:
+            BundleError, CalibrationError: as for `tracker_for`.
+        """
 
 
 class NoTracker:
-    """Tracks nothing: the bundle's own table for every page."""
-
-    def table(self) -> Table:
-        """Always empty."""
-        return {}
-
-    def update(self, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> Lesson:
-        """Learns nothing."""
-        return Lesson()
-
-    def bend(self, rest: Shift) -> None:
-        """Nothing."""
-
-
-class ShiftTracker:
-    """Kalman filter of the image's shift, one an axis, which walks from page to page.
+    """Follows nothing: the bundle's own table for every page.
 
     Args:
-        reader: reads and applies shift.
-        walk_px: standard deviation of the walk from page to page.
-        limit_px: the estimate is held within this distance per axis; drift beyond it needs a recalibration.
+        decoder: decodes every page.
     """
 
-    def __init__(self, reader: ShiftReader, walk_px: float = WALK_PX, limit_px: float = 3.0) -> None:
-        self._reader, self._walk, self._limit = reader, walk_px, limit_px
+    def __init__(self, decoder: Decoder) -> None:
+        self._decoder = decoder
+
+    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        """See `Tracker`."""
+        return confirmed(self._decoder.decode(pair, levels, pilots=pilots))
+
+    def fork(self) -> NoTracker:
+        """Itself: it learns nothing."""
+        return self
+
+    def refitted(self, decoder: Decoder) -> NoTracker:
+        """See `Tracker`."""
+        return NoTracker(decoder)
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """One decode of a page.
+
+    Attributes:
+        state: what it was decoded with.
+        after: what the page shows of the next one.
+        inference: its phases freed from all that is known of drift by now.
+        check: what its pilots confirm.
+        again: whether the image lies far enough from where it was looked at for another decode to pay.
+    """
+
+    state: ImageState
+    after: ImageState
+    inference: Inference
+    check: PilotCheck
+    again: bool
+
+
+class ImageTracker:
+    """Kalman filter of the image's drift, which walks from page to page, with a search where that is lost.
+
+    Args:
+        decoder: of the bundle as it is.
+        model: reads drift from decoded phases.
+        tables: applies it.
+        search: finds an image that was lost, None where the bundle cannot.
+        walk: standard deviation of the drift from page to page, [4].
+    """
+
+    def __init__(
+        self,
+        decoder: Decoder,
+        model: DriftModel,
+        tables: DriftTables,
+        search: PageSearch | None,
+        walk: Real = WALK,
+    ) -> None:
+        self._decoder, self._model, self._tables, self._search, self._walk = decoder, model, tables, search, walk
+        start = np.diag([WALK[0], WALK[1], START_TILT, START_TILT]) ** 2
         self._lock = threading.Lock()
-        """Guards the three below; never held while measuring or moving."""
-        self._shift = Shift()
-        self._variance = (walk_px**2, walk_px**2)
-        """Of the shift before the next page is measured, per axis."""
-        self._table: Table = {}
+        """Guards the state; never held while anything is computed."""
+        self._state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2))
 
     @property
-    def shift(self) -> Shift:
-        """The present estimate."""
+    def state(self) -> ImageState:
+        """What the next page is decoded with."""
         with self._lock:
-            return self._shift
+            return self._state
 
-    def table(self) -> Table:
-        """Tensors for the next page."""
-        with self._lock:
-            return self._table
+    def fork(self) -> ImageTracker:
+        """See `Tracker`."""
+        other = ImageTracker(self._decoder, self._model, self._tables, self._search, self._walk)
+        other._state = self.state
+        return other
 
-    def bend(self, rest: Shift) -> NDArray[np.float64] | None:
-        """What to add to the phases of a page whose table was `rest` off, None for nothing."""
-        return self._reader.bend(rest) if rest != Shift() else None
+    def refitted(self, decoder: Decoder) -> ImageTracker:
+        """See `Tracker`: what drift does to phases is taken to be as before."""
+        search = None if self._search is None else BundleSearch(decoder)
+        return ImageTracker(decoder, self._model, BundleTables(decoder), search, self._walk)
 
-    def update(self, page: DecodedPage, table: Table, pilots: Pilots | None = None) -> Lesson:
-        """Take in the shift that `page`, decoded with `table`, still shows.
+    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        """Decode a page where its image lies.
 
-        A jump is believed at once. A page decoded with a table that has been replaced since teaches the filter nothing:
-        its remainder is already accounted for.
+        The image is looked for before anything is decoded at the start and after a page that was not confirmed, and
+        after it where the pilots confirm too little. What is learnt counts for the next page only where this one's
+        pilots confirm it: a page that is not this device's moves nothing.
         """
-        measured = self._reader.measure(page, pilots)
-        if measured is None:
-            with self._lock:  # it walks on unseen
-                self._variance = (self._variance[0] + self._walk**2, self._variance[1] + self._walk**2)
-            return Lesson()
-        rest = measured.shift
-        jumped = max(abs(rest.x_px), abs(rest.y_px)) > JUMP_PX
+        begun, clock = self.state, _Clock()
+        check_levels(levels)
+        self._decoder.check(pair)
+        pilots = pilots or self._decoder.pilots(levels)
+        clock.add("check_s")
+        state, found = begun, None
+        if not begun.settled and self._search is not None:
+            found = self._search.find(pair, pilots, self._around(begun))
+            state = self._moved_to(found, begun)
+            clock.add("search_s")
+        best: _Attempt | None = None
+        for _ in range(ATTEMPTS):
+            inference = state.decoder.infer(pair, state.table)
+            clock.add("inference_s")
+            attempt = self._read(inference, state, levels, pilots)
+            best = attempt if best is None or _more(attempt, best) else best
+            clock.add("decision_s")
+            if attempt.again:
+                state = attempt.after
+                continue
+            if found is not None or self._search is None or not _search_may_pay(best):
+                break
+            found = self._search.find(pair, pilots, self._around(begun))
+            state = self._moved_to(found, best.after)
+            clock.add("search_s")
+            if state is best.after:
+                break
+        assert best is not None  # at least one attempt
+        page = state.decoder.post_process(best.inference, levels, pilots)
+        after = self._learn(begun, best, page.check, found)
+        clock.add("decision_s")
+        page = replace(page, timings=clock.timings, image=_position(after, found))
+        return confirmed(page, found)
+
+    def _read(self, inference: Inference, state: ImageState, levels: int, pilots: Pilots) -> _Attempt:
+        """Take in what a decoded page shows of drift beyond what its state knows."""
+        known = inference.turned(-self._model.phase_change(state.untraced))
+        jump = self._model.estimate(known, levels, pilots, np.diag(WIDEST**2))
+        unseen = replace(state, covariance=state.covariance + np.diag(self._walk**2))
+        if jump is None:
+            return _Attempt(state, unseen, known, read_pilots(known.p, pilots).check, again=False)
+        shift, error = jump.drift[SHIFT], jump.deviations[SHIFT]
+        plain = np.linalg.norm(shift / error) > PLAIN_DEVIATIONS
+        jumped = bool(plain and np.abs(shift).max() > JUMP_PX)
+        prior = _after_jump(state.covariance, shift) if jumped else state.covariance
+        slow = self._model.estimate(known, levels, pilots, prior)
+        if slow is None or not (plain or error.max() <= LARGEST_ERROR_PX):
+            return _Attempt(state, unseen, known, read_pilots(known.p, pilots).check, again=False)
+        drift = state.drift + slow.drift
+        after = self._state_at(drift, slow.covariance + np.diag(self._walk**2), state)
+        freed = known.turned(-self._model.phase_change(slow.drift))
+        again = jumped or after.decoder is not state.decoder
+        return _Attempt(state, after, freed, read_pilots(freed.p, pilots).check, again)
+
+    def _state_at(self, drift: Real, covariance: Real, like: ImageState) -> ImageState:
+        """The state of a drift: its shift in the table that is fed, its tilt traced where it is large and certain."""
+        away, error = np.abs(drift[TILT] - like.traced_tilt), np.sqrt(np.diag(covariance)[TILT])
+        decoder, traced = like.decoder, like.traced_tilt
+        if np.any((away > RETRACE_RAD) & (away > PLAIN_DEVIATIONS * error)):
+            decoder, traced = self._tables.traced(drift[TILT]), drift[TILT].copy()
+        return replace(
+            like,
+            drift=drift,
+            covariance=covariance,
+            decoder=decoder,
+            table=self._tables.shifted(drift[SHIFT]),
+            traced_tilt=traced,
+        )
+
+    def _moved_to(self, found: FoundImage, state: ImageState) -> ImageState:
+        """The state where the image was found; the same one where that is nothing new."""
+        away = found.shift_px - state.drift[SHIFT]
+        if not found.found or np.abs(away).max() < NEARBY_PX:
+            return state
+        tilt = START_TILT + TILT_PER_PX * float(np.linalg.norm(away))
+        covariance = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, tilt, tilt]) ** 2
+        return self._state_at(np.concatenate([found.shift_px, state.drift[TILT]]), covariance, state)
+
+    def _learn(self, begun: ImageState, best: _Attempt, check: PilotCheck, found: FoundImage | None) -> ImageState:
+        """Keep what a page showed for the next one, unless another page has been learnt from in the meantime."""
+        if check.confirmed:
+            fruitless = begun.fruitless if found is None else 1.0 if check.sound else check.share
+            after = replace(best.after, settled=True, fruitless=1.0 if check.sound else fruitless)
+        else:
+            after = replace(begun, settled=False)
         with self._lock:
-            before, variance = self._shift, self._variance
-            late = table is not self._table
-        gains = [1.0 if jumped else v / (v + e**2) for v, e in zip(variance, measured.error_px, strict=True)]
-        believed = Shift(gains[0] * rest.x_px, gains[1] * rest.y_px)
-        if late:
-            return Lesson(believed, jumped)
-        after = Shift(self._held(before.x_px + believed.x_px), self._held(before.y_px + believed.y_px))
-        moved = self._reader.move(after)
-        left = [g * e**2 + self._walk**2 for g, e in zip(gains, measured.error_px, strict=True)]
-        with self._lock:
-            if self._table is table:
-                self._shift, self._variance, self._table = after, (left[0], left[1]), moved
-        return Lesson(believed, jumped and after != before)
+            if self._state is begun:
+                self._state = after
+        return after if check.confirmed else best.after
 
-    def _held(self, value: float) -> float:
-        return min(self._limit, max(-self._limit, value))
+    @staticmethod
+    def _around(state: ImageState) -> Real:
+        """Where to look: where calibration saw the image, and where it was last."""
+        last = state.drift[SHIFT]
+        return np.stack([np.zeros(2), last]) if np.abs(last).max() > NEARBY_PX else np.zeros((1, 2))
 
 
-def decode_tracked(
-    decoder: Decoder, tracker: Tracker, pair: FramePair, levels: int, pilots: Pilots | None = None
-) -> DecodedPage:
-    """Decode a pair with the tracker's table, its phases freed from what the page itself shows of further shift.
-
-    Where it shows that the image has jumped, it is decoded again. The last answer counts, its timings too: they say
-    nothing of the attempts before it.
+class BundleTables:
+    """The tables of a bundle's device under drift.
 
     Args:
-        decoder, tracker: of one model.
-        pair, levels, pilots: as for `Decoder.decode`.
+        decoder: of the bundle as it is.
+
+    Raises:
+        BundleError: the twin cannot be traced.
+        CalibrationError: the bundle holds no calibration.
     """
-    for attempt in range(1, ATTEMPTS + 1):
-        table = tracker.table()
-        page = decoder.decode(pair, levels, table, pilots)
-        lesson = tracker.update(page, table, pilots)
-        if not lesson.again or attempt == ATTEMPTS:
-            break
-    bend = tracker.bend(lesson.rest)
-    return page if bend is None else decoder.settle_again(page, bend, pilots)
+
+    def __init__(self, decoder: Decoder) -> None:
+        self._decoder, self._calibration = decoder, calibration_of(decoder.bundle)
+        self._registration = default_registration(decoder)
+
+    def shifted(self, shift_px: Real) -> Table:
+        """See `DriftTables`."""
+        return {"registration": shifted(self._registration, shift_px)} if np.any(shift_px) else {}
+
+    def traced(self, tilt_rad: Real) -> Decoder:
+        """See `DriftTables`."""
+        bundle = self._decoder.bundle
+        parameters = self._calibration.vector.copy()
+        for name, tilt in zip(("camera_tilt_x_rad", "camera_tilt_y_rad"), tilt_rad, strict=True):
+            parameters[NAMES.index(name)] += tilt
+        table = sampling_table(OnnxTwin(bundle, 1), parameters, self._calibration.turn_rad, bundle.profile)
+        return self._decoder.with_table({n: v for n, v in table.items() if n in self._decoder.table_shapes})
 
 
 def tracker_for(decoder: Decoder) -> Tracker:
     """The tracker that a bundle's decoder is run with, in service and in evaluation.
 
     Raises:
-        BundleError, CalibrationError: see `PhaseShift.of_decoder`.
+        BundleError, CalibrationError: see `DriftModel.of_decoder`.
     """
-    return ShiftTracker(_PhaseReader(decoder)) if "registration" in decoder.table_shapes else NoTracker()
+    if "registration" not in decoder.table_shapes:
+        return NoTracker(decoder)
+    search = BundleSearch(decoder) if decoder.shows_field else None
+    return ImageTracker(decoder, DriftModel.of_decoder(decoder), BundleTables(decoder), search)
 
 
-class _PhaseReader:
-    """`PhaseShift` as the tracker asks for it."""
+def confirmed(page: DecodedPage, found: FoundImage | None = None) -> DecodedPage:
+    """The page itself, if its pilots bear out what is claimed of it.
 
-    def __init__(self, decoder: Decoder) -> None:
-        self._reader = PhaseShift.of_decoder(decoder)
+    Args:
+        page: decoded.
+        found: outcome of a search for its image, None where none was made.
 
-    def measure(self, page: DecodedPage, pilots: Pilots | None) -> Measured | None:
-        found = self._reader.measure(page, pilots)
-        if found is None:
-            return None
-        x, y = map(float, found.shift_px)
-        return Measured(Shift(x, y), (float(found.error_px[0]), float(found.error_px[1])))
+    Raises:
+        UnconfirmedPageError: they do not.
+    """
+    check = page.check
+    if check.confirmed:
+        return page
+    lost = found is not None and not found.found
+    looked = f"; its image was looked for within {REACH_PX:g} px and {'not ' if lost else ''}found" if found else ""
+    error = UnconfirmedPageError(
+        "page",
+        f"pilots that confirm {max(0.0, check.confirmed_bits):.2f} of the {check.claimed_bits:.2f} bits a symbol that "
+        f"are claimed{looked}",
+        f"at least {LEAST_CONFIRMED_SHARE:.0%} of them: frames and pilots of this device, as it was calibrated (if it "
+        "has changed, recalibrate)",
+        Reason.IMAGE_NOT_FOUND if lost else Reason.PILOTS_DISAGREE,
+        recalibration_due=True,
+    )
+    error.page = page
+    raise error
 
-    def move(self, shift: Shift) -> Table:
-        return self._reader.move(_array(shift))
 
-    def bend(self, shift: Shift) -> NDArray[np.float64]:
-        return self._reader.bend(_array(shift))
+def _search_may_pay(best: _Attempt) -> bool:
+    """Whether the pilots confirm less than they did when a search last found nothing new."""
+    return not best.check.sound and best.check.share < FRUITLESS * best.state.fruitless
 
 
-def _array(shift: Shift) -> NDArray[np.float64]:
-    return np.array([shift.x_px, shift.y_px])
+def _after_jump(covariance: Real, shift_px: Real) -> Real:
+    """Covariance [4, 4] of the drift after a jump: the shift may be anything, and its tilt comes with it."""
+    tilt = covariance[TILT, TILT] + np.eye(2) * (TILT_PER_PX * float(np.linalg.norm(shift_px))) ** 2
+    return np.block([[np.diag(WIDEST[SHIFT] ** 2), np.zeros((2, 2))], [np.zeros((2, 2)), tilt]])
+
+
+def _more(attempt: _Attempt, than: _Attempt) -> bool:
+    return attempt.check.confirmed_bits > than.check.confirmed_bits
+
+
+def _position(state: ImageState, found: FoundImage | None) -> ImagePosition:
+    x, y, tilt_x, tilt_y = map(float, state.drift)
+    return ImagePosition(x, y, tilt_x, tilt_y, found is not None, found is not None and found.found)
+
+
+class _Clock:
+    """Adds up how long the parts of a page take."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.timings = Timings(0.0, 0.0, 0.0)
+
+    def add(self, part: str) -> None:
+        """Count the time since the last call as one of `Timings`' parts."""
+        now = time.perf_counter()
+        self.timings = replace(self.timings, **{part: getattr(self.timings, part) + now - self._last})
+        self._last = now

@@ -20,8 +20,8 @@ from optics.registration.table import sampling_table
 from optics.simulator import Simulator, true_parameters
 from runtime.cli_evaluate import evaluate
 from runtime.decoder import Decoder
-from runtime.phase_shift import PhaseShift
-from runtime.tracking import ShiftTracker, tracker_for
+from runtime.image_drift import SHIFT, DriftModel
+from runtime.tracking import WIDEST, ImageTracker, tracker_for
 from tests.optics.small import small_profile
 from train.cli_train import train
 from train.run import load_run
@@ -74,7 +74,7 @@ def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(made: tupl
 
 def test_the_image_is_followed(made: tuple[Path, Path, float], small_device: list[str]) -> None:
     decoder = Decoder.load(made[1])
-    assert isinstance(tracker_for(decoder), ShiftTracker)
+    assert isinstance(tracker_for(decoder), ImageTracker)
     with Recording.open(small_device[3]) as recording:
         pair, symbols = recording.frames(0), recording.symbols(0)
     assert symbols is not None
@@ -83,10 +83,9 @@ def test_the_image_is_followed(made: tuple[Path, Path, float], small_device: lis
     known = Pilots.of_symbols(mask, symbols, 256)
     by = (0.0, 0.3)  # rows, columns
     moved = [np.rint(ndimage.shift(f.astype(float), by, mode="nearest")) for f in (pair.in_phase, pair.quadrature)]
-    seen = decoder.decode(FramePair(*(frame.astype(np.uint8) for frame in moved)), 256, pilots=known)
-    plain = decoder.decode(pair, 256, pilots=known)
-    shift = PhaseShift.of_decoder(decoder)
-    found, before = shift.estimate(seen, known), shift.estimate(plain, known)
+    seen = decoder.infer(FramePair(*(frame.astype(np.uint8) for frame in moved)))
+    model, prior = DriftModel.of_decoder(decoder), np.diag(WIDEST**2)
+    found, before = (model.estimate(page, 256, known, prior) for page in (seen, decoder.infer(pair)))
     assert found is not None
     assert before is not None
-    np.testing.assert_allclose(found.shift_px - before.shift_px, (0.3, 0.0), atol=0.06)
+    np.testing.assert_allclose(found.drift[SHIFT] - before.drift[SHIFT], (0.3, 0.0), atol=0.06)

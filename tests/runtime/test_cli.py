@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from optics.errors import CalibrationError
+from optics.pilots import Pilots
 from optics.recording import FramePair, Recording, RecordingWriter
 from runtime import cli, cli_recalibrate
 from runtime.bundle import Bundle
@@ -282,9 +283,35 @@ def test_evaluate_warns_where_a_bundle_reads_nothing(
     assert evaluate(toy_zip, recording[0], tmp_path / "e.json")["air_bits_per_symbol"] > 0
     assert "warning" not in capsys.readouterr().err
     with h5py.File(recording[0], "r+") as file:
-        file["symbols"][...] = np.random.default_rng(0).permutation(file["symbols"][()], axis=2)
+        shuffle_data(file)
     assert evaluate(toy_zip, recording[0], tmp_path / "f.json")["air_bits_per_symbol"] < 0
     assert "these pages carry nothing" in capsys.readouterr().err
+
+
+def shuffle_data(file: h5py.File) -> None:
+    """Write down other symbols than were written, the pilots left as they are."""
+    symbols, data = file["symbols"][()], ~Pilots.of_profile(toy.PROFILE, 16).mask
+    symbols[:, data] = np.random.default_rng(0).permutation(symbols[:, data], axis=1)
+    file["symbols"][...] = symbols
+
+
+def test_evaluate_names_and_counts_pages_whose_pilots_contradict_what_was_decoded(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with h5py.File(recording[0], "r+") as file:
+        symbols = file["symbols"][()]
+        symbols[1] = np.random.default_rng(0).integers(16, size=toy.PAGE)
+        file["symbols"][...] = symbols
+        pages = len(symbols)
+    where, report = ["--bundle", toy_zip, "--recording", recording[0]], tmp_path / "e.json"
+    assert run(["evaluate", *where, "--json", report]) == 2
+    printed = capsys.readouterr()
+    assert "1 whose pilots do not bear out what is claimed" in printed.out
+    assert f"1 of {pages} pages that were refused (page 1: page: got pilots that confirm" in printed.err
+    figures = json.loads(report.read_text())
+    assert (figures["pages"], figures["pages_unconfirmed"]) == (pages - 1, 1)
+    assert [page["page"] for page in figures["refused_pages"] if page["unconfirmed"]] == [1]
+    assert figures["air_bits_per_symbol"] > 2
 
 
 @pytest.fixture
@@ -445,7 +472,7 @@ def test_decode_warns_of_symbols_that_are_not_the_pages_and_refuses_those_of_ano
     where = ["decode", "--target", service.target, "--recording", recording[0]]
     with h5py.File(recording[0], "r+") as file:
         symbols = file["symbols"][()]
-        file["symbols"][...] = np.random.default_rng(0).permutation(symbols.ravel()).reshape(symbols.shape)
+        shuffle_data(file)
     assert run(where) == 0
     assert "warning: by what the bundle believes, these pages carry nothing" in capsys.readouterr().err
     with h5py.File(recording[0], "r+") as file:
@@ -463,7 +490,7 @@ def test_decode_reads_the_services_source(service: LightpageServer, tmp_path: Pa
     assert all(page["symbol_error_rate"] == 0 for page in pages)
 
 
-def test_decode_uses_the_devices_own_pilots_and_warns_where_they_disagree(
+def test_decode_uses_the_devices_own_pilots_and_refuses_pages_where_they_disagree(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Pages of a device whose pilots are fixed phases, sent and read, without a word of what was written."""
@@ -483,13 +510,15 @@ def test_decode_uses_the_devices_own_pilots_and_warns_where_they_disagree(
     out = tmp_path / "out.h5"
     with LightpageServer(plane, Recalibrator(plane, toy.fit_references)) as server:
         for where in (["--recording", path], ["--source", "--pages", "2"]):
-            assert run(["decode", "--target", server.target, *where, "--out", out]) == 0
+            assert run(["decode", "--target", server.target, *where, "--out", out]) == 2
             with h5py.File(out) as file:
                 assert (file["symbols"][0] == symbols[0])[~toy.OWN_MASK].all()
-            warnings = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
-            assert len(warnings) == 1
-            assert "page 1 (0." in warnings[0]
-            assert "piston is unknown" in warnings[0]
+                assert list(file["pages"]) == [0]
+            errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("lightpage: error")]
+            assert len(errors) == 1
+            assert "1 of 2 pages that were refused" in errors[0]
+            assert "page 1" in errors[0]
+            assert "pilots that confirm" in errors[0]
 
 
 def test_recalibrate_and_rollback_work_on_a_running_service(service: LightpageServer, tmp_path: Path) -> None:
@@ -682,7 +711,7 @@ def test_a_stored_model_whose_calibration_is_bad_leaves_the_base_in_service(
     def tracker(made: Decoder) -> NoTracker:
         if made is not decoder:
             raise CalibrationError("bundle toy-1+r1: calibration", "no table", "a calibration document")
-        return NoTracker()
+        return NoTracker(made)
 
     store, registry = ModelStore(tmp_path / "store", decoder.bundle), ModelRegistry(decoder, tracker)
     store.remember(toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1"))

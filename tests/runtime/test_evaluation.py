@@ -20,7 +20,7 @@ def peak_bytes(decoder: Decoder, path: Path) -> int:
     with Recording.open(path) as recording:
         tracemalloc.start()
         try:
-            evaluate(decoder, recording, NoTracker())
+            evaluate(decoder, recording, NoTracker(decoder))
             return tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()

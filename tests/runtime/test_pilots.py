@@ -1,4 +1,4 @@
-"""The pilots give the piston and how far to believe, and the tracker a slow shift."""
+"""The pilots give the piston, how far a decoder may be believed, and whether a page may be given out."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from optics.errors import PageError
-from optics.pilots import Pilots, estimate_piston, estimate_trust, remove_piston, without_spoilt
-from runtime.bundle import Table
-from runtime.decoder import DecodedPage, Decoder
-from runtime.tracking import Lesson, Measured, NoTracker, Shift, ShiftTracker, decode_tracked
+from optics.measures import achievable_rate, own_information
+from optics.pilots import Pilots, estimate_piston, estimate_trust, read_pilots, remove_piston, without_spoilt
 from tests.runtime import toy
 
 
@@ -59,114 +57,6 @@ def test_pilots_of_another_page_shape_are_refused() -> None:
         Pilots.of_symbols(np.ones((3, 3), bool), np.zeros(toy.PAGE, np.uint8), 8)
     with pytest.raises(PageError, match="pilots"):
         Pilots.of_symbols(np.zeros(toy.PAGE, bool), np.zeros(toy.PAGE, np.uint8), 8)
-
-
-class ShiftedImage:
-    """A camera whose image has moved; the measured remainder is the truth less what the table of the page held."""
-
-    def __init__(self, x: float, y: float, error_px: float = 1e-6) -> None:
-        self.truth, self.error = Shift(x, y), error_px
-        self.silent = False
-        self.pilots: Pilots | None = None
-        self.page: DecodedPage | None = None
-        self.held = Shift()
-        """What the table of the page at hand holds."""
-
-    def measure(self, page: DecodedPage, pilots: Pilots | None) -> Measured | None:
-        self.pilots = pilots
-        rest = Shift(self.truth.x_px - self.held.x_px, self.truth.y_px - self.held.y_px)
-        return None if self.silent else Measured(rest, (self.error, self.error))
-
-    def move(self, shift: Shift) -> Table:
-        return {"shift": np.array([shift.x_px, shift.y_px])}
-
-    def bend(self, shift: Shift) -> np.ndarray:
-        return np.full(toy.PAGE, shift.x_px)
-
-    def show(self, tracker: ShiftTracker, page: DecodedPage, table: Table) -> Lesson:
-        """Let the tracker learn from a page that was decoded with this table."""
-        self.held = Shift(*table.get("shift", np.zeros(2)))
-        return tracker.update(page, table)
-
-
-@pytest.fixture
-def seen(decoder: Decoder) -> DecodedPage:
-    return decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16), 16)
-
-
-def test_the_tracker_settles_on_the_shift_and_stops_at_its_limit(seen: DecodedPage) -> None:
-    image = ShiftedImage(1.5, -40.0)
-    tracker = ShiftTracker(image, limit_px=3)
-    for _ in range(20):
-        image.show(tracker, seen, tracker.table())
-    assert tracker.shift.x_px == pytest.approx(1.5, abs=1e-3)
-    assert tracker.shift.y_px == -3
-    assert tracker.table()["shift"][0] == tracker.shift.x_px
-
-
-def test_the_tracker_ignores_silent_pages_and_late_answers(seen: DecodedPage) -> None:
-    image = ShiftedImage(1.0, 0.0)
-    tracker = ShiftTracker(image)
-    old = tracker.table()
-    assert image.show(tracker, seen, old) == Lesson(Shift(1.0, 0.0), again=True)
-    assert tracker.shift == Shift(1.0, 0.0)
-    # decoded before the step above: its remainder is already taken in, but the page itself is worth another decode
-    assert image.show(tracker, seen, old).again
-    assert tracker.shift == Shift(1.0, 0.0)
-    assert not image.show(tracker, seen, tracker.table()).again
-    image.silent = True
-    assert image.show(tracker, seen, tracker.table()) == Lesson()
-    assert tracker.shift == Shift(1.0, 0.0)
-    assert NoTracker().update(seen, {}) == Lesson()
-
-
-def test_the_tracker_believes_a_page_as_far_as_its_error_allows(seen: DecodedPage) -> None:
-    walk, error = 0.02, 0.03
-    image = ShiftedImage(0.05, -0.05, error)
-    tracker = ShiftTracker(image, walk)
-    first = image.show(tracker, seen, tracker.table())
-    assert first.rest.x_px == pytest.approx(0.05 * walk**2 / (walk**2 + error**2))
-    assert not first.again
-    # the steady state of a random walk under noise: P = (walk^2 + sqrt(walk^4 + 4 walk^2 error^2)) / 2
-    for _ in range(30):
-        last = image.show(tracker, seen, tracker.table())
-    variance = (walk**2 + np.sqrt(walk**4 + 4 * walk**2 * error**2)) / 2
-    rest = 0.05 - (tracker.shift.x_px - last.rest.x_px)
-    assert last.rest.x_px / rest == pytest.approx(variance / (variance + error**2), rel=1e-6)
-    # what was not seen for long may be anywhere
-    image.silent = True
-    for _ in range(200):
-        image.show(tracker, seen, tracker.table())
-    image.silent, image.truth = False, Shift(0.0, 0.0)
-    assert image.show(tracker, seen, tracker.table()).rest.x_px == pytest.approx(-0.05, rel=0.02)
-
-
-def test_the_tracker_measures_a_page_by_the_pilots_that_came_with_it(decoder: Decoder) -> None:
-    symbols = np.random.default_rng(4).integers(16, size=toy.PAGE).astype(np.uint8)
-    mask = np.zeros(toy.PAGE, bool)
-    mask[::3, ::4] = True
-    own = Pilots.of_symbols(mask, symbols, 16)
-    image = ShiftedImage(0.0, 0.0)
-    decode_tracked(decoder, ShiftTracker(image), toy.ToyDevice().page(symbols, 16), 16, own)
-    assert image.pilots is own
-
-
-def test_a_page_is_freed_from_the_shift_that_it_shows_itself(decoder: Decoder) -> None:
-    """The decoder of the toy knows no shift: what the tracker says of the page can only come in afterwards."""
-
-    class Bent(ShiftedImage):
-        def bend(self, shift: Shift) -> np.ndarray:
-            return -shift.x_px * slope
-
-    symbols = toy.symbols_of(16, 3)[0]
-    slope = np.broadcast_to(np.linspace(-12, 12, toy.PAGE[1]), toy.PAGE)
-    pair = toy.ToyDevice().page(symbols, 16)
-    plain = decoder.decode(pair, 16)
-    page = decode_tracked(decoder, ShiftTracker(Bent(0.05, 0.0)), pair, 16)
-    moved = np.angle(np.exp(1j * (page.phase - plain.phase + page.piston_rad - plain.piston_rad)))
-    np.testing.assert_allclose(moved, -0.05 * slope, atol=1e-3)
-    np.testing.assert_array_equal(page.symbols, np.rint(page.phase * 16 / (2 * np.pi)) % 16)
-    assert page.pilot_trust < plain.pilot_trust  # the toy's pilots were right as they were
 
 
 class TestTrust:
@@ -231,3 +121,48 @@ class TestTrust:
         assert without_spoilt(p, changed) is changed
         left = without_spoilt(p, Pilots(pilots.mask, np.roll(pilots.phases, 1)))
         assert estimate_trust(p, left, estimate_piston(p, left).angle_rad) < 0.01
+
+
+class TestCheck:
+    """What a decoder claims of its pilots, held against what they are."""
+
+    @staticmethod
+    def page(kappa: float, claim: float, seed: int = 0) -> tuple[np.ndarray, Pilots]:
+        return TestTrust.noisy(kappa, claim, seed)
+
+    def test_the_bits_are_those_of_the_metrics_at_levels_too_fine_to_matter(self) -> None:
+        p, pilots = self.page(30, 30)
+        check = read_pilots(p, pilots).check
+        phase, kappa = np.arctan2(p[1], p[0])[pilots.mask], np.hypot(*p)[pilots.mask]
+        assert check.claimed_bits == pytest.approx(float(own_information(phase, kappa, 256).mean()), abs=1e-6)
+        reading = read_pilots(p, pilots)
+        symbols = np.rint(pilots.phases * 256 / (2 * np.pi)).astype(np.uint8)  # 16 levels lie on 256
+        rate = achievable_rate(phase - reading.piston.angle_rad, reading.trust * kappa, symbols, 256)
+        assert check.confirmed_bits == pytest.approx(float(rate.mean()), abs=1e-6)
+
+    @pytest.mark.parametrize("kappa", [3, 30, 300, 3000])
+    def test_true_claims_are_confirmed_and_no_recalibration_is_due(self, kappa: float) -> None:
+        checks = [read_pilots(*self.page(kappa, kappa, seed)).check for seed in range(40)]
+        assert all(check.confirmed for check in checks)
+        assert np.mean([check.share for check in checks]) == pytest.approx(1, abs=0.05)
+        if kappa >= 30:  # in dimmer light few pilots tell little
+            assert all(check.sound and not check.recalibration_due for check in checks)
+
+    def test_a_device_that_has_drifted_is_answered_and_a_recalibration_is_due(self) -> None:
+        checks = [read_pilots(*self.page(30, 3000, seed)).check for seed in range(40)]
+        assert all(check.confirmed and check.recalibration_due for check in checks)
+
+    def test_claims_of_which_little_is_left_are_not_confirmed(self) -> None:
+        checks = [read_pilots(*self.page(1.5, 3000, seed)).check for seed in range(40)]
+        assert not any(check.confirmed for check in checks)
+
+    @pytest.mark.parametrize("claim", [0.05, 1, 30, 3000])
+    def test_noise_is_never_confirmed_whatever_it_claims(self, claim: float) -> None:
+        checks = [read_pilots(*self.page(0, claim, seed)).check for seed in range(400)]
+        assert not any(check.confirmed for check in checks)
+
+    def test_a_page_that_claims_nothing_confirms_nothing(self) -> None:
+        _, pilots = self.page(1, 1)
+        check = read_pilots(np.zeros((2, *toy.PAGE)), pilots).check
+        assert check.claimed_bits == check.share == 0
+        assert not check.confirmed

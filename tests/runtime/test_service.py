@@ -586,25 +586,24 @@ def test_recalibration_that_would_decode_worse_is_refused(start: Start) -> None:
 class DriftTracker(NoTracker):
     """Has learnt where the drifted device's offsets are."""
 
-    def table(self) -> Table:
+    def __init__(self, decoder: Decoder) -> None:
         references = toy.ToyDevice(DRIFTED).references()
-        return {
+        table: Table = {
             "reference_in_phase": references.in_phase.astype(np.float32),
             "reference_quadrature": references.quadrature.astype(np.float32),
         }
+        super().__init__(decoder.with_table(table))
 
 
 def test_a_re_fit_is_judged_against_what_the_tracker_makes_of_the_old_model(
-    start: Start, monkeypatch: pytest.MonkeyPatch
+    start: Start,
 ) -> None:
-    monkeypatch.setattr("runtime.decoder.PAGE_INPUTS", frozenset(["reference_in_phase", "reference_quadrature"]))
-
     def half_way(*arguments: object) -> FitResult:
         good = toy.fit_references(*arguments)  # type: ignore[arg-type]
         table = {name: values - 8 for name, values in good.table.items()}
         return FitResult(table, good.calibration_toml, good.report)
 
-    tracked = start(fit=half_way, tracker=lambda decoder: DriftTracker())
+    tracked = start(fit=half_way, tracker=DriftTracker)
     tracked.device.offsets = DRIFTED
     with pytest.raises(RecalibrationRefusedError, match="model in service"):
         tracked.client.recalibrate(count=2)

@@ -19,12 +19,21 @@ class ConfidenceFormat(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     CONFIDENCE_FORMAT_UNSPECIFIED: _ClassVar[ConfidenceFormat]
     CONFIDENCE_FORMAT_FLOAT32: _ClassVar[ConfidenceFormat]
     CONFIDENCE_FORMAT_UINT8: _ClassVar[ConfidenceFormat]
+
+class LossReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    LOSS_REASON_UNSPECIFIED: _ClassVar[LossReason]
+    LOSS_REASON_PILOTS_DISAGREE: _ClassVar[LossReason]
+    LOSS_REASON_IMAGE_NOT_FOUND: _ClassVar[LossReason]
 PIXEL_TYPE_UNSPECIFIED: PixelType
 PIXEL_TYPE_UINT8: PixelType
 PIXEL_TYPE_UINT16: PixelType
 CONFIDENCE_FORMAT_UNSPECIFIED: ConfidenceFormat
 CONFIDENCE_FORMAT_FLOAT32: ConfidenceFormat
 CONFIDENCE_FORMAT_UINT8: ConfidenceFormat
+LOSS_REASON_UNSPECIFIED: LossReason
+LOSS_REASON_PILOTS_DISAGREE: LossReason
+LOSS_REASON_IMAGE_NOT_FOUND: LossReason
 
 class DescribeRequest(_message.Message):
     __slots__ = ()
@@ -156,7 +165,7 @@ class DecodeFramesRequest(_message.Message):
     def __init__(self, header: _Optional[_Union[DecodeHeader, _Mapping]] = ..., chunk: _Optional[bytes] = ...) -> None: ...
 
 class DecodeReply(_message.Message):
-    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings", "pilot_trust")
+    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings", "pilot_trust", "claimed_bits", "confirmed_bits", "recalibration_due", "image")
     ROWS_FIELD_NUMBER: _ClassVar[int]
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
     LEVELS_FIELD_NUMBER: _ClassVar[int]
@@ -170,6 +179,10 @@ class DecodeReply(_message.Message):
     MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
     TIMINGS_FIELD_NUMBER: _ClassVar[int]
     PILOT_TRUST_FIELD_NUMBER: _ClassVar[int]
+    CLAIMED_BITS_FIELD_NUMBER: _ClassVar[int]
+    CONFIRMED_BITS_FIELD_NUMBER: _ClassVar[int]
+    RECALIBRATION_DUE_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_FIELD_NUMBER: _ClassVar[int]
     rows: int
     columns: int
     levels: int
@@ -183,7 +196,27 @@ class DecodeReply(_message.Message):
     model_version: str
     timings: Timings
     pilot_trust: float
-    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ...) -> None: ...
+    claimed_bits: float
+    confirmed_bits: float
+    recalibration_due: bool
+    image: ImagePosition
+    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ..., claimed_bits: _Optional[float] = ..., confirmed_bits: _Optional[float] = ..., recalibration_due: _Optional[bool] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ...) -> None: ...
+
+class ImagePosition(_message.Message):
+    __slots__ = ("shift_x_px", "shift_y_px", "tilt_x_rad", "tilt_y_rad", "searched", "found")
+    SHIFT_X_PX_FIELD_NUMBER: _ClassVar[int]
+    SHIFT_Y_PX_FIELD_NUMBER: _ClassVar[int]
+    TILT_X_RAD_FIELD_NUMBER: _ClassVar[int]
+    TILT_Y_RAD_FIELD_NUMBER: _ClassVar[int]
+    SEARCHED_FIELD_NUMBER: _ClassVar[int]
+    FOUND_FIELD_NUMBER: _ClassVar[int]
+    shift_x_px: float
+    shift_y_px: float
+    tilt_x_rad: float
+    tilt_y_rad: float
+    searched: bool
+    found: bool
+    def __init__(self, shift_x_px: _Optional[float] = ..., shift_y_px: _Optional[float] = ..., tilt_x_rad: _Optional[float] = ..., tilt_y_rad: _Optional[float] = ..., searched: _Optional[bool] = ..., found: _Optional[bool] = ...) -> None: ...
 
 class Timings(_message.Message):
     __slots__ = ("receive_s", "decode_s", "inference_s", "total_s")
@@ -254,7 +287,7 @@ class Progress(_message.Message):
     def __init__(self, step: _Optional[str] = ..., fraction: _Optional[float] = ...) -> None: ...
 
 class RecalibrationResult(_message.Message):
-    __slots__ = ("model_version", "previous_version", "pages_used", "pages_held_back", "air_before", "air_after", "angle_deg", "coherence_before", "coherence_after", "seconds")
+    __slots__ = ("model_version", "previous_version", "pages_used", "pages_held_back", "air_before", "air_after", "angle_deg", "coherence_before", "coherence_after", "seconds", "pages_lost_before", "image")
     MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
     PREVIOUS_VERSION_FIELD_NUMBER: _ClassVar[int]
     PAGES_USED_FIELD_NUMBER: _ClassVar[int]
@@ -265,6 +298,8 @@ class RecalibrationResult(_message.Message):
     COHERENCE_BEFORE_FIELD_NUMBER: _ClassVar[int]
     COHERENCE_AFTER_FIELD_NUMBER: _ClassVar[int]
     SECONDS_FIELD_NUMBER: _ClassVar[int]
+    PAGES_LOST_BEFORE_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_FIELD_NUMBER: _ClassVar[int]
     model_version: str
     previous_version: str
     pages_used: int
@@ -275,7 +310,9 @@ class RecalibrationResult(_message.Message):
     coherence_before: float
     coherence_after: float
     seconds: float
-    def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ..., pages_used: _Optional[int] = ..., pages_held_back: _Optional[int] = ..., air_before: _Optional[float] = ..., air_after: _Optional[float] = ..., angle_deg: _Optional[float] = ..., coherence_before: _Optional[float] = ..., coherence_after: _Optional[float] = ..., seconds: _Optional[float] = ...) -> None: ...
+    pages_lost_before: int
+    image: ImagePosition
+    def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ..., pages_used: _Optional[int] = ..., pages_held_back: _Optional[int] = ..., air_before: _Optional[float] = ..., air_after: _Optional[float] = ..., angle_deg: _Optional[float] = ..., coherence_before: _Optional[float] = ..., coherence_after: _Optional[float] = ..., seconds: _Optional[float] = ..., pages_lost_before: _Optional[int] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ...) -> None: ...
 
 class RollbackRequest(_message.Message):
     __slots__ = ()
@@ -300,13 +337,17 @@ class ListModelsReply(_message.Message):
     def __init__(self, models: _Optional[_Iterable[_Union[Model, _Mapping]]] = ...) -> None: ...
 
 class ErrorDetail(_message.Message):
-    __slots__ = ("kind", "thing", "got", "wanted")
+    __slots__ = ("kind", "thing", "got", "wanted", "reason", "recalibration_due")
     KIND_FIELD_NUMBER: _ClassVar[int]
     THING_FIELD_NUMBER: _ClassVar[int]
     GOT_FIELD_NUMBER: _ClassVar[int]
     WANTED_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    RECALIBRATION_DUE_FIELD_NUMBER: _ClassVar[int]
     kind: str
     thing: str
     got: str
     wanted: str
-    def __init__(self, kind: _Optional[str] = ..., thing: _Optional[str] = ..., got: _Optional[str] = ..., wanted: _Optional[str] = ...) -> None: ...
+    reason: LossReason
+    recalibration_due: bool
+    def __init__(self, kind: _Optional[str] = ..., thing: _Optional[str] = ..., got: _Optional[str] = ..., wanted: _Optional[str] = ..., reason: _Optional[_Union[LossReason, str]] = ..., recalibration_due: _Optional[bool] = ...) -> None: ...

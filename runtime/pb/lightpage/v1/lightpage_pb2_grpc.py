@@ -28,7 +28,8 @@ if _version_not_supported:
 
 class LightpageStub:
     """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
-    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it.
+    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
+    and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
     """
 
     def __init__(self, channel):
@@ -71,7 +72,8 @@ class LightpageStub:
 
 class LightpageServicer:
     """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
-    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it.
+    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
+    and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
     """
 
     def Describe(self, request, context):
@@ -162,7 +164,8 @@ def add_LightpageServicer_to_server(servicer, server):
  # This class is part of an EXPERIMENTAL API.
 class Lightpage:
     """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
-    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it.
+    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
+    and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
     """
 
     @staticmethod
