@@ -145,12 +145,12 @@ class TrueOptics:
         """Field on the exit facet to the computed camera plane."""
         return self.channel.camera_field(exit_field)
 
-    def reference(self) -> Complex:
-        """Reference beam on the computed camera plane."""
+    def reference(self, offset_m: tuple[float, float] = (0.0, 0.0)) -> Complex:
+        """Reference beam on the computed camera plane, or `offset_m` (x, y) from there."""
         knobs = self.device.reference
         axis_x, axis_y = self.camera_axes_m
         half_width, half_height = self.profile.page_width_m / 2, self.profile.page_height_m / 2
-        x, y = axis_x[None, :], axis_y[:, None]
+        x, y = axis_x[None, :] + offset_m[0], axis_y[:, None] + offset_m[1]
         phase = (
             knobs.tilt_x_rad * x / half_width
             + knobs.tilt_y_rad * y / half_height
@@ -182,7 +182,7 @@ class TrueOptics:
 
 
 class Simulator:
-    """A device with a memory: its piston and image shift walk from page to page.
+    """A device with a memory: its piston and image shift walk from page to page, and it may be knocked.
 
     Args:
         profile: nominal device.
@@ -191,6 +191,8 @@ class Simulator:
         seed: of noise and drift from page to page; the same seed and calls give the same frames. The ripple of the
             reference belongs to the device (`reference.ripple_seed`).
         steps: splitting steps of a sheared pipe; `splitting_steps` if left out.
+        reference_stays: whether the image moves over the reference, as when page or pipe move, and not with it, as when
+            the cameras do.
 
     Raises:
         PageError: a level count outside 2..256.
@@ -198,13 +200,21 @@ class Simulator:
     """
 
     def __init__(
-        self, profile: Profile, device: Device, levels: int = 256, seed: int = 0, steps: int | None = None
+        self,
+        profile: Profile,
+        device: Device,
+        levels: int = 256,
+        seed: int = 0,
+        steps: int | None = None,
+        *,
+        reference_stays: bool = False,
     ) -> None:
         check_levels(levels)
         check_camera(profile)
         self.optics = TrueOptics(profile, device, steps)
         self.levels = levels
         self.seed = seed
+        self.reference_stays = reference_stays
         self._walk = np.random.default_rng([seed, _WALK])
         self._piston = float(self._walk.uniform(-np.pi, np.pi))
         self._shift = np.zeros(2)
@@ -228,6 +238,10 @@ class Simulator:
     @cached_property
     def _reference(self) -> Complex:
         return self.optics.reference()
+
+    def knock(self, shift_px: tuple[float, float]) -> None:
+        """Move the image at once by (x, y) camera pixels, on both cameras; it walks on from there."""
+        self._shift = self._shift + np.asarray(shift_px)
 
     def skip(self, pages: int) -> None:
         """Let `pages` pages pass unseen: what follows is what would have followed had they been simulated."""
@@ -270,15 +284,14 @@ class Simulator:
     def _frames(self, field: Complex, shift: tuple[float, float], noise: np.random.Generator | None) -> FramePair:
         device = self.device
         homodyne = device.homodyne
-        intensities = (
-            in_phase_intensity(field, self._reference),
-            homodyne.quadrature_gain
-            * quadrature_intensity(
-                field, self._reference, np.deg2rad(homodyne.quadrature_error_deg), homodyne.quadrature_sign
-            ),
-        )
+        error, sign = np.deg2rad(homodyne.quadrature_error_deg), homodyne.quadrature_sign
         frames = []
-        for intensity, pose in zip(intensities, (device.in_phase_camera, device.quadrature_camera), strict=True):
+        for pose, quadrature in ((device.in_phase_camera, False), (device.quadrature_camera, True)):
+            reference = self._reference_behind(pose, shift)
+            if quadrature:
+                intensity = homodyne.quadrature_gain * quadrature_intensity(field, reference, error, sign)
+            else:
+                intensity = in_phase_intensity(field, reference)
             seen = resample(intensity, *self.optics.camera_axes_m, *self.optics.view(pose, shift))
             if noise is None:
                 counts = to_counts(seen * self.optics.electrons_per_unit, device.sensor)
@@ -286,6 +299,14 @@ class Simulator:
                 counts = expose(seen, self.optics.electrons_per_unit, device.sensor, noise)
             frames.append(counts.astype(frame_type(device.sensor.bit_depth)))
         return FramePair(*frames)
+
+    def _reference_behind(self, pose: CameraPose, shift: tuple[float, float]) -> Complex:
+        """The reference where a camera sees it behind an image that has moved by `shift`, on the image's plane."""
+        if not self.reference_stays or shift == (0.0, 0.0):
+            return self._reference
+        middle = tuple(count // 2 for count in self.profile.frame_shape)
+        still, moved = ([float(axis[middle]) for axis in self.optics.view(pose, by)] for by in ((0.0, 0.0), shift))
+        return self.optics.reference((still[0] - moved[0], still[1] - moved[1]))
 
 
 def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:

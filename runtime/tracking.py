@@ -20,7 +20,7 @@ from runtime.bundle import Table
 from runtime.calibrated import calibration_of
 from runtime.decoder import DecodedPage, Decoder, ImagePosition, Inference, Timings
 from runtime.errors import Reason, UnconfirmedPageError
-from runtime.image_drift import SHIFT, TILT, DriftModel, default_registration
+from runtime.image_drift import SHIFT, TILT, DriftModel, Estimate, default_registration
 from runtime.image_search import BundleSearch, PageSearch
 from runtime.twin import OnnxTwin
 
@@ -33,7 +33,13 @@ ATTEMPTS = 4
 """Most decodes of one page: a search, and then corrections to a tenth of what is left each."""
 
 WALK = np.array([0.02, 0.02, 0.001, 0.001])
-"""Standard deviation of the drift from one page to the next."""
+"""Standard deviation of the drift from one page to the next of a quiet device."""
+
+WALK_MEMORY = 0.2
+"""Weight of the last page in what is known of a device's walk: it is learnt within some five pages."""
+
+LARGEST_WALK_PX = 0.3
+"""A step beyond this says nothing of the walk."""
 
 WIDEST = np.array([3.0, 3.0, 0.03, 0.03])
 """Standard deviation of a jump, as far as phases can show it."""
@@ -76,6 +82,7 @@ class ImageState:
         decoder: whose table holds `traced_tilt` of it.
         table: tensors that are fed for the page.
         traced_tilt: [2].
+        walk: variance of the drift from one page to the next, as the last pages showed it, [4].
         settled: whether the last page was confirmed here. Until then the image is looked for first.
         fruitless: share that the pilots confirmed when a search last found nothing new here, else 1.
     """
@@ -85,6 +92,7 @@ class ImageState:
     decoder: Decoder
     table: Table
     traced_tilt: Real
+    walk: Real
     settled: bool = False
     fruitless: float = 1.0
 
@@ -179,7 +187,7 @@ class ImageTracker:
         model: reads drift from decoded phases.
         tables: applies it.
         search: finds an image that was lost, None where the bundle cannot.
-        walk: standard deviation of the drift from page to page, [4].
+        walk: standard deviation of the drift from page to page, [4], to begin with and at least.
     """
 
     def __init__(
@@ -194,7 +202,7 @@ class ImageTracker:
         start = np.diag([WALK[0], WALK[1], START_TILT, START_TILT]) ** 2
         self._lock = threading.Lock()
         """Guards the state; never held while anything is computed."""
-        self._state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2))
+        self._state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), walk**2)
 
     @property
     def state(self) -> ImageState:
@@ -258,7 +266,7 @@ class ImageTracker:
         """Take in what a decoded page shows of drift beyond what its state knows."""
         known = inference.turned(-self._model.phase_change(state.untraced))
         jump = self._model.estimate(known, levels, pilots, np.diag(WIDEST**2))
-        unseen = replace(state, covariance=state.covariance + np.diag(self._walk**2))
+        unseen = replace(state, covariance=state.covariance + np.diag(state.walk))
         if jump is None:
             return _Attempt(state, unseen, known, read_pilots(known.p, pilots).check, again=False)
         shift, error = jump.drift[SHIFT], jump.deviations[SHIFT]
@@ -268,11 +276,18 @@ class ImageTracker:
         slow = self._model.estimate(known, levels, pilots, prior)
         if slow is None or not (plain or error.max() <= LARGEST_ERROR_PX):
             return _Attempt(state, unseen, known, read_pilots(known.p, pilots).check, again=False)
-        drift = state.drift + slow.drift
-        after = self._state_at(drift, slow.covariance + np.diag(self._walk**2), state)
+        walk = self._walked(state, jump)
+        after = self._state_at(state.drift + slow.drift, slow.covariance + np.diag(walk), replace(state, walk=walk))
         freed = known.turned(-self._model.phase_change(slow.drift))
         again = jumped or after.decoder is not state.decoder
         return _Attempt(state, after, freed, read_pilots(freed.p, pilots).check, again)
+
+    def _walked(self, state: ImageState, step: Estimate) -> Real:
+        """What is known of the walk after a page that has moved by `step`."""
+        quiet, last = self._walk**2, np.maximum(step.drift**2 - np.diag(step.covariance), 0)
+        walk = np.maximum(quiet, state.walk + WALK_MEMORY * (last - state.walk))
+        walk[TILT] = quiet[TILT]
+        return np.asarray(np.minimum(walk, np.maximum(quiet, LARGEST_WALK_PX**2)))
 
     def _state_at(self, drift: Real, covariance: Real, like: ImageState) -> ImageState:
         """The state of a drift: its shift in the table that is fed, its tilt traced where it is large and certain."""
