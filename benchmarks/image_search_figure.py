@@ -29,7 +29,7 @@ def draw(figures: dict[str, Any], path: Path) -> None:
         spread = 2 ** rng.uniform(-0.15, 0.15, len(rows))
         places = [row["offset_px"] for row in rows] * spread
         first.plot(places, [row["share_of_tracked"] for row in rows], ".", color=colour, label=name, alpha=0.6)
-        walk = figures[f"{name}: straight walk"]["rows"]
+        walk = figures[f"{name}: straight walk, reference stays"]["rows"]
         second.plot([abs(row["place_px"][1]) for row in walk], [row["air"] for row in walk], color=colour, label=name)
         bins = np.linspace(0, 1.2, 49)
         right, wrong = (figures[f"{name}: {kind} pages"]["shares"] for kind in ("sound", "wrong"))

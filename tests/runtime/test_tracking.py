@@ -332,3 +332,20 @@ def test_the_time_of_a_page_counts_its_search_and_every_attempt(device: FakeDevi
     assert page.timings.search_s > 0
     parts = (page.timings.check_s, page.timings.inference_s, page.timings.decision_s, page.timings.search_s)
     assert page.timings.total_s == pytest.approx(sum(parts))
+
+
+def test_the_walk_of_a_restless_device_is_learnt(device: FakeDevice) -> None:
+    device.error = 0.03
+    rng = np.random.default_rng(0)
+    tracker = settled(device)
+    for _ in range(40):
+        device.drift[SHIFT] += rng.normal(0, 0.09, 2)
+        tracker.decode(device.page(), 16)
+    assert 0.04 < np.sqrt(tracker.state.walk[0]) < 0.2
+    # so a step is believed that a quiet device would not have made
+    before = tracker.state.drift[0]
+    device.drift[0] = before + 0.09
+    tracker.decode(device.page(), 16)
+    assert tracker.state.drift[0] - before > 0.06
+    quiet = settled(FakeDevice(device.decoder, error=0.03))
+    assert quiet.state.walk[0] == WALK[0] ** 2
