@@ -14,7 +14,7 @@ IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo test bench bench-decoders train-decoders image check-image proto lint format clean
+.PHONY: help setup demo test bench bench-image-search bench-decoders train-decoders image check-image proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -76,6 +76,9 @@ train-decoders: $(STAMP)  ## every decoder in every light at quarter scale, trai
 
 bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 	$(BIN)/lightpage bench
+
+bench-image-search: $(STAMP)  ## how the image is found, followed and confirmed: tables and a picture, in most of an hour
+	$(BIN)/python -m benchmarks.image_search --out runs/bench-image-search
 
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
 	$(BIN)/python proto/generate.py

@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.image_search_figure import draw
+from benchmarks.image_search_figure import POINTS, draw
 from benchmarks.image_search_tables import (
     tell_apart,
     tell_full_size,
@@ -76,6 +76,7 @@ DEVICES = 50
 """Others, over whose pages they are shared out."""
 WAYS = ("random walk", "straight walk, reference stays")
 FULL_SIZE_PAGES = 3
+BRIGHT, DIM = POINTS
 NOISY = "-0.6deg-32e-4px"
 REPEATS = 15
 SETTLE_S = 0.2
@@ -366,27 +367,33 @@ class Kept:
         return part
 
 
-def points(out: Path) -> Iterator[Point]:
-    """Both operating points."""
-    yield Point("15,000 e-", Decoder.load(bundle_path(DEFAULT)), Device())
+def points(out: Path, names: tuple[str, ...]) -> Iterator[Point]:
+    """The operating points of these names."""
+    if BRIGHT in names:
+        yield Point(BRIGHT, Decoder.load(bundle_path(DEFAULT)), Device())
+    if DIM not in names:
+        return
     kept, bundle = TRAINED / "bench" / NOISY, out / "noisy.zip"
     if not bundle.exists():
         export_kept(kept, out / "noisy", bundle, refinements=0)
-    yield Point("32 e-", Decoder.load(bundle), light_of(kept)[1])
+    yield Point(DIM, Decoder.load(bundle), light_of(kept)[1])
 
 
 @click.command()
 @click.option("--seeds", default=10, show_default=True, type=click.IntRange(1), help="Of every offset.")
 @click.option("--pages", default=WALKED, show_default=True, type=click.IntRange(10), help="Of a walk.")
 @click.option("--wrong", default=WRONG_PAGES, show_default=True, type=click.IntRange(2), help="Pages of each kind.")
+@click.option("--point", "names", multiple=True, type=click.Choice(POINTS), default=POINTS, help="Only these.")
 @click.option("--bundle", type=click.Path(path_type=Path, exists=True), help="Of another device.")
 @click.option("--recording", type=click.Path(path_type=Path, exists=True), help="Of that device, walking.")
 @click.option("--out", required=True, type=OutputFolder())
-def main(seeds: int, pages: int, wrong: int, bundle: Path | None, recording: Path | None, out: Path) -> None:
+def main(
+    seeds: int, pages: int, wrong: int, names: tuple[str, ...], bundle: Path | None, recording: Path | None, out: Path
+) -> None:
     """Measure how the image is found, followed and believed."""
     out.mkdir(parents=True, exist_ok=True)
     kept = Kept(out, {"seeds": seeds, "pages": pages, "wrong": wrong})
-    for point in points(out):
+    for point in points(out, names):
         name = point.name
         rows = kept.get(f"{name}: offsets", partial(offsets, point, seeds))["rows"]
         click.echo(tell_offsets(name, rows, OFFSETS_PX, WANTED_SHARE))
@@ -401,7 +408,8 @@ def main(seeds: int, pages: int, wrong: int, bundle: Path | None, recording: Pat
     if bundle is not None and recording is not None:
         part = f"{recording.name} by {bundle.name}"
         click.echo(tell_gaps(part, kept.get(part, partial(gaps, bundle, recording))))
-    draw(kept.figures, out / "image_search.png")
+    if set(names) == set(POINTS):
+        draw(kept.figures, out / "image_search.png")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from optics.files import OutputFile, write_json
 from optics.progress import warn
 from optics.recording import Recording
 from runtime.decoder import Decoder
-from runtime.evaluation import Evaluation
+from runtime.evaluation import Evaluation, NothingReadError
 from runtime.evaluation import evaluate as evaluate_recording
 from runtime.refused import WORTH_NOTHING, refusal, unconfirmed
 from runtime.shipped import DEFAULT, bundle_path
@@ -33,7 +33,12 @@ def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int |
     decoder = Decoder.load(bundle_path(bundle), threads)
     with Recording.open(recording) as pages, tqdm(total=pages.pages, unit="page", desc="evaluate") as bar:
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
-        count, result = pages.pages, evaluate_recording(decoder, pages, tracker, bar.update)
+        try:
+            count, result = pages.pages, evaluate_recording(decoder, pages, tracker, bar.update)
+        except NothingReadError as error:
+            if json_path is not None:
+                write_json(json_path, error.figures)
+            raise
     if json_path is not None:
         write_json(json_path, result.to_json())
     click.echo(describe(result))

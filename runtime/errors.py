@@ -53,7 +53,6 @@ class LostPageError(LightpageError):
         super().__init__(thing, got, wanted)
         self.reason, self.recalibration_due = reason, recalibration_due
 
-
     def about(self, thing: str) -> Self:
         """The same error about a page that is known by another name."""
         return type(self)(thing, self.got, self.wanted, self.reason, self.recalibration_due)

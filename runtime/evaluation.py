@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -88,9 +88,25 @@ class Evaluation:
             "confidence_bins": [asdict(part) for part in self.confidence_bins],
             "maps": {name: page.round(_MAP_DECIMALS).tolist() for name, page in vars(self.maps).items()},
             "bundle": self.bundle,
-            "pages_unconfirmed": unconfirmed(self.refused),
-            "refused_pages": [asdict(page) for page in self.refused],
+            **_refused_json(self.refused),
         }
+
+
+class NothingReadError(InvalidInputError):
+    """No page of a recording was read.
+
+    Args:
+        thing, got, wanted: see `LightpageError`.
+        figures: what there is to tell all the same, under the names of `Evaluation.to_json`.
+    """
+
+    def __init__(self, thing: str, got: object, wanted: object, figures: dict[str, Any]) -> None:
+        super().__init__(thing, got, wanted)
+        self.figures = figures
+
+
+def _refused_json(refused: Sequence[RefusedPage]) -> dict[str, Any]:
+    return {"pages_unconfirmed": unconfirmed(refused), "refused_pages": [asdict(page) for page in refused]}
 
 
 def was_seen(decoder: Decoder, frames: FramePair) -> bool:
@@ -127,7 +143,8 @@ def evaluate(
 
     Raises:
         RecordingError: another device's recording, or one without symbols.
-        InvalidInputError: the bundle has seen every page, or none of the others can be decoded.
+        InvalidInputError: the bundle has seen every page.
+        NothingReadError: no page could be decoded, or none was confirmed.
     """
     check_recording(decoder, recording)
     if not recording.has_symbols:
@@ -153,7 +170,15 @@ def evaluate(
             timings.append(page.timings)
         page_done()
     if not timings and refused:
-        raise refusal(f"recording {recording.path}", refused, recording.pages)
+        told = refusal(f"recording {recording.path}", refused, recording.pages)
+        figures = {
+            "bundle_version": decoder.version,
+            "pages": 0,
+            "pages_left_out": recording.pages - len(refused),
+            "bundle": _describe(decoder, levels),
+            **_refused_json(refused),
+        }
+        raise NothingReadError(told.thing, told.got, told.wanted, figures)
     if not timings:
         raise InvalidInputError(
             f"recording {recording.path}",

@@ -16,7 +16,7 @@ from scipy import ndimage
 from optics.pilots import Pilots, read_pilots
 from optics.profile import Profile
 from optics.registration.coherence import branch_shares
-from optics.registration.table import registration_coefficients, shifted, symbol_centres
+from optics.registration.table import shifted, symbol_centres
 from optics.registration.twin import BRANCHES, Twin
 from runtime.calibrated import calibration_of
 from runtime.decoder import Decoder, Inference
@@ -41,7 +41,7 @@ decoder that is lost hardly more."""
 SAFE_DEVIATIONS = 2.5
 """A decision serves like a pilot where the nearest wrong one lies this many standard deviations away."""
 
-_CAP = 400.0
+_CAP = 1500.0
 """Largest concentration that counts as such: no symbol shall outvote the rest."""
 
 _OUTLIER = 3.0
@@ -90,7 +90,7 @@ class DriftModel:
             BundleError: the twin cannot be traced.
             CalibrationError: the bundle holds no calibration.
         """
-        registration = default_registration(decoder)
+        registration = decoder.table_value("registration")
         pair, profile = decoder.bundle.golden.pair, decoder.bundle.profile
         moved = [
             [
@@ -154,14 +154,6 @@ def tilt_slopes(twin: Twin, parameters: Real, profile: Profile) -> Real:
     middle = np.sum(power[..., None] * rays.places, axis=0) / np.maximum(power.sum(axis=0), 1e-12)[:, None]
     edges = np.array([profile.page_width_m, profile.page_height_m]) / 2
     return np.asarray((middle / edges).T.reshape(2, *profile.page_shape))
-
-
-def default_registration(decoder: Decoder) -> NDArray[np.float32]:
-    """The registration that a decode takes where none is fed: the bundle's re-fitted one, else its calibration's."""
-    bundle = decoder.bundle
-    if (kept := bundle.table.get("registration")) is not None:
-        return kept
-    return registration_coefficients(OnnxTwin(bundle, 1), calibration_of(bundle).vector, bundle.profile)
 
 
 def _solve(residual: Real, slopes: Real, weight: Real, prior: Real) -> Estimate | None:

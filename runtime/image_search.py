@@ -12,7 +12,6 @@ from optics.recording import FramePair
 from optics.registration.image_search import FoundImage, ImageSearch
 from runtime.calibrated import calibration_of
 from runtime.decoder import Decoder
-from runtime.image_drift import default_registration
 from runtime.twin import OnnxTwin
 
 Real = NDArray[np.float64]
@@ -41,7 +40,7 @@ class BundleSearch:
 
     def __init__(self, decoder: Decoder) -> None:
         bundle = decoder.bundle
-        self._decoder, self._registration = decoder, default_registration(decoder)
+        self._decoder, self._registration = decoder, decoder.table_value("registration")
         self._search = ImageSearch(OnnxTwin(bundle, _TWIN_THREADS), calibration_of(bundle).vector, bundle.profile)
 
     def find(

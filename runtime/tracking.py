@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -15,19 +15,21 @@ from optics.pilots import LEAST_CONFIRMED_SHARE, PilotCheck, Pilots, read_pilots
 from optics.recording import FramePair
 from optics.registration.image_search import REACH_PX, FoundImage
 from optics.registration.parameters import NAMES
+from optics.registration.phases import tilt_of_shift
 from optics.registration.table import sampling_table, shifted
 from runtime.bundle import Table
 from runtime.calibrated import calibration_of
 from runtime.decoder import DecodedPage, Decoder, ImagePosition, Inference, Timings
 from runtime.errors import Reason, UnconfirmedPageError
-from runtime.image_drift import SHIFT, TILT, DriftModel, Estimate, default_registration
+from runtime.image_drift import SHIFT, TILT, DriftModel, Estimate
 from runtime.image_search import BundleSearch, PageSearch
 from runtime.twin import OnnxTwin
 
 Real = NDArray[np.float64]
 
-JUMP_PX = 0.1
-"""Shift from one page to the next that noise (0.03 px on a bench page's pilots) and slow drift do not explain."""
+JUMP_PX = 0.06
+"""Shift of a page from which it is decoded again, where noise (0.01 px on a bench page) does not explain it: what phases
+lose that are put right to first order, 0.03 bit here and 0.17 at 0.15 px."""
 
 ATTEMPTS = 4
 """Most decodes of one page: a search, and then corrections to a tenth of what is left each."""
@@ -44,14 +46,17 @@ LARGEST_WALK_PX = 0.3
 WIDEST = np.array([3.0, 3.0, 0.03, 0.03])
 """Standard deviation of a jump, as far as phases can show it."""
 
+SEARCHED_PX = 0.03
+"""Correction of a found image's place from which the page is decoded again: half a percent of the AIR is worth it."""
+
 SEARCH_ERROR_PX = 0.15
 """Standard deviation of a found image's place, three times what it is on a bench page's 54 pilots."""
 
-TILT_PER_PX = 0.006
-"""Standard deviation of the tilt that comes with a shift, radians a camera pixel: half of what the most curved
-reference in the capture range gives."""
+TILT_PER_PX = 0.0007
+"""Standard deviation of the tilt that comes with a shift, beside what follows if the reference stays, radians a camera
+pixel: a tenth of what the most curved reference in the capture range gives."""
 
-START_TILT = 0.01
+START_TILT = 0.002
 """Standard deviation of the tilt of a device that was not looked at for long, radians."""
 
 RETRACE_RAD = 0.015
@@ -84,6 +89,7 @@ class ImageState:
         traced_tilt: [2].
         walk: variance of the drift from one page to the next, as the last pages showed it, [4].
         settled: whether the last page was confirmed here. Until then the image is looked for first.
+        jump_px: shift since the last page, (x, y), of which it is not known whether the reference has come along.
         fruitless: share that the pilots confirmed when a search last found nothing new here, else 1.
     """
 
@@ -94,6 +100,7 @@ class ImageState:
     traced_tilt: Real
     walk: Real
     settled: bool = False
+    jump_px: Real = field(default_factory=lambda: np.zeros(2))
     fruitless: float = 1.0
 
     @property
@@ -110,6 +117,9 @@ class DriftTables(Protocol):
 
     def traced(self, tilt_rad: Real) -> Decoder:
         """The decoder with the table of a device whose signal is tilted so against the reference."""
+
+    def tilt_of(self, shift_px: Real) -> Real:
+        """Tilt (x, y) of the signal against a reference that stays while the image shifts, radians."""
 
 
 class Tracker(Protocol):
@@ -178,6 +188,11 @@ class _Attempt:
     check: PilotCheck
     again: bool
 
+    @property
+    def correction_px(self) -> float:
+        """How far from where it was looked at the image is now taken to lie, along the worse axis."""
+        return float(np.abs(self.after.drift - self.state.drift)[SHIFT].max())
+
 
 class ImageTracker:
     """Kalman filter of the image's drift, which walks from page to page, with a search where that is lost.
@@ -239,14 +254,15 @@ class ImageTracker:
             state = self._moved_to(found, begun)
             clock.add("search_s")
         best: _Attempt | None = None
+        just_found = found is not None and found.found
         for _ in range(ATTEMPTS):
             inference = state.decoder.infer(pair, state.table)
             clock.add("inference_s")
             attempt = self._read(inference, state, levels, pilots)
             best = attempt if best is None or _more(attempt, best) else best
             clock.add("decision_s")
-            if attempt.again:
-                state = attempt.after
+            if attempt.again or (just_found and attempt.correction_px > SEARCHED_PX):
+                state, just_found = attempt.after, False
                 continue
             if found is not None or self._search is None or not _search_may_pay(best):
                 break
@@ -255,6 +271,7 @@ class ImageTracker:
             clock.add("search_s")
             if state is best.after:
                 break
+            just_found = True
         assert best is not None  # at least one attempt
         page = state.decoder.post_process(best.inference, levels, pilots)
         after = self._learn(begun, best, page.check, found)
@@ -272,15 +289,30 @@ class ImageTracker:
         shift, error = jump.drift[SHIFT], jump.deviations[SHIFT]
         plain = np.linalg.norm(shift / error) > PLAIN_DEVIATIONS
         jumped = bool(plain and np.abs(shift).max() > JUMP_PX)
-        prior = _after_jump(state.covariance, shift) if jumped else state.covariance
-        slow = self._model.estimate(known, levels, pilots, prior)
-        if slow is None or not (plain or error.max() <= LARGEST_ERROR_PX):
+        if not (plain or error.max() <= LARGEST_ERROR_PX):
             return _Attempt(state, unseen, known, read_pilots(known.p, pilots).check, again=False)
+        step = state.jump_px + (shift if jumped else 0)
+        prior = _after_jump(state.covariance, shift) if jumped else state.covariance
+        # the pilots say whether the reference has come along
+        tilts = [np.zeros(2), self._tables.tilt_of(step)] if np.any(step) else [np.zeros(2)]
+        read = [self._freed(known, tilt, levels, pilots, prior) for tilt in tilts]
+        freed, drift, covariance, check = max(read, key=lambda each: each[3].confirmed_bits)
         walk = self._walked(state, jump)
-        after = self._state_at(state.drift + slow.drift, slow.covariance + np.diag(walk), replace(state, walk=walk))
-        freed = known.turned(-self._model.phase_change(slow.drift))
-        again = jumped or after.decoder is not state.decoder
-        return _Attempt(state, after, freed, read_pilots(freed.p, pilots).check, again)
+        settled = replace(state, walk=walk, jump_px=np.zeros(2))
+        after = self._state_at(state.drift + drift, covariance + np.diag(walk), settled)
+        return _Attempt(state, after, freed, check, again=jumped or after.decoder is not state.decoder)
+
+    def _freed(
+        self, known: Inference, tilt: Real, levels: int, pilots: Pilots, prior: Real
+    ) -> tuple[Inference, Real, Real, PilotCheck]:
+        """A page freed from a tilt and from what drift it shows then; all of that drift, its covariance, the check."""
+        guess = np.concatenate([np.zeros(2), tilt])
+        tilted = known.turned(-self._model.phase_change(guess)) if tilt.any() else known
+        rest = self._model.estimate(tilted, levels, pilots, prior)
+        if rest is None:
+            return tilted, guess, prior, read_pilots(tilted.p, pilots).check
+        freed = tilted.turned(-self._model.phase_change(rest.drift))
+        return freed, guess + rest.drift, rest.covariance, read_pilots(freed.p, pilots).check
 
     def _walked(self, state: ImageState, step: Estimate) -> Real:
         """What is known of the walk after a page that has moved by `step`."""
@@ -311,7 +343,8 @@ class ImageTracker:
             return state
         tilt = START_TILT + TILT_PER_PX * float(np.linalg.norm(away))
         covariance = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, tilt, tilt]) ** 2
-        return self._state_at(np.concatenate([found.shift_px, state.drift[TILT]]), covariance, state)
+        moved = replace(state, jump_px=state.jump_px + away)
+        return self._state_at(np.concatenate([found.shift_px, state.drift[TILT]]), covariance, moved)
 
     def _learn(self, begun: ImageState, best: _Attempt, check: PilotCheck, found: FoundImage | None) -> ImageState:
         """Keep what a page showed for the next one, unless another page has been learnt from in the meantime."""
@@ -345,11 +378,17 @@ class BundleTables:
 
     def __init__(self, decoder: Decoder) -> None:
         self._decoder, self._calibration = decoder, calibration_of(decoder.bundle)
-        self._registration = default_registration(decoder)
+        self._registration = decoder.table_value("registration")
 
     def shifted(self, shift_px: Real) -> Table:
         """See `DriftTables`."""
         return {"registration": shifted(self._registration, shift_px)} if np.any(shift_px) else {}
+
+    def tilt_of(self, shift_px: Real) -> Real:
+        """See `DriftTables`."""
+        profile = self._decoder.bundle.profile
+        half = profile.page_width_m / 2, profile.page_height_m / 2
+        return tilt_of_shift(self._calibration.parameters, shift_px * profile.camera.pitch_m, *half)
 
     def traced(self, tilt_rad: Real) -> Decoder:
         """See `DriftTables`."""

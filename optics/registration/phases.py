@@ -8,6 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 def launch_phase(value: Mapping[str, Any], x: Any, y: Any) -> Any:
     """Aberrations of the launch side, radians.
@@ -41,3 +44,26 @@ def camera_phase(value: Mapping[str, Any], x: Any, y: Any, edge_x: float, edge_y
         + value["camera_astigmatism_0_rad"] * (x * x - y * y)
         + value["camera_astigmatism_45_rad"] * 2 * x * y
     )
+
+
+def tilt_of_shift(
+    value: Mapping[str, float], shift_m: NDArray[np.float64], half_width_m: float, half_height_m: float
+) -> NDArray[np.float64]:
+    """What `camera_phase` gains as tilt, at the page's edges, where the image moves over a reference that stays.
+
+    The gradient of its quadratic terms times the shift; the constant that is left over is piston.
+
+    Args:
+        value: parameters by name.
+        shift_m: (x, y) by which the image moves in the camera plane, metres.
+        half_width_m, half_height_m: of the page.
+
+    Returns:
+        (camera_tilt_x_rad, camera_tilt_y_rad), [2].
+    """
+    curved, straight, diagonal = (
+        value[f"camera_{name}_rad"] for name in ("curvature", "astigmatism_0", "astigmatism_45")
+    )
+    bend = np.array([[curved + straight, diagonal], [diagonal, curved - straight]])
+    corner_squared = half_width_m**2 + half_height_m**2
+    return np.asarray(2 * (bend @ shift_m) * [half_width_m, half_height_m] / corner_squared, np.float64)

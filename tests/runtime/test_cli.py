@@ -274,7 +274,10 @@ def test_evaluate_refuses_what_it_cannot_measure_in_one_line(
     lines = [line for line in capsys.readouterr().err.splitlines() if "error:" in line]
     assert len(lines) == 1
     assert re.search(named, lines[0])
-    assert not out.exists()
+    if edit == "black":  # each page was looked at, and the reasons are kept
+        assert [page["page"] for page in json.loads(out.read_text())["refused_pages"]] == [0, 1, 2, 3]
+    else:
+        assert not out.exists()
 
 
 def test_evaluate_warns_where_a_bundle_reads_nothing(
@@ -312,6 +315,11 @@ def test_evaluate_names_and_counts_pages_whose_pilots_contradict_what_was_decode
     assert (figures["pages"], figures["pages_unconfirmed"]) == (pages - 1, 1)
     assert [page["page"] for page in figures["refused_pages"] if page["unconfirmed"]] == [1]
     assert figures["air_bits_per_symbol"] > 2
+    with h5py.File(recording[0], "r+") as file:
+        file["symbols"][...] = np.random.default_rng(0).integers(16, size=(pages, *toy.PAGE))
+    assert run(["evaluate", *where, "--json", report]) == 2
+    figures = json.loads(report.read_text())
+    assert (figures["pages"], figures["pages_unconfirmed"], len(figures["refused_pages"])) == (0, pages, pages)
 
 
 @pytest.fixture

@@ -49,6 +49,28 @@ def test_a_device_that_is_another_and_not_drifted_is_refused(tmp_path: Path) -> 
     refused(other, lambda written: [written[0], written[1]], "else calibrate anew", tmp_path)
 
 
+def test_a_re_fit_starts_where_the_image_is_found(tmp_path: Path) -> None:
+    """Nine pixels are further than the re-fit itself would look; both models are judged as the service reads."""
+    decoder = Decoder.load(bundle_path(DEFAULT))
+    profile = decoder.bundle.profile
+    simulator = Simulator(profile, Device(), LEVELS, 8)
+    simulator.knock((9.0, -5.0))
+    written = random_symbols(profile, LEVELS, 2, np.random.default_rng(8))
+    known = KnownPages(tuple(map(simulator.page, written)), tuple(np.asarray(written)), LEVELS, simulator.references())
+    outcome = recalibrate(decoder, known, tmp_path / "n.zip", "bench+r1", refit, lambda *_: None)
+    assert outcome.report.image is not None
+    assert (outcome.report.image.shift_x_px, outcome.report.image.shift_y_px) == pytest.approx((9, -5), abs=0.3)
+    # 16 levels bound the AIR by 4 bits; the earlier model finds the image too
+    assert outcome.air_before > 3.9
+    assert outcome.air_after > 3.9
+    assert outcome.pages_lost_before == 0
+    new = calibration_of(Bundle.open(outcome.path)).parameters
+    old = calibration_of(decoder.bundle).parameters
+    for camera in ("in_phase", "quadrature"):
+        moved = [new[f"{camera}_shift_{axis}_px"] - old[f"{camera}_shift_{axis}_px"] for axis in "xy"]
+        assert moved == pytest.approx((9, -5), abs=0.1)
+
+
 def test_small_losses_do_not_add_up_unseen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A re-fit that is as good as the one before is refused where the first calibration was much better than both."""
 

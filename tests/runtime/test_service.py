@@ -33,7 +33,7 @@ from runtime.client import LightpageClient
 from runtime.convert import KnownPilots
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
-from runtime.errors import SourceError, StoppingError
+from runtime.errors import Reason, SourceError, StoppingError, UnconfirmedPageError
 from runtime.limits import Limits
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
@@ -593,6 +593,37 @@ class DriftTracker(NoTracker):
             "reference_quadrature": references.quadrature.astype(np.float32),
         }
         super().__init__(decoder.with_table(table))
+
+
+def test_a_page_whose_pilots_disagree_is_lost_and_not_answered(start: Start) -> None:
+    service = start()
+    pair = toy.ToyDevice().page(np.random.default_rng(5).integers(16, size=toy.PAGE).astype(np.uint8), 16)
+    with pytest.raises(UnconfirmedPageError, match="frame pair: got pilots that confirm") as caught:
+        service.client.decode(pair, 16)
+    assert caught.value.reason is Reason.PILOTS_DISAGREE
+    assert caught.value.recalibration_due
+    count = service.plane.metrics.registry.get_sample_value
+    assert count("lightpage_pages_lost_total", {"reason": "PILOTS_DISAGREE"}) == 1
+    assert count("lightpage_recalibration_due") == 1
+    assert count("lightpage_calls_total", {"method": "DecodeFrames", "code": "DATA_LOSS"}) == 1
+    # the page after it is answered, and what its pilots confirm is told
+    page = service.client.decode(a_page()[1], 16)
+    assert not page.recalibration_due
+    assert page.confirmed_bits == pytest.approx(page.claimed_bits, rel=0.15)
+    assert page.image is None  # the toy knows no shift
+    assert count("lightpage_recalibration_due") == 0
+
+
+def test_a_lost_page_of_the_source_is_named_and_says_why_on_the_wire(start: Start) -> None:
+    service = start()
+    service.device.offsets = (230.0, 20.0)
+    with grpc.insecure_channel(service.server.target) as channel, pytest.raises(grpc.RpcError) as caught:
+        service.stub(channel).ReadPage(pb.ReadPageRequest(page=7), timeout=20)
+    assert caught.value.code() == grpc.StatusCode.DATA_LOSS
+    detail = pb.ErrorDetail.FromString(dict(caught.value.trailing_metadata())["lightpage-error-bin"])
+    assert (detail.kind, detail.thing) == ("UnconfirmedPageError", "page 7 of toy:device")
+    assert detail.reason == pb.LOSS_REASON_PILOTS_DISAGREE
+    assert detail.recalibration_due
 
 
 def test_a_re_fit_is_judged_against_what_the_tracker_makes_of_the_old_model(

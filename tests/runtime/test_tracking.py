@@ -99,6 +99,9 @@ class FakeTables:
     def shifted(self, shift_px: Real) -> Table:
         return {"shift": shift_px.astype(np.float32)} if np.any(shift_px) else {}
 
+    def tilt_of(self, shift_px: Real) -> Real:
+        return np.zeros(2)
+
     def traced(self, tilt_rad: Real) -> Decoder:
         self._device.traces.append(tilt_rad.copy())
         return FakeDecoder(self._device, tilt_rad.copy())  # type: ignore[return-value]
@@ -139,12 +142,13 @@ def test_the_image_is_looked_for_before_the_first_page_and_not_before_the_next(
     assert page.image is not None
     assert (page.image.searched, page.image.found) == (True, True)
     assert (page.image.shift_x_px, page.image.shift_y_px) == pytest.approx(shift, abs=1e-3)
-    assert len(device.decodes) == 1
+    assert len(device.decodes) <= 2  # where it was found, and, if that was a little off, where it lies
+    device.decodes.clear()
     page = tracker.decode(device.page(), 16)
     assert page.image is not None
     assert not page.image.searched
     assert len(device.searches) == 1
-    np.testing.assert_allclose(device.decodes[1][SHIFT], shift, atol=1e-3)
+    np.testing.assert_allclose(device.decodes, [(*shift, 0, 0)], atol=1e-3)
 
 
 def test_a_jump_is_followed_at_once_and_the_page_decoded_again(device: FakeDevice) -> None:
@@ -162,7 +166,7 @@ def test_a_knock_out_of_sight_is_searched_for(device: FakeDevice) -> None:
     device.drift[SHIFT] = (-7.0, 9.0)
     page = tracker.decode(device.page(), 16)
     assert len(device.searches) == 1
-    assert len(device.decodes) == 2
+    assert len(device.decodes) <= 3
     assert page.image is not None
     assert page.image.found
     assert (page.image.shift_x_px, page.image.shift_y_px) == pytest.approx((-7, 9), abs=1e-3)

@@ -10,6 +10,7 @@ project is imported.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -343,11 +344,22 @@ class ForeignDevice:
 
     # --- recordings ---------------------------------------------------------------------------------------------------
 
-    def walk(self, pages: int, rng: np.random.Generator) -> list[PageDrift]:
-        """Piston and shift of each page: random walks from a random piston."""
+    def walk(
+        self, pages: int, rng: np.random.Generator, jumps_px: Mapping[int, tuple[float, float]] | None = None
+    ) -> list[PageDrift]:
+        """Piston and shift of each page: random walks from a random piston.
+
+        Args:
+            pages: how many.
+            rng: of the steps.
+            jumps_px: (x, y) by which the image jumps before a page, beside its walk; before page 0, while nobody read.
+        """
         p = self.parameters
         pistons = rng.uniform(-np.pi, np.pi) + np.cumsum(p.piston_drift_rad * rng.standard_normal(pages))
-        shifts = np.cumsum(p.shift_drift_px * rng.standard_normal((pages, 2)), axis=0)
+        steps = p.shift_drift_px * rng.standard_normal((pages, 2))
+        for page, jump in (jumps_px or {}).items():
+            steps[page] += jump
+        shifts = np.cumsum(steps, axis=0)
         return [PageDrift(float(a), (float(s[0]), float(s[1]))) for a, s in zip(pistons, shifts, strict=True)]
 
     def write(
@@ -358,6 +370,7 @@ class ForeignDevice:
         seed: int,
         pilots: NDArray[np.bool_] | None = None,
         with_symbols: bool = True,
+        jumps_px: Mapping[int, tuple[float, float]] | None = None,
     ) -> NDArray[np.uint8]:
         """Record pages of random symbols, without a profile; returns the symbols [page, ny, nx].
 
@@ -368,10 +381,11 @@ class ForeignDevice:
             seed: of symbols, noise and drift.
             pilots: boolean [ny, nx], written as it is.
             with_symbols: whether the file tells the symbols.
+            jumps_px: see `walk`.
         """
         rng = np.random.default_rng([seed, 2])
         symbols = rng.integers(0, levels, size=(pages, *PAGE_SHAPE), dtype=np.uint8)
-        drifts = self.walk(pages, rng)
+        drifts = self.walk(pages, rng, jumps_px)
         with h5py.File(str(path), "w") as file:
             file.attrs["format"] = "lightpage-recording"
             file.attrs["version"] = 1

@@ -309,6 +309,9 @@ class TestNoise:
         shifts = np.diff([drift.shift_px for drift in walk], axis=0)
         assert pistons.std() == pytest.approx(0.5, rel=0.1)
         assert shifts.std(axis=0) == pytest.approx([0.2, 0.2], rel=0.1)
+        jumped = device.walk(2000, np.random.default_rng(0), {0: (5.0, 0.0), 3: (-2.0, 7.0)})
+        moved = np.array([drift.shift_px for drift in jumped]) - [drift.shift_px for drift in walk]
+        np.testing.assert_allclose(moved[[0, 2, 3, 1999]], [(5, 0), (5, 0), (3, 7), (3, 7)], atol=1e-9)
 
 
 class TestRecording:

@@ -169,7 +169,7 @@ def _air(settings: Settings, case: Case, work: Path, progress: Progress) -> Resu
         seed = ["--seed", str(_FIRST_SEED + settings.seed)] if name == "simulate" else []
         command = [sys.executable, "-m", "runtime.cli", name, *arguments, *seed]
         done = subprocess.run(command, capture_output=True, text=True)
-        # where some pages could not be decoded, evaluate fails after it has written the figures of the others
+        # where pages could not be decoded, evaluate fails after it has written the figures that there are
         if done.returncode != 0 and not figures.exists():
             said = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
             raise LightpageError(f"lightpage {name} {' '.join(arguments)}", said, "figures of a drifted device")
@@ -181,6 +181,8 @@ def _air(settings: Settings, case: Case, work: Path, progress: Progress) -> Resu
 def air_of_all_pages(evaluation: Mapping[str, Any]) -> float:
     """Bits per symbol of what `lightpage evaluate` wrote; pages that could not be decoded carry nothing."""
     pages = evaluation["pages"]
+    if not pages:
+        return 0.0
     return float(evaluation["air_bits_per_symbol"] * pages / (pages + len(evaluation["refused_pages"])))
 
 

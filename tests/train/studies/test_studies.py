@@ -241,6 +241,7 @@ def test_a_turned_pipe_costs_the_shipped_decoder_some_of_its_rate(tmp_path: Path
 def test_pages_that_are_refused_under_a_drift_carry_nothing() -> None:
     evaluation = {"air_bits_per_symbol": 6.0, "pages": 3, "refused_pages": [{"page": 1}]}
     assert drift.air_of_all_pages(evaluation) == 4.5
+    assert drift.air_of_all_pages({"pages": 0, "refused_pages": [{"page": 0}]}) == 0
 
 
 def test_a_bundle_that_cannot_be_measured_is_told_and_no_earlier_figure_taken(
