@@ -28,8 +28,8 @@ from runtime.twin import OnnxTwin
 Real = NDArray[np.float64]
 
 JUMP_PX = 0.06
-"""Shift of a page from which it is decoded again, where noise (0.01 px on a bench page) does not explain it: what phases
-lose that are put right to first order, 0.03 bit here and 0.17 at 0.15 px."""
+"""Shift of a page from which it is decoded again, where noise (0.01 px on a bench page) does not explain it. Phases put
+right to first order lose 0.03 bit here, and 0.17 at 0.15 px."""
 
 ATTEMPTS = 4
 """Most decodes of one page: a search, and then corrections to a tenth of what is left each."""
