@@ -348,11 +348,13 @@ class ImageTracker:
 
     def _learn(self, begun: ImageState, best: _Attempt, check: PilotCheck, found: FoundImage | None) -> ImageState:
         """Keep what a page showed for the next one, unless another page has been learnt from in the meantime."""
-        if check.confirmed:
-            fruitless = begun.fruitless if found is None else 1.0 if check.sound else check.share
-            after = replace(best.after, settled=True, fruitless=1.0 if check.sound else fruitless)
-        else:
+        if not check.confirmed:
             after = replace(begun, settled=False)
+        elif check.sound:
+            after = replace(best.after, settled=True, fruitless=1.0)
+        else:
+            share = begun.fruitless if found is None else check.share
+            after = replace(best.after, settled=True, fruitless=share)
         with self._lock:
             if self._state is begun:
                 self._state = after

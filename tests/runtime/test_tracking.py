@@ -17,6 +17,7 @@ from runtime.errors import Reason, UnconfirmedPageError
 from runtime.image_drift import SHIFT, TILT, DriftModel, Estimate
 from runtime.tracking import ATTEMPTS, RETRACE_RAD, WALK, ImageTracker, NoTracker
 from tests.runtime import toy
+from tests.runtime.test_image_drift import SLOPES
 
 Real = np.ndarray
 
@@ -353,3 +354,41 @@ def test_the_walk_of_a_restless_device_is_learnt(device: FakeDevice) -> None:
     assert tracker.state.drift[0] - before > 0.06
     quiet = settled(FakeDevice(device.decoder, error=0.03))
     assert quiet.state.walk[0] == WALK[0] ** 2
+
+
+class PhaseDecoder(FakeDecoder):
+    """Shows drift in its phases alone, by the slopes of `tests.runtime.test_image_drift`."""
+
+    def infer(self, pair: FramePair, table: Table | None = None) -> Inference:
+        device = self._device
+        shift = (table or {}).get("shift", np.zeros(2))
+        device.held = np.concatenate([np.asarray(shift, np.float64), self._tilt])
+        inference = self._decoder.infer(pair)
+        return inference.turned(DriftModel(SLOPES).phase_change(device.drift - device.held))
+
+
+class CurvedReference(FakeTables):
+    """Over which an image tilts as it shifts, if the reference stays."""
+
+    def tilt_of(self, shift_px: Real) -> Real:
+        return 0.2 * shift_px
+
+    def traced(self, tilt_rad: Real) -> Decoder:
+        return PhaseDecoder(self._device, tilt_rad.copy())  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("stays", [False, True])
+def test_the_pilots_say_whether_the_reference_has_come_along(device: FakeDevice, stays: bool) -> None:
+    tracker = ImageTracker(
+        PhaseDecoder(device, np.zeros(2)),  # type: ignore[arg-type]
+        DriftModel(SLOPES),
+        CurvedReference(device),
+        None,
+    )
+    tracker.decode(device.page(), 16)
+    device.drift = np.array([0.6, -0.3, 0.12 * stays, -0.06 * stays])
+    page = tracker.decode(device.page(), 16)
+    assert page.check.sound
+    np.testing.assert_allclose(tracker.state.drift[SHIFT], device.drift[SHIFT], atol=0.05)
+    # what is known of tilt before a jump would leave most of it out
+    np.testing.assert_allclose(tracker.state.drift[TILT], device.drift[TILT], atol=0.02)
