@@ -73,6 +73,9 @@ LARGEST_ERROR_PX = 0.15
 NEARBY_PX = 0.3
 """A search that ends so near to where the page was decoded has found nothing new."""
 
+CONTRADICTED = 0.9
+"""Share of what pilots confirmed of an earlier attempt below which a later one, made where that said, is no better."""
+
 FRUITLESS = 0.9
 """Share of what the pilots confirmed when a search found nothing new, below which another one may."""
 
@@ -259,7 +262,7 @@ class ImageTracker:
             inference = state.decoder.infer(pair, state.table)
             clock.add("inference_s")
             attempt = self._read(inference, state, levels, pilots)
-            best = attempt if best is None or _more(attempt, best) else best
+            best = attempt if best is None or not _contradicted(attempt, best) else best
             clock.add("decision_s")
             if attempt.again or (just_found and attempt.correction_px > SEARCHED_PX):
                 state, just_found = attempt.after, False
@@ -453,8 +456,9 @@ def _after_jump(covariance: Real, shift_px: Real) -> Real:
     return np.block([[np.diag(WIDEST[SHIFT] ** 2), np.zeros((2, 2))], [np.zeros((2, 2)), tilt]])
 
 
-def _more(attempt: _Attempt, than: _Attempt) -> bool:
-    return attempt.check.confirmed_bits > than.check.confirmed_bits
+def _contradicted(attempt: _Attempt, earlier: _Attempt) -> bool:
+    """Whether the pilots contradict a later attempt: a chance advantage of the earlier one is none."""
+    return attempt.check.confirmed_bits < CONTRADICTED * earlier.check.confirmed_bits
 
 
 def _position(state: ImageState, found: FoundImage | None) -> ImagePosition:
