@@ -17,11 +17,12 @@ from tests.system.foreign_device import ForeignDevice
 PAGES = 16
 STEPS = 300
 SYNTHETIC = 48
-MINUTES = 12
+MINUTES = 20
+"""Five on a good day; machines differ by a factor of three, and other tests run beside this one."""
 JUMPS = {0: (-6.0, 8.0), 2: (9.0, -5.0)}
 """Camera pixels: while nobody read, and between two pages."""
 KEPT_SHARE = 0.95
-"""Of the AIR where the image lies still: 98% but for what leaves the cameras with an image eight pixels further off."""
+"""Of the AIR of other pages, read in order: 98%, but for how pages differ and for what leaves the cameras."""
 SEED = "LIGHTPAGE_FOREIGN_SEED"
 """Environment variable that repeats the device of an earlier test; another is drawn each time without it."""
 
@@ -34,26 +35,24 @@ def lightpage(*arguments: str, status: int = 0) -> str:
     return done.stderr
 
 
-def read_after_jumps(device: ForeignDevice, bundle: Path, seed: int, folder: Path) -> None:
-    """Pages of a device that walks, read where its image lies still and where it has jumped; the same otherwise."""
-    rates = {}
-    for name, jumps in (("still", {}), ("jumped", JUMPS)):
-        path, figures = folder / f"{name}.h5", folder / f"{name}.json"
-        device.write(path, pages=4, levels=256, seed=seed + 1, jumps_px=jumps)
-        lightpage("evaluate", "--bundle", str(bundle), "--recording", str(path), "--json", str(figures))
-        rates[name] = np.array(json.loads(figures.read_text())["air_per_page"])
-    print(f"AIR of pages whose image lies still {rates['still'].round(2)}, has jumped {rates['jumped'].round(2)}")
-    assert rates["jumped"].shape == (4,)
-    assert np.all(rates["jumped"] > KEPT_SHARE * rates["still"]), f"seed {seed}"
+def read_after_jumps(device: ForeignDevice, bundle: Path, still: float, seed: int, folder: Path) -> None:
+    """Pages of a device that walks and jumps, read by a decoder that was just started; `still` is the AIR without."""
+    path, figures = folder / "jumped.h5", folder / "jumped.json"
+    device.write(path, pages=3, levels=256, seed=seed + 1, jumps_px=JUMPS)
+    lightpage("evaluate", "--bundle", str(bundle), "--recording", str(path), "--json", str(figures))
+    rates = json.loads(figures.read_text())["air_per_page"]
+    print(f"AIR of pages whose image has jumped {np.round(rates, 2)}, without {still:.2f}")
+    assert len(rates) == 3
+    assert min(rates) > KEPT_SHARE * still, f"seed {seed}"
 
 
 def refuse_another_device(bundle: Path, seed: int, folder: Path) -> None:
     """No page of another device is given out, whatever its cameras show."""
     path = folder / "other.h5"
     depth = ForeignDevice.draw(seed).parameters.bit_depth
-    ForeignDevice.draw(seed + 1).with_parameters(bit_depth=depth).write(path, pages=2, levels=256, seed=seed)
+    ForeignDevice.draw(seed + 1).with_parameters(bit_depth=depth).write(path, pages=1, levels=256, seed=seed)
     told = lightpage("evaluate", "--bundle", str(bundle), "--recording", str(path), status=2)
-    assert "2 of 2 pages that were refused" in told, told
+    assert "1 of 1 pages that were refused" in told, told
 
 
 @pytest.mark.slow
@@ -87,5 +86,5 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
     # 300 steps on 14 pages are a start, not a decoder: 3.6 to 4.5 on devices seen so far; unrelated light gives none
     assert evaluation["air_bits_per_symbol"] > 2.5, f"seed {seed}: {evaluation}"
 
-    read_after_jumps(device, bundle, seed, tmp_path)
+    read_after_jumps(device, bundle, evaluation["air_bits_per_symbol"], seed, tmp_path)
     refuse_another_device(bundle, seed, tmp_path)
