@@ -56,8 +56,9 @@ from runtime.decoder import Decoder
 from runtime.errors import UnconfirmedPageError
 from runtime.evaluation import evaluate
 from runtime.image_search import BundleSearch
+from runtime.image_tracker import tracker_for
 from runtime.shipped import DEFAULT, bundle_path
-from runtime.tracking import Tracker, tracker_for
+from runtime.tracking import Tracker
 from train.field import FieldRecovery, TorchFieldSolver
 from train.twin import RayTwin, TorchTwin
 

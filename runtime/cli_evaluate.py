@@ -13,9 +13,10 @@ from optics.recording import Recording
 from runtime.decoder import Decoder
 from runtime.evaluation import Evaluation, NothingReadError
 from runtime.evaluation import evaluate as evaluate_recording
+from runtime.image_tracker import tracker_for
 from runtime.refused import WORTH_NOTHING, refusal, unconfirmed
 from runtime.shipped import DEFAULT, bundle_path
-from runtime.tracking import NoTracker, tracker_for
+from runtime.tracking import NoTracker
 
 
 @click.command()

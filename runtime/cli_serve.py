@@ -16,6 +16,7 @@ from optics.errors import BundleError, CalibrationError, InvalidInputError
 from runtime.address import check_address
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
+from runtime.image_tracker import tracker_for
 from runtime.metrics import MetricsServer, ServiceMetrics
 from runtime.recalibrator import Recalibrator
 from runtime.refit import refit
@@ -24,7 +25,6 @@ from runtime.server import LightpageServer
 from runtime.shipped import DEFAULT, bundle_path
 from runtime.sources import open_source
 from runtime.store import ModelStore
-from runtime.tracking import tracker_for
 
 ADDRESS = "127.0.0.1:50051"
 

@@ -19,12 +19,12 @@ from runtime.client import LightpageClient, Recalibrated
 from runtime.convert import RemotePage
 from runtime.dataplane import DataPlane
 from runtime.decoder import Decoder
+from runtime.image_tracker import tracker_for
 from runtime.recalibrator import Recalibrator
 from runtime.refit import refit
 from runtime.registry import ModelRegistry
 from runtime.server import LightpageServer
 from runtime.sources import SimulatorSource
-from runtime.tracking import tracker_for
 
 Floats = NDArray[np.float64]
 

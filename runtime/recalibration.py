@@ -27,8 +27,9 @@ from runtime.bundle import Bundle, Table, npz, write_bundle
 from runtime.decoder import Decoder, ImagePosition
 from runtime.errors import UnconfirmedPageError
 from runtime.frames import named
+from runtime.image_tracker import tracker_for
 from runtime.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
-from runtime.tracking import Tracker, tracker_for
+from runtime.tracking import Tracker
 
 _RECALIBRATED = re.compile(r"(.*)\+r(\d+)")
 

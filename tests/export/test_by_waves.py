@@ -21,7 +21,7 @@ from optics.simulator import Simulator, true_parameters
 from runtime.cli_evaluate import evaluate
 from runtime.decoder import Decoder
 from runtime.image_drift import SHIFT, DriftModel
-from runtime.tracking import WIDEST, ImageTracker, tracker_for
+from runtime.image_tracker import WIDEST, ImageTracker, tracker_for
 from tests.optics.small import small_profile
 from train.cli_train import train
 from train.run import load_run

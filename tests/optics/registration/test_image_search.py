@@ -24,7 +24,7 @@ SEARCH = ImageSearch(TWIN, PARAMETERS, PROFILE)
 SYMBOLS = random_symbols(PROFILE, 256, 1, np.random.default_rng(1))[0]
 
 NEAR_PX = 0.3
-"""A page decoded so near to its image reads a few bits and shows the rest of the way (`runtime.tracking`)."""
+"""A page decoded so near to its image reads a few bits and shows the rest of the way (`runtime.image_tracker`)."""
 
 
 def known(symbols: NDArray[np.uint8] = SYMBOLS, count: int = 54) -> Pilots:

@@ -15,7 +15,8 @@ from runtime.bundle import Table
 from runtime.decoder import Decoder, Inference
 from runtime.errors import Reason, UnconfirmedPageError
 from runtime.image_drift import SHIFT, TILT, DriftModel, Estimate
-from runtime.tracking import ATTEMPTS, RETRACE_RAD, WALK, ImageTracker, NoTracker
+from runtime.image_tracker import ATTEMPTS, RETRACE_RAD, WALK, ImageTracker
+from runtime.tracking import NoTracker
 from tests.runtime import toy
 from tests.runtime.test_image_drift import SLOPES
 
