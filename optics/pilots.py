@@ -29,10 +29,14 @@ LEAST_CONFIRMED_SHARE = 0.25
 a third on the bench device, four pixels off a thirtieth, a page of another device nothing."""
 
 LEAST_CONFIRMED_NATS = 9.0
-"""Information that all pilots together must confirm: unrelated ones do so less often than e^-9, once in 8,000 pages."""
+"""Information that all pilots together must confirm, beyond what fitting to them gains. Chance confirms as much about once
+in e^9 = 8,000 pages."""
 
 SOUND_SHARE = 0.85
-"""Share below which a device is no longer as it was calibrated. Where it is, pages confirm more than nine tenths."""
+"""Share below which a device is no longer as it was calibrated, where the pilots' own noise does not explain it."""
+
+_NOISE_DEVIATIONS = 3.0
+"""Standard deviations of the pilots' noise that are allowed for before a device is said to have changed."""
 
 
 @dataclass(frozen=True)
@@ -97,11 +101,15 @@ class PilotCheck:
         claimed_bits: information per pilot that the concentrations claim, as the decoder states them.
         confirmed_bits: information per pilot that the known phases show, the claims scaled by the trust that they
             deserve: log2 of the density at the true phase over that of no knowledge.
+        noise_bits: standard deviation of `confirmed_bits` where the claims are true.
+        gained_nats: what fitting the piston, and drift where it was read, to the same pilots gains by chance.
     """
 
     pilots: int
     claimed_bits: float
     confirmed_bits: float
+    noise_bits: float
+    gained_nats: float
 
     @property
     def share(self) -> float:
@@ -109,15 +117,25 @@ class PilotCheck:
         return max(0.0, self.confirmed_bits) / self.claimed_bits if self.claimed_bits > 0 else 0.0
 
     @property
-    def confirmed(self) -> bool:
-        """Whether the page may be given out: the pilots bear out what is claimed, and are no chance."""
+    def agrees(self) -> bool:
+        """Whether the pilots bear out enough of what is claimed."""
+        return self.share >= LEAST_CONFIRMED_SHARE
+
+    @property
+    def tells(self) -> bool:
+        """Whether the pilots together tell more than chance would."""
         nats = self.confirmed_bits * np.log(2) * self.pilots
-        return bool(nats >= LEAST_CONFIRMED_NATS and self.share >= LEAST_CONFIRMED_SHARE)
+        return bool(nats >= LEAST_CONFIRMED_NATS + self.gained_nats)
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the page may be given out."""
+        return self.agrees and self.tells
 
     @property
     def sound(self) -> bool:
-        """Whether the device is as the decoder knows it."""
-        return self.share >= SOUND_SHARE
+        """Whether the device is as the decoder knows it, as far as this page's pilots can tell."""
+        return self.confirmed_bits >= SOUND_SHARE * self.claimed_bits - _NOISE_DEVIATIONS * self.noise_bits
 
     @property
     def recalibration_due(self) -> bool:
@@ -167,23 +185,39 @@ def estimate_trust(p: NDArray[np.floating], pilots: Pilots, angle_rad: float) ->
     return min(1.0, (_BELIEF + len(missed) - 1) / (_BELIEF + float(missed.sum())))
 
 
-def check_claims(p: NDArray[np.floating], pilots: Pilots, angle_rad: float, trust: float) -> PilotCheck:
+def check_claims(
+    p: NDArray[np.floating], pilots: Pilots, angle_rad: float, trust: float, fitted: int = 0
+) -> PilotCheck:
     """Hold what a decoder claims of its pilots against what they are.
+
+    The piston is fitted to the same pilots: with their concentrations' sum K, chance gains log(2 pi K) / 2 nats by it,
+    the width of what it may be over that of what is left. Any other parameter gains about log(n) / 2 from n pilots.
 
     Args:
         p: (px, py), [2, ny, nx].
         pilots: the known symbols of this page, those left out that are spoilt.
         angle_rad: the page's piston, as `estimate_piston` found it.
         trust: factor on the concentrations, as `estimate_trust` found it.
+        fitted: parameters beside the piston that were fitted to these pilots.
 
     Raises:
         PageError: the page has another shape than the pilots.
     """
     errors = _errors(p, pilots)
-    kappa = np.abs(errors)
-    claimed = kappa * (mean_resultant(kappa) - 1) - np.log(i0e(kappa))
+    kappa, count = np.abs(errors), len(errors)
+    mean = mean_resultant(kappa)
+    claimed = kappa * (mean - 1) - np.log(i0e(kappa))
     confirmed = -trust * _missed(errors, angle_rad) / 2 - np.log(i0e(trust * kappa))
-    return PilotCheck(len(kappa), float(claimed.mean() / np.log(2)), float(confirmed.mean() / np.log(2)))
+    # of kappa cos(error): kappa^2 (E cos^2 - (E cos)^2), with E cos^2 = 1 - I1 / (kappa I0)
+    variance = kappa * np.maximum(kappa * (1 - mean**2) - mean, 0)
+    by_piston = max(0.0, float(np.log(max(2 * np.pi * trust * kappa.sum(), 1.0))) / 2)
+    return PilotCheck(
+        pilots=count,
+        claimed_bits=float(claimed.mean() / np.log(2)),
+        confirmed_bits=float(confirmed.mean() / np.log(2)),
+        noise_bits=float(np.sqrt(variance.sum()) / count / np.log(2)),
+        gained_nats=by_piston + fitted * float(np.log(count)) / 2,
+    )
 
 
 def without_spoilt(p: NDArray[np.floating], pilots: Pilots) -> Pilots:
@@ -231,12 +265,13 @@ class PilotReading:
     check: PilotCheck
 
 
-def read_pilots(p: NDArray[np.floating], pilots: Pilots) -> PilotReading:
+def read_pilots(p: NDArray[np.floating], pilots: Pilots, fitted: int = 0) -> PilotReading:
     """Read a page's pilots, those few left out that contradict all others.
 
     Args:
         p: (px, py), [2, ny, nx].
         pilots: the known symbols of this page.
+        fitted: parameters beside the piston that were fitted to these pilots before.
 
     Raises:
         PageError: the page has another shape than the pilots.
@@ -244,7 +279,7 @@ def read_pilots(p: NDArray[np.floating], pilots: Pilots) -> PilotReading:
     sound = without_spoilt(p, pilots)
     piston = estimate_piston(p, sound)
     trust = estimate_trust(p, sound, piston.angle_rad)
-    return PilotReading(piston, trust, check_claims(p, sound, piston.angle_rad, trust))
+    return PilotReading(piston, trust, check_claims(p, sound, piston.angle_rad, trust, fitted))
 
 
 def _errors(p: NDArray[np.floating], pilots: Pilots) -> NDArray[np.complex128]:

@@ -114,7 +114,7 @@ class DecodedPage:
         pilot_trust: share of the network's claimed concentration that they bear out, 0..1; low after a drift.
         check: information that is claimed of the pilots, and what of it they confirm.
         timings: seconds.
-        image: where the image was looked at, None where it is not followed.
+        image: where the image lies as this page shows it, None where it is not followed.
     """
 
     symbols: NDArray[np.uint8]
@@ -321,8 +321,8 @@ class Decoder:
         return np.asarray(real + 1j * imaginary, np.complex64), left
 
     @property
-    def shows_field(self) -> bool:
-        """Whether `recover_field` can work, on the grid that registration measures on."""
+    def has_field_graph(self) -> bool:
+        """Whether `recover_field` runs the field alone, and not all of the decoder."""
         return FIELD in self.bundle.files
 
     @cached_property

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from optics.registration.parameters import NAMES
 from optics.registration.phases import tilt_of_shift
 from optics.registration.table import sampling_table, shifted
+from optics.registration.twin import Twin
 from runtime.bundle import Table
 from runtime.calibrated import calibration_of
 from runtime.decoder import Decoder
-from runtime.twin import OnnxTwin
 
 Real = NDArray[np.float64]
 
@@ -36,14 +36,14 @@ class BundleTables:
 
     Args:
         decoder: of the bundle as it is.
+        twin: of the bundle.
 
     Raises:
-        BundleError: the twin cannot be traced.
         CalibrationError: the bundle holds no calibration.
     """
 
-    def __init__(self, decoder: Decoder) -> None:
-        self._decoder, self._calibration = decoder, calibration_of(decoder.bundle)
+    def __init__(self, decoder: Decoder, twin: Twin) -> None:
+        self._decoder, self._twin, self._calibration = decoder, twin, calibration_of(decoder.bundle)
         self._registration = decoder.table_value("registration")
 
     def shifted(self, shift_px: Real) -> Table:
@@ -62,5 +62,5 @@ class BundleTables:
         parameters = self._calibration.vector.copy()
         for name, tilt in zip(("camera_tilt_x_rad", "camera_tilt_y_rad"), tilt_rad, strict=True):
             parameters[NAMES.index(name)] += tilt
-        table = sampling_table(OnnxTwin(bundle, 1), parameters, self._calibration.turn_rad, bundle.profile)
+        table = sampling_table(self._twin, parameters, self._calibration.turn_rad, bundle.profile)
         return self._decoder.with_table({n: v for n, v in table.items() if n in self._decoder.table_shapes})

@@ -28,9 +28,11 @@ class Reason(StrEnum):
 
     UNSPECIFIED = "UNSPECIFIED"
     PILOTS_DISAGREE = "PILOTS_DISAGREE"
-    """The image is where it was looked at, or nobody looked for it, and the pilots contradict what was decoded."""
+    """The pilots contradict what was decoded; the image was found, or nobody looked for it."""
     IMAGE_NOT_FOUND = "IMAGE_NOT_FOUND"
-    """The image was looked for and is not there: it lies further off, or the frames are not this page's."""
+    """The same, and a search did not find the image: it lies further off, or the frames are not this page's."""
+    TOO_FEW_PILOTS = "TOO_FEW_PILOTS"
+    """The pilots agree, but are too few, or too dim, to tell a page from chance."""
 
 
 class LostPageError(LightpageError):
@@ -53,9 +55,9 @@ class LostPageError(LightpageError):
         super().__init__(thing, got, wanted)
         self.reason, self.recalibration_due = reason, recalibration_due
 
-    def about(self, thing: str) -> Self:
-        """The same error about a page that is known by another name."""
-        return type(self)(thing, self.got, self.wanted, self.reason, self.recalibration_due)
+    def about(self, page: str) -> Self:
+        """The same error, and of which page it is."""
+        return type(self)(f"{page}: {self.thing}", self.got, self.wanted, self.reason, self.recalibration_due)
 
 
 class UnconfirmedPageError(LostPageError):
@@ -67,8 +69,14 @@ class UnconfirmedPageError(LostPageError):
 
     page: DecodedPage | None = None
 
-    def about(self, thing: str) -> Self:
+    @property
+    def decoded(self) -> DecodedPage:
+        """What was decoded; only on the side that decoded it."""
+        assert self.page is not None
+        return self.page
+
+    def about(self, page: str) -> Self:
         """See `LostPageError`."""
-        other = super().about(thing)
+        other = super().about(page)
         other.page = self.page
         return other

@@ -20,7 +20,6 @@ from optics.registration.table import shifted, symbol_centres
 from optics.registration.twin import BRANCHES, Twin
 from runtime.calibrated import calibration_of
 from runtime.decoder import Decoder, Inference
-from runtime.twin import OnnxTwin
 
 Real = NDArray[np.float64]
 
@@ -46,6 +45,9 @@ _CAP = 1500.0
 
 _OUTLIER = 3.0
 """Residual in standard deviations from which a symbol's weight falls."""
+
+_MOST_OVER_CLAIM = 3.0
+"""Variance that decisions may leave over what pilots alone leave; decisions among too few levels leave far more."""
 
 _ROUNDS = 3
 
@@ -83,11 +85,14 @@ class DriftModel:
         self._slopes = slopes
 
     @classmethod
-    def of_decoder(cls, decoder: Decoder) -> DriftModel:
+    def of_decoder(cls, decoder: Decoder, twin: Twin) -> DriftModel:
         """Find what shift does on the golden page, with four runs of the graph; what tilt does follows from the twin.
 
+        Args:
+            decoder: of a bundle.
+            twin: of that bundle.
+
         Raises:
-            BundleError: the twin cannot be traced.
             CalibrationError: the bundle holds no calibration.
         """
         registration = decoder.table_value("registration")
@@ -101,7 +106,7 @@ class DriftModel:
         ]
         by_table = [np.angle(np.exp(1j * (plus - minus))) / (2 * PROBE_PX) for plus, minus in moved]
         by_shift = [-ndimage.median_filter(slope, SMOOTHING).astype(np.float64) for slope in by_table]
-        by_tilt = tilt_slopes(OnnxTwin(decoder.bundle, 1), calibration_of(decoder.bundle).vector, profile)
+        by_tilt = tilt_slopes(twin, calibration_of(decoder.bundle).vector, profile)
         return cls(np.stack([*by_shift, *by_tilt]))
 
     def phase_change(self, drift: Real) -> Real:
@@ -136,7 +141,9 @@ class DriftModel:
         decided[at] = pilots.phases
         chosen = safe | at
         weight = np.minimum(concentration[chosen], _CAP)
-        return _solve(_wrapped(phase - decided)[chosen], self._slopes[:, chosen], weight, prior)
+        fine = _solve(_wrapped(phase - decided)[chosen], self._slopes[:, chosen], weight, prior)
+        # a page of more levels than it is read with is decided wrongly throughout
+        return coarse if fine is None or fine.over_claim > _MOST_OVER_CLAIM else fine
 
 
 def tilt_slopes(twin: Twin, parameters: Real, profile: Profile) -> Real:

@@ -10,14 +10,11 @@ from numpy.typing import NDArray
 from optics.pilots import Pilots
 from optics.recording import FramePair
 from optics.registration.image_search import FoundImage, ImageSearch
+from optics.registration.twin import Twin
 from runtime.calibrated import calibration_of
 from runtime.decoder import Decoder
-from runtime.twin import OnnxTwin
 
 Real = NDArray[np.float64]
-
-_TWIN_THREADS = 1
-"""The twin traces the pilots only; a second thread would only spin."""
 
 
 class PageSearch(Protocol):
@@ -32,16 +29,16 @@ class BundleSearch:
 
     Args:
         decoder: of the bundle; its field graph, references and angle between the arms are used.
+        twin: of the bundle.
 
     Raises:
-        BundleError: the twin cannot be traced.
         CalibrationError: the bundle holds no calibration.
     """
 
-    def __init__(self, decoder: Decoder) -> None:
-        bundle = decoder.bundle
-        self._decoder, self._registration = decoder, decoder.table_value("registration")
-        self._search = ImageSearch(OnnxTwin(bundle, _TWIN_THREADS), calibration_of(bundle).vector, bundle.profile)
+    def __init__(self, decoder: Decoder, twin: Twin) -> None:
+        self._decoder, self._references = decoder, decoder.references
+        self._registration, self._homodyne = (decoder.table_value(name) for name in ("registration", "homodyne"))
+        self._search = ImageSearch(twin, calibration_of(decoder.bundle).vector, decoder.bundle.profile)
 
     def find(
         self, pair: FramePair, pilots: Pilots, around_px: Real | None = None, references: FramePair | None = None
@@ -56,7 +53,6 @@ class BundleSearch:
         Raises:
             BundleError: no graph of the bundle shows the field.
         """
-        decoder = self._decoder
-        homodyne = np.asarray(decoder.table_value("homodyne"), np.float32)
-        field, _ = decoder.recover_field(pair, references or decoder.references, self._registration, homodyne)
+        references = references or self._references
+        field, _ = self._decoder.recover_field(pair, references, self._registration, self._homodyne)
         return self._search.find(field, pilots, around_px)

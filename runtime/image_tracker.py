@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from dataclasses import dataclass, field, replace
@@ -19,15 +20,19 @@ from runtime.drift_tables import BundleTables, DriftTables
 from runtime.image_drift import SHIFT, TILT, DriftModel, Estimate
 from runtime.image_search import BundleSearch, PageSearch
 from runtime.tracking import NoTracker, Tracker, confirmed
+from runtime.twin import TWIN_THREADS, OnnxTwin
 
 Real = NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
 
 JUMP_PX = 0.06
 """Shift of a page from which it is decoded again, where noise (0.01 px on a bench page) does not explain it. Phases put
 right to first order lose 0.03 bit here, and 0.17 at 0.15 px."""
 
-ATTEMPTS = 4
-"""Most decodes of one page: a search, and then corrections to a tenth of what is left each."""
+CORRECTIONS = 2
+"""Times that a page is decoded again where it shows that its image lies, before and after a search: each is good to a
+tenth of what is left."""
 
 WALK = np.array([0.02, 0.02, 0.001, 0.001])
 """Standard deviation of the drift from one page to the next of a quiet device."""
@@ -58,21 +63,31 @@ RETRACE_RAD = 0.015
 """Tilt from which the table is traced again: branches of one symbol then differ by twice as much, which the network
 takes for noise; below, turning the decoded phases costs less than 0.02 bit."""
 
-PLAIN_DEVIATIONS = 4.0
+SIGNIFICANT_DEVIATIONS = 4.0
 """A shift of so many standard deviations is there, however large they are: the further off a page is, the less exactly
 it says by how much, until it has been decoded where it lies."""
 
 LARGEST_ERROR_PX = 0.15
-"""Standard deviation of the estimate, per axis, above which a page is left out unless its shift is plain to see."""
+"""Standard deviation of the estimate, per axis, above which a page is left out unless its shift is significant."""
 
 NEARBY_PX = 0.3
 """A search that ends so near to where the page was decoded has found nothing new."""
 
-CONTRADICTED = 0.9
-"""Share of what pilots confirmed of an earlier attempt below which a later one, made where that said, is no better."""
+WORSE = 0.9
+"""A later attempt at a page replaces an earlier one unless its pilots confirm less than this share of what they did."""
 
-FRUITLESS = 0.9
-"""Share of what the pilots confirmed when a search found nothing new, below which another one may."""
+DROP = 0.85
+"""A page is searched for where its pilots confirm less than this share of what they lately did, and the device is not
+sound. So a device that has changed for good is searched for once."""
+
+SHARE_MEMORY = 0.2
+"""Weight of the last page in the share that pilots lately confirmed."""
+
+FEWEST_PILOTS = 12
+"""Pilots of a page from which drift is read: four numbers can be fitted to fewer whatever they are."""
+
+_FITTED = 4
+"""Numbers of a drift."""
 
 
 @dataclass(frozen=True)
@@ -86,9 +101,9 @@ class ImageState:
         table: tensors that are fed for the page.
         traced_tilt: [2].
         walk: variance of the drift from one page to the next, as the last pages showed it, [4].
-        settled: whether the last page was confirmed here. Until then the image is looked for first.
+        settled: whether a page was confirmed yet. Until then the image is looked for before anything is decoded.
         jump_px: shift since the last page, (x, y), of which it is not known whether the reference has come along.
-        fruitless: share that the pilots confirmed when a search last found nothing new here, else 1.
+        share: of the claimed information, what pilots lately confirmed; 1 before any page.
     """
 
     drift: Real
@@ -99,7 +114,7 @@ class ImageState:
     walk: Real
     settled: bool = False
     jump_px: Real = field(default_factory=lambda: np.zeros(2))
-    fruitless: float = 1.0
+    share: float = 1.0
 
     @property
     def untraced(self) -> Real:
@@ -113,17 +128,21 @@ class _Attempt:
 
     Attributes:
         state: what it was decoded with.
-        after: what the page shows of the next one.
+        after: what it shows of where the image lies.
         inference: its phases freed from all that is known of drift by now.
         check: what its pilots confirm.
+        prior: covariance of the drift before the page was read, [4, 4].
         again: whether the image lies far enough from where it was looked at for another decode to pay.
+        step: drift as the page alone shows it, None where it does not.
     """
 
     state: ImageState
     after: ImageState
     inference: Inference
     check: PilotCheck
-    again: bool
+    prior: Real
+    again: bool = False
+    step: Estimate | None = None
 
     @property
     def correction_px(self) -> float:
@@ -139,22 +158,14 @@ class ImageTracker:
         model: reads drift from decoded phases.
         tables: applies it.
         search: finds an image that was lost, None where the bundle cannot.
-        walk: standard deviation of the drift from page to page, [4], to begin with and at least.
     """
 
-    def __init__(
-        self,
-        decoder: Decoder,
-        model: DriftModel,
-        tables: DriftTables,
-        search: PageSearch | None,
-        walk: Real = WALK,
-    ) -> None:
-        self._decoder, self._model, self._tables, self._search, self._walk = decoder, model, tables, search, walk
-        start = np.diag([WALK[0], WALK[1], START_TILT, START_TILT]) ** 2
+    def __init__(self, decoder: Decoder, model: DriftModel, tables: DriftTables, search: PageSearch | None) -> None:
+        self._decoder, self._model, self._tables, self._search = decoder, model, tables, search
+        start = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, START_TILT, START_TILT]) ** 2
         self._lock = threading.Lock()
         """Guards the state; never held while anything is computed."""
-        self._state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), walk**2)
+        self._state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), WALK**2)
 
     @property
     def state(self) -> ImageState:
@@ -162,23 +173,30 @@ class ImageTracker:
         with self._lock:
             return self._state
 
+    @property
+    def image_px(self) -> tuple[float, float]:
+        """See `Tracker`."""
+        x, y = map(float, self.state.drift[SHIFT])
+        return x, y
+
     def fork(self) -> ImageTracker:
         """See `Tracker`."""
-        other = ImageTracker(self._decoder, self._model, self._tables, self._search, self._walk)
+        other = ImageTracker(self._decoder, self._model, self._tables, self._search)
         other._state = self.state
         return other
 
     def refitted(self, decoder: Decoder) -> ImageTracker:
         """See `Tracker`: what drift does to phases is taken to be as before."""
-        search = None if self._search is None else BundleSearch(decoder)
-        return ImageTracker(decoder, self._model, BundleTables(decoder), search, self._walk)
+        twin = OnnxTwin(decoder.bundle, TWIN_THREADS)
+        search = None if self._search is None else BundleSearch(decoder, twin)
+        return ImageTracker(decoder, self._model, BundleTables(decoder, twin), search)
 
     def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
         """Decode a page where its image lies.
 
-        The image is looked for before anything is decoded at the start and after a page that was not confirmed, and
-        after it where the pilots confirm too little. What is learnt counts for the next page only where this one's
-        pilots confirm it: a page that is not this device's moves nothing.
+        The image is looked for before anything is decoded at the start, and later where the pilots confirm too little.
+        What is learnt counts for the next page only where this one's pilots confirm it: a page that is not this
+        device's moves nothing.
         """
         begun, clock = self.state, _Clock()
         check_levels(levels)
@@ -190,54 +208,70 @@ class ImageTracker:
             found = self._search.find(pair, pilots, self._around(begun))
             state = self._moved_to(found, begun)
             clock.add("search_s")
+        best = self._attempts(pair, state, levels, pilots, found, clock)
+        step = best.step if found is None else None
+        if found is None and self._search is not None and _search_may_pay(best.check, begun):
+            found = self._search.find(pair, pilots, self._around(begun))
+            moved = self._moved_to(found, best.after)
+            clock.add("search_s")
+            if moved is not best.after:
+                there = self._attempts(pair, moved, levels, pilots, found, clock)
+                if not _worse(there, best):
+                    best, step = there, None
+        page = self._decoder.post_process(best.inference, levels, pilots)
+        self._learn(begun, best, step, searched=found is not None)
+        clock.add("decision_s")
+        page = replace(page, check=best.check, image=_position(best.after, found), timings=clock.timings)
+        return confirmed(page, found)
+
+    def _attempts(
+        self,
+        pair: FramePair,
+        state: ImageState,
+        levels: int,
+        pilots: Pilots,
+        found: FoundImage | None,
+        clock: _Clock,
+    ) -> _Attempt:
+        """Decode at a place, and again where the page shows that its image lies: the best attempt, with its first step."""
+        enough = SEARCHED_PX if found is not None and found.found else np.inf
         best: _Attempt | None = None
-        just_found = found is not None and found.found
-        for _ in range(ATTEMPTS):
+        for _ in range(1 + CORRECTIONS):
             inference = state.decoder.infer(pair, state.table)
             clock.add("inference_s")
             attempt = self._read(inference, state, levels, pilots)
-            best = attempt if best is None or not _contradicted(attempt, best) else best
             clock.add("decision_s")
-            if attempt.again or (just_found and attempt.correction_px > SEARCHED_PX):
-                state, just_found = attempt.after, False
-                continue
-            if found is not None or self._search is None or not _search_may_pay(best):
+            if best is not None and _worse(attempt, best):
                 break
-            found = self._search.find(pair, pilots, self._around(begun))
-            state = self._moved_to(found, best.after)
-            clock.add("search_s")
-            if state is best.after:
+            best = attempt if best is None else replace(attempt, step=best.step)
+            if not attempt.again and attempt.correction_px <= enough:
                 break
-            just_found = True
+            # the same page once more: what it has taught already is no knowledge from before it
+            state, enough = replace(attempt.after, covariance=attempt.prior), np.inf
         assert best is not None  # at least one attempt
-        page = state.decoder.post_process(best.inference, levels, pilots)
-        after = self._learn(begun, best, page.check, found)
-        clock.add("decision_s")
-        page = replace(page, timings=clock.timings, image=_position(after, found))
-        return confirmed(page, found)
+        return best
 
     def _read(self, inference: Inference, state: ImageState, levels: int, pilots: Pilots) -> _Attempt:
         """Take in what a decoded page shows of drift beyond what its state knows."""
         known = inference.turned(-self._model.phase_change(state.untraced))
-        jump = self._model.estimate(known, levels, pilots, np.diag(WIDEST**2))
-        unseen = replace(state, covariance=state.covariance + np.diag(state.walk))
-        if jump is None:
-            return _Attempt(state, unseen, known, read_pilots(known.p, pilots).check, again=False)
-        shift, error = jump.drift[SHIFT], jump.deviations[SHIFT]
-        plain = np.linalg.norm(shift / error) > PLAIN_DEVIATIONS
-        jumped = bool(plain and np.abs(shift).max() > JUMP_PX)
-        if not (plain or error.max() <= LARGEST_ERROR_PX):
-            return _Attempt(state, unseen, known, read_pilots(known.p, pilots).check, again=False)
-        step = state.jump_px + (shift if jumped else 0)
+        many = len(pilots.phases) >= FEWEST_PILOTS
+        step = self._model.estimate(known, levels, pilots, np.diag(WIDEST**2)) if many else None
+        unread = _Attempt(state, state, known, read_pilots(known.p, pilots).check, state.covariance)
+        if step is None:
+            return unread
+        shift, error = step.drift[SHIFT], step.deviations[SHIFT]
+        significant = bool(np.linalg.norm(shift / error) > SIGNIFICANT_DEVIATIONS)
+        if not (significant or error.max() <= LARGEST_ERROR_PX):
+            return unread
+        jumped = significant and bool(np.abs(shift).max() > JUMP_PX)
         prior = _after_jump(state.covariance, shift) if jumped else state.covariance
-        # the pilots say whether the reference has come along
-        tilts = [np.zeros(2), self._tables.tilt_of(step)] if np.any(step) else [np.zeros(2)]
+        # after a jump the pilots say whether the reference has come along
+        jump = state.jump_px + (shift if jumped else 0)
+        tilts = [np.zeros(2), self._tables.tilt_of(jump)] if np.any(jump) else [np.zeros(2)]
         read = [self._freed(known, tilt, levels, pilots, prior) for tilt in tilts]
         freed, drift, covariance, check = max(read, key=lambda each: each[3].confirmed_bits)
-        walk = self._walked(state, jump)
-        settled = replace(state, walk=walk, jump_px=np.zeros(2))
-        after = self._state_at(state.drift + drift, covariance + np.diag(walk), settled)
-        return _Attempt(state, after, freed, check, again=jumped or after.decoder is not state.decoder)
+        after = self._state_at(state.drift + drift, covariance, replace(state, jump_px=np.zeros(2)))
+        return _Attempt(state, after, freed, check, prior, jumped or after.decoder is not state.decoder, step)
 
     def _freed(
         self, known: Inference, tilt: Real, levels: int, pilots: Pilots, prior: Real
@@ -249,20 +283,13 @@ class ImageTracker:
         if rest is None:
             return tilted, guess, prior, read_pilots(tilted.p, pilots).check
         freed = tilted.turned(-self._model.phase_change(rest.drift))
-        return freed, guess + rest.drift, rest.covariance, read_pilots(freed.p, pilots).check
-
-    def _walked(self, state: ImageState, step: Estimate) -> Real:
-        """What is known of the walk after a page that has moved by `step`."""
-        quiet, last = self._walk**2, np.maximum(step.drift**2 - np.diag(step.covariance), 0)
-        walk = np.maximum(quiet, state.walk + WALK_MEMORY * (last - state.walk))
-        walk[TILT] = quiet[TILT]
-        return np.asarray(np.minimum(walk, np.maximum(quiet, LARGEST_WALK_PX**2)))
+        return freed, guess + rest.drift, rest.covariance, read_pilots(freed.p, pilots, _FITTED).check
 
     def _state_at(self, drift: Real, covariance: Real, like: ImageState) -> ImageState:
         """The state of a drift: its shift in the table that is fed, its tilt traced where it is large and certain."""
         away, error = np.abs(drift[TILT] - like.traced_tilt), np.sqrt(np.diag(covariance)[TILT])
         decoder, traced = like.decoder, like.traced_tilt
-        if np.any((away > RETRACE_RAD) & (away > PLAIN_DEVIATIONS * error)):
+        if np.any((away > RETRACE_RAD) & (away > SIGNIFICANT_DEVIATIONS * error)):
             decoder, traced = self._tables.traced(drift[TILT]), drift[TILT].copy()
         return replace(
             like,
@@ -283,19 +310,25 @@ class ImageTracker:
         moved = replace(state, jump_px=state.jump_px + away)
         return self._state_at(np.concatenate([found.shift_px, state.drift[TILT]]), covariance, moved)
 
-    def _learn(self, begun: ImageState, best: _Attempt, check: PilotCheck, found: FoundImage | None) -> ImageState:
-        """Keep what a page showed for the next one, unless another page has been learnt from in the meantime."""
-        if not check.confirmed:
-            after = replace(begun, settled=False)
-        elif check.sound:
-            after = replace(best.after, settled=True, fruitless=1.0)
-        else:
-            share = begun.fruitless if found is None else check.share
-            after = replace(best.after, settled=True, fruitless=share)
+    def _learn(self, begun: ImageState, best: _Attempt, step: Estimate | None, *, searched: bool) -> None:
+        """Keep what a page showed for the next one, unless another page has been learnt from in the meantime.
+
+        Args:
+            begun: what the page began with.
+            best: the attempt that counts.
+            step: drift from where the image was expected, None where that says nothing of the walk.
+            searched: whether the image was looked for.
+        """
+        after = begun
+        if best.check.confirmed:
+            walk = begun.walk if step is None else _walked(begun.walk, step)
+            share = min(1.0, best.check.share)
+            lately = share if searched else begun.share + SHARE_MEMORY * (share - begun.share)
+            after = replace(best.after, settled=True, walk=walk, share=lately)
+        after = replace(after, covariance=after.covariance + np.diag(after.walk))
         with self._lock:
             if self._state is begun:
                 self._state = after
-        return after if check.confirmed else best.after
 
     @staticmethod
     def _around(state: ImageState) -> Real:
@@ -312,13 +345,25 @@ def tracker_for(decoder: Decoder) -> Tracker:
     """
     if "registration" not in decoder.table_shapes:
         return NoTracker(decoder)
-    search = BundleSearch(decoder) if decoder.shows_field else None
-    return ImageTracker(decoder, DriftModel.of_decoder(decoder), BundleTables(decoder), search)
+    twin, search = OnnxTwin(decoder.bundle, TWIN_THREADS), None
+    if decoder.has_field_graph:
+        search = BundleSearch(decoder, twin)
+    else:
+        _log.warning("%s: no field graph, so an image that is lost is not looked for", decoder.bundle.thing)
+    return ImageTracker(decoder, DriftModel.of_decoder(decoder, twin), BundleTables(decoder, twin), search)
 
 
-def _search_may_pay(best: _Attempt) -> bool:
-    """Whether the pilots confirm less than they did when a search last found nothing new."""
-    return not best.check.sound and best.check.share < FRUITLESS * best.state.fruitless
+def _search_may_pay(check: PilotCheck, begun: ImageState) -> bool:
+    """Whether the pilots confirm too little, or much less than they lately did."""
+    return not check.confirmed or (not check.sound and check.share < DROP * begun.share)
+
+
+def _walked(walk: Real, step: Estimate) -> Real:
+    """What is known of the walk, variances [4], after a page that has moved by `step`."""
+    quiet, last = WALK**2, np.maximum(step.drift**2 - np.diag(step.covariance), 0)
+    slow = np.abs(step.drift) <= LARGEST_WALK_PX
+    slow[TILT] = False  # a page shows too little of it
+    return np.asarray(np.where(slow, np.maximum(quiet, walk + WALK_MEMORY * (last - walk)), walk))
 
 
 def _after_jump(covariance: Real, shift_px: Real) -> Real:
@@ -327,9 +372,8 @@ def _after_jump(covariance: Real, shift_px: Real) -> Real:
     return np.block([[np.diag(WIDEST[SHIFT] ** 2), np.zeros((2, 2))], [np.zeros((2, 2)), tilt]])
 
 
-def _contradicted(attempt: _Attempt, earlier: _Attempt) -> bool:
-    """Whether the pilots contradict a later attempt: a chance advantage of the earlier one is none."""
-    return attempt.check.confirmed_bits < CONTRADICTED * earlier.check.confirmed_bits
+def _worse(attempt: _Attempt, earlier: _Attempt) -> bool:
+    return attempt.check.confirmed_bits < WORSE * earlier.check.confirmed_bits
 
 
 def _position(state: ImageState, found: FoundImage | None) -> ImagePosition:

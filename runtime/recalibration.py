@@ -6,7 +6,6 @@ import math
 import re
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -25,7 +24,7 @@ from optics.progress import Progress
 from optics.recording import FramePair, hash_frames
 from runtime.bundle import Bundle, Table, npz, write_bundle
 from runtime.decoder import Decoder, ImagePosition
-from runtime.errors import UnconfirmedPageError
+from runtime.errors import LostPageError, UnconfirmedPageError
 from runtime.frames import named
 from runtime.image_tracker import tracker_for
 from runtime.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
@@ -56,6 +55,7 @@ class KnownPages:
         levels: M of those symbols.
         references: reference-only frames taken with them, or None: then those of the last recalibration hold.
         pilot_mask: where the pilots are, bool [ny, nx], or None for the device's usual positions.
+        image_px: where the image was last seen against the model's calibration, (x, y), camera pixels.
     """
 
     pairs: tuple[FramePair, ...]
@@ -63,6 +63,7 @@ class KnownPages:
     levels: int
     references: FramePair | None = None
     pilot_mask: NDArray[np.bool_] | None = None
+    image_px: tuple[float, float] = (0.0, 0.0)
 
     def check(self, decoder: Decoder) -> None:
         """Check everything against the device of `decoder`.
@@ -96,7 +97,7 @@ class KnownPages:
 
     def part(self, pages: slice) -> KnownPages:
         """Some of the pages, the rest as it is."""
-        return KnownPages(self.pairs[pages], self.symbols[pages], self.levels, self.references, self.pilot_mask)
+        return replace(self, pairs=self.pairs[pages], symbols=self.symbols[pages])
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ class Fit(Protocol):
 class RecalibrationOutcome:
     """A new bundle and why it is better: AIR in bits per symbol on held-back pages, decoded as the service does it.
 
-    `pages_lost_before` of these pages were not confirmed, or refused, by the earlier model.
+    `pages_lost_before` of these pages the earlier model would not have given out; they count with no bits.
     """
 
     path: Path
@@ -194,22 +195,24 @@ def recalibrate(
     pages.check(decoder)
     fitted_count = min(FIT_PAGES, len(pages.pairs) - 1)
     fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))
-    tracker = tracker_for(decoder) if tracker is None else tracker
+    tracker = tracker_for(decoder) if tracker is None else tracker.fork()
     measuring = partial(_within, progress, "measure the model in service", 0.0)
-    before, lost_before = -math.inf, len(held_back.pairs)  # of a model that refuses the frames: any other is better
-    with suppress(FrameError):
-        rates, lost_before = _air(tracker.fork(), decoder.bundle, held_back, measuring)
-        before = fmean(rates)
+    judged = _judged(tracker, decoder.bundle, held_back, measuring)
+    before, lost_before = (
+        fmean(0.0 if page.lost else page.air for page in judged),
+        sum(page.lost is not None for page in judged),
+    )
+    fitted = replace(fitted, image_px=tracker.image_px)
     try:
         result = fit(decoder.bundle, fitted, lambda step, share: progress(step, 0.05 + 0.85 * share), decoder)
         judging = partial(_within, progress, "judge by the held-back pages", 0.9)
         judging(0.0)
         refitted = decoder.of_bundle(_refitted(decoder.bundle, result))
-        rates, lost = _air(tracker.refitted(refitted), decoder.bundle, held_back, judging)
+        judged = _judged(tracker.refitted(refitted), decoder.bundle, held_back, judging)
     except (CalibrationError, FrameError) as error:
         raise RecalibrationRefusedError(error.thing, error.got, error.wanted) from error
-    after = fmean(rates)
-    _judge(before, rates, lost, pages.levels)
+    after = fmean(page.air for page in judged)
+    _judge(before, judged, pages.levels)
     progress("write the new bundle", 0.95)
     golden, bundle = held_back.pairs[0], refitted.bundle
     files = {
@@ -244,42 +247,57 @@ def _within(progress: Progress, step: str, start: float, share: float) -> None:
     progress(step, start + 0.05 * share)
 
 
-def _air(
-    tracker: Tracker, bundle: Bundle, pages: KnownPages, progress: Callable[[float], None]
-) -> tuple[list[float], int]:
-    """AIR over the data symbols of each page, bits per symbol, and how many of the pages were not confirmed.
+@dataclass(frozen=True)
+class _Judged:
+    """A held-back page: its AIR over the data symbols, bits per symbol, and whether it would not have been given out."""
 
-    Raises:
-        FrameError: the model refuses the frames.
-    """
+    air: float
+    lost: LostPageError | FrameError | None = None
+
+
+def _judged(tracker: Tracker, bundle: Bundle, pages: KnownPages, progress: Callable[[float], None]) -> list[_Judged]:
+    """The pages, as a service reads them with this tracker."""
     mask = bundle.pilot_mask if pages.pilot_mask is None else pages.pilot_mask
-    data, rates, lost = ~mask, list[float](), 0
+    data, judged = ~mask, list[_Judged]()
     for pair, symbols in zip(pages.pairs, pages.symbols, strict=True):
-        progress(len(rates) / len(pages.pairs))
+        progress(len(judged) / len(pages.pairs))
+        lost = None
         try:
             page = tracker.decode(pair, pages.levels, Pilots.of_symbols(mask, symbols, pages.levels))
+        except FrameError as error:
+            judged.append(_Judged(0.0, error))
+            continue
         except UnconfirmedPageError as error:
-            if error.page is None:
-                raise
-            page, lost = error.page, lost + 1
+            page, lost = error.decoded, error
         figures = measure(page.phase[data], page.concentration[data], symbols[data], pages.levels)
-        rates.append(figures.air_bits_per_symbol)
-    return rates, lost
+        judged.append(_Judged(figures.air_bits_per_symbol, lost))
+    return judged
 
 
-def _judge(before: float, rates: list[float], lost: int, levels: int) -> None:
-    """Each page must show its symbols, whatever the others do, and all together more of them than before."""
-    least, worst, after = MIN_AIR_SHARE * math.log2(levels), min(rates), fmean(rates)
+def _judge(before: float, judged: list[_Judged], levels: int) -> None:
+    """Each page must show its symbols, whatever the others do, and all together more of them than before.
+
+    Raises:
+        RecalibrationRefusedError: they do not.
+    """
+    for page in judged:
+        if isinstance(page.lost, FrameError):
+            raise RecalibrationRefusedError(page.lost.thing, page.lost.got, page.lost.wanted)
+    least, worst, after = (
+        MIN_AIR_SHARE * math.log2(levels),
+        min(page.air for page in judged),
+        fmean(p.air for p in judged),
+    )
     if not worst >= least:
         raise RecalibrationRefusedError(
             "re-fitted geometry",
             f"an AIR of {worst:.3f} bit/symbol on one of the held-back pages",
             f"at least {least:.3f}: the page does not match its symbols",
         )
-    if lost:
+    if lost := sum(page.lost is not None for page in judged):
         raise RecalibrationRefusedError(
             "re-fitted geometry",
-            f"{lost} of {len(rates)} held-back pages whose pilots do not confirm what is claimed",
+            f"{lost} of {len(judged)} held-back pages whose pilots do not confirm what is claimed",
             "pages of this device, as its decoder was trained: else calibrate and train anew",
         )
     if after < before - TOLERATED_LOSS_BITS:

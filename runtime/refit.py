@@ -14,12 +14,13 @@ from optics.registration.calibrate import LEAST_KEPT, KnownPage, refine
 from optics.registration.calibration import Calibration
 from optics.registration.parameters import NAMES
 from optics.registration.table import sampling_table
+from optics.registration.twin import Twin
 from runtime.bundle import Bundle
 from runtime.calibrated import calibration_of
 from runtime.decoder import Decoder, ImagePosition
 from runtime.image_search import BundleSearch
 from runtime.recalibration import FitReport, FitResult, KnownPages
-from runtime.twin import OnnxTwin
+from runtime.twin import TWIN_THREADS, OnnxTwin
 
 Real = NDArray[np.float64]
 
@@ -27,8 +28,6 @@ _REFITTED = frozenset({"places", "parameters"})
 """Inputs that a re-fitted geometry is fed to, by one of which a decoder knows it."""
 _SEARCHED_SYMBOLS = 300
 """Known symbols by which the image is looked for: enough in any light that can be calibrated in, and soon done."""
-_TWIN_THREADS = 1
-"""The twin traces few points at a time; a second thread would only spin."""
 
 
 def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> FitResult:
@@ -55,9 +54,9 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
     references = pages.references or _kept_references(bundle)
     if references is None:
         raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
-    twin = OnnxTwin(bundle, _TWIN_THREADS)
+    twin = OnnxTwin(bundle, TWIN_THREADS)
     progress("find the image", 0.0)
-    image = _find(decoder, pages, references)
+    image = _find(decoder, twin, pages, references)
     start = moved_cameras(earlier.vector, image)
     known = [
         KnownPage(pair, np.exp(1j * symbol_phases(symbols, pages.levels)))
@@ -100,15 +99,18 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
     )
 
 
-def _find(decoder: Decoder, pages: KnownPages, references: FramePair) -> ImagePosition | None:
+def _find(decoder: Decoder, twin: Twin, pages: KnownPages, references: FramePair) -> ImagePosition | None:
     """Where the image of the first page lies against the earlier calibration; None where the search does not find it.
+
+    It is looked for there and where the service saw it last.
 
     All symbols are known here, and an even share of them stands for all.
     """
     symbols, mask = pages.symbols[0], np.zeros(pages.symbols[0].size, bool)
     mask[:: max(1, mask.size // _SEARCHED_SYMBOLS)] = True
     pilots = Pilots.of_symbols(mask.reshape(symbols.shape), symbols, pages.levels)
-    found = BundleSearch(decoder).find(pages.pairs[0], pilots, references=references)
+    around = np.array([(0.0, 0.0), pages.image_px])
+    found = BundleSearch(decoder, twin).find(pages.pairs[0], pilots, around, references)
     x, y = map(float, found.shift_px)
     return ImagePosition(x, y, searched=True, found=True) if found.found else None
 

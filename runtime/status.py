@@ -49,6 +49,7 @@ _REASONS = {
     Reason.UNSPECIFIED: pb.LOSS_REASON_UNSPECIFIED,
     Reason.PILOTS_DISAGREE: pb.LOSS_REASON_PILOTS_DISAGREE,
     Reason.IMAGE_NOT_FOUND: pb.LOSS_REASON_IMAGE_NOT_FOUND,
+    Reason.TOO_FEW_PILOTS: pb.LOSS_REASON_TOO_FEW_PILOTS,
 }
 
 _FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")

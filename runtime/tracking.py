@@ -25,6 +25,10 @@ class Tracker(Protocol):
             FrameError, PageError, InvalidInputError: see `Decoder.decode`.
         """
 
+    @property
+    def image_px(self) -> tuple[float, float]:
+        """Where the image of the last page lay against calibration, (x, y), camera pixels."""
+
     def fork(self) -> Tracker:
         """Another one that has learnt the same, and learns on its own from there."""
 
@@ -50,6 +54,11 @@ class NoTracker:
         """See `Tracker`."""
         return confirmed(self._decoder.decode(pair, levels, pilots=pilots))
 
+    @property
+    def image_px(self) -> tuple[float, float]:
+        """Where calibration saw it."""
+        return 0.0, 0.0
+
     def fork(self) -> NoTracker:
         """Itself: it learns nothing."""
         return self
@@ -74,14 +83,17 @@ def confirmed(page: DecodedPage, found: FoundImage | None = None) -> DecodedPage
         return page
     lost = found is not None and not found.found
     looked = f"; its image was looked for within {REACH_PX:g} px and {'not ' if lost else ''}found" if found else ""
-    error = UnconfirmedPageError(
-        "page",
-        f"pilots that confirm {max(0.0, check.confirmed_bits):.2f} of the {check.claimed_bits:.2f} bits a symbol that "
-        f"are claimed{looked}",
-        f"at least {LEAST_CONFIRMED_SHARE:.0%} of them: frames and pilots of this device, as it was calibrated (if it "
-        "has changed, recalibrate)",
-        Reason.IMAGE_NOT_FOUND if lost else Reason.PILOTS_DISAGREE,
-        recalibration_due=True,
-    )
+    told = f"{max(0.0, check.confirmed_bits):.2f} of {check.claimed_bits:.2f} claimed bits a symbol confirmed{looked}"
+    if check.agrees:
+        reason = Reason.TOO_FEW_PILOTS
+        told = f"{check.pilots} that tell {check.pilots * max(0.0, check.confirmed_bits):.0f} bits together{looked}"
+        wanted = "more pilots, or more light: as much may be chance"
+    else:
+        reason = Reason.IMAGE_NOT_FOUND if lost else Reason.PILOTS_DISAGREE
+        wanted = (
+            f"at least {LEAST_CONFIRMED_SHARE:.0%} of them: frames and pilots of this device, as it was calibrated (if "
+            "it has changed, recalibrate)"
+        )
+    error = UnconfirmedPageError("pilots", told, wanted, reason, check.recalibration_due)
     error.page = page
     raise error

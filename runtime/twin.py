@@ -16,6 +16,8 @@ Real = NDArray[np.float64]
 
 INPUTS = {"parameters": 1, "points": 2, "anchors": 2, "camera_places": 2}
 """Inputs of the graph, all float64, with their number of axes."""
+TWIN_THREADS = 1
+"""For few points at a time, where a second thread would only spin."""
 OUTPUTS = ("places", "phases", "positions", "pixels")
 
 

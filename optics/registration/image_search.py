@@ -34,6 +34,9 @@ _FINE_PX = (1.0, 0.4, 0.15)
 FALSE_ALARMS = 1e-5
 """How often light that is not this page's may pass for it in one search."""
 
+_FEWEST_PILOTS = 4
+"""Fewer agree by chance wherever they are looked at."""
+
 _INDEPENDENT_PER_PX2 = 0.5
 """Independent trials per square pixel searched, twice what the field's correlation length of 5 pixels suggests, and
 for the fine search."""
@@ -95,8 +98,9 @@ class ImageSearch:
             around_px: shifts [K, 2], (x, y) in camera pixels; all within `REACH_PX` of any of them is searched. By
                 default the image is looked for where the calibration saw it.
         """
-        around = np.zeros((1, 2)) if around_px is None else np.unique(np.asarray(around_px, np.float64), axis=0)
-        trials = _lattice(around, REACH_PX, COARSE_PX)
+        around = np.zeros((1, 2)) if around_px is None else np.asarray(around_px, np.float64)
+        # on one lattice, so that windows which overlap are searched once
+        trials = np.unique(_lattice(np.rint(around / COARSE_PX) * COARSE_PX, REACH_PX, COARSE_PX), axis=0)
         scores = self._scores(field, self._template(pilots, _COARSE_SAMPLES), trials, order=1)
         best = trials[int(np.argmax(scores))]
         smooth = ndimage.spline_filter(field.real, 3) + 1j * ndimage.spline_filter(field.imag, 3)
@@ -106,7 +110,7 @@ class ImageSearch:
             scores = self._scores(smooth, template, near, order=3)
             score = float(scores.max())
             best = best + step * _vertex(scores.reshape(3, 3))
-        return FoundImage(best, score, needed_significance(len(pilots.phases), len(around)))
+        return FoundImage(best, score, needed_significance(len(pilots.phases), len(trials) * COARSE_PX**2))
 
     def _samples_per_pixel(self) -> Real:
         """Grid samples (x, y) for a camera pixel along x and along y, in the mean of both cameras, [2, 2]."""
@@ -144,14 +148,16 @@ class ImageSearch:
         return np.array(found)
 
 
-def needed_significance(pilots: int, windows: int = 1) -> float:
-    """Significance that unrelated light reaches once in 1 / `FALSE_ALARMS` searches of so many windows.
+def needed_significance(pilots: int, area_px2: float = (2 * REACH_PX) ** 2) -> float:
+    """Significance that unrelated light reaches once in 1 / `FALSE_ALARMS` searches of an area, square camera pixels.
 
     The sum of n unrelated phasors with normally distributed parts has |sum|^2 / sum | |^2 / n distributed as
     Beta(1, n - 1); independent trials multiply.
     """
-    trials = windows * (2 * REACH_PX) ** 2 * _INDEPENDENT_PER_PX2
-    return float(pilots * (1 - (FALSE_ALARMS / trials) ** (1 / max(1, pilots - 1))))
+    if pilots < _FEWEST_PILOTS:
+        return float("inf")
+    trials = area_px2 * _INDEPENDENT_PER_PX2
+    return float(pilots * (1 - (FALSE_ALARMS / trials) ** (1 / (pilots - 1))))
 
 
 def _lattice(around: Real, reach: float, step: float) -> Real:

@@ -25,6 +25,7 @@ class LossReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     LOSS_REASON_UNSPECIFIED: _ClassVar[LossReason]
     LOSS_REASON_PILOTS_DISAGREE: _ClassVar[LossReason]
     LOSS_REASON_IMAGE_NOT_FOUND: _ClassVar[LossReason]
+    LOSS_REASON_TOO_FEW_PILOTS: _ClassVar[LossReason]
 PIXEL_TYPE_UNSPECIFIED: PixelType
 PIXEL_TYPE_UINT8: PixelType
 PIXEL_TYPE_UINT16: PixelType
@@ -34,6 +35,7 @@ CONFIDENCE_FORMAT_UINT8: ConfidenceFormat
 LOSS_REASON_UNSPECIFIED: LossReason
 LOSS_REASON_PILOTS_DISAGREE: LossReason
 LOSS_REASON_IMAGE_NOT_FOUND: LossReason
+LOSS_REASON_TOO_FEW_PILOTS: LossReason
 
 class DescribeRequest(_message.Message):
     __slots__ = ()
