@@ -59,6 +59,7 @@ from runtime.image_search import BundleSearch
 from runtime.image_tracker import tracker_for
 from runtime.shipped import DEFAULT, bundle_path
 from runtime.tracking import Tracker
+from runtime.twin import TWIN_THREADS, OnnxTwin
 from train.field import FieldRecovery, TorchFieldSolver
 from train.twin import RayTwin, TorchTwin
 
@@ -102,7 +103,7 @@ class Point:
     @cached_property
     def search(self) -> BundleSearch:
         """The decoder's search."""
-        return BundleSearch(self.decoder)
+        return BundleSearch(self.decoder, OnnxTwin(self.decoder.bundle, TWIN_THREADS))
 
     @cached_property
     def pilots(self) -> Pilots:

@@ -29,8 +29,8 @@ LEAST_CONFIRMED_SHARE = 0.25
 a third on the bench device, four pixels off a thirtieth, a page of another device nothing."""
 
 LEAST_CONFIRMED_NATS = 9.0
-"""Information that all pilots together must confirm, beyond what fitting to them gains. Chance confirms as much about once
-in e^9 = 8,000 pages."""
+"""Information that all pilots together must confirm, beyond what fitting to them gains. Chance confirms as much about
+once in e^9 = 8,000 pages."""
 
 SOUND_SHARE = 0.85
 """Share below which a device is no longer as it was calibrated, where the pilots' own noise does not explain it."""
@@ -186,19 +186,19 @@ def estimate_trust(p: NDArray[np.floating], pilots: Pilots, angle_rad: float) ->
 
 
 def check_claims(
-    p: NDArray[np.floating], pilots: Pilots, angle_rad: float, trust: float, fitted: int = 0
+    p: NDArray[np.floating], pilots: Pilots, angle_rad: float, trust: float, gained_nats: float = 0.0
 ) -> PilotCheck:
     """Hold what a decoder claims of its pilots against what they are.
 
     The piston is fitted to the same pilots: with their concentrations' sum K, chance gains log(2 pi K) / 2 nats by it,
-    the width of what it may be over that of what is left. Any other parameter gains about log(n) / 2 from n pilots.
+    the width of what it may be over that of what is left.
 
     Args:
         p: (px, py), [2, ny, nx].
         pilots: the known symbols of this page, those left out that are spoilt.
         angle_rad: the page's piston, as `estimate_piston` found it.
         trust: factor on the concentrations, as `estimate_trust` found it.
-        fitted: parameters beside the piston that were fitted to these pilots.
+        gained_nats: the same of whatever else was fitted to these pilots.
 
     Raises:
         PageError: the page has another shape than the pilots.
@@ -216,7 +216,7 @@ def check_claims(
         claimed_bits=float(claimed.mean() / np.log(2)),
         confirmed_bits=float(confirmed.mean() / np.log(2)),
         noise_bits=float(np.sqrt(variance.sum()) / count / np.log(2)),
-        gained_nats=by_piston + fitted * float(np.log(count)) / 2,
+        gained_nats=by_piston + gained_nats,
     )
 
 
@@ -265,13 +265,13 @@ class PilotReading:
     check: PilotCheck
 
 
-def read_pilots(p: NDArray[np.floating], pilots: Pilots, fitted: int = 0) -> PilotReading:
+def read_pilots(p: NDArray[np.floating], pilots: Pilots, gained_nats: float = 0.0) -> PilotReading:
     """Read a page's pilots, those few left out that contradict all others.
 
     Args:
         p: (px, py), [2, ny, nx].
         pilots: the known symbols of this page.
-        fitted: parameters beside the piston that were fitted to these pilots before.
+        gained_nats: see `check_claims`.
 
     Raises:
         PageError: the page has another shape than the pilots.
@@ -279,7 +279,7 @@ def read_pilots(p: NDArray[np.floating], pilots: Pilots, fitted: int = 0) -> Pil
     sound = without_spoilt(p, pilots)
     piston = estimate_piston(p, sound)
     trust = estimate_trust(p, sound, piston.angle_rad)
-    return PilotReading(piston, trust, check_claims(p, sound, piston.angle_rad, trust, fitted))
+    return PilotReading(piston, trust, check_claims(p, sound, piston.angle_rad, trust, gained_nats))
 
 
 def _errors(p: NDArray[np.floating], pilots: Pilots) -> NDArray[np.complex128]:

@@ -86,9 +86,6 @@ SHARE_MEMORY = 0.2
 FEWEST_PILOTS = 12
 """Pilots of a page from which drift is read: four numbers can be fitted to fewer whatever they are."""
 
-_FITTED = 4
-"""Numbers of a drift."""
-
 
 @dataclass(frozen=True)
 class ImageState:
@@ -233,7 +230,7 @@ class ImageTracker:
         found: FoundImage | None,
         clock: _Clock,
     ) -> _Attempt:
-        """Decode at a place, and again where the page shows that its image lies: the best attempt, with its first step."""
+        """Decode at a place, and again where the page shows that its image lies: the best one, with the first step."""
         enough = SEARCHED_PX if found is not None and found.found else np.inf
         best: _Attempt | None = None
         for _ in range(1 + CORRECTIONS):
@@ -283,7 +280,8 @@ class ImageTracker:
         if rest is None:
             return tilted, guess, prior, read_pilots(tilted.p, pilots).check
         freed = tilted.turned(-self._model.phase_change(rest.drift))
-        return freed, guess + rest.drift, rest.covariance, read_pilots(freed.p, pilots, _FITTED).check
+        check = read_pilots(freed.p, pilots, rest.gained_nats(prior)).check
+        return freed, guess + rest.drift, rest.covariance, check
 
     def _state_at(self, drift: Real, covariance: Real, like: ImageState) -> ImageState:
         """The state of a drift: its shift in the table that is fed, its tilt traced where it is large and certain."""

@@ -249,7 +249,7 @@ def _within(progress: Progress, step: str, start: float, share: float) -> None:
 
 @dataclass(frozen=True)
 class _Judged:
-    """A held-back page: its AIR over the data symbols, bits per symbol, and whether it would not have been given out."""
+    """A held-back page: its AIR over the data symbols, bits per symbol, and why it would not have been given out."""
 
     air: float
     lost: LostPageError | FrameError | None = None

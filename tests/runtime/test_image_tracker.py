@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 
-from optics.pilots import Pilots
+from optics.pilots import PilotCheck, Pilots
 from optics.recording import FramePair
 from optics.registration.image_search import REACH_PX, FoundImage
 from runtime.bundle import Table
 from runtime.decoder import Decoder, Inference
 from runtime.errors import Reason, UnconfirmedPageError
 from runtime.image_drift import SHIFT, TILT, DriftModel, Estimate
-from runtime.image_tracker import ATTEMPTS, RETRACE_RAD, WALK, ImageTracker
+from runtime.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageTracker
 from runtime.tracking import NoTracker
 from tests.runtime import toy
 from tests.runtime.test_image_drift import SLOPES
@@ -201,10 +201,13 @@ def test_a_page_that_is_nowhere_is_lost_with_its_reason_and_moves_nothing(device
         assert caught.value.page is not None
         assert caught.value.page.pilot_trust < 0.1
     np.testing.assert_array_equal(tracker.state.drift, before.drift)
+    assert len(device.searches) == 3  # each of them was looked for
     device.drift = np.array([1.0, 0.0, 0.0, 0.0])
     device.searches.clear()
+    device.decodes.clear()
     assert tracker.decode(device.page(), 16).check.confirmed
-    assert len(device.searches) == 1  # looked for again after pages that were lost
+    assert (len(device.searches), len(device.decodes)) == (0, 1)  # wrong frames between two pages cost them nothing
+    assert tracker.image_px == pytest.approx((1.0, 0.0), abs=1e-3)
 
 
 def test_a_page_whose_image_is_found_but_whose_pilots_disagree_says_that(device: FakeDevice) -> None:
@@ -240,6 +243,32 @@ def test_a_device_that_has_changed_for_good_is_searched_once_and_answered(
     assert len(device.searches) == 1
     assert len(device.decodes) == 5
     assert all(page.check.recalibration_due for page in pages)
+
+
+def test_pages_that_differ_from_one_another_are_not_searched_for(
+    device: FakeDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Few pilots in dim light confirm now more and now less of what is claimed, on a device that is as it was."""
+    tracker = settled(device)
+    rng = np.random.default_rng(6)
+    shares = [float(rng.uniform(0.6, 1.1)) for _ in range(30)]
+    read = iter(shares)
+    monkeypatch.setattr(PilotCheck, "share", property(lambda _: next(read, 0.8)))
+    monkeypatch.setattr("optics.pilots._NOISE_DEVIATIONS", 1e6)
+    for _ in range(10):
+        tracker.decode(device.page(), 16)
+    assert device.searches == []
+
+
+def test_a_device_that_has_changed_since_it_was_read_is_searched_for_once(
+    device: FakeDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracker = settled(device)
+    monkeypatch.setattr("optics.pilots.SOUND_SHARE", 1.5)
+    monkeypatch.setattr(PilotCheck, "share", property(lambda _: 0.6))
+    for _ in range(5):
+        assert tracker.decode(device.page(), 16).check.recalibration_due
+    assert len(device.searches) == 1
 
 
 def test_the_filter_believes_a_page_as_far_as_its_error_allows(device: FakeDevice) -> None:
@@ -285,7 +314,7 @@ def test_attempts_are_bounded_where_the_image_flees(device: FakeDevice) -> None:
         tracker.decode(device.page(), 16)
     finally:
         FakeDecoder.infer = infer  # type: ignore[method-assign]
-    assert len(device.decodes) == ATTEMPTS
+    assert len(device.decodes) == 1 + CORRECTIONS
 
 
 def test_a_fork_learns_on_its_own(device: FakeDevice) -> None:
@@ -355,6 +384,54 @@ def test_the_walk_of_a_restless_device_is_learnt(device: FakeDevice) -> None:
     assert tracker.state.drift[0] - before > 0.06
     quiet = settled(FakeDevice(device.decoder, error=0.03))
     assert quiet.state.walk[0] == WALK[0] ** 2
+
+
+def test_a_knock_says_nothing_of_the_walk(device: FakeDevice) -> None:
+    tracker = settled(device)
+    for knock in ((1.5, -1.0), (9.0, 9.0)):
+        device.drift[SHIFT] = knock
+        tracker.decode(device.page(), 16)
+        np.testing.assert_array_equal(tracker.state.walk, WALK**2)
+
+
+class NoiseDecoder(FakeDecoder):
+    """Says of every page whatever it likes, and is very sure of it."""
+
+    rng = np.random.default_rng(8)
+
+    def infer(self, pair: FramePair, table: Table | None = None) -> Inference:
+        sure = replace(self._decoder.infer(pair), concentration=np.full(toy.PAGE, 300.0, np.float32))
+        return sure.turned(self.rng.uniform(-np.pi, np.pi, toy.PAGE))
+
+
+class NoiseTables(FakeTables):
+    def tilt_of(self, shift_px: Real) -> Real:
+        return 0.2 * shift_px
+
+    def traced(self, tilt_rad: Real) -> Decoder:
+        return NoiseDecoder(self._device, tilt_rad.copy())  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("pilots", [1, 2, 3, 4, 6, 12, 54])
+def test_noise_is_not_given_out_however_few_the_pilots_are(device: FakeDevice, pilots: int) -> None:
+    """Piston and drift are fitted to the same pilots that then confirm the page: few would confirm anything."""
+    tracker = ImageTracker(
+        NoiseDecoder(device, np.zeros(2)),  # type: ignore[arg-type]
+        DriftModel(SLOPES),
+        NoiseTables(device),
+        None,
+    )
+    mask = np.zeros(toy.PAGE, bool)
+    mask.flat[np.linspace(0, mask.size - 1, pilots).astype(int)] = True
+    known = Pilots.of_symbols(mask, toy.symbols_of(16, 1)[0], 16)
+    pair, given_out = device.page(), 0
+    for _ in range(1000):
+        try:
+            tracker.fork().decode(pair, 16, known)
+        except UnconfirmedPageError:
+            continue
+        given_out += 1
+    assert given_out == 0
 
 
 class PhaseDecoder(FakeDecoder):
