@@ -77,12 +77,12 @@ def decode(
             if writer is not None:
                 writer.append(page)
             results.append(page_report(page))
+        if json_path is not None:
+            data = {"target": target, "levels": levels, "pages": results, "refused_pages": [asdict(r) for r in refused]}
+            data["pages_unconfirmed"] = unconfirmed(refused)
+            write_json(json_path, data)
         if refused and not results:
             raise refusal(thing, refused, count)
-    if json_path is not None:
-        data = {"target": target, "levels": levels, "pages": results, "refused_pages": [asdict(r) for r in refused]}
-        data["pages_unconfirmed"] = unconfirmed(refused)
-        write_json(json_path, data)
     click.echo(table(results))
     rates = [rate for result in results if (rate := result["air_bits_per_symbol"]) is not None]
     if rates and fmean(rates) <= 0:
@@ -118,8 +118,9 @@ def page_report(page: RemotePage) -> dict[str, Any]:
 def drifted(due: list[dict[str, Any]]) -> str:
     """What to think of pages that confirm less than they would on the device as it was calibrated."""
     claimed, confirmed = (fmean(result[name] for result in due) for name in ("claimed_bits", "confirmed_bits"))
+    pages = f"{len(due)} {'page' if len(due) == 1 else 'pages'}"
     return (
-        f"the pilots of {len(due)} pages confirm {confirmed:.2f} of the {claimed:.2f} bits a symbol that are claimed: "
+        f"the pilots of {pages} confirm {confirmed:.2f} of the {claimed:.2f} bits a symbol that are claimed: "
         "the device has changed since it was calibrated (lightpage recalibrate)"
     )
 

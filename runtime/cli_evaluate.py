@@ -24,7 +24,7 @@ from runtime.tracking import NoTracker
 @click.option("--recording", required=True, type=click.Path(), help="HDF5 recording with known symbols.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
-@click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow slow shift page by page.")
+@click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
 def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int | None, tracking: bool) -> None:
     """Measure a bundle on the pages of a recording that it has not seen.
 

@@ -50,7 +50,7 @@ _log = logging.getLogger(__name__)
     help="Folder whose recordings a caller may name to recalibrate with.",
 )
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
-@click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow slow shift page by page.")
+@click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
 def serve(
     bundle: str,
     source: str | None,

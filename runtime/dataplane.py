@@ -211,7 +211,7 @@ class DataPlane:
         try:
             page = model.tracker.decode(pair, levels, pilots)
         except LostPageError as error:
-            self.metrics.lost(error.reason)
+            self.metrics.lost(error)
             raise error.about(thing) from None
         self.metrics.page(page, model.version)
         return page

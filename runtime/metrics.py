@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
 
 from runtime.decoder import DecodedPage
-from runtime.errors import Reason
+from runtime.errors import LostPageError, UnconfirmedPageError
 
 if TYPE_CHECKING:
     from threading import Thread
@@ -48,19 +48,22 @@ class ServiceMetrics:
         self.piston.set(page.piston_rad)
         self.pilots.set(page.pilot_coherence)
         self.trust.set(page.pilot_trust)
+        self._check(page)
+        if page.image is not None:
+            self.image.labels("x").set(page.image.shift_x_px)
+            self.image.labels("y").set(page.image.shift_y_px)
+
+    def lost(self, error: LostPageError) -> None:
+        """Count a page that was not given out, which is a sign of drift too."""
+        self.lost_pages.labels(error.reason.value).inc()
+        if isinstance(error, UnconfirmedPageError):
+            self._check(error.decoded)
+
+    def _check(self, page: DecodedPage) -> None:
         self.share.set(page.check.share)
         self.due.set(page.check.recalibration_due)
-        if (image := page.image) is not None:
-            self.image.labels("x").set(image.shift_x_px)
-            self.image.labels("y").set(image.shift_y_px)
-            if image.searched:
-                self.searches.labels(str(image.found).lower()).inc()
-
-    def lost(self, reason: Reason) -> None:
-        """Count a page that was not given out, which is a sign of drift too."""
-        self.lost_pages.labels(reason.value).inc()
-        self.share.set(0.0)
-        self.due.set(1)
+        if page.image is not None and page.image.searched:
+            self.searches.labels(str(page.image.found).lower()).inc()
 
     def in_service(self, version: str) -> None:
         """Say which model decodes now."""

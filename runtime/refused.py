@@ -27,16 +27,22 @@ class RefusedPage:
         page: its number, None where only the service knows it.
         reason: why, for people.
         unconfirmed: whether it was decoded, and its pilots did not bear out the result.
+        loss: why, for programs: the name of a `runtime.errors.Reason`; None of a page that was not decoded.
+        recalibration_due: whether it shows that the device has changed since it was calibrated.
     """
 
     page: int | None
     reason: str
     unconfirmed: bool = False
+    loss: str | None = None
+    recalibration_due: bool = False
 
     @classmethod
     def of(cls, page: int | None, error: LightpageError) -> Self:
         """The page that an error is about."""
-        return cls(page, str(error), isinstance(error, LostPageError))
+        if not isinstance(error, LostPageError):
+            return cls(page, str(error))
+        return cls(page, str(error), True, error.reason.value, error.recalibration_due)
 
 
 def unconfirmed(refused: Sequence[RefusedPage]) -> int:

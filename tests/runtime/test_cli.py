@@ -310,10 +310,11 @@ def test_evaluate_names_and_counts_pages_whose_pilots_contradict_what_was_decode
     assert run(["evaluate", *where, "--json", report]) == 2
     printed = capsys.readouterr()
     assert "1 whose pilots do not bear out what is claimed" in printed.out
-    assert f"1 of {pages} pages that were refused (page 1: page: got pilots that confirm" in printed.err
+    assert f"1 of {pages} pages that were refused (page 1: pilots: got 0.0" in printed.err
     figures = json.loads(report.read_text())
     assert (figures["pages"], figures["pages_unconfirmed"]) == (pages - 1, 1)
-    assert [page["page"] for page in figures["refused_pages"] if page["unconfirmed"]] == [1]
+    refused = [(page["page"], page["loss"], page["recalibration_due"]) for page in figures["refused_pages"]]
+    assert refused == [(1, "PILOTS_DISAGREE", True)]
     assert figures["air_bits_per_symbol"] > 2
     with h5py.File(recording[0], "r+") as file:
         file["symbols"][...] = np.random.default_rng(0).integers(16, size=(pages, *toy.PAGE))
@@ -456,7 +457,7 @@ def test_decode_goes_on_after_bad_pages_and_ends_with_their_names(
     assert f"recording {with_bad_pages}: got 2 of 4 pages that were refused (page 1: " in capsys.readouterr().err
 
 
-def test_decode_of_bad_pages_alone_writes_nothing(
+def test_decode_of_bad_pages_alone_writes_what_was_refused_and_no_symbols(
     service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with h5py.File(recording[0], "r+") as file:
@@ -464,7 +465,9 @@ def test_decode_of_bad_pages_alone_writes_nothing(
     where = ["--target", service.target, "--recording", recording[0]]
     assert run(["decode", *where, "--out", tmp_path / "decoded.h5", "--json", tmp_path / "d.json"]) == 2
     assert "4 of 4 pages" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["d.json", "r.h5"]
+    told = json.loads((tmp_path / "d.json").read_text())
+    assert (told["pages"], len(told["refused_pages"]), told["pages_unconfirmed"]) == ([], 4, 0)
 
 
 def test_decode_names_pages_that_a_recording_does_not_have(
@@ -526,7 +529,7 @@ def test_decode_uses_the_devices_own_pilots_and_refuses_pages_where_they_disagre
             assert len(errors) == 1
             assert "1 of 2 pages that were refused" in errors[0]
             assert "page 1" in errors[0]
-            assert "pilots that confirm" in errors[0]
+            assert "claimed bits a symbol confirmed" in errors[0]
 
 
 def test_recalibrate_and_rollback_work_on_a_running_service(service: LightpageServer, tmp_path: Path) -> None:

@@ -598,7 +598,7 @@ class DriftTracker(NoTracker):
 def test_a_page_whose_pilots_disagree_is_lost_and_not_answered(start: Start) -> None:
     service = start()
     pair = toy.ToyDevice().page(np.random.default_rng(5).integers(16, size=toy.PAGE).astype(np.uint8), 16)
-    with pytest.raises(UnconfirmedPageError, match="frame pair: got pilots that confirm") as caught:
+    with pytest.raises(UnconfirmedPageError, match=r"frame pair: pilots: got 0\.00 of") as caught:
         service.client.decode(pair, 16)
     assert caught.value.reason is Reason.PILOTS_DISAGREE
     assert caught.value.recalibration_due
@@ -621,7 +621,7 @@ def test_a_lost_page_of_the_source_is_named_and_says_why_on_the_wire(start: Star
         service.stub(channel).ReadPage(pb.ReadPageRequest(page=7), timeout=20)
     assert caught.value.code() == grpc.StatusCode.DATA_LOSS
     detail = pb.ErrorDetail.FromString(dict(caught.value.trailing_metadata())["lightpage-error-bin"])
-    assert (detail.kind, detail.thing) == ("UnconfirmedPageError", "page 7 of toy:device")
+    assert (detail.kind, detail.thing) == ("UnconfirmedPageError", "page 7 of toy:device: pilots")
     assert detail.reason == pb.LOSS_REASON_PILOTS_DISAGREE
     assert detail.recalibration_due
 

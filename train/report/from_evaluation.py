@@ -73,6 +73,10 @@ class _Evaluation(_Part):
     refused_pages: list[dict[str, Any]]
 
 
+class _PageCount(_Part):
+    pages: int | None = None
+
+
 def report_of_evaluation(path: Path) -> ReportData:
     """Read the figures of an evaluation, and a page from its bundle if that is still there.
 
@@ -89,7 +93,7 @@ def report_of_evaluation(path: Path) -> ReportData:
         title=f"Evaluation of bundle {bundle.name}, version {found.bundle_version}",
         pages=f"All figures are of {found.pages} pages that the bundle was neither calibrated nor trained on. Of the "
         f"same recording, {found.pages_left_out} pages that it has seen were left out, and {refused} could not be "
-        "decoded.",
+        "decoded or were not confirmed by their pilots.",
         facts=_facts(found),
         profile=profile,
         calibration=calibration,
@@ -115,7 +119,10 @@ def report_of_evaluation(path: Path) -> ReportData:
 def _read(path: Path) -> _Evaluation:
     thing, wanted = f"{path}", "a finished training run, or the JSON that this version's `lightpage evaluate` writes"
     try:
-        return _Evaluation.model_validate_json(path.read_bytes())
+        text = path.read_bytes()
+        if _PageCount.model_validate_json(text).pages == 0:
+            raise InvalidInputError(thing, "an evaluation that read no page", "one of pages that could be read")
+        return _Evaluation.model_validate_json(text)
     except OSError as error:
         raise InvalidInputError(thing, error, wanted) from None
     except ValidationError as error:

@@ -208,6 +208,13 @@ def test_an_evaluation(evaluation: Path, tmp_path: Path) -> None:
     assert "version small-1" in text
 
 
+def test_an_evaluation_that_read_no_page(tmp_path: Path) -> None:
+    path = tmp_path / "e.json"
+    path.write_text(json.dumps({"pages": 0, "pages_left_out": 0, "refused_pages": [{"page": 0}]}))
+    with pytest.raises(InvalidInputError, match="read no page"):
+        report_of_evaluation(path)
+
+
 def test_maps_of_an_evaluation_average_to_its_figures(evaluation: Path) -> None:
     found = json.loads(evaluation.read_text())
     maps = {name: np.array(rows, dtype=float) for name, rows in found["maps"].items()}
