@@ -40,12 +40,12 @@ from benchmarks.image_search_tables import (
 )
 from benchmarks.kept import TRAINED
 from benchmarks.kept_bundle import export_kept, light_of
-from optics.device import CameraPose, Device, draw_device
+from optics.device import Device, draw_device
 from optics.errors import FrameError, InvalidInputError
 from optics.files import OutputFolder, write_json
 from optics.measures import measure
 from optics.page import random_symbols
-from optics.pilots import SOUND_SHARE, Pilots
+from optics.pilots import Pilots
 from optics.profile import load_profile
 from optics.recording import FramePair, Recording
 from optics.registration.image_search import ImageSearch
@@ -54,7 +54,7 @@ from optics.simulator import Simulator, true_parameters
 from runtime.cli import run
 from runtime.decoder import Decoder
 from runtime.errors import UnconfirmedPageError
-from runtime.evaluation import evaluate
+from runtime.evaluation import evaluate, was_seen
 from runtime.image_search import BundleSearch
 from runtime.image_tracker import tracker_for
 from runtime.shipped import DEFAULT, bundle_path
@@ -142,6 +142,11 @@ class Point:
         return figures.air_bits_per_symbol, told
 
 
+def share_of(air: float, reference: float) -> float:
+    """Of a reference page's AIR; 0 where that was not read."""
+    return air / reference if reference > 0 else 0.0
+
+
 def offsets(point: Point, seeds: int) -> Figures:
     """The first page of a decoder that was just started, its image off by so much in any direction."""
     rows = []
@@ -161,7 +166,11 @@ def offsets(point: Point, seeds: int) -> Figures:
                 air, found = point.air(point.tracker.fork(), knocked(simulators[stays], by, written[1]), written[1])
                 rows.append(
                     {"seed": seed, "offset_px": offset, "by_px": by, "reference_stays": stays, "air": air}
-                    | {"share_of_tracked": air / tracked, "extra_seconds": found["seconds"] - told["seconds"], **found}
+                    | {
+                        "share_of_tracked": share_of(air, tracked),
+                        "extra_seconds": found["seconds"] - told["seconds"],
+                        **found,
+                    }
                 )
     return {"rows": rows}
 
@@ -189,9 +198,9 @@ def apart(point: Point, seeds: int) -> Figures:
                     "shift_y_px": pose.shift_y_px + offset * np.sin(way),
                 }
             )
-            device = point.device.model_copy(update={"quadrature_camera": CameraPose(**moved.model_dump())})
+            device = point.device.model_copy(update={"quadrature_camera": moved})
             air, told = point.air(point.tracker.fork(), point.simulator(seed, device).page(written), written)
-            rows.append({"seed": seed, "offset_px": offset, "share_of_tracked": air / tracked, **told})
+            rows.append({"seed": seed, "offset_px": offset, "share_of_tracked": share_of(air, tracked), **told})
     return {"rows": rows}
 
 
@@ -251,14 +260,14 @@ def walk(point: Point, pages: int, way: str) -> Figures:
         air, told = point.air(tracker, simulator.page(written), written)
         rows.append({"place_px": place.tolist(), "air": air, **told})
     rates = [row["air"] for row in rows]
-    last = fmean(rates[-10:]) / rates[0]
-    return {"rows": rows, "first": rates[0], "worst_share": min(rates) / rates[0], "last_share": last}
+    worst, last = (share_of(air, rates[0]) for air in (min(rates), fmean(rates[-10:])))
+    return {"rows": rows, "first": rates[0], "worst_share": worst, "last_share": last}
 
 
 def sound_pages(point: Point, pages: int) -> Figures:
     """Pages of the device as it is, read one after the other: how often one is not given out, or a re-fit is asked."""
     simulator = Simulator(point.decoder.bundle.profile, point.device, LEVELS, _WALKS + 1)
-    tracker, shares, lost = point.tracker.fork(), [], 0
+    tracker, shares, lost, due = point.tracker.fork(), [], 0, 0
     for page in tqdm(range(pages), desc=f"{point.name}: sound pages", unit="page"):
         try:
             found = tracker.decode(simulator.page(point.symbols(_WALKS, 1, page)), LEVELS)
@@ -266,7 +275,7 @@ def sound_pages(point: Point, pages: int) -> Figures:
             lost += 1
         else:
             shares.append(found.check.share)
-    due = sum(share < SOUND_SHARE for share in shares)
+            due += found.check.recalibration_due
     return {"pages": pages, "unconfirmed": lost, "recalibration_due": due, "shares": shares}
 
 
@@ -334,13 +343,13 @@ def gaps(bundle: Path, recording: Path) -> Figures:
         in_order = evaluate(decoder, pages, tracker.fork()).air_per_page
         mask = decoder.bundle.pilot_mask if (own := pages.pilots()) is None else own
         for page in tqdm(range(pages.pages), desc=str(recording), unit="page"):
-            symbols = pages.symbols(page)
-            if symbols is None:
-                raise InvalidInputError(f"recording {recording}", "no symbols", "known symbols to measure against")
+            frames, symbols = pages.frames(page), pages.symbols(page)
+            if symbols is None or was_seen(decoder, frames):
+                continue
             known = Pilots.of_symbols(mask, symbols, pages.levels)
             air, told = 0.0, Figures()
             with suppress(UnconfirmedPageError):
-                decoded = tracker.fork().decode(pages.frames(page), pages.levels, known)
+                decoded = tracker.fork().decode(narrow(frames, pages.bit_depth), pages.levels, known)
                 figures = measure(decoded.phase[~mask], decoded.concentration[~mask], symbols[~mask], pages.levels)
                 assert decoded.image is not None
                 air = figures.air_bits_per_symbol
