@@ -55,6 +55,7 @@ from runtime.cli import run
 from runtime.decoder import Decoder
 from runtime.errors import UnconfirmedPageError
 from runtime.evaluation import evaluate, was_seen
+from runtime.frames import narrow
 from runtime.image_search import BundleSearch
 from runtime.image_tracker import tracker_for
 from runtime.shipped import DEFAULT, bundle_path
