@@ -152,6 +152,24 @@ class TestRandomness:
             assert np.abs(one.astype(int) - other.astype(int)).max() <= 20
             assert one.max() > 20_000
 
+    def test_a_knock_moves_the_image_on_both_cameras_and_it_walks_on_from_there(self) -> None:
+        simulator = Simulator(TINY, gentle(drift=Drift(piston_rad=0, shift_px=0)), levels=16, seed=2, steps=8)
+        simulator.knock((3.0, -2.0))
+        simulator.knock((1.0, 0.0))
+        assert simulator.simulate(symbols(TINY)).shift_px == (4.0, -2.0)
+        assert simulator.simulate(symbols(TINY)).shift_px == (4.0, -2.0)
+
+    def test_a_reference_that_stays_is_not_moved_by_a_knock_and_one_that_comes_along_is(self) -> None:
+        seen = {}
+        for stays in (False, True):
+            simulator = Simulator(TINY, gentle(), levels=16, seed=2, steps=8, reference_stays=stays)
+            before = simulator.references()
+            simulator.knock((3.0, -2.0))
+            seen[stays] = before, simulator.references(), simulator.page(symbols(TINY))
+        assert np.array_equal(seen[True][0].in_phase, seen[True][1].in_phase)
+        # either way it is the same signal; the reference's phase under it differs
+        assert not np.array_equal(seen[True][2].in_phase, seen[False][2].in_phase)
+
     def test_moving_to_another_state_keeps_piston_and_shift(self) -> None:
         simulator = Simulator(TINY, Device(), levels=16, seed=4, steps=8)
         before = simulator.simulate(symbols(TINY))

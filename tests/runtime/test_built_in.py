@@ -64,6 +64,22 @@ def test_weights_that_an_old_graph_lists_as_inputs_are_no_table() -> None:
     assert names_of(graph.built_in({}, ())) == FRAMES | set(toy.TABLE_INPUTS)
 
 
+@pytest.mark.parametrize("raw", [True, False])
+@pytest.mark.parametrize("dtype", ["float32", "float64", "int32", "int64", "uint8"])
+def test_a_default_is_what_the_graph_holds(dtype: str, raw: bool) -> None:
+    values = np.arange(6).reshape(2, 3).astype(dtype)
+    kind = helper.np_dtype_to_tensor_dtype(values.dtype)
+    data = values.tobytes() if raw else values.ravel()
+    default = helper.make_tensor("gain", kind, values.shape, data, raw=raw)
+    inputs = [helper.make_tensor_value_info(name, kind, values.shape) for name in ("x", "gain")]
+    output = helper.make_tensor_value_info("y", kind, values.shape)
+    graph = helper.make_graph([helper.make_node("Add", ["x", "gain"], ["y"])], "g", inputs, [output], [default])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9)
+    found = GraphFile(model.SerializeToString(), "graph").default("gain")
+    assert found.dtype == values.dtype
+    np.testing.assert_array_equal(found, values)
+
+
 @pytest.mark.parametrize("model", [b"", b"no model", toy.decoder_onnx()[:1000]])
 def test_bytes_that_are_no_model_are_refused(model: bytes) -> None:
     with pytest.raises(BundleError, match=r"decoder\.onnx.*wanted an ONNX model"):
