@@ -26,10 +26,11 @@ RUN apt-get update \
     && python3 -m venv /opt/lightpage
 WORKDIR /src
 COPY pyproject.toml constraints.txt LICENSE README.md ./
-COPY optics optics
+COPY lightpage lightpage
 COPY train train
 COPY export export
 COPY runtime runtime
+COPY analysis analysis
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
@@ -51,7 +52,7 @@ WORKDIR /state
 VOLUME ["/bundles", "/state"]
 EXPOSE 50051
 HEALTHCHECK --interval=10s --timeout=5s --start-period=60s --retries=3 \
-    CMD ["python", "-m", "runtime.healthcheck"]
+    CMD ["python", "-m", "runtime.commands.healthcheck"]
 ENTRYPOINT ["lightpage", "serve"]
 CMD ["--source", "simulator:bench", "--address", "0.0.0.0:50051"]
 

@@ -64,7 +64,7 @@ bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: th
 	$(COMPARE) --profile paper --angle -0.6 --symbol-size 2 --pages 12 --steps 4000 --arm coherent --arm refined \
 	    --arm oracle --out runs/bench-decoders/full-size-small-symbols
 	$(COMPARE) --ideal --angle 0 --angle -0.6 --arm mode --published-steps 1125 --out runs/bench-decoders/ideal
-	$(BIN)/python -m benchmarks.speed --decoder fast --decoder coherent --decoder wave --decoder refined \
+	$(BIN)/python -m analysis.speed.speed --decoder fast --decoder coherent --decoder wave --decoder refined \
 	    --decoder "ray 32/64" --decoder "ray 64/128"
 	$(BIN)/python -m benchmarks.scaling
 
@@ -78,7 +78,7 @@ bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 	$(BIN)/lightpage bench
 
 bench-image-search: $(STAMP)  ## how the image is found, followed and confirmed: tables and a picture, in most of an hour
-	$(BIN)/python -m benchmarks.image_search --out runs/bench-image-search
+	$(BIN)/python -m analysis.tracking.image_search --out runs/bench-image-search
 
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
 	$(BIN)/python proto/generate.py

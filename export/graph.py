@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from optics.profile import Profile
-from optics.recording import FramePair
-from train.decoder import SymbolDecoder
-from train.field import FieldRecovery, relative_power
+from lightpage.device.profile import Profile
+from lightpage.recording.reader import FramePair
+from train.models.decoder import SymbolDecoder
+from train.models.field import FieldRecovery, relative_power
 from train.published.decoder import PublishedDecoder, sample_frames
 
 FRAME_INPUTS = ("in_phase", "quadrature")
@@ -54,7 +54,7 @@ class DecoderGraph(nn.Module):
         self.table_inputs = (*TABLE_INPUTS, *decoder.table_inputs)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """Decode one pair: frames and `table_inputs` to `OUTPUTS`; see `optics.registration.table`."""
+        """Decode one pair: frames and `table_inputs` to `OUTPUTS`; see `lightpage.calibration.sampling_table`."""
         seen = len(FRAME_INPUTS) + len(TABLE_INPUTS)
         measured = self.recovery.measure(*tensors[:seen])
         table = dict(zip(self.decoder.table_inputs, tensors[seen:], strict=True))

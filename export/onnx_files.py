@@ -15,8 +15,8 @@ from onnxscript import optimizer
 from torch import nn
 
 from export.graph import FRAME_INPUTS, HALVED, TABLE_INPUTS, FieldGraph, Graph
-from optics.registration.parameters import nominal
-from train.twin import RayTwin
+from lightpage.calibration.parameters import nominal
+from train.models.twin import RayTwin
 
 OPSET = 20
 _FOLDED = 20_000

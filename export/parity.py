@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 
 from export.graph import Graph
-from optics.errors import BundleError
-from optics.recording import FramePair
+from lightpage.errors import BundleError
+from lightpage.recording.reader import FramePair
 
 TOLERANCE = 1e-3
 """Largest error of p relative to its norm in fp32."""

@@ -1,14 +1,14 @@
-"""Errors that only decoding and a running service have, beside those of `optics/errors.py`."""
+"""Errors that only decoding and a running service have, beside those of `lightpage/errors.py`."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 from typing import TYPE_CHECKING, Self
 
-from optics.errors import BusyError, LightpageError
+from lightpage.errors import BusyError, LightpageError
 
 if TYPE_CHECKING:
-    from runtime.decoder import DecodedPage
+    from runtime.decoding.decoder import DecodedPage
 
 
 class SourceError(LightpageError):

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from optics.cli import simulate
-from optics.device import Device
-from optics.profile import Profile, load_profile
-from optics.registration.calibrate import Registered
-from optics.registration.calibration import Calibration, load_calibration
-from optics.registration.parameters import NAMES
-from optics.simulator import true_parameters
-from tests.optics.small import small_profile
+from lightpage.calibration.calibrate import Registered
+from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.parameters import NAMES
+from lightpage.cli.simulate import simulate
+from lightpage.device.profile import Profile, load_profile
+from lightpage.device.state import Device
+from lightpage.simulator.simulator import true_parameters
+from tests.lightpage.small import small_profile
 
 BENCH_PAGES = 3
 SMALL_PAGES = 8
@@ -46,7 +46,7 @@ def bench_calibration(
     bench_recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Profile, Path, Calibration]:
     """The bench profile, a recording of a realistic device, and that device's calibration, made by the command."""
-    from train.cli_calibrate import calibrate
+    from train.commands.calibrate import calibrate
 
     out = _shared_folder(tmp_path_factory) / "bench-calibration.toml"
     with open(f"{out}.lock", "w") as lock:

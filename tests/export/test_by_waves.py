@@ -10,22 +10,22 @@ import pytest
 from click.testing import CliRunner
 from scipy import ndimage
 
-from export.cli_export import export_run
-from optics.device import Device
-from optics.measures import measure
-from optics.page import random_symbols
-from optics.pilots import Pilots
-from optics.recording import FramePair, Recording
-from optics.registration.table import sampling_table
-from optics.simulator import Simulator, true_parameters
-from runtime.cli_evaluate import evaluate
-from runtime.decoder import Decoder
-from runtime.image_drift import SHIFT, DriftModel
-from runtime.image_tracker import WIDEST, ImageTracker, tracker_for
-from tests.optics.small import small_profile
-from train.cli_train import train
-from train.run import load_run
-from train.twin import RayTwin, TorchTwin
+from export.command import export_run
+from lightpage.calibration.sampling_table import sampling_table
+from lightpage.device.state import Device
+from lightpage.metrics.information import measure
+from lightpage.page.pilots import Pilots
+from lightpage.page.symbols import random_symbols
+from lightpage.recording.reader import FramePair, Recording
+from lightpage.simulator.simulator import Simulator, true_parameters
+from runtime.commands.evaluate import evaluate
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.image_drift import SHIFT, DriftModel
+from runtime.decoding.image_tracker import WIDEST, ImageTracker, tracker_for
+from tests.lightpage.small import small_profile
+from train.commands.train import train
+from train.models.twin import RayTwin, TorchTwin
+from train.runs import load_run
 
 DEVICE = Device()
 

@@ -13,28 +13,28 @@ import torch
 from click.testing import CliRunner
 
 from export import cli_export
-from export.cli_export import export, export_run
+from export.command import export, export_run
 from export.graph import TABLE_INPUTS
 from export.parity import check_parity
-from optics.device import Device
-from optics.errors import BundleError, InvalidInputError
-from optics.grid import field_grid
-from optics.page import pilot_mask, random_symbols
-from optics.recording import FramePair
-from optics.registration.calibrate import Registered
-from optics.registration.calibration import Calibration
-from optics.registration.parameters import NAMES, nominal
-from optics.registration.table import sampling_table
-from optics.simulator import Simulator, true_parameters
-from runtime.bundle import Bundle, write_bundle
-from runtime.decoder import Decoder
-from runtime.manifest import FIELD
-from runtime.ort import open_session
+from lightpage.calibration.calibrate import Registered
+from lightpage.calibration.document import Calibration
+from lightpage.calibration.parameters import NAMES, nominal
+from lightpage.calibration.sampling_table import sampling_table
+from lightpage.device.state import Device
+from lightpage.errors import BundleError, InvalidInputError
+from lightpage.page.symbols import pilot_mask, random_symbols
+from lightpage.recording.reader import FramePair
+from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.waves.grid import field_grid
+from runtime.bundle.bundle import Bundle, write_bundle
+from runtime.bundle.manifest import FIELD
+from runtime.decoding.decoder import Decoder
+from runtime.execution.session import open_session
 from tests.export.untrained import untrained_decoder
-from tests.optics.small import small_profile
-from train.fitting import Hyperparameters
-from train.run import GOLDEN, REFERENCES, WEIGHTS, Run, load_run
-from train.twin import RayTwin, TorchTwin
+from tests.lightpage.small import small_profile
+from train.fitting.fit import Hyperparameters
+from train.models.twin import RayTwin, TorchTwin
+from train.runs import GOLDEN, REFERENCES, WEIGHTS, Run, load_run
 
 CHOICES = Hyperparameters(channels=8, blocks=1)
 
@@ -121,7 +121,7 @@ def test_the_fields_own_graph_shows_the_decoders_field(
     np.testing.assert_allclose(field, expected, atol=1e-4)
     np.testing.assert_allclose(left, expected_left, atol=1e-4)
     # as a decoder that looks at the field more coarsely would have it
-    monkeypatch.setattr("runtime.decoder.field_grid", partial(field_grid, step_px=3))
+    monkeypatch.setattr("runtime.decoding.decoder.field_grid", partial(field_grid, step_px=3))
     with pytest.raises(BundleError, match=r"output field.*wanted .*field\.onnx beside it"):
         without.recover_field(*asked)
 

@@ -9,19 +9,19 @@ import numpy as np
 from export.graph import FRAME_INPUTS, DecoderGraph, table_tensors
 from export.onnx_files import decoder_onnx
 from export.parity import check_parity, torch_answer
-from optics.device import Device
-from optics.grid import field_grid
-from optics.page import random_symbols
-from optics.profile import Camera
-from optics.registration.samplers import FieldSampler
-from optics.registration.table import sampling_table
-from optics.simulator import Simulator, true_parameters
-from runtime.ort import open_session
+from lightpage.calibration.samplers import FieldSampler
+from lightpage.calibration.sampling_table import sampling_table
+from lightpage.device.profile import Camera
+from lightpage.device.state import Device
+from lightpage.page.symbols import random_symbols
+from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.waves.grid import field_grid
+from runtime.execution.session import open_session
 from tests.export.untrained import untrained_decoder
-from tests.optics.small import small_profile
-from train.fitting import Hyperparameters
-from train.localizers.coherent import BILINEAR
-from train.twin import RayTwin, TorchTwin
+from tests.lightpage.small import small_profile
+from train.fitting.fit import Hyperparameters
+from train.models.localizers.coherent import BILINEAR
+from train.models.twin import RayTwin, TorchTwin
 
 PROFILE = small_profile().model_copy(update={"camera": Camera(columns_px=685, rows_px=457, pitch_m=2.4e-6)})
 HURRIED = Hyperparameters(channels=8, blocks=1, field_rounds=0, binning=2, samples=3, interpolation=BILINEAR)

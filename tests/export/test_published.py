@@ -10,18 +10,18 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from export.cli_export import export_run
-from optics.errors import BundleError
-from optics.recording import Recording
-from runtime.cli_evaluate import evaluate
-from runtime.decoder import Decoder
-from runtime.evaluation import NothingReadError
-from runtime.recalibration import KnownPages, recalibrate
-from runtime.refit import refit
-from train.cli_train import train
+from export.command import export_run
+from lightpage.errors import BundleError
+from lightpage.recording.reader import Recording
+from runtime.bulk.evaluation import NothingReadError
+from runtime.commands.evaluate import evaluate
+from runtime.decoding.decoder import Decoder
+from runtime.recalibration.recalibration import KnownPages, recalibrate
+from runtime.recalibration.refit import refit
+from train.commands.train import train
 from train.published.recipe import published_decoder
 from train.published.training import PublishedChoices
-from train.run import load_run, load_weights
+from train.runs import load_run, load_weights
 
 
 @pytest.mark.parametrize("localizer", ["none", "mode", "ray"])

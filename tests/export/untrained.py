@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from optics.profile import Profile
-from train.decoder import SymbolDecoder
-from train.fitting import Hyperparameters
+from lightpage.device.profile import Profile
+from train.fitting.fit import Hyperparameters
+from train.models.decoder import SymbolDecoder
 
 
 def untrained_decoder(profile: Profile, parameters: NDArray[np.float64], choices: Hyperparameters) -> SymbolDecoder:

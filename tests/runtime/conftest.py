@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from runtime.bundle import Bundle
-from runtime.decoder import Decoder
+from runtime.bundle.bundle import Bundle
+from runtime.decoding.decoder import Decoder
 from tests.runtime import toy
 
 

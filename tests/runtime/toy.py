@@ -13,16 +13,16 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from optics.errors import CalibrationError
-from optics.page import random_symbols, symbol_phases
-from optics.profile import Profile, parse_profile
-from optics.progress import Progress
-from optics.recording import FramePair, RecordingWriter
-from runtime.bundle import Bundle, npz, write_bundle
-from runtime.decoder import Decoder
-from runtime.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
-from runtime.recalibration import FitReport, FitResult, KnownPages
-from runtime.sources import SourcePage
+from lightpage.device.profile import Profile, parse_profile
+from lightpage.errors import CalibrationError
+from lightpage.page.symbols import random_symbols, symbol_phases
+from lightpage.progress import Progress
+from lightpage.recording.reader import FramePair, RecordingWriter
+from runtime.acquisition.sources import SourcePage
+from runtime.bundle.bundle import Bundle, npz, write_bundle
+from runtime.bundle.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
+from runtime.decoding.decoder import Decoder
+from runtime.recalibration.recalibration import FitReport, FitResult, KnownPages
 
 PROFILE_TOML = """
 schema_version = 1

@@ -29,7 +29,7 @@ SEED = "LIGHTPAGE_FOREIGN_SEED"
 
 def lightpage(*arguments: str, status: int = 0) -> str:
     """Run the command as a user would, in a process of its own; returns what it writes to standard error."""
-    command = [sys.executable, "-m", "runtime.cli", *arguments]
+    command = [sys.executable, "-m", "lightpage.cli.main", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60 * MINUTES, check=False)
     assert done.returncode == status, f"{' '.join(arguments)}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
     return done.stderr

@@ -132,7 +132,7 @@ def test_the_image_is_not_root_quiet_and_checked() -> None:
     assert "USER 10001:10001" in runtime
     assert "ORT_DISABLE_TELEMETRY=1" in runtime
     assert "PYTHONDONTWRITEBYTECODE=1" in runtime
-    assert 'CMD ["python", "-m", "runtime.healthcheck"]' in runtime
+    assert 'CMD ["python", "-m", "runtime.commands.healthcheck"]' in runtime
     assert 'ENTRYPOINT ["lightpage", "serve"]' in runtime
 
 
@@ -234,7 +234,7 @@ import importlib, pkgutil, sys
 for package in ("optics", "runtime"):
     for module in pkgutil.walk_packages(importlib.import_module(package).__path__, package + "."):
         importlib.import_module(module.name)
-print("runtime.cli" in sys.modules, "runtime.healthcheck" in sys.modules)
+print("lightpage.cli.main" in sys.modules, "runtime.commands.healthcheck" in sys.modules)
 """
     assert ask(torchless, imports_everything) == "True True"
 
@@ -259,8 +259,8 @@ def test_the_shipped_bundle_decodes_without_torch(torchless: Path) -> None:
     decodes = """
 import sys
 import numpy as np
-from runtime.decoder import Decoder
-from runtime.shipped import bundle_path
+from runtime.decoding.decoder import Decoder
+from runtime.bundle.shipped import bundle_path
 decoder = Decoder.load(bundle_path("bench"), threads=1)
 page = decoder.decode(decoder.bundle.golden.pair, 16)
 print(page.symbols.shape, bool(np.median(page.confidence) > 0.5), "torch" in sys.modules)

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from optics.errors import InvalidInputError
-from optics.lenses import LENSES
-from optics.profile import Profile
-from optics.recording import FramePair
-from optics.registration.samplers import smooth_reference
+from lightpage.calibration.samplers import smooth_reference
+from lightpage.device.lenses import LENSES
+from lightpage.device.profile import Profile
+from lightpage.errors import InvalidInputError
+from lightpage.recording.reader import FramePair
 from train.published.localizers import NAMES, Localizer, ModeLocalizer, NoLocalizer, RayLocalizer
 from train.published.unet import PublishedUNet, samples_for
 

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from optics.lenses import LensPrescription
-from optics.profile import Profile
-from optics.waves import WaveGeometry, cells_for, mode_detuning, modes_of_plane
-from train.parts import adjoint, matmul, multiply, parts, stacked
+from lightpage.device.lenses import LensPrescription
+from lightpage.device.profile import Profile
+from lightpage.waves.channel import WaveGeometry, cells_for, mode_detuning, modes_of_plane
+from train.models.parts import adjoint, matmul, multiply, parts, stacked
 from train.published.rays import RayTracer
 
 AFFINE_START = (0.98, 0.95)

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from optics.errors import InvalidInputError
-from optics.lenses import LensPrescription, Surface
-from optics.profile import Profile
+from lightpage.device.lenses import LensPrescription, Surface
+from lightpage.device.profile import Profile
+from lightpage.errors import InvalidInputError
 
 _NEWTON_STEPS = 8
 """Each doubles the digits; a lens's surface takes four or five, more only close to a sphere's rim."""
@@ -74,8 +74,8 @@ class _Rays(NamedTuple):
 class RayTracer(nn.Module):
     """Traces the rays of one nominal device. Its pipe is a prism over the parallelogram |x|, |y'| < w/2.
 
-    Without a prescription the lenses are ideal: they obey the sine condition, as in `optics.waves` and `train.twin`. A
-    ray parallel to the axis at (x, y) comes to the centre of the entrance with the direction sines -(x, y)/f, and one
+    Without a prescription the lenses are ideal: they obey the sine condition, as in the wave channel and `train.models.twin`.
+    A ray parallel to the axis at (x, y) comes to the centre of the entrance with the direction sines -(x, y)/f, and one
     that leaves the pipe with sines s lands at f s, wherever it left. With slopes in place of sines every ray would land
     at the same place, as walls keep the length of s, but the outer ones would meet walls sooner.
 

@@ -11,11 +11,11 @@ from lightning.pytorch.callbacks import Callback
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from optics.lenses import lens_of
-from optics.profile import Profile
-from optics.recording import FramePair
-from train.fitting import Fitted, best_kappa_scale, fit, seed_stretch
-from train.material import Material, Trained
+from lightpage.device.lenses import lens_of
+from lightpage.device.profile import Profile
+from lightpage.recording.reader import FramePair
+from train.data.material import Material, Trained
+from train.fitting.fit import Fitted, best_kappa_scale, fit, seed_stretch
 from train.published.decoder import PARAXIAL, PublishedDecoder, make_localizer
 from train.published.states import page_states
 from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
@@ -107,7 +107,7 @@ def train_published(
         localizer, choices, profile, turn: as for `published_decoder`.
         mask: pilots, bool [ny, nx], which are not learnt from.
         training, validation: pages of one recording.
-        callbacks, devices, progress: as for `train.fitting.fit`.
+        callbacks, devices, progress: as for `train.fitting.fit.fit`.
     """
     seed_stretch(run, choices.seed)
     recording = training.recording

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from optics.files import replace_text
-from optics.page import symbol_phases
-from optics.recording import Recording
-from train.features import FeatureExtractor, PageState
+from lightpage.files import replace_text
+from lightpage.page.symbols import symbol_phases
+from lightpage.recording.reader import Recording
+from train.data.features import FeatureExtractor, PageState
 
 _AT_ONCE = 16
 """Pages between two writes of the file."""

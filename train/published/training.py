@@ -14,10 +14,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import Dataset
 
-from optics.page import symbol_phases
-from optics.recording import Recording
-from train.features import PageState
-from train.fitting import DecoderTraining, Page
+from lightpage.page.symbols import symbol_phases
+from lightpage.recording.reader import Recording
+from train.data.features import PageState
+from train.fitting.fit import DecoderTraining, Page
 from train.published.decoder import PARAXIAL, PublishedDecoder
 from train.published.localizers import RayLocalizer
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from optics.errors import InvalidInputError
+from lightpage.errors import InvalidInputError
 
 KERNEL = 5
 LEVELS = 3

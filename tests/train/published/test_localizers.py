@@ -7,9 +7,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from optics.profile import Profile
-from optics.waves import WaveChannel, WaveGeometry, cells_for
-from tests.optics.small import small_profile
+from lightpage.device.profile import Profile
+from lightpage.waves.channel import WaveChannel, WaveGeometry, cells_for
+from tests.lightpage.small import small_profile
 from train.published.decoder import over_reference, sample_pair
 from train.published.localizers import Localizer, ModeLocalizer, NoLocalizer, RayLocalizer, page_places
 

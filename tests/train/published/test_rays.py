@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from optics.errors import InvalidInputError
-from optics.lenses import LENSES, LensPrescription
-from optics.profile import Profile, load_profile
-from optics.registration.parameters import nominal
-from optics.registration.twin import BRANCHES
-from tests.optics.small import small_profile
+from lightpage.calibration.interfaces import BRANCHES
+from lightpage.calibration.parameters import nominal
+from lightpage.device.lenses import LENSES, LensPrescription
+from lightpage.device.profile import Profile, load_profile
+from lightpage.errors import InvalidInputError
+from tests.lightpage.small import small_profile
+from train.models.twin import RayTwin, TorchTwin
 from train.published.rays import RayTracer, Traced, _Rays, _through
-from train.twin import RayTwin, TorchTwin
 
 ACHROMAT = LENSES["AC508-080-A"]
 SLOPED = np.deg2rad(-0.6)

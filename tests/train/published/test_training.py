@@ -10,18 +10,18 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from optics.errors import InvalidInputError
-from optics.page import pilot_mask
-from optics.profile import load_profile
-from optics.recording import FramePair, Recording
+from lightpage.device.profile import load_profile
+from lightpage.errors import InvalidInputError
+from lightpage.page.symbols import pilot_mask
+from lightpage.recording.reader import FramePair, Recording
 from tests.conftest import SMALL_PAGES
-from tests.optics.small import THICK, small_profile
-from train.cli_train import train
-from train.features import PageState
-from train.fitting import Page
+from tests.lightpage.small import THICK, small_profile
+from train.commands.train import train
+from train.data.features import PageState
+from train.fitting.fit import Page
 from train.published.recipe import published_choices, published_decoder, train_published
 from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
-from train.run import load_run
+from train.runs import load_run
 
 STEP_RATES = (1e-3, 2e-4, 1e-4)
 

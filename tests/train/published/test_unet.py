@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from optics.errors import InvalidInputError
+from lightpage.errors import InvalidInputError
 from train.published.unet import HEAD_STRIDES, PublishedUNet, samples_for
 
 

@@ -1,0 +1,1 @@
+"""Studies, reports and comparisons: above all other packages."""

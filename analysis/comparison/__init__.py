@@ -1,0 +1,1 @@
+"""Decoders compared on the same light."""

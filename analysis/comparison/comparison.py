@@ -1,0 +1,475 @@
+"""One light, and every decoder on it: the same recording, the same held-out pages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+from torch.utils.data import Dataset
+
+from analysis.comparison.decoders_figure import MAP
+from analysis.comparison.kept import CALIBRATION, Kept
+from analysis.comparison.levels import LevelFigures, level_figures
+from analysis.comparison.oracle import Oracle
+from analysis.report.data import exit_centroids
+from lightpage.calibration.calibrate import calibrate
+from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.known_pages import known_pages
+from lightpage.device.profile import Profile
+from lightpage.device.state import Device, Sensor
+from lightpage.metrics.information import achievable_rate, measure, own_information, page_kilobytes
+from lightpage.page.symbols import pilot_mask
+from lightpage.progress import percent_bar
+from lightpage.recording.reader import Recording, hash_frames
+from lightpage.simulator.recording_job import RecordingJob
+from lightpage.simulator.simulator import true_parameters
+from train.data.feature_store import FeatureStore, fill
+from train.data.features import FeatureExtractor, PageFeatures
+from train.data.known_light import explained
+from train.data.patches import training_pages
+from train.fitting.curves import Curve
+from train.fitting.fit import (
+    DecoderTraining,
+    Fitted,
+    Hyperparameters,
+    Page,
+    SymbolTraining,
+    best_kappa_scale,
+    decode_pages,
+    fit_network,
+    without_piston,
+)
+from train.models.decoder import LOCALIZERS
+from train.models.field import FieldRecovery, TorchFieldSolver
+from train.models.localizers.coherent import BILINEAR
+from train.models.twin import RayTwin, TorchTwin
+from train.published.localizers import NAMES as PUBLISHED
+from train.published.recipe import train_published
+from train.published.states import page_states
+from train.published.training import FramePages, PublishedChoices
+from train.runs import begin
+from train.trainers.refinement import Prediction, RefinementPages, fit_prediction, fit_refinements, refined_pages
+from train.trainers.symbols import LIKENESS_PAGES
+
+Real = NDArray[np.float64]
+
+LEVELS = 256
+ORACLE = "oracle"
+REFINED = "refined"
+WAVE_REFINED = "wave-refined"
+ORACLE_REFINED = "oracle-refined"
+FIRST_LOOKS = {REFINED: "coherent", WAVE_REFINED: "wave", ORACLE_REFINED: ORACLE}
+"""Arms that look again, and the arm whose first look they share."""
+FAST = "fast"
+HURRIED = Hyperparameters(channels=48, field_rounds=0, binning=2, field_step=3, samples=3, interpolation=BILINEAR)
+"""A coherent decoder for when time counts more than the last half bit."""
+ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, WAVE_REFINED, ORACLE, ORACLE_REFINED)
+WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
+"""Whether a symbol's light meets walls of a pair, as the columns of the table say it."""
+CALIBRATED = 2
+HELD_OUT_SHARE = 0.05
+LAST_SHARE = 0.2
+SETTLED_BITS = 0.02
+"""A decoder whose validation AIR gains as much in that last share of its steps has not learnt what it could."""
+LEVEL_PAGES = 4
+"""Of each number of levels, and as many as are calibrated on: thirty thousand symbols on the bench device."""
+
+
+def calibrated(profile: Profile, recording: Recording, path: Path) -> Calibration:
+    """The calibration from nominal on the recording's first pages, kept in `path`."""
+    if not path.exists():
+        pages = known_pages(recording, profile, range(CALIBRATED))
+        twin, solver = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
+        with percent_bar() as progress:
+            fitted = calibrate(twin, solver, profile, recording.references(), pages, progress)
+        hashes = [hash_frames(page.pair) for page in pages]
+        Calibration.from_registered(fitted, profile, hashes).save(path)
+    return load_calibration(path)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What all arms share.
+
+    Attributes:
+        recording: open.
+        profile, device: nominal and true.
+        fitted: the calibration.
+        out: folder of everything.
+        training, validation, unseen: page numbers.
+        levels: numbers of levels of further recordings, on which confidences are judged.
+        seed: of the recording; theirs follow.
+        kept: of this light.
+    """
+
+    recording: Recording
+    profile: Profile
+    device: Device
+    fitted: Calibration
+    out: Path
+    training: range
+    validation: range
+    unseen: range
+    levels: tuple[int, ...]
+    seed: int
+    kept: Kept
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        profile: Profile,
+        device: Device,
+        levels: tuple[int, ...],
+        seed: int,
+        kept: Kept,
+    ) -> Bench:
+        """Calibrated, and split into pages for training, for validation and for the figures."""
+        kept.bring_calibration()
+        pages = recording.pages - CALIBRATED
+        held, last = max(2, round(HELD_OUT_SHARE * pages)), recording.pages
+        return cls(
+            recording=recording,
+            profile=profile,
+            device=device,
+            fitted=calibrated(profile, recording, kept.light / CALIBRATION),
+            out=kept.light,
+            training=range(CALIBRATED, last - 2 * held),
+            validation=range(last - 2 * held, last - held),
+            unseen=range(last - held, last),
+            levels=levels,
+            seed=seed,
+            kept=kept,
+        )
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """Pilots, bool [ny, nx]."""
+        return pilot_mask(self.profile)
+
+    @property
+    def pages(self) -> list[int]:
+        """All that is not calibrated on, in order."""
+        return [*self.training, *self.validation, *self.unseen]
+
+    def parameters(self, arm: str) -> Real:
+        """The device as an arm knows it, [P]: fitted, or true."""
+        return true_parameters(self.profile, self.device) if arm == ORACLE else self.fitted.vector
+
+    def extractor(self, arm: str) -> FeatureExtractor:
+        """Of the calibrated device; of the true one for what an oracle looks at again, the signal's power left in."""
+        if arm == ORACLE:
+            turn, references = self.device.homodyne.turn_rad, self.recording.references()
+            return FeatureExtractor(self.profile, self.parameters(arm), turn, references, "coherent")
+        choices = HURRIED if arm == FAST else Hyperparameters()
+        return FeatureExtractor(
+            self.profile,
+            self.fitted.vector,
+            self.fitted.turn_rad,
+            self.recording.references(),
+            "coherent" if arm == FAST else arm,
+            rounds=choices.field_rounds,
+            binning=choices.binning,
+            grid=choices.grid(self.profile),
+            coherent=choices.coherent_localizer(self.profile),
+        )
+
+    def symbol_arm(self, name: str, size: str, choices: Hyperparameters) -> Outcome:
+        """Features, then the network at symbol pitch."""
+        if name == FAST:
+            choices = replace(HURRIED, steps=choices.steps, seed=choices.seed)
+            size = f"{choices.channels}x{choices.blocks}x{choices.levels}"
+        else:
+            channels, blocks, levels = map(int, size.split("x"))
+            choices = replace(choices, channels=channels, blocks=blocks, levels=levels)
+        look = FIRST_LOOKS.get(name, name)
+        folder, features, first, preparing = self.first_look(look, size, choices)
+        if name not in FIRST_LOOKS:
+            self.kept.keep(folder)
+            drawn = choices.drawn(self.profile.page_shape)
+            outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing, drawn)
+            return replace(outcome, by_levels=self.at_levels(name, folder, [first], outcome.kappa_scale))
+        extractor, parameters = self.extractor(look), self.parameters(look)
+        pages = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
+        known = explained(extractor, self.profile, parameters, pages)
+        prediction = fit_prediction(self.profile, parameters, known, extractor.grid)
+        counts = len(self.training), len(self.validation)
+        material = RefinementPages(self.recording, self.pages, *counts, features)
+        key = self.key(look)
+        refined = fit_refinements(folder, choices, material, extractor, prediction, first, key, devices=1)
+        self.kept.keep(folder)
+        at = folder / f"refinement-{choices.refinements}"
+        held_out = self.held_out(at / "features")
+        preparing = refined.seconds - sum(one.seconds for one in refined.trained)
+        again = choices.of_refinement()
+        drawn = again.drawn(self.profile.page_shape)
+        arm = f"{name} {choices.refinements}"
+        outcome = self.outcome(arm, size, again.steps, at, refined.last, *held_out, preparing, drawn)
+        looks = [first, *refined.trained]
+        by_levels = self.at_levels(look, at, looks, outcome.kappa_scale, prediction)
+        return replace(outcome, looks=len(looks), by_levels=by_levels)
+
+    def at_levels(
+        self,
+        name: str,
+        folder: Path,
+        looks: list[Fitted[SymbolTraining]],
+        scale: float,
+        prediction: Prediction | None = None,
+    ) -> list[LevelFigures]:
+        """What a decoder is worth among fewer levels, on recordings of their own."""
+        found = []
+        for levels in self.levels:
+            at = folder / f"levels-{levels}"
+            with recorded(
+                self.profile, self.device, LEVEL_PAGES, self.seed + levels, self.out / at.name, levels
+            ) as pages:
+                numbers = list(range(pages.pages))
+                looked = partial(self.features_of, name, pages, numbers)
+                fill(at / "look-0", self.key(name), len(numbers), looked, f"pages of {levels} levels")
+                for number in range(1, len(looks)):
+                    assert prediction is not None
+                    earlier = at / f"look-{number - 1}"
+                    material = RefinementPages(pages, numbers, len(numbers), 0, earlier)
+                    make = partial(
+                        refined_pages,
+                        self.extractor(name),
+                        prediction,
+                        material,
+                        FeatureStore(earlier),
+                        looks[number - 1].module,
+                    )
+                    key = f"{self.key(name)} {looks[number - 1].validation_air}"
+                    fill(at / f"look-{number}", key, len(numbers), make, f"look {number} at them")
+                last = FeatureStore(at / f"look-{len(looks) - 1}")
+                found.append(level_figures(self.decoded(looks[-1].module, last, scale), pages, numbers, self.mask))
+        return found
+
+    def key(self, name: str) -> str:
+        """What the features of an arm depend on, beside the recording."""
+        if name == ORACLE:
+            return ""
+        return self.fitted.to_toml() + (HURRIED.first_look if name == FAST else "")
+
+    def features_of(
+        self, name: str, recording: Recording, pages: Sequence[int], start: int, shift: tuple[float, float]
+    ) -> Iterator[PageFeatures]:
+        """First looks of an arm at pages from a place in their order on, the image having moved by `shift` before."""
+        if name == ORACLE:
+            return Oracle(recording, self.profile, self.device).pages(pages[start:], shift)
+        return self.extractor(name).pages(recording, pages[start:], shift)
+
+    def first_look(
+        self, name: str, size: str, choices: Hyperparameters
+    ) -> tuple[Path, Path, Fitted[SymbolTraining], float]:
+        """Run, features, trained network, and seconds that the features took."""
+        features = self.out / name / "features"
+        make = partial(self.features_of, name, self.recording, self.pages)
+        preparing = fill(features, self.key(name), len(self.pages), make, f"features of {name}")
+        training, (validation, _) = FeatureStore(features, range(len(self.training))), self.held_out(features)
+        patches = training_pages([training], self.mask, choices)
+        folder = self.begun(self.out / name / f"{size}-{choices.steps}", asdict(replace(choices, refinements=0)))
+        return (
+            folder,
+            features,
+            fit_network(folder, choices, self.mask, LEVELS, patches, validation, devices=1),
+            preparing,
+        )
+
+    def held_out(self, features: Path) -> tuple[FeatureStore, FeatureStore]:
+        """Features of the validation pages, and of those for the figures."""
+        first, last, end = len(self.training), len(self.training) + len(self.validation), len(self.pages)
+        return FeatureStore(features, range(first, last)), FeatureStore(features, range(last, end))
+
+    def published_arm(self, name: str, choices: PublishedChoices) -> Outcome:
+        """States of the pages, then a published decoder on raw frames."""
+        states, preparing = page_states(
+            self.out / "states.json", self.fitted.to_toml(), self.recording, self.extractor("coherent"), self.pages
+        )
+        by_page = dict(zip(self.pages, states, strict=True))
+        training, validation, unseen = (
+            FramePages(self.recording, part, [by_page[page] for page in part])
+            for part in (self.training, self.validation, self.unseen)
+        )
+        size = "/".join(map(str, choices.channels))
+        chosen = asdict(choices) | {"channels": list(choices.channels)}
+        folder = self.begun(self.out / name / f"{size.replace('/', '-')}-{choices.steps}", chosen)
+        turn = self.fitted.turn_rad
+        trained = train_published(folder, name, choices, self.profile, turn, self.mask, training, validation, devices=1)
+        self.kept.keep(folder)
+        drawn = choices.steps * choices.batch
+        return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing, drawn)
+
+    def begun(self, folder: Path, options: dict[str, Any]) -> Path:
+        """The folder of a run that was begun with these options; finished, if it was kept."""
+        folder.mkdir(parents=True, exist_ok=True)
+        if self.kept.bring(folder, options):
+            click.echo(f"trained before: {folder.relative_to(self.out.parent)}", err=True)
+        begin(folder, options)
+        return folder
+
+    def decoded(self, module: DecoderTraining[Any], pages: Dataset[Page], scale: float) -> NDArray[np.float32]:
+        """p of all data symbols of pages, piston off and made honest, [2, symbols]."""
+        found = zip(*decode_pages(module, pages), strict=True)
+        return np.concatenate([without_piston(p * scale, t, self.mask)[:, ~self.mask] for p, t in found], axis=1)
+
+    def outcome(
+        self,
+        name: str,
+        size: str,
+        steps: int,
+        folder: Path,
+        trained: Fitted[Any],
+        validation: Dataset[Page],
+        unseen: Dataset[Page],
+        preparing: float,
+        drawn: float,
+    ) -> Outcome:
+        """Figures of the held-out pages, kappa made honest on the validation pages."""
+        module: DecoderTraining[Any] = trained.module
+        scale = best_kappa_scale(module, validation, self.mask)
+        px, py = self.decoded(module, unseen, scale)
+        truth = [self.recording.symbols(page) for page in self.unseen]
+        symbols = np.concatenate([page[~self.mask] for page in truth if page is not None])
+        figures = measure(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
+        by_symbol = np.full(self.profile.page_shape, np.nan)
+        rates = achievable_rate(np.arctan2(py, px), np.hypot(px, py), symbols, LEVELS)
+        by_symbol[~self.mask] = rates.reshape(len(truth), -1).mean(axis=0)
+        np.save(folder / MAP, by_symbol)
+        zones = symbols_by_walls(self.profile, self.fitted)
+        groups = {name: by_symbol[~self.mask & there] for name, there in zones.items()}
+        validated = trained.curves.get("val_air", [])
+        data = int((~self.mask).sum())
+        return Outcome(
+            kappa_scale=scale,
+            validation_curve=validated,
+            training_curve=trained.curves.get("train_air", []),
+            run=str(folder.relative_to(self.out.parent)),
+            arm=name,
+            size=size,
+            steps=steps,
+            air=figures.air_bits_per_symbol,
+            own_mi=figures.own_mi_bits_per_symbol,
+            own_mi_unscaled=float(own_information(np.arctan2(py, px), np.hypot(px, py) / scale, LEVELS).mean()),
+            page_kB=page_kilobytes(figures.air_bits_per_symbol, data),
+            own_mi_kB=page_kilobytes(figures.own_mi_bits_per_symbol, data),
+            by_walls={name: float(air.mean()) if air.size else float("nan") for name, air in groups.items()},
+            validation_air=trained.validation_air,
+            gained_in_last_fifth=gained_at_the_end(validated, steps),
+            preparing_seconds=preparing,
+            training_seconds=trained.seconds,
+            pages_per_second=drawn / trained.seconds,
+        )
+
+
+def symbols_by_walls(profile: Profile, fitted: Calibration) -> dict[str, NDArray[np.bool_]]:
+    """Which symbols' light meets the walls of `WALLS`, bool [ny, nx] each."""
+    met = np.rint(exit_centroids(profile, fitted)).astype(bool)
+    return {name: (met[0] == x) & (met[1] == y) for name, (x, y) in WALLS.items()}
+
+
+def gained_at_the_end(curve: Curve, steps: int) -> float:
+    """What the best of the last fifth of a run's steps has over the best before, of a curve of (step, value)."""
+    late = [value for step, value in curve if step > (1 - LAST_SHARE) * steps]
+    early = [value for step, value in curve if step <= (1 - LAST_SHARE) * steps]
+    return max(late) - max(early) if late and early else float("nan")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one arm reached with a network of one size.
+
+    Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor on its
+    concentrations that the validation pages ask for, `own_mi_unscaled` what it claims without, `looks` how often it
+    looks, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light meets the
+    walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by step. The size is that of the
+    first look's network, steps, times and curves are those of the last look, which goes on from the ones before.
+    `analysis.comparison.decoders.compared` tells `over_oracle` and `over_published`.
+    """
+
+    run: str
+    arm: str
+    size: str
+    steps: int
+    air: float
+    own_mi: float
+    own_mi_unscaled: float
+    page_kB: float
+    own_mi_kB: float
+    by_walls: dict[str, float]
+    validation_air: float
+    gained_in_last_fifth: float
+    preparing_seconds: float
+    training_seconds: float
+    pages_per_second: float
+    kappa_scale: float
+    training_curve: Curve
+    validation_curve: Curve
+    looks: int = 1
+    over_oracle: float | None = None
+    over_published: float | None = None
+    by_levels: list[LevelFigures] = field(default_factory=list)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether more steps would hardly have helped; False if that was not seen."""
+        return self.gained_in_last_fifth < SETTLED_BITS
+
+    def line(self) -> str:
+        over = ["" if ratio is None else f"{ratio:.3f}" for ratio in (self.over_oracle, self.over_published)]
+        walls = "".join(f"{self.by_walls[name]:>7.3f} " for name in WALLS)
+        return (
+            f"{self.arm:<16} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} "
+            f"{self.own_mi - self.air:>7.3f} {self.page_kB:>6.2f} {self.own_mi_kB:>6.2f} "
+            f"{walls}{over[0]:>10} {over[1]:>10} "
+            f"{self.gained_in_last_fifth:>8.3f}{' ' if self.is_settled else UNSETTLED} "
+            f"{self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f} {self.pages_per_second:>7.2f}"
+        )
+
+
+HEADER = (
+    f"{'arm':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} {'own-kB':>6} "
+    + "".join(f"{name:>7} " for name in WALLS)
+    + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8}  {'features':>9} {'training':>8} {'pages/s':>7}"
+)
+"""Held-out pages, bits a symbol and kB a page; own-MI and what it claims beyond the AIR, concentrations multiplied by
+one factor that the validation pages ask for; AIR where a symbol's light meets no wall of the pipe, a wall of pair x,
+of pair y, or of both; AIR over the oracle's, and over that of the best published decoder; of the last look alone, as
+its steps: what validation AIR gained in the last fifth of them (`FOOTNOTE`), minutes of features and of training, and
+pages it trained on a second, validation counted as time: of a kept arm, on the machine that trained it. The network's
+size is the first look's."""
+UNSETTLED = "*"
+FOOTNOTE = (
+    f"{UNSETTLED} still learning: validation AIR gained {SETTLED_BITS} bit or more in the last {LAST_SHARE:.0%} of the"
+    " steps; no comparison with it counts yet"
+)
+
+
+def light_name(device: Device, symbol_size_px: int, apart: str = "") -> str:
+    """Name of the folder of a light; `apart` says what else sets it apart."""
+    geometry, sensor = device.geometry, device.sensor
+    dimmed = "" if sensor.exposure_relative == Sensor().exposure_relative else f"-{sensor.exposure_relative:g}x"
+    return f"{geometry.pipe_angle_deg:g}deg-{sensor.full_well_e:g}e-{symbol_size_px}px{dimmed}{apart}"
+
+
+@contextmanager
+def recorded(
+    profile: Profile, device: Device, pages: int, seed: int, folder: Path, levels: int = LEVELS
+) -> Iterator[Recording]:
+    """The recording of a light, of so many pages and some to calibrate on before them; made if it is not there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    begin(folder, {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed})
+    path = folder / "recording.h5"
+    if not path.exists():
+        job = RecordingJob(profile, device, levels, seed, truth=True, out=path)
+        job.claim(force=False)
+        job.run(CALIBRATED + pages)
+    with Recording.open(path) as recording:
+        yield recording

@@ -1,0 +1,129 @@
+"""Calibrations and trained arms that need not be made again: some take hours, and they are small.
+
+They lie in a folder for each light, which says in its `begun.json` what the light is, and there in a folder for each
+run, which says with which options it was begun.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lightpage.errors import InvalidInputError
+from lightpage.files import replace_file
+from train.fitting.fit import CHECKPOINTS, FITTED, FITTED_WEIGHTS
+from train.runs import BEGUN, FORMAT
+
+TRAINED = Path(__file__).parents[1] / "weights"
+CALIBRATION = "calibration.toml"
+_LARGE = 1000
+"""Numbers of a tensor from which it is kept in half precision."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of a light.
+
+    Attributes:
+        light: folder of the light, with its recording.
+        folder: where it is kept, which need not be there.
+        adds: whether what is trained now is to be kept too.
+    """
+
+    light: Path
+    folder: Path
+    adds: bool = False
+
+    @property
+    def is_of_this_light(self) -> bool:
+        """Whether something is kept, and of just this light: device, pages, seed and the code's format."""
+        return (self.folder / BEGUN).exists() and _read(self.folder / BEGUN) == _read(self.light / BEGUN)
+
+    def bring_calibration(self) -> None:
+        """Copy the calibration to where it would be made again; one that is there stays.
+
+        Raises:
+            InvalidInputError: things are to be kept, where something of another light is kept.
+        """
+        if self.adds and (self.folder / BEGUN).exists() and not self.is_of_this_light:
+            wanted = "device, pages and seed of what is kept there, or another --trained"
+            raise InvalidInputError(f"--keep in {self.folder}", "another light", wanted)
+        if self.is_of_this_light and not (self.light / CALIBRATION).exists():
+            _copy(self.folder / CALIBRATION, self.light / CALIBRATION)
+
+    def bring(self, run: Path, options: dict[str, Any]) -> bool:
+        """Copy a trained run, and what was trained on it, to where it would be trained again.
+
+        Nothing is taken where training has begun, or that was begun with other options or another calibration.
+
+        Args:
+            run: its folder below the light's.
+            options: with which it would be begun.
+
+        Returns:
+            Whether it was copied.
+        """
+        kept = self.folder / run.relative_to(self.light)
+        if (run / FITTED).exists() or (run / CHECKPOINTS).exists() or not (kept / FITTED).exists():
+            return False
+        if not self.is_of_this_light or _read(kept / BEGUN) != {"format": FORMAT, **options}:
+            return False
+        if (self.folder / CALIBRATION).read_text() != (self.light / CALIBRATION).read_text():
+            return False
+        # what says that a training is finished comes last
+        for name in (BEGUN, FITTED_WEIGHTS, FITTED):
+            for path in sorted(kept.rglob(name)):
+                _copy(path, run / path.relative_to(kept))
+        return True
+
+    def keep(self, run: Path) -> None:
+        """Copy a trained run, and what was trained on it, large tensors in half precision, if that was wanted.
+
+        Raises:
+            InvalidInputError: another light, another calibration, or another training with the same options is kept.
+        """
+        if not self.adds:
+            return
+        _copy_or_check(self.light / BEGUN, self.folder / BEGUN)
+        _copy_or_check(self.light / CALIBRATION, self.folder / CALIBRATION)
+        kept = self.folder / run.relative_to(self.light)
+        for path in sorted(run.rglob(FITTED), key=lambda path: len(path.parts)):
+            to = kept / path.parent.relative_to(run)
+            if not (to / FITTED).exists():
+                if (path.parent / BEGUN).exists():
+                    _copy(path.parent / BEGUN, to / BEGUN)
+                weights = torch.load(path.parent / FITTED_WEIGHTS, map_location="cpu", weights_only=True)
+                halved = {name: value.half() if _is_large(value) else value for name, value in weights.items()}
+                to.mkdir(parents=True, exist_ok=True)
+                replace_file(to / FITTED_WEIGHTS, partial(torch.save, halved), "weights")
+            _copy_or_check(path, to / FITTED)
+
+
+def _is_large(value: torch.Tensor) -> bool:
+    return value.is_floating_point() and value.numel() >= _LARGE
+
+
+def _copy(path: Path, to: Path) -> None:
+    """Copy a small file, whole or not at all."""
+    to.parent.mkdir(parents=True, exist_ok=True)
+    content = path.read_bytes()
+    replace_file(to, lambda file: file.write(content))
+
+
+def _copy_or_check(path: Path, to: Path) -> None:
+    if not to.exists():
+        _copy(path, to)
+    elif to.read_bytes() != path.read_bytes():
+        raise InvalidInputError(f"--keep of {path}", f"another one in {to}", "the same one, or another --trained")
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"options {path}", error, "the JSON that was written when the work began") from None

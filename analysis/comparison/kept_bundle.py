@@ -1,0 +1,174 @@
+"""A kept arm of the comparison as a bundle, to measure in the runtime what was trained for a certain light.
+
+    python -m analysis.comparison.kept_bundle --kept analysis/weights/bench/-0.6deg-32e-4px --out bundle.zip
+
+A few pages of the light are simulated anew: they say how strong the light is, and how honest the claims are.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import click
+import numpy as np
+import torch
+
+from analysis.comparison.comparison import CALIBRATED
+from analysis.comparison.kept import CALIBRATION
+from export.command import export_run
+from export.graph import DecoderGraph, table_tensors
+from export.parity import torch_answer
+from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.known_pages import known_pages
+from lightpage.calibration.sampling_table import sampling_table
+from lightpage.cli.main import run as run_command
+from lightpage.device.profile import Profile, parse_profile
+from lightpage.device.state import Device
+from lightpage.errors import InvalidInputError
+from lightpage.files import NewPath, OutputFolder
+from lightpage.page.symbols import pilot_mask, symbol_phases
+from lightpage.recording.reader import Recording, hash_frames
+from lightpage.simulator.recording_job import RecordingJob
+from train.data.features import FeatureExtractor
+from train.data.known_light import explained
+from train.fitting.fit import FITTED, FITTED_WEIGHTS, Hyperparameters, honest_factor, without_piston
+from train.models.decoder import COHERENT, SymbolDecoder
+from train.models.twin import RayTwin, TorchTwin
+from train.runs import BEGUN, GOLDEN, REFERENCES, Run, save_arrays, save_weights
+from train.trainers.refinement import fit_prediction
+from train.trainers.symbols import LIKENESS_PAGES
+
+LEVELS = 256
+JUDGED = 3
+"""Pages by which claims are made honest: thousands of symbols each."""
+
+
+def light_of(kept: Path) -> tuple[Profile, Device, int]:
+    """Profile, true device and seed of a kept light.
+
+    Raises:
+        InvalidInputError: nothing is kept there.
+    """
+    try:
+        begun = json.loads((kept / BEGUN).read_text())
+        profile = parse_profile(begun["--profile"], f"{kept / BEGUN}: profile")
+        return profile, Device.model_validate(begun["device"]), int(begun["--seed"])
+    except (OSError, ValueError, KeyError) as error:
+        raise InvalidInputError(f"--kept {kept}", error, f"the folder of a kept light with its {BEGUN}") from None
+
+
+def export_kept(kept: Path, work: Path, out: Path, localizer: str = COHERENT, refinements: int = 1) -> None:
+    """Write the bundle of an arm.
+
+    Args:
+        kept: folder of the light.
+        work: folder for pages and run; made, and gone on with if it is there.
+        out: new bundle.
+        localizer: whose arm.
+        refinements: passes behind the first, 0 or 1.
+
+    Raises:
+        InvalidInputError: no such arm is kept.
+    """
+    profile, device, seed = light_of(kept)
+    arm = next((folder for folder in sorted((kept / localizer).glob("*")) if (folder / FITTED).exists()), None)
+    if arm is None:
+        raise InvalidInputError(f"--kept {kept}", f"no trained {localizer}", "a localizer that is kept there")
+    work.mkdir(parents=True, exist_ok=True)
+    calibration = load_calibration(kept / CALIBRATION)
+    path = work / "recording.h5"
+    if not path.exists():
+        job = RecordingJob(profile, device, LEVELS, seed, truth=False, out=path)
+        job.claim(force=False)
+        job.run(CALIBRATED + LIKENESS_PAGES + JUDGED)
+    with Recording.open(path) as recording:
+        decoder = _decoder(arm, profile, calibration, recording, localizer, refinements)
+        references, mask = recording.references(), pilot_mask(profile)
+        judged = range(CALIBRATED + LIKENESS_PAGES, recording.pages)
+        run = Run(
+            localizer=localizer,
+            profile_toml=profile.to_toml(),
+            calibration_toml=calibration.to_toml(),
+            hyperparameters=decoder.choices,
+            camera_bit_depth=recording.bit_depth,
+            trained_pages=tuple(hash_frames(recording.frames(page)) for page in judged),
+            validation_air=_validation_air(arm, refinements),
+            kappa_scale=_kappa_scale(decoder, profile, calibration, recording, judged),
+            seconds=0.0,
+            provenance={"command": f"python -m analysis.comparison.kept_bundle --kept {kept.name}", "seed": seed},
+        )
+        save_weights(decoder.state_dict(), work)
+        save_arrays(
+            work / REFERENCES,
+            {"in_phase": references.in_phase, "quadrature": references.quadrature, "pilots": mask},
+        )
+        golden = recording.frames(judged[0])
+        save_arrays(work / GOLDEN, {"in_phase": golden.in_phase, "quadrature": golden.quadrature})
+    run.save(work)
+    export_run(work, out, name=kept.name, version="kept")
+
+
+def _decoder(
+    arm: Path, profile: Profile, calibration: Calibration, recording: Recording, localizer: str, refinements: int
+) -> SymbolDecoder:
+    """The trained decoder, put together as training does it."""
+    begun = json.loads((arm / BEGUN).read_text())
+    options = {name: value for name, value in begun.items() if name != "format"} | {"refinements": refinements}
+    choices = Hyperparameters(**options)
+    decoder = SymbolDecoder(profile, calibration.vector, localizer, choices)
+    decoder.network.load_state_dict(_weights(arm))
+    if refinements:
+        extractor = FeatureExtractor(
+            profile, calibration.vector, calibration.turn_rad, recording.references(), localizer
+        )
+        pages = known_pages(recording, profile, range(CALIBRATED, CALIBRATED + LIKENESS_PAGES))
+        known = explained(extractor, profile, calibration.vector, pages)
+        decoder.prediction = fit_prediction(profile, calibration.vector, known, extractor.grid)
+        decoder.refiners[0].load_state_dict(_weights(arm / "refinement-1"))
+    return decoder.float().eval()
+
+
+def _weights(folder: Path) -> dict[str, torch.Tensor]:
+    kept: dict[str, torch.Tensor] = torch.load(folder / FITTED_WEIGHTS, map_location="cpu", weights_only=True)
+    return kept
+
+
+def _validation_air(arm: Path, refinements: int) -> float:
+    folder = arm / f"refinement-{refinements}" if refinements else arm
+    return float(json.loads((folder / FITTED).read_text())["validation_air"])
+
+
+def _kappa_scale(
+    decoder: SymbolDecoder, profile: Profile, calibration: Calibration, recording: Recording, pages: range
+) -> float:
+    """Factor on p under which pages are most likely, their piston off."""
+    table = sampling_table(TorchTwin(RayTwin(profile)), calibration.vector, calibration.turn_rad, profile)
+    graph = DecoderGraph(profile, decoder, 1.0).eval()
+    tensors = table_tensors(graph, table, recording.references())
+    mask, shown, truths = pilot_mask(profile), [], []
+    for page in pages:
+        symbols = recording.symbols(page)
+        assert symbols is not None
+        truth = symbol_phases(symbols, LEVELS).astype(np.float32)
+        p = torch_answer(graph, recording.frames(page), tensors)["p"]
+        shown.append(without_piston(p, truth, mask)[:, ~mask])
+        truths.append(truth[~mask])
+    return honest_factor(np.concatenate(shown, axis=1), np.concatenate(truths))
+
+
+@click.command()
+@click.option("--kept", required=True, type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--localizer", default=COHERENT, show_default=True)
+@click.option("--refinements", default=1, show_default=True, type=click.IntRange(0, 1))
+@click.option("--work", default=Path("runs/kept-bundle"), show_default=True, type=OutputFolder())
+@click.option("--out", required=True, type=NewPath())
+def main(kept: Path, localizer: str, refinements: int, work: Path, out: Path) -> None:
+    """Export a kept arm of the comparison as a bundle."""
+    export_kept(kept, work / kept.name, out, localizer, refinements)
+    click.echo(out)
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(main, name="python -m benchmarks.kept_bundle"))

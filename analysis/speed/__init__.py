@@ -1,0 +1,1 @@
+"""Decoders timed side by side."""

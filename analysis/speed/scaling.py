@@ -1,0 +1,65 @@
+"""Time per symbol of the coherent decoder in the runtime, page and frames growing together, the symbol's size fixed.
+
+    python -m benchmarks.scaling
+
+`lightpage study scaling` compares it with other decoders, all in torch.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import click
+import numpy as np
+
+from analysis.speed.speed import at_symbol_pitch, frames_of, seconds_of, session_of
+from analysis.studies.scaling import enlarged
+from lightpage.cli.main import run
+from lightpage.device.profile import load_profile
+from lightpage.files import OutputFile, write_json
+from runtime.execution.cpus import available_cpus
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """Median seconds of a page."""
+
+    symbols: int
+    seconds: float
+
+    @property
+    def each_us(self) -> float:
+        """Microseconds a symbol."""
+        return 1e6 * self.seconds / self.symbols
+
+
+@click.command()
+@click.option("--profile", "profile_name", default="bench", show_default=True, help="The smallest device.")
+@click.option("--factor", "factors", type=click.IntRange(1, 16), multiple=True, default=(1, 2, 4, 8), show_default=True)
+@click.option("--repeats", type=click.IntRange(1, 1000), default=5, show_default=True)
+@click.option("--threads", type=click.IntRange(1), help="Of one decode; the usable cores if left out.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def main(
+    profile_name: str, factors: tuple[int, ...], repeats: int, threads: int | None, json_path: Path | None
+) -> None:
+    """Time pages of devices that are so many times as large along each axis."""
+    smallest, threads = load_profile(profile_name), threads or available_cpus()
+    results = []
+    click.echo(f"{'symbols':>8} {'ms a page':>10} {'us a symbol':>12} {'over the smallest':>18}")
+    for factor in sorted(set(factors)):
+        profile = enlarged(smallest, factor)
+        session, feeds = session_of(profile, *at_symbol_pitch(profile, "coherent"), threads), frames_of(profile)
+        session.run(["p"], feeds)
+        seconds = [seconds_of(session, feeds) for _ in range(repeats)]
+        results.append(Scaled(profile.page.columns * profile.page.rows, float(np.median(seconds))))
+        last, over = results[-1], results[-1].each_us / results[0].each_us
+        click.echo(f"{last.symbols:>8,} {1e3 * last.seconds:>10.1f} {last.each_us:>12.2f} {over:>18.3f}")
+    if json_path is not None:
+        figures = {"profile": smallest.name, "threads": threads, "repeats": repeats}
+        write_json(json_path, figures | {"pages": [asdict(result) for result in results]})
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, name="python -m benchmarks.scaling"))

@@ -1,0 +1,1 @@
+"""How the image is found, followed and confirmed."""

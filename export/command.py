@@ -1,0 +1,164 @@
+"""The command `lightpage export`: a finished training run to a bundle that the runtime loads."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from export.graph import (
+    FRAME_INPUTS,
+    DecoderGraph,
+    FieldGraph,
+    Graph,
+    PublishedGraph,
+    published_tensors,
+    table_tensors,
+)
+from export.onnx_files import decoder_onnx, field_onnx, twin_onnx
+from export.parity import check_parity, torch_answer
+from lightpage.calibration.sampling_table import sampling_table
+from lightpage.errors import BundleError
+from lightpage.files import NewPath, OutputFile, write_json
+from lightpage.progress import Progress, percent_bar
+from lightpage.recording.reader import FramePair
+from runtime.bundle.bundle import Bundle, npz, write_bundle
+from runtime.bundle.manifest import DECODER, FIELD, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.frames import narrow
+from runtime.execution.session import open_session
+from train.models.twin import RayTwin, TorchTwin
+from train.published.recipe import published_decoder
+from train.published.training import PublishedChoices
+from train.runs import GOLDEN as RUN_GOLDEN
+from train.runs import REFERENCES, Run, load_arrays, load_decoder, load_run, load_weights
+
+Tensors = dict[str, NDArray[np.generic]]
+PILOT_ARRAYS = {"mask": "pilots", "phases": "pilot_phases"}
+"""Arrays of the bundle's pilots by their name in the run; phases only where the device has fixed ones of its own."""
+_LEAST_CONTRAST = 2.0
+"""Residual of swapped frames over that of right ones below which the two cannot be told apart by it."""
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--out", required=True, type=NewPath(), help="New bundle: a folder, or a .zip.")
+@click.option("--name", default=None, help="Name of the bundle; the profile's if left out.")
+@click.option("--version", "version", default="1", show_default=True)
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def export(run: Path, out: Path, name: str | None, version: str, json_path: Path | None) -> None:
+    """Export a training run, proving the bundle against torch with the runtime's own decoder."""
+    with percent_bar() as progress:
+        bundle, error = export_run(run, out, name, version, progress)
+    size = sum(len(data) for data in bundle.files.values())
+    if json_path is not None:
+        figures = {"bundle": str(out), "version": version, "parity_error": error, "unpacked_bytes": size}
+        write_json(json_path, figures)
+    click.echo(f"{out}: version {version}, p within {error:.1e} of torch, {size / 1e6:.1f} MB unpacked")
+
+
+def export_run(
+    folder: Path,
+    out: Path,
+    name: str | None = None,
+    version: str = "1",
+    progress: Progress = lambda step, share: None,
+) -> tuple[Bundle, float]:
+    """Write the bundle of a run.
+
+    Returns:
+        The bundle as opened again, and the relative error of p against torch on the golden page.
+
+    Raises:
+        InvalidInputError: the run is unfinished.
+        BundleError: `version` is none, or the exported decoder does not say what torch says; nothing stays at `out`.
+    """
+    check_version(version, "--version")
+    if out.exists():
+        raise BundleError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
+    run = load_run(folder)
+    profile, calibration = run.profile, run.calibration
+    twin = RayTwin(profile)
+    kept, golden = load_arrays(folder / REFERENCES), load_arrays(folder / RUN_GOLDEN)
+    references, pair = (
+        narrow(FramePair(arrays["in_phase"], arrays["quadrature"]), run.camera_bit_depth) for arrays in (kept, golden)
+    )
+    frame_dtype = pair.in_phase.dtype.name
+    graph, defaults = _graph(folder, run, references, twin)
+    progress("ask torch", 0.0)
+    expected = torch_answer(graph, pair, defaults)
+    progress("decoder to ONNX", 0.2)
+    decoder = decoder_onnx(graph, frame_dtype, profile.frame_shape, defaults)
+    progress("ask ONNX Runtime", 0.6)
+    session = open_session(decoder, f"{out}: {DECODER}")
+    (answer,) = session.run(["p"], dict(zip(FRAME_INPUTS, (pair.in_phase, pair.quadrature), strict=True)))
+    error = check_parity(expected["p"], np.asarray(answer), str(out))
+    manifest = Manifest(
+        name=name or profile.name,
+        version=version,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        profile=run.profile_toml,
+        calibration=run.calibration_toml,
+        camera_bit_depth=run.camera_bit_depth,
+        frame_dtype="uint8" if frame_dtype == "uint8" else "uint16",
+        metrics={"validation_air_bits_per_symbol": run.validation_air, "training_seconds": run.seconds},
+        calibrated_pages=calibration.calibrated_pages,
+        trained_pages=run.trained_pages,
+        table_inputs=tuple(defaults),
+        residual_output="residual" if "residual" in graph.outputs else None,
+        residual_limit=_residual_limit(graph, pair, defaults),
+        provenance=Provenance(**run.provenance),
+    )
+    files = {
+        DECODER: decoder,
+        TWIN: twin_onnx(twin),
+        **({FIELD: field_onnx(FieldGraph(profile), frame_dtype, defaults)} if isinstance(graph, DecoderGraph) else {}),
+        GOLDEN: npz(in_phase=pair.in_phase, quadrature=pair.quadrature, p=expected["p"]),
+        PILOTS: npz(**{name: kept[key] for name, key in PILOT_ARRAYS.items() if key in kept}),
+    }
+    progress("load the bundle as the service does", 0.8)
+    partial = out.with_name(f".{out.stem}-unproven{out.suffix}")
+    _remove(partial)
+    try:
+        write_bundle(partial, manifest, files)
+        Decoder.load(partial)
+    finally:
+        _remove(partial)
+    write_bundle(out, manifest, files)
+    return Bundle.open(out), error
+
+
+def _graph(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tuple[Graph, Tensors]:
+    """A run's decoder as a graph, and the defaults of its table.
+
+    Raises:
+        InvalidInputError: no weights.
+    """
+    profile, calibration, choices = run.profile, run.calibration, run.hyperparameters
+    if isinstance(choices, PublishedChoices):
+        decoder = published_decoder(run.localizer, choices, profile, references, calibration.turn_rad)
+        published = PublishedGraph(load_weights(folder, decoder), run.kappa_scale).eval()
+        return published, published_tensors(decoder)
+    table = sampling_table(TorchTwin(twin), calibration.vector, calibration.turn_rad, profile)
+    graph = DecoderGraph(profile, load_decoder(folder, run), run.kappa_scale).eval()
+    return graph, table_tensors(graph, table, references)
+
+
+def _residual_limit(graph: Graph, pair: FramePair, defaults: Tensors) -> float | None:
+    """Half way, in ratio, between the residuals of right and of swapped frames; None where both are alike."""
+    if "residual" not in graph.outputs:
+        return None
+    right = float(torch_answer(graph, pair, defaults)["residual"])
+    swapped = float(torch_answer(graph, FramePair(pair.quadrature, pair.in_phase), defaults)["residual"])
+    return float(np.sqrt(right * swapped)) if swapped > _LEAST_CONTRAST * right else None
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""The ground: devices, pages, recordings, waves, calibration, metrics and a simulator; no torch, no network."""

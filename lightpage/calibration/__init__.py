@@ -1,0 +1,1 @@
+"""From a few known pages to a device's geometry."""

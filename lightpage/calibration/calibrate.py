@@ -1,0 +1,423 @@
+"""From nominal geometry to this device: coarse-to-fine registration of a known page by rays, then a fit by waves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.coherence import COHERENT_BRANCHES, page_coherence
+from lightpage.calibration.interfaces import FieldSolver, Twin
+from lightpage.calibration.parameters import PARAMETERS, indices, nominal
+from lightpage.calibration.patch_fit import Fit, fit_parameters
+from lightpage.calibration.patches import (
+    Measurement,
+    Patch,
+    measure,
+    middle_patches,
+    patch_edge,
+    patches,
+    search_window,
+)
+from lightpage.calibration.samplers import FieldSampler, FrameSampler
+from lightpage.calibration.sampling_table import registration_coefficients
+from lightpage.calibration.wave_fit import WaveFit
+from lightpage.device.profile import Profile
+from lightpage.errors import CalibrationError
+from lightpage.progress import Progress
+from lightpage.recording.reader import FramePair
+from lightpage.waves.grid import field_grid, symbol_samples
+
+Real = NDArray[np.float64]
+SIGNIFICANT = 16.0
+"""A patch counts from here: unrelated light reaches it in fewer than one search in a hundred, the widest included."""
+_FEWEST = 5
+"""Patches that must be looked for, and measurements that must be found, to fit anything."""
+_CAMERA_GROUPS = ("in_phase", "quadrature", "centre", "camera_phase")
+_SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "launch")
+_ALL_GROUPS = tuple(dict.fromkeys(p.group for p in PARAMETERS))
+_LEAST_OVER_CHANCE = 8.0
+"""Coherence that a calibration must reach, in units of 1/sqrt(symbols of a page), what chance gives. Measured on the
+bench device: 34 or more where it was found, 18 with half of the symbols wrong; at most 2.3 for the right symbols at
+nominal geometry and 1.2 for unrelated symbols at the right one."""
+LEAST_KEPT = 0.9
+"""Share of a calibration's coherence that other pages of its device show, drifted a little or not: its own pages are
+alike to 0.01; on the bench device a pipe angle that is a degree off leaves 0.87."""
+_LEAST_SIGNIFICANT = 0.1
+"""Share of the searched patches that must be found in the end: half are where the device was found, a quarter with half
+of the symbols wrong (no branch carries light from all of the page)."""
+_REFLECTED = ("x", "y")
+"""Branches without which a device is not known: the direct image says nothing of the pipe's angle, x hardly more."""
+_LEAST_REFLECTED = 0.05
+"""Share of the patches of either reflected branch that must be found in the end: a third of y's are where the device
+was found, unrelated light makes less than one in a hundred."""
+_WANTED = "right symbols and profile, a device in the capture range"
+_WANTED_REFLECTIONS = f"{_WANTED}, a page wide enough for its light to meet the pipe's walls"
+_LEAST_QUADRATURE = 0.5
+"""Sine of the angle between the arms below which the two frames hardly differ."""
+
+
+@dataclass(frozen=True)
+class KnownPage:
+    """A frame pair with the symbols that were written: phasors exp(i theta), [ny, nx]."""
+
+    pair: FramePair
+    symbols: NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Registered:
+    """What registration found.
+
+    Attributes:
+        parameters: [P] fitted vector.
+        deviations: [P] standard deviations.
+        turn: angle between the homodyne arms, radians.
+        coherence_before, coherence_after: mean over the pages, at the start's geometry and at the fitted one.
+        cost: mean squared normalised residual of the last fit of patches.
+        significant: share of the measured patches that were found, in the last stage.
+    """
+
+    parameters: Real
+    deviations: Real
+    turn: float
+    coherence_before: float
+    coherence_after: float
+    cost: float
+    significant: float
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """One round of measuring and fitting, distances in camera pixels."""
+
+    name: str
+    reach_px: float
+    step_px: float
+    groups: tuple[str, ...]
+    branches: tuple[str, ...] = ("direct",)
+    middle_only: bool = False
+    use_phase: bool = False
+    half_rate: bool = False
+    wanted: str = _WANTED
+
+
+_SINGLE_CAMERA = (
+    _Stage("find the direct image", 50, 4, _CAMERA_GROUPS, middle_only=True, half_rate=True),
+    _Stage("follow it outwards", 24, 4, _SHAPE_GROUPS, half_rate=True),
+    _Stage("settle the cameras", 6, 2, _SHAPE_GROUPS),
+)
+_COMPLEX = (
+    _Stage("find the reflections", 32, 4, _ALL_GROUPS, _REFLECTED, half_rate=True, wanted=_WANTED_REFLECTIONS),
+    _Stage("all branches, coarse", 8, 2, _ALL_GROUPS, COHERENT_BRANCHES),
+    _Stage("all branches, fine", 3, 1, _ALL_GROUPS, COHERENT_BRANCHES),
+)
+_PHASES = (_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True),) * 2
+"""Each round halves what is left of the error, since patches are measured about the current geometry; two bring it
+within reach of the waves."""
+_DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True),)
+"""From an earlier calibration: the complex field is right from the start, so nothing is searched camera by camera."""
+_DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3}
+_DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for parameter in PARAMETERS])
+"""How far a device drifts, as a share of what it may lie from nominal. What a fit cannot tell well stays as it was: a
+decoder has learned the earlier calibration's errors, and loses 0.1 bit a symbol where a re-fit draws others."""
+
+
+def calibrate(
+    twin: Twin,
+    solve_field: FieldSolver,
+    profile: Profile,
+    references: FramePair,
+    pages: Sequence[KnownPage],
+    progress: Progress = lambda what, share: None,
+) -> Registered:
+    """Register known pages from nominal geometry.
+
+    Args:
+        twin: ray tracer of the nominal device.
+        solve_field: recovers the complex field from registered frames.
+        profile: the nominal device.
+        references: reference-only frames.
+        pages: one to a few known pages; the first is fitted, all are judged by.
+        progress: told of every stage, and within it of every patch or derivative, so that it may stop the work soon.
+
+    Raises:
+        CalibrationError: nothing within the capture range explains the frames, or the page is too small to tell.
+    """
+    work = _Registration(twin, solve_field, profile, references, list(pages), progress)
+    work.total = len(_SINGLE_CAMERA) + len(_COMPLEX) + len(_PHASES) + 5
+    for stage in _SINGLE_CAMERA:
+        work.single_camera(stage)
+    work.estimate_turn()
+    for stage in _COMPLEX:
+        work.complex_field(stage)
+    work.estimate_turn()
+    work.waves("relation of the cameras", ("in_phase", "quadrature"))
+    for stage in _PHASES:
+        work.complex_field(stage)
+    work.waves("waves", _ALL_GROUPS)
+    return work.result(nominal())
+
+
+def refine(
+    twin: Twin,
+    solve_field: FieldSolver,
+    profile: Profile,
+    references: FramePair,
+    pages: Sequence[KnownPage],
+    start: Real,
+    turn: float,
+    progress: Progress = lambda what, share: None,
+) -> Registered:
+    """Register known pages from an earlier calibration that has drifted: the reflections need no search from nominal.
+
+    Args:
+        start: [P] earlier parameters.
+        turn: earlier angle between the homodyne arms.
+        twin, solve_field, profile, references, pages, progress: as for `calibrate`.
+
+    Raises:
+        CalibrationError: the pages do not fit near the earlier calibration.
+    """
+    work = _Registration(twin, solve_field, profile, references, list(pages), progress)
+    work.parameters, work.turn = start.copy(), turn
+    work.total = len(_DRIFTED) + 2
+    for stage in _DRIFTED:
+        work.complex_field(stage, start, _DRIFT_SCALE)
+    work.waves("waves", _ALL_GROUPS, start, _DRIFT_SCALE)
+    return work.result(start)
+
+
+def least_coherence(symbols: int) -> float:
+    """Coherence of a page of so many symbols above which a geometry is that of the device."""
+    return _LEAST_OVER_CHANCE / math.sqrt(symbols)
+
+
+def check_found(coherence: float, significant: float, symbols: int, reflected: Mapping[str, float]) -> None:
+    """Check that a registration ended at the device and not at a guess.
+
+    Args:
+        coherence: of the known pages with the fitted geometry.
+        significant: share of the patches that were found in the last stage.
+        symbols: number of symbols on a page.
+        reflected: the same share for each reflected branch.
+
+    Raises:
+        CalibrationError: unrelated light would do nearly as well.
+    """
+    least = least_coherence(symbols)
+    if not (coherence >= least and significant >= _LEAST_SIGNIFICANT):
+        raise CalibrationError(
+            "calibration, outcome",
+            f"a coherence of {coherence:.3f} and {significant:.0%} of the patches found",
+            f"at least {least:.3f} and {_LEAST_SIGNIFICANT:.0%}: {_WANTED}",
+        )
+    for branch, share in reflected.items():
+        if not share >= _LEAST_REFLECTED:
+            raise CalibrationError(
+                f"calibration, light that the pipe reflects along {branch}",
+                f"{share:.0%} of the patches found",
+                f"at least {_LEAST_REFLECTED:.0%}: {_WANTED_REFLECTIONS}",
+            )
+
+
+class _Registration:
+    """The state that the stages pass on."""
+
+    def __init__(
+        self,
+        twin: Twin,
+        solve_field: FieldSolver,
+        profile: Profile,
+        references: FramePair,
+        pages: list[KnownPage],
+        progress: Progress,
+    ) -> None:
+        if not pages:
+            raise CalibrationError("calibration", "no known page", "at least one page with known symbols")
+        self.twin, self.solve_field, self.profile = twin, solve_field, profile
+        self.references, self.pages, self.progress = references, pages, progress
+        self.patches = patches(profile)
+        self._samples = symbol_samples(profile)
+        if len(self.patches) < _FEWEST:
+            rows, columns = profile.page_shape
+            raise CalibrationError(
+                f"calibration, profile {profile.name}",
+                f"a page of {columns} x {rows} symbols, which makes {len(self.patches)} patches to look for",
+                f"at least {_FEWEST} patches of about {patch_edge(profile)} x {patch_edge(profile)} symbols",
+            )
+        self.grid = field_grid(profile)
+        self.parameters = nominal()
+        self.deviations = np.zeros_like(self.parameters)
+        self.turn = np.pi / 2
+        self.fit: Fit | None = None
+        self.total = 1
+        self._stage, self._done = "", 0
+        self._pixel = profile.camera.pitch_m
+        self._looked: list[Measurement] = []
+        self._found: list[Measurement] = []
+
+    def _begin(self, what: str) -> None:
+        """Tell of the next stage."""
+        self._stage, self._done = what, self._done + 1
+        self._tell(0.0)
+
+    def _tell(self, share: float) -> None:
+        """Tell what share of the present stage is behind."""
+        self.progress(self._stage, (self._done - 1 + share) / self.total)
+
+    def single_camera(self, stage: _Stage, centre: Real | None = None) -> None:
+        """Measure the direct branch on each camera by itself and fit places and slopes."""
+        self._begin(stage.name)
+        in_phase, quadrature = self._on_each_camera(stage)
+        self._fit(stage, in_phase + quadrature, centre)
+
+    def complex_field(self, stage: _Stage, centre: Real | None = None, prior_scale: float | Real = 1.0) -> None:
+        """Measure branches on the recovered field and fit."""
+        self._begin(stage.name)
+        sampler = FieldSampler(self._field(self.pages[0])[0], self.grid)
+        self._fit(stage, self._measure(sampler, stage, (0, 1)), centre, prior_scale)
+
+    def estimate_turn(self) -> None:
+        """The angle between the arms, from the phases that the same known symbols show on either camera."""
+        stage = _Stage("angle between the arms", 0, 1, (), COHERENT_BRANCHES)
+        self._begin(stage.name)
+        total = 0j
+        for one, other in zip(*self._on_each_camera(stage), strict=True):
+            if min(one.significance, other.significance) > SIGNIFICANT:
+                weight = 1 / (1 / one.significance + 1 / other.significance)
+                total += weight * np.exp(1j * (one.phase - other.phase))
+        self.turn = float(np.angle(total))
+        if abs(np.sin(self.turn)) < _LEAST_QUADRATURE:
+            raise CalibrationError(
+                "angle between the homodyne arms", f"{np.rad2deg(self.turn):.0f} degrees", "about +90 or -90 degrees"
+            )
+
+    def waves(
+        self, what: str, groups: tuple[str, ...], centre: Real | None = None, prior_scale: float | Real = 1.0
+    ) -> None:
+        """Fit `groups` and the angle between the arms to the waves of the first page."""
+        self._begin(what)
+        page = self.pages[0]
+        fit = WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
+        found = fit.fit(self.parameters, self.turn, groups, centre, prior_scale, self._tell)
+        self.parameters, self.deviations, self.turn = found.parameters, found.deviations, found.turn
+
+    def result(self, before: Real) -> Registered:
+        """Judge the outcome; `before` is the geometry that it is compared with."""
+        if self.fit is None:
+            raise CalibrationError("calibration", "no fit", "at least one stage")
+        self._begin("coherence")
+        after = self._coherence(self.parameters)
+        significant = len(self._found) / len(self._looked)
+        reflected = {branch: self._share(branch) for branch in _REFLECTED}
+        check_found(after, significant, self.pages[0].symbols.size, reflected)
+        return Registered(
+            parameters=self.parameters,
+            deviations=self.deviations,
+            turn=self.turn,
+            coherence_before=self._coherence(before, 0.5),
+            coherence_after=after,
+            cost=self.fit.cost,
+            significant=significant,
+        )
+
+    def _share(self, branch: str) -> float:
+        """Share of the patches of a branch that the last stage found."""
+        looked, found = (sum(m.branch == branch for m in part) for part in (self._looked, self._found))
+        return found / looked if looked else 0.0
+
+    def _coherence(self, parameters: Real, begun: float = 0.0) -> float:
+        """Mean over the pages; takes half of the stage, of which the share `begun` is behind."""
+        found = []
+        for number, page in enumerate(self.pages):
+            self._tell(begun + number / len(self.pages) / 2)
+            sampler = FieldSampler(self._field(page, parameters)[0], self.grid)
+            found.append(page_coherence(sampler, self.twin, parameters, self.profile, page.symbols))
+        return float(np.mean(found))
+
+    def _field(
+        self, page: KnownPage, parameters: Real | None = None, turn: float | None = None
+    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+        registration = registration_coefficients(
+            self.twin, self.parameters if parameters is None else parameters, self.profile
+        )
+        turn = self.turn if turn is None else turn
+        homodyne = np.array([np.cos(turn), np.sin(turn)], dtype=np.float32)
+        return self.solve_field(page.pair, self.references, registration, homodyne)
+
+    def _frame_samplers(self, page: KnownPage) -> list[FrameSampler]:
+        frames = (page.pair.in_phase, page.pair.quadrature)
+        references = (self.references.in_phase, self.references.quadrature)
+        return [
+            FrameSampler(frame, reference, camera, self.twin, self.parameters)
+            for camera, (frame, reference) in enumerate(zip(frames, references, strict=True))
+        ]
+
+    def _where(self, stage: _Stage) -> list[Patch]:
+        if not stage.middle_only:
+            return self.patches
+        return middle_patches(self.profile, self.patches, _FEWEST)
+
+    def _on_each_camera(self, stage: _Stage) -> list[list[Measurement]]:
+        """The first page's patches as either camera sees them by itself."""
+        return [
+            self._measure(sampler, stage, (camera,), camera / 2)
+            for camera, sampler in enumerate(self._frame_samplers(self.pages[0]))
+        ]
+
+    def _measure(
+        self, sampler: FrameSampler | FieldSampler, stage: _Stage, cameras: tuple[int, ...], begun: float = 0.0
+    ) -> list[Measurement]:
+        """The first page's patches as `sampler` sees them.
+
+        Args:
+            sampler: the field, or one camera's light.
+            stage: what to look for.
+            cameras: through which of the two; each takes half of the stage.
+            begun: share of the stage that is behind.
+        """
+        window = search_window(stage.reach_px * self._pixel, stage.step_px * self._pixel)
+        where, found = self._where(stage), list[Measurement]()
+        for number, patch in enumerate(where):
+            self._tell(begun + number / len(where) * len(cameras) / 2)
+            found += measure(
+                sampler,
+                self.twin,
+                self.parameters,
+                self.profile,
+                patch,
+                self.pages[0].symbols,
+                stage.branches,
+                window,
+                samples=max(1, self._samples // 2) if stage.half_rate else self._samples,
+                cameras=cameras,
+            )
+        return found
+
+    def _fit(
+        self, stage: _Stage, found: list[Measurement], centre: Real | None, prior_scale: float | Real = 1.0
+    ) -> None:
+        good = [m for m in found if m.significance > SIGNIFICANT]
+        self._looked, self._found = found, good
+        if len(good) < _FEWEST:
+            best = max((m.significance for m in found), default=0.0)
+            raise CalibrationError(
+                f"calibration, stage '{stage.name}'",
+                f"{len(good)} of {len(found)} patches of known symbols found (best significance {best:.1f})",
+                f"at least {_FEWEST} above {SIGNIFICANT:.0f}: {stage.wanted}",
+            )
+        self.fit = fit_parameters(
+            self.twin,
+            self.profile,
+            good,
+            self.parameters,
+            indices(*stage.groups),
+            use_phase=stage.use_phase,
+            centre=centre,
+            prior_scale=prior_scale,
+        )
+        self.parameters = self.fit.parameters

@@ -1,0 +1,185 @@
+"""The calibration document: what calibration found of one device, as checked TOML."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, field_serializer
+
+from lightpage.calibration.calibrate import Registered
+from lightpage.calibration.parameters import NAMES, as_dict, as_vector
+from lightpage.device.profile import Count, Finite, Profile, Table, to_toml, validate
+from lightpage.errors import ProfileError
+from lightpage.files import replace_text
+
+Real = NDArray[np.float64]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+PageHash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+_ADDED = {"parameters": {"lens_path_relative": -1.0}, "deviations": {"lens_path_relative": 0.0}}
+"""What documents lack that were written before it: they took lenses for ideal."""
+
+
+def _names_problem(values: dict[str, Any]) -> str:
+    """Which names are missing or unknown, in words; empty when they are just those of the twin's parameters."""
+    missing = [name for name in NAMES if name not in values]
+    unknown = sorted(set(values) - set(NAMES))
+    parts = [("no " + ", ".join(missing)) if missing else "", ("unknown " + ", ".join(unknown)) if unknown else ""]
+    return "; ".join(part for part in parts if part)
+
+
+def _just_the_names(values: dict[str, float]) -> dict[str, float]:
+    problem = _names_problem(values)
+    if problem:
+        raise ValueError(problem)
+    return {name: values[name] for name in NAMES}
+
+
+class Calibration(Table):
+    """Fitted geometry of one device against its nominal profile.
+
+    Attributes:
+        schema_version: 1.
+        profile_name: name of the nominal profile that the numbers deviate from.
+        turn_rad: angle between the homodyne arms, radians: 90 degrees plus error, negative when Q is inverted.
+        coherence_before, coherence_after: of the known pages at nominal and at fitted geometry, 0 to 1.
+        coherence_at_first: `coherence_after` of the calibration from nominal, where this is a re-fit that followed it.
+        cost: mean squared normalised residual of the fit, about 1 when the twin explains the measurements.
+        significant: share of the measured patches that were found, 0 to 1.
+        pages_used: known pages that were fitted on or judged by.
+        calibrated_pages: their SHA-256 (`hash_frames`), so that no figure counts them as held out.
+        parameters: fitted value of every parameter of `lightpage.calibration.parameters`, in the unit of its name.
+        deviations: their standard deviations, same names and units.
+    """
+
+    schema_version: Literal[1] = 1
+    profile_name: Annotated[str, Field(min_length=1)]
+    turn_rad: Finite
+    coherence_before: Share
+    coherence_after: Share
+    coherence_at_first: Share | None = None
+    cost: NonNegative
+    significant: Share
+    pages_used: Count
+    calibrated_pages: tuple[PageHash, ...]
+    parameters: Annotated[dict[str, Finite], AfterValidator(_just_the_names)]
+    deviations: Annotated[dict[str, NonNegative], AfterValidator(_just_the_names)]
+
+    @field_serializer("calibrated_pages")
+    def _as_list(self, pages: tuple[str, ...]) -> list[str]:
+        return list(pages)
+
+    @classmethod
+    def from_registered(cls, registered: Registered, profile: Profile, hashes: Sequence[str]) -> Self:
+        """The document of a registration.
+
+        Args:
+            registered: what registration found.
+            profile: the nominal device.
+            hashes: SHA-256 of the known pages, one each.
+        """
+        return cls(
+            profile_name=profile.name,
+            turn_rad=float(registered.turn),
+            coherence_before=float(registered.coherence_before),
+            coherence_after=float(registered.coherence_after),
+            cost=float(registered.cost),
+            significant=float(registered.significant),
+            pages_used=len(hashes),
+            calibrated_pages=tuple(hashes),
+            parameters=as_dict(registered.parameters),
+            deviations=as_dict(registered.deviations),
+        )
+
+    def followed_by(self, fitted: Self) -> Self:
+        """A re-fit that started here, with what it has to remember of this one.
+
+        It remembers the coherence at first, so that many small losses are not taken for none, and the pages of every
+        earlier fit, so that no figure counts one of them as held out.
+        """
+        return fitted.model_copy(
+            update={
+                "coherence_at_first": self.reference_coherence,
+                "calibrated_pages": (*self.calibrated_pages, *fitted.calibrated_pages),
+            }
+        )
+
+    @property
+    def reference_coherence(self) -> float:
+        """The coherence that later fits are measured by: that of the calibration from nominal."""
+        return self.coherence_after if self.coherence_at_first is None else self.coherence_at_first
+
+    @property
+    def fitted(self) -> frozenset[str]:
+        """Names of the parameters that were fitted; the others, as the lenses' path where they are ideal, were held."""
+        return frozenset(name for name, deviation in self.deviations.items() if deviation > 0)
+
+    @property
+    def vector(self) -> Real:
+        """The fitted parameters as a ray twin takes them, [P]."""
+        return as_vector(self.parameters)
+
+    def angle_deg(self, profile: Profile) -> float:
+        """Angle of the pipe, degrees: the profile's and what was fitted on top."""
+        return profile.pipe.angle_deg + float(np.rad2deg(self.parameters["pipe_angle_rad"]))
+
+    def check_profile(self, profile: Profile) -> None:
+        """Check that the calibration belongs to devices of `profile`.
+
+        Raises:
+            ProfileError: it was made for another profile.
+        """
+        if self.profile_name != profile.name:
+            raise ProfileError(
+                "calibration: profile_name", repr(self.profile_name), f"{profile.name!r}, the profile in use"
+            )
+
+    def to_toml(self) -> str:
+        """The document as TOML text; `parse_calibration` reads it back to an equal calibration."""
+        return to_toml(self, without=("coherence_at_first",) if self.coherence_at_first is None else ())
+
+    def save(self, path: str | Path) -> None:
+        """Write the document, replacing what is there in one step.
+
+        Raises:
+            InvalidInputError: the path cannot be written.
+        """
+        replace_text(path, self.to_toml(), "calibration file")
+
+
+def parse_calibration(text: str, source: str = "calibration") -> Calibration:
+    """Read a calibration from TOML text.
+
+    Raises:
+        ProfileError: not TOML, or a missing, unknown or unphysical key; the message names it.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ProfileError(source, f"text that is not TOML ({error})", "a TOML document") from None
+    for table in ("parameters", "deviations"):
+        values = data.get(table)
+        if isinstance(values, dict):
+            data[table] = values = _ADDED[table] | values
+        problem = _names_problem(values) if isinstance(values, dict) else ""
+        if problem:
+            raise ProfileError(f"{source}: [{table}]", problem, "every parameter of the ray twin and no other")
+    return validate(Calibration, data, source)
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a calibration from a TOML file.
+
+    Raises:
+        ProfileError: unreadable, not TOML, or a missing, unknown or unphysical key; the message names it.
+    """
+    try:
+        text = Path(path).read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ProfileError(f"calibration file {path}", error, "a readable TOML file") from None
+    return parse_calibration(text, f"calibration file {path}")

@@ -1,0 +1,111 @@
+"""The sampling table: what a decoder must know of the geometry, symbol by symbol, made by tracing a twin.
+
+Per branch and symbol it holds the place and phase of the symbol's centre and their Taylor coefficients, so that a
+decoder rebuilds both at every sample of the symbol: places are linear in the offset, phases quadratic to 1e-3 rad.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.interfaces import Twin
+from lightpage.device.profile import Profile
+from lightpage.waves.grid import field_grid
+
+Real = NDArray[np.float64]
+Table = dict[str, NDArray[np.float32]]
+
+SAMPLING_TABLE = ("registration", "homodyne", "parameters", "places", "place_gradients", "phases", "positions")
+"""Names of the table's tensors, as inputs of an exported decoder."""
+
+_FIT_POINTS = 9
+
+
+def monomial_powers() -> list[tuple[int, int]]:
+    """Powers (of x, of y) of a cubic's ten terms, the order of `registration`'s last axis."""
+    return [(i, j) for j in range(4) for i in range(4 - j)]
+
+
+def symbol_centres(profile: Profile) -> Real:
+    """Centres of all symbols as (x, y), [ny * nx, 2], metres from the page's centre, row by row."""
+    rows, columns = profile.page_shape
+    x = (np.arange(columns) - (columns - 1) / 2) * profile.symbol_pitch_m
+    y = (np.arange(rows) - (rows - 1) / 2) * profile.symbol_pitch_m
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def registration_coefficients(twin: Twin, parameters: Real, profile: Profile) -> NDArray[np.float32]:
+    """Pixels of both cameras as cubics in the grid's coordinates over the page's corner radius, [2, 2, 10]."""
+    grid = field_grid(profile)
+    x, y = np.linspace(grid.x_m[0], grid.x_m[-1], _FIT_POINTS), np.linspace(grid.y_m[0], grid.y_m[-1], _FIT_POINTS)
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    u, v = places.T / profile.corner_m
+    terms = np.stack([u**i * v**j for i, j in monomial_powers()], axis=-1)
+    pixels = twin.pixels(parameters, places)
+    coefficients = [np.linalg.lstsq(terms, camera, rcond=None)[0].T for camera in pixels]
+    return np.stack(coefficients).astype(np.float32)
+
+
+def shifted(registration: NDArray[np.float32], shift_px: Real) -> NDArray[np.float32]:
+    """The registration [2, 2, 10] of an image that lies (x, y) camera pixels from where calibration saw it."""
+    moved = registration.copy()
+    moved[..., monomial_powers().index((0, 0))] += np.asarray(shift_px, dtype=np.float32)
+    return moved
+
+
+def sampling_table(twin: Twin, parameters: Real, turn: float, profile: Profile) -> Table:
+    """Trace the whole page.
+
+    Args:
+        twin: ray tracer of the device.
+        parameters: [P] fitted parameters.
+        turn: angle between the homodyne arms, radians (90 degrees plus error, negative when Q is inverted).
+        profile: the nominal device.
+
+    Returns:
+        registration [2, 2, 10]; homodyne [2] (cosine and sine of the turn); parameters [P] themselves; with one symbol
+        pitch as the unit of offset: places [B, 2, ny, nx] in grid samples (column, row), place_gradients [B, 4, ny, nx]
+        as (dx/dx, dx/dy, dy/dx, dy/dy), phases [B, 6, ny, nx] as (value, d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2), the
+        value within +-pi; positions [2, ny, nx], exit centroid over the pipe's width.
+    """
+    grid = field_grid(profile)
+    rows, columns = profile.page_shape
+    centres = symbol_centres(profile)
+    step = profile.symbol_pitch_m / 2
+    offsets = {(i, j): np.array([i, j]) * step for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    places, phases = {}, {}
+    positions = np.empty(0)
+    for key, offset in offsets.items():
+        rays = twin.trace(parameters, centres + offset, centres)
+        places[key], phases[key] = rays.places, rays.phases
+        if key == (0, 0):
+            positions = rays.positions
+    origin = np.array([grid.x_m[0], grid.y_m[0]])
+    middle = (places[0, 0] - origin) / grid.pitch_m
+    along_x = (places[1, 0] - places[-1, 0]) / grid.pitch_m
+    along_y = (places[0, 1] - places[0, -1]) / grid.pitch_m
+    value = phases[0, 0]
+    taylor = [
+        np.angle(np.exp(1j * value)),
+        phases[1, 0] - phases[-1, 0],
+        phases[0, 1] - phases[0, -1],
+        4 * (phases[1, 0] - 2 * value + phases[-1, 0]),
+        phases[1, 1] - phases[1, -1] - phases[-1, 1] + phases[-1, -1],
+        4 * (phases[0, 1] - 2 * value + phases[0, -1]),
+    ]
+
+    def as_maps(stack: Real) -> NDArray[np.float32]:
+        """[B, N, C] to [B, C, ny, nx]."""
+        return np.moveaxis(stack, -1, 1).reshape(len(stack), -1, rows, columns).astype(np.float32)
+
+    gradients = np.stack([along_x[..., 0], along_y[..., 0], along_x[..., 1], along_y[..., 1]], axis=-1)
+    return {
+        "registration": registration_coefficients(twin, parameters, profile),
+        "homodyne": np.array([np.cos(turn), np.sin(turn)], dtype=np.float32),
+        "parameters": parameters.astype(np.float32),
+        "places": as_maps(middle),
+        "place_gradients": as_maps(gradients),
+        "phases": as_maps(np.stack(taylor, axis=-1)),
+        "positions": np.ascontiguousarray(positions.T.reshape(2, rows, columns), dtype=np.float32),
+    }

@@ -1,0 +1,158 @@
+"""The wave model of a calibrated device: the simulation's channel with the ray twin's fitted parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.parameters import as_dict
+from lightpage.calibration.phases import camera_phase, launch_phase
+from lightpage.device.profile import Profile
+from lightpage.waves.channel import WaveChannel, WaveGeometry, cells_for
+from lightpage.waves.grid import FieldGrid, field_grid, splitting_steps
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+_ILLUMINATION = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+"""Powers of (x, y) in an illumination."""
+
+
+def fitted_geometry(profile: Profile, value: Mapping[str, Any]) -> WaveGeometry:
+    """The geometry of fitted parameters by name, numbers or tensors."""
+    return WaveGeometry(
+        wavelength_m=profile.light.wavelength_m,
+        focal_length_m=profile.lens.focal_length_m * (1 + value["focal_length_relative"]),
+        pipe_length_m=profile.pipe.length_m * (1 + value["pipe_length_relative"]),
+        pipe_width_m=profile.pipe.width_m * (1 + value["pipe_width_relative"]),
+        refractive_index=profile.pipe.refractive_index,
+        pipe_angle=np.deg2rad(profile.pipe.angle_deg) + value["pipe_angle_rad"],
+        pipe_roll=value["pipe_roll_rad"],
+        lens_path=profile.seidel_terms(1 + value["lens_path_relative"]),
+    )
+
+
+def modulator_axes(profile: Profile, samples: int) -> tuple[Real, Real]:
+    """Places of so many samples per symbol and axis from the page's centre, [nx samples] and [ny samples], metres."""
+    rows, columns = (count * samples for count in profile.page_shape)
+    pitch = profile.symbol_pitch_m / samples
+    x, y = ((np.arange(count) - (count - 1) / 2) * pitch for count in (columns, rows))
+    return np.asarray(x), np.asarray(y)
+
+
+def fitted_launch_phase(profile: Profile, value: Mapping[str, Any], geometry: WaveGeometry, x_m: Any, y_m: Any) -> Any:
+    """Smooth phase at the launch side, radians, of places from the page's centre; numbers, arrays or tensors."""
+    corner = profile.corner_m
+    at = launch_phase(value, x_m / corner, y_m / corner)
+    return at - _ramp(value, geometry, x_m, y_m)
+
+
+def fitted_camera_phase(profile: Profile, value: Mapping[str, Any], geometry: WaveGeometry, x_m: Any, y_m: Any) -> Any:
+    """Smooth phase against the reference at places of the camera plane, radians; numbers, arrays or tensors."""
+    corner = profile.corner_m
+    edges = profile.page_width_m / 2 / corner, profile.page_height_m / 2 / corner
+    return camera_phase(value, x_m / corner, y_m / corner, *edges) + _ramp(value, geometry, x_m, y_m)
+
+
+def _ramp(value: Mapping[str, Any], geometry: WaveGeometry, x_m: Any, y_m: Any) -> Any:
+    """What a pipe off the lenses' axis does."""
+    per_metre = geometry.wave_number / geometry.focal_length_m
+    return per_metre * (value["pipe_centre_x_m"] * x_m + value["pipe_centre_y_m"] * y_m)
+
+
+class FittedWaves:
+    """Modulator to common grid and back, with fitted geometry and smooth phases.
+
+    Args:
+        profile: the nominal device.
+        parameters: [P] fitted (or, for an oracle, true) parameters of the ray twin.
+        samples: samples per symbol and axis on the modulator's side.
+        filled: whether each sample stands for a pixel of that size; else for a point.
+        stride: samples of the common grid from one to the next that is computed.
+        accuracy: share of the splitting steps that a simulation takes.
+        grid: the common grid, where it is not the usual one.
+        like: waves whose work is shared where geometry and sampling are the same.
+
+    Attributes:
+        x, y: places of the modulator's samples over the page's half width and half height, [nx samples], [ny samples].
+        channel: lenses and pipe.
+        launch: [ny samples, nx samples] phasor of the smooth phases at the launch side.
+        against_reference: [Gy, Gx] phasor of the smooth phases at the camera, which multiplies all light there.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        parameters: Real,
+        samples: int,
+        *,
+        filled: bool = False,
+        stride: int = 1,
+        accuracy: float = 1.0,
+        grid: FieldGrid | None = None,
+        like: FittedWaves | None = None,
+    ) -> None:
+        value = as_dict(parameters)
+        geometry = fitted_geometry(profile, value)
+        grid = grid or field_grid(profile)
+        grid_x, grid_y = grid.x_m[::stride], grid.y_m[::stride]
+        x, y = modulator_axes(profile, samples)
+        pitch = profile.symbol_pitch_m / samples
+        self.x, self.y = x / (profile.page_width_m / 2), y / (profile.page_height_m / 2)
+        page = x + value["page_centre_x_m"], y + value["page_centre_y_m"]
+        self._sampling = (
+            geometry,
+            value["page_centre_x_m"],
+            value["page_centre_y_m"],
+            samples,
+            filled,
+            stride,
+            accuracy,
+            grid.shape,
+        )
+        self.channel: WaveChannel
+        if like is not None and like._sampling == self._sampling:
+            self.channel = like.channel
+        else:
+            self.channel = WaveChannel(
+                geometry,
+                *page,
+                grid_x,
+                grid_y,
+                cells=cells_for(geometry, *page, float(grid.x_m[-1]), float(grid.y_m[-1])),
+                steps=splitting_steps(profile, accuracy),
+                envelope_m=pitch if filled else 0.0,
+            )
+        at_launch = fitted_launch_phase(profile, value, geometry, x[None, :], y[:, None])
+        at_camera = fitted_camera_phase(profile, value, geometry, grid_x[None, :], grid_y[:, None])
+        self.launch: Complex = np.exp(1j * at_launch)
+        self.against_reference: Complex = np.exp(1j * at_camera)
+        self._camera = self.against_reference / stride  # samples that stand for more area are larger
+
+    def to_camera(self, field: Complex) -> Complex:
+        """Field on the modulator [ny samples, nx samples] to the common grid [Gy, Gx], against the reference."""
+        return np.asarray(self.channel.forward(field * self.launch) * self._camera)
+
+    def to_page(self, field: Complex) -> Complex:
+        """Field on the common grid [Gy, Gx] back to the modulator, by the adjoint."""
+        return np.asarray(self.channel.adjoint(field * self._camera.conj()) * self.launch.conj())
+
+
+def on_modulator(phases: Real, samples: int) -> Complex:
+    """A page's phases [ny, nx] as a field on the modulator, [ny samples, nx samples]."""
+    return np.asarray(np.exp(1j * np.kron(phases, np.ones((samples, samples)))))
+
+
+def illumination_terms(x: Any, y: Any) -> list[Any]:
+    """Terms of an illumination that is a quadratic in the page's coordinates, over the modulator.
+
+    Args:
+        x, y: places over the page's half width and half height, arrays or tensors [nx] and [ny].
+
+    Returns:
+        Six of [ny, nx], the even one first.
+    """
+    return [x[None, :] ** i * y[:, None] ** j for i, j in _ILLUMINATION]

@@ -1,0 +1,1 @@
+"""The `lightpage` command and what its subcommands share."""

@@ -1,0 +1,1 @@
+"""What a device should be (profile) and what it is (state)."""

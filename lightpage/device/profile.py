@@ -1,0 +1,286 @@
+"""Device profiles: the nominal numbers of a storage device, read from TOML and checked on load."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails
+
+from lightpage.device.lens_path import SeidelTerms
+from lightpage.errors import ProfileError
+
+Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
+"""Of a part of the device, metres."""
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Radians = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]
+"""Of a term of a lens's path: more would take more memory to compute with than there is."""
+Count = Annotated[int, Field(gt=0)]
+Side = Annotated[int, Field(gt=0, le=30_000)]
+"""Pixels along one side of a sensor: the largest that are made have some twenty thousand."""
+
+_MOST_REFLECTIONS = 100
+
+SHIPPED = ("bench", "paper")
+
+
+class Table(BaseModel):
+    """A checked TOML table: frozen, no unknown keys, no NaN or infinity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+T = TypeVar("T", bound=Table)
+
+
+class Light(Table):
+    """The laser."""
+
+    wavelength_m: Length
+
+
+class Lens(Table):
+    """The launch and the de-launch lens, both in a 2f arrangement."""
+
+    focal_length_m: Length
+
+
+class LensPath(Table):
+    """Optical path of either lens beyond an ideal one's, by its terms, for the page's corner at the pipe's wall."""
+
+    piston_rad: Radians = 0.0
+    distortion_rad: Radians = 0.0
+    astigmatism_rad: Radians = 0.0
+    field_curvature_rad: Radians = 0.0
+    coma_rad: Radians = 0.0
+    spherical_rad: Radians = 0.0
+
+    def at(self, share: float) -> LensPath:
+        """The same lenses, stated for a page whose corner lies at that share of this one's distance."""
+        powers = {"piston": 4, "distortion": 3, "astigmatism": 2, "field_curvature": 2, "coma": 1, "spherical": 0}
+        return LensPath(
+            **{f"{name}_rad": getattr(self, f"{name}_rad") * share**power for name, power in powers.items()}
+        )
+
+    def times(self, factor: float) -> LensPath:
+        """Of lenses so many times as large.
+
+        Raises:
+            ProfileError: a term that is more than a profile may state.
+        """
+        larger = {name: factor * value for name, value in self.model_dump().items()}
+        return validate(LensPath, larger, f"lens_path of lenses {factor:g} times as large")
+
+
+class Pipe(Table):
+    """The light-pipe: a glass prism whose cross-section is a rhombus of height `width_m`, sheared by `angle_deg`."""
+
+    length_m: Length
+    width_m: Length
+    refractive_index: Annotated[float, Field(ge=1, le=4)]
+    angle_deg: Annotated[float, Field(ge=-5, le=5)] = 0.0
+
+
+class Slm(Table):
+    """The spatial light modulator."""
+
+    pitch_m: Length
+
+
+class PageLayout(Table):
+    """How symbols lie on the SLM, and which of them are pilots."""
+
+    columns: Count
+    rows: Count
+    symbol_size_px: Count
+    pilot_fraction: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
+    pilot_seed: Annotated[int, Field(ge=0)] = 0
+
+
+class Camera(Table):
+    """The sensor of both cameras."""
+
+    columns_px: Side
+    rows_px: Side
+    pitch_m: Length
+
+
+class Profile(Table):
+    """What the data sheet of a device says. Lengths in metres, angles in degrees, pixels where the key says so."""
+
+    schema_version: Literal[1]
+    name: Annotated[str, Field(min_length=1)]
+    light: Light
+    lens: Lens
+    pipe: Pipe
+    slm: Slm
+    page: PageLayout
+    camera: Camera
+    lens_path: LensPath = LensPath()
+
+    @model_validator(mode="after")
+    def _page_fits_the_optics(self) -> Self:
+        numerical_aperture = max(self.page_width_m, self.page_height_m) / 2 / self.lens.focal_length_m
+        if numerical_aperture >= 0.5:
+            raise ValueError(
+                f"page.columns, page.rows: the page's edge enters at {numerical_aperture:.2f} of the focal length, "
+                "wanted below 0.5"
+            )
+        reflections = numerical_aperture * self.pipe.length_m / (self.pipe.refractive_index * self.pipe.width_m)
+        if reflections > _MOST_REFLECTIONS:
+            raise ValueError(
+                f"pipe.length_m, pipe.width_m: light of the page's edge meets a wall {reflections:.3g} times, "
+                f"wanted at most {_MOST_REFLECTIONS}"
+            )
+        return self
+
+    @property
+    def page_width_m(self) -> float:
+        """Width of the page on the SLM, metres."""
+        return self.page.columns * self.page.symbol_size_px * self.slm.pitch_m
+
+    @property
+    def corner_m(self) -> float:
+        """Distance of the page's corner from its centre, metres: aberrations and distortions are stated there."""
+        return math.hypot(self.page_width_m, self.page_height_m) / 2
+
+    @property
+    def light_curvature_rad(self) -> float:
+        """Phase of the light of the page's corner, steeper in the pipe, against that of its centre, radians: negative.
+
+        A reference beam of this `curvature_rad` is matched to it: against that beam light that met no wall is flat, and
+        what walls reflected has only a ramp left, as from a source beside the pipe.
+        """
+        path_m = self.pipe.length_m * (self.corner_m / self.lens.focal_length_m) ** 2 / (2 * self.pipe.refractive_index)
+        return -2 * math.pi / self.light.wavelength_m * path_m
+
+    @property
+    def page_height_m(self) -> float:
+        """Height of the page on the SLM, metres."""
+        return self.page.rows * self.page.symbol_size_px * self.slm.pitch_m
+
+    @property
+    def symbol_pitch_m(self) -> float:
+        """Edge of one symbol on the SLM, metres."""
+        return self.page.symbol_size_px * self.slm.pitch_m
+
+    @property
+    def page_shape(self) -> tuple[int, int]:
+        """Symbols as (rows, columns)."""
+        return self.page.rows, self.page.columns
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """Camera pixels as (rows, columns)."""
+        return self.camera.rows_px, self.camera.columns_px
+
+    @property
+    def ideal_lenses(self) -> bool:
+        """Whether the lenses have no path beyond the ideal one."""
+        return self.lens_path == LensPath()
+
+    def seidel_terms(self, share: Any = 1.0) -> SeidelTerms:
+        """The lenses' path beyond the ideal one, and how much of it there is, as a number or a tensor."""
+        field, aperture = self.corner_m, self.pipe.width_m / 2
+        path = self.lens_path
+        return SeidelTerms(
+            piston=share * path.piston_rad / field**4,
+            distortion=share * path.distortion_rad / (field**3 * aperture),
+            astigmatism=share * path.astigmatism_rad / (field * aperture) ** 2,
+            field_curvature=share * path.field_curvature_rad / (field * aperture) ** 2,
+            coma=share * path.coma_rad / (field * aperture**3),
+            spherical=share * path.spherical_rad / aperture**4,
+        )
+
+    def with_symbols_of(self, size_px: int) -> Profile:
+        """The same device with symbols of another size, SLM pixels, on as much of its page as whole symbols cover."""
+        page = self.page
+        columns, rows = (count * page.symbol_size_px // size_px for count in (page.columns, page.rows))
+        update = {"columns": columns, "rows": rows, "symbol_size_px": size_px}
+        cut = self.model_copy(update={"page": page.model_copy(update=update)})
+        return cut.model_copy(update={"lens_path": self.lens_path.at(cut.corner_m / self.corner_m)})
+
+    def with_ideal_lenses(self) -> Profile:
+        """The same device with lenses that have no path beyond the ideal one."""
+        return self.model_copy(update={"lens_path": LensPath()})
+
+    def to_toml(self) -> str:
+        """The profile as TOML text, which `parse_profile` reads back to an equal one; ideal lenses are left out."""
+        return to_toml(self, without=("lens_path",) if self.ideal_lenses else ())
+
+
+def to_toml(table: Table, without: tuple[str, ...] = ()) -> str:
+    """Write a checked table (scalars first, then its sub-tables one level down) as TOML text, some keys left out."""
+    scalars: list[str] = []
+    tables: list[str] = []
+    for key, value in table.model_dump(exclude=set(without)).items():
+        if isinstance(value, dict):
+            tables += ["", f"[{key}]", *(f"{k} = {_toml_value(v)}" for k, v in value.items())]
+        else:
+            scalars.append(f"{key} = {_toml_value(value)}")
+    return "\n".join([*scalars, *tables]) + "\n"
+
+
+def _toml_value(value: object) -> str:
+    if isinstance(value, str):
+        # a JSON string is a TOML one but for this character
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value)
+
+
+def validate(model: type[T], data: dict[str, Any], source: str) -> T:
+    """Check `data` against `model`; a `ProfileError` lists every offending key with what came and what was wanted."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        problems = "; ".join(_problem(e) for e in error.errors())
+        raise ProfileError(source, problems, f"a valid {model.__name__.lower()}") from None
+
+
+def _problem(error: ErrorDetails) -> str:
+    """One offending key, in words: what pydantic gives with a missing or an unknown one is a whole table."""
+    key = ".".join(str(part) for part in error["loc"]) or "document"
+    if error["type"] == "missing":
+        return f"no {key}"
+    if error["type"] == "extra_forbidden":
+        return f"unknown {key}"
+    return f"{key} = {error['input']!r} ({error['msg']})"
+
+
+def parse_profile(text: str, source: str = "profile") -> Profile:
+    """Read a profile from TOML text.
+
+    Raises:
+        ProfileError: not TOML, a missing, unknown or unphysical key.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ProfileError(source, f"text that is not TOML ({error})", "a TOML document") from None
+    return validate(Profile, data, source)
+
+
+def load_profile(name_or_path: str | Path) -> Profile:
+    """Load a shipped profile by name (`bench`, `paper`) or any profile by path.
+
+    Raises:
+        ProfileError: no such profile, or it does not validate.
+    """
+    if str(name_or_path) in SHIPPED:
+        text = resources.files("lightpage.device").joinpath("profiles", f"{name_or_path}.toml").read_text("utf-8")
+        return parse_profile(text, f"profile {name_or_path}")
+    path = Path(name_or_path)
+    try:
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ProfileError(
+            f"profile {name_or_path}", error, f"a readable TOML file or one of {', '.join(SHIPPED)}"
+        ) from None
+    return parse_profile(text, f"profile {path}")

@@ -1,0 +1,1 @@
+"""How much a decoded page carries, and how honest its confidences are."""

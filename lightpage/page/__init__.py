@@ -1,0 +1,1 @@
+"""Symbols, their phases, and pilots."""

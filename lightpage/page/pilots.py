@@ -1,0 +1,295 @@
+"""What pilots show: the piston, which frames alone do not, and how far a decoder's claims may be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import i0e
+
+from lightpage.device.profile import Profile
+from lightpage.errors import PageError
+from lightpage.metrics.information import mean_resultant
+from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
+
+_BELIEF = 20.0
+"""Pilots that count for the decoder before any is seen: noise of 54 pilots then costs under 0.01 bit a symbol."""
+
+_SPOILT = 0.01
+"""Share of pilots that are expected to say nothing: a dead place of the modulator, a value that was not written."""
+_MOST_SPOILT = 0.05
+"""Where more of them contradict the rest, it is the device that has changed, and all of them count."""
+_ROUNDS = 10
+_MEDIAN_CHI2 = 0.4549
+"""Of the chi-squared distribution with one degree of freedom."""
+
+LEAST_CONFIRMED_SHARE = 0.25
+"""Share of the claimed information that the pilots of a page must confirm. A page whose image lies a pixel off confirms
+a third on the bench device, four pixels off a thirtieth, a page of another device nothing."""
+
+LEAST_CONFIRMED_NATS = 9.0
+"""Information that all pilots together must confirm, beyond what fitting to them gains. Chance confirms as much about
+once in e^9 = 8,000 pages."""
+
+SOUND_SHARE = 0.85
+"""Share below which a device is no longer as it was calibrated, where the pilots' own noise does not explain it."""
+
+_NOISE_DEVIATIONS = 3.0
+"""Standard deviations of the pilots' noise that are allowed for before a device is said to have changed."""
+
+
+@dataclass(frozen=True)
+class Pilots:
+    """Known symbols of a page.
+
+    Attributes:
+        mask: where they are, bool [ny, nx].
+        phases: what they are, radians, one a True in `mask` in row order.
+    """
+
+    mask: NDArray[np.bool_]
+    phases: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        """Check that there is one phase a pilot.
+
+        Raises:
+            PageError: no pilots, or another number of phases.
+        """
+        count = int(np.count_nonzero(self.mask))
+        if count == 0 or self.phases.shape != (count,):
+            raise PageError("pilots", f"{count} positions and phases of shape {self.phases.shape}", "one phase each")
+
+    @classmethod
+    def of_profile(cls, profile: Profile, levels: int, mask: NDArray[np.bool_] | None = None) -> Pilots:
+        """The seeded pattern of `profile` for pages of `levels` levels, at `mask` or at its default positions."""
+        where = pilot_mask(profile) if mask is None else mask
+        return cls.of_symbols(where, pilot_symbols(profile, levels), levels)
+
+    @classmethod
+    def of_symbols(cls, mask: NDArray[np.bool_], symbols: NDArray[np.uint8], levels: int) -> Pilots:
+        """Pilots whose values stand in a page of known symbols [ny, nx].
+
+        Raises:
+            PageError: mask and page differ in shape.
+        """
+        if mask.shape != symbols.shape:
+            raise PageError("pilot positions", f"shape {mask.shape}", f"shape {symbols.shape}, as the page has")
+        return cls(mask, symbol_phases(symbols[mask], levels))
+
+
+@dataclass(frozen=True)
+class Piston:
+    """The common phase of a page.
+
+    Attributes:
+        angle_rad: to be taken off every decoded phase, -pi..pi.
+        coherence: 1 where all pilots agree on it, near 1/sqrt(number of pilots) where they say nothing.
+    """
+
+    angle_rad: float
+    coherence: float
+
+
+@dataclass(frozen=True)
+class PilotCheck:
+    """What a decoder claims to know of the pilots, and how much of it they confirm.
+
+    Attributes:
+        pilots: how many were looked at.
+        claimed_bits: information per pilot that the concentrations claim, as the decoder states them.
+        confirmed_bits: information per pilot that the known phases show, the claims scaled by the trust that they
+            deserve: log2 of the density at the true phase over that of no knowledge.
+        noise_bits: standard deviation of `confirmed_bits` where the claims are true.
+        gained_nats: what fitting the piston, and drift where it was read, to the same pilots gains by chance.
+    """
+
+    pilots: int
+    claimed_bits: float
+    confirmed_bits: float
+    noise_bits: float
+    gained_nats: float
+
+    @property
+    def share(self) -> float:
+        """Confirmed over claimed information, 0 where nothing is claimed or confirmed."""
+        return max(0.0, self.confirmed_bits) / self.claimed_bits if self.claimed_bits > 0 else 0.0
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the pilots bear out enough of what is claimed."""
+        return self.share >= LEAST_CONFIRMED_SHARE
+
+    @property
+    def tells(self) -> bool:
+        """Whether the pilots together tell more than chance would."""
+        nats = self.confirmed_bits * np.log(2) * self.pilots
+        return bool(nats >= LEAST_CONFIRMED_NATS + self.gained_nats)
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the page may be given out."""
+        return self.agrees and self.tells
+
+    @property
+    def sound(self) -> bool:
+        """Whether the device is as the decoder knows it, as far as this page's pilots can tell."""
+        return self.confirmed_bits >= SOUND_SHARE * self.claimed_bits - _NOISE_DEVIATIONS * self.noise_bits
+
+    @property
+    def recalibration_due(self) -> bool:
+        """Whether the device has changed so far that a recalibration pays."""
+        return not self.sound
+
+
+def estimate_piston(p: NDArray[np.floating], pilots: Pilots) -> Piston:
+    """Piston of a page from its pilots, each weighted by its concentration.
+
+    angle of sum (px + i py) exp(-i theta) over the pilots, theta their known phase.
+
+    Args:
+        p: (px, py), [2, ny, nx].
+        pilots: the known symbols of this page.
+
+    Raises:
+        PageError: the page has another shape than the pilots.
+    """
+    errors = _errors(p, pilots)
+    total, weight = np.sum(errors), float(np.abs(errors).sum())
+    return Piston(float(np.angle(total)), float(abs(total) / weight) if weight > 0 else 0.0)
+
+
+def remove_piston(phase: NDArray[np.floating], angle_rad: float) -> NDArray[np.float32]:
+    """`phase` less the piston, wrapped to -pi..pi, float32, same shape."""
+    turned = phase.astype(np.float64) - angle_rad
+    return np.asarray(turned - 2 * np.pi * np.rint(turned / (2 * np.pi)), np.float32)
+
+
+def estimate_trust(p: NDArray[np.floating], pilots: Pilots, angle_rad: float) -> float:
+    """Factor on the claimed concentrations that the pilots bear out, 0 to 1.
+
+    Twice kappa (1 - cos error), summed over n pilots whose piston they gave themselves, is about n - 1 where the claims
+    are true. A device that has drifted shows more; the pilots are then most likely under claims that are smaller by as
+    much. The decoder starts with the credit of `_BELIEF` pilots, and gets no more than it claims.
+
+    Args:
+        p: (px, py), [2, ny, nx].
+        pilots: the known symbols of this page, those left out that are spoilt.
+        angle_rad: the page's piston, as `estimate_piston` found it.
+
+    Raises:
+        PageError: the page has another shape than the pilots.
+    """
+    missed = _missed(_errors(p, pilots), angle_rad)
+    return min(1.0, (_BELIEF + len(missed) - 1) / (_BELIEF + float(missed.sum())))
+
+
+def check_claims(
+    p: NDArray[np.floating], pilots: Pilots, angle_rad: float, trust: float, gained_nats: float = 0.0
+) -> PilotCheck:
+    """Hold what a decoder claims of its pilots against what they are.
+
+    The piston is fitted to the same pilots: with their concentrations' sum K, chance gains log(2 pi K) / 2 nats by it,
+    the width of what it may be over that of what is left.
+
+    Args:
+        p: (px, py), [2, ny, nx].
+        pilots: the known symbols of this page, those left out that are spoilt.
+        angle_rad: the page's piston, as `estimate_piston` found it.
+        trust: factor on the concentrations, as `estimate_trust` found it.
+        gained_nats: the same of whatever else was fitted to these pilots.
+
+    Raises:
+        PageError: the page has another shape than the pilots.
+    """
+    errors = _errors(p, pilots)
+    kappa, count = np.abs(errors), len(errors)
+    mean = mean_resultant(kappa)
+    claimed = kappa * (mean - 1) - np.log(i0e(kappa))
+    confirmed = -trust * _missed(errors, angle_rad) / 2 - np.log(i0e(trust * kappa))
+    # of kappa cos(error): kappa^2 (E cos^2 - (E cos)^2), with E cos^2 = 1 - I1 / (kappa I0)
+    variance = kappa * np.maximum(kappa * (1 - mean**2) - mean, 0)
+    by_piston = max(0.0, float(np.log(max(2 * np.pi * trust * kappa.sum(), 1.0))) / 2)
+    return PilotCheck(
+        pilots=count,
+        claimed_bits=float(claimed.mean() / np.log(2)),
+        confirmed_bits=float(confirmed.mean() / np.log(2)),
+        noise_bits=float(np.sqrt(variance.sum()) / count / np.log(2)),
+        gained_nats=by_piston + gained_nats,
+    )
+
+
+def without_spoilt(p: NDArray[np.floating], pilots: Pilots) -> Pilots:
+    """The pilots less those few that contradict all others, as a dead place of the modulator does.
+
+    A pilot is left out where its error is more likely one of any size, `_SPOILT` of all pilots having such, than what
+    the concentration claimed there allows after the others have told how far claims may be believed.
+
+    Args:
+        p: (px, py), [2, ny, nx].
+        pilots: the known symbols of this page.
+
+    Raises:
+        PageError: the page has another shape than the pilots.
+    """
+    errors = _errors(p, pilots)
+    kappa, sound = np.abs(errors), np.ones(len(errors), bool)
+    for turn in range(_ROUNDS):
+        missed = _missed(errors, float(np.angle(errors[sound].sum())))
+        over_claim = float(np.mean(missed[sound]) if turn else np.median(missed) / _MEDIAN_CHI2)
+        trust = 1 / max(1.0, over_claim)
+        odds = np.log((1 - _SPOILT) / _SPOILT) - np.log(i0e(trust * kappa)) - trust * missed / 2
+        before, sound = sound, odds > 0
+        if np.array_equal(before, sound) or not sound.any():
+            break
+    if np.count_nonzero(~sound) > _MOST_SPOILT * len(sound):
+        return pilots
+    mask = pilots.mask.copy()
+    mask[pilots.mask] = sound
+    return Pilots(mask, pilots.phases[sound])
+
+
+@dataclass(frozen=True)
+class PilotReading:
+    """All that a page's pilots say of it.
+
+    Attributes:
+        piston: common phase of the page.
+        trust: factor on the claimed concentrations, 0..1.
+        check: what the decoder claims, and what of it the pilots confirm.
+    """
+
+    piston: Piston
+    trust: float
+    check: PilotCheck
+
+
+def read_pilots(p: NDArray[np.floating], pilots: Pilots, gained_nats: float = 0.0) -> PilotReading:
+    """Read a page's pilots, those few left out that contradict all others.
+
+    Args:
+        p: (px, py), [2, ny, nx].
+        pilots: the known symbols of this page.
+        gained_nats: see `check_claims`.
+
+    Raises:
+        PageError: the page has another shape than the pilots.
+    """
+    sound = without_spoilt(p, pilots)
+    piston = estimate_piston(p, sound)
+    trust = estimate_trust(p, sound, piston.angle_rad)
+    return PilotReading(piston, trust, check_claims(p, sound, piston.angle_rad, trust, gained_nats))
+
+
+def _errors(p: NDArray[np.floating], pilots: Pilots) -> NDArray[np.complex128]:
+    """Beliefs at the pilots, kappa exp(i error), complex [pilots], piston and all."""
+    if p.shape[1:] != pilots.mask.shape:
+        raise PageError("pilot positions", f"shape {pilots.mask.shape}", f"shape {p.shape[1:]}, as the page has")
+    at_pilots = p[0][pilots.mask].astype(np.float64) + 1j * p[1][pilots.mask]
+    return np.asarray(at_pilots * np.exp(-1j * pilots.phases), np.complex128)
+
+
+def _missed(errors: NDArray[np.complex128], angle_rad: float) -> NDArray[np.float64]:
+    """Twice kappa (1 - cos error) of each pilot, less the piston: chi-squared of one degree where claims are true."""
+    return np.asarray(2 * (np.abs(errors) - (errors * np.exp(-1j * angle_rad)).real), np.float64)

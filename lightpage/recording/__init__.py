@@ -1,0 +1,1 @@
+"""Frames and pages in HDF5."""

@@ -1,0 +1,367 @@
+"""Recordings: frame pairs, reference frames and, where they are known, symbols, in one HDF5 file.
+
+The layout is the contract with other people's devices. Root attributes: `format` = "lightpage-recording",
+`version` = 1, `camera_bit_depth`, `levels` (256 if absent), optionally `profile` (the nominal profile as TOML text) and
+`black_level` (counts of a camera in the dark, 0 if absent; taken off when frames are read).
+Datasets: `in_phase` and `quadrature` [page, row, column], `reference_in_phase` and `reference_quadrature`
+[row, column], uint8 or uint16, counts right-aligned; optionally `symbols` uint8 [page, ny, nx] and `pilots`, boolean
+[ny, nx]. A simulator adds the group `truth`, which no decoder reads.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.device.profile import Profile, parse_profile
+from lightpage.errors import ProfileError, RecordingError
+from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
+from lightpage.recording.layout import (
+    FORMAT,
+    FRAMES,
+    MAX_BIT_DEPTH,
+    MIN_BIT_DEPTH,
+    REFERENCES,
+    VERSION,
+    FramePair,
+    frame_type,
+    hash_frames,
+    page_hashes,
+)
+from lightpage.recording.writer import RecordingWriter
+
+__all__ = ["FramePair", "Recording", "RecordingWriter", "hash_frames", "page_hashes"]
+
+_SYMBOL_PAGES_AT_ONCE = 64
+"""Pages of symbols checked in one read, so that opening a long recording stays small in memory."""
+
+
+class Recording:
+    """A recording opened for reading and checked; use it in a `with` statement, or close it."""
+
+    def __init__(self, file: h5py.File, path: Path) -> None:
+        """Check `file`, which must be open for reading; `Recording.open` is the usual way in.
+
+        Raises:
+            RecordingError: the file is not a recording, or it is inconsistent.
+        """
+        self.path = path
+        self._file = file
+        self._check_header()
+        self._check_frames()
+        self._check_page()
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """Open and check a recording without reading its frames.
+
+        Raises:
+            RecordingError: missing, truncated, foreign, newer than this program, or inconsistent; the message names the
+                file, the dataset or attribute, what came and what was wanted.
+        """
+        path = Path(path)
+        if not path.is_file():
+            came = "no regular file" if path.exists() else "no such file"
+            raise RecordingError(f"recording {path}", came, "a readable, complete HDF5 file")
+        try:
+            file = h5py.File(str(path), "r")
+        except OSError as error:
+            raise RecordingError(f"recording {path}", error, "a readable, complete HDF5 file") from None
+        try:
+            return cls(file, path)
+        except BaseException:
+            file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; nothing can be read afterwards."""
+        self._file.close()
+
+    @property
+    def pages(self) -> int:
+        """Number of pages."""
+        return int(self._file["in_phase"].shape[0])
+
+    @property
+    def levels(self) -> int:
+        """Level count M of the symbols."""
+        return self._levels
+
+    @property
+    def bit_depth(self) -> int:
+        """Bits of a camera count; full scale is 2**bit_depth - 1."""
+        return self._bit_depth
+
+    @property
+    def black_level(self) -> int:
+        """Counts of a camera in the dark; `frames` and `references` are free of them."""
+        return self._black_level
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """Camera pixels as (rows, columns)."""
+        _, rows, columns = self._file["in_phase"].shape
+        return int(rows), int(columns)
+
+    @property
+    def page_shape(self) -> tuple[int, int] | None:
+        """Symbols as (rows, columns), or None when the file holds neither symbols nor pilots."""
+        for name in ("symbols", "pilots"):
+            if name in self._file:
+                rows, columns = self._file[name].shape[-2:]
+                return int(rows), int(columns)
+        return None
+
+    @property
+    def has_symbols(self) -> bool:
+        """Whether the written symbols are known."""
+        return "symbols" in self._file
+
+    @property
+    def profile_text(self) -> str | None:
+        """The nominal profile as TOML text, or None."""
+        return self._profile_text
+
+    def frames(self, page: int) -> FramePair:
+        """The frame pair of one page, its black level taken off.
+
+        Raises:
+            RecordingError: no such page, or its data cannot be read.
+        """
+        return FramePair(*(self._read_page(name, page) for name in FRAMES))
+
+    def references(self) -> FramePair:
+        """The two reference-only frames, their black level taken off.
+
+        Raises:
+            RecordingError: the data cannot be read.
+        """
+        return FramePair(*(self._read(name, ()) for name in REFERENCES))
+
+    def symbols(self, page: int) -> NDArray[np.uint8] | None:
+        """The symbols [ny, nx] of one page, or None when the file holds none.
+
+        Raises:
+            RecordingError: no such page, or its data cannot be read.
+        """
+        return self._read_page("symbols", page) if self.has_symbols else None
+
+    def pilots(self) -> NDArray[np.bool_] | None:
+        """The recording's own pilot positions [ny, nx], or None: then the profile's default positions hold.
+
+        Raises:
+            RecordingError: the data cannot be read.
+        """
+        return self._read("pilots", ()).astype(np.bool_) if "pilots" in self._file else None
+
+    def page_hash(self, page: int) -> str:
+        """SHA-256 of one frame pair in hex, by which pages that were trained on are recognised; see `page_hashes`.
+
+        Raises:
+            RecordingError: no such page, or its data cannot be read.
+        """
+        return hash_frames(self.frames(page))
+
+    def check_against(self, profile: Profile) -> None:
+        """Check that the recording belongs to devices of this profile.
+
+        Raises:
+            RecordingError: frames or page of another shape.
+        """
+        if self.frame_shape != profile.frame_shape:
+            raise RecordingError(
+                self._thing("in_phase"),
+                f"frames of {_size(self.frame_shape)} pixels",
+                f"{_size(profile.frame_shape)} (profile {profile.name})",
+            )
+        if self.page_shape not in (None, profile.page_shape):
+            raise RecordingError(
+                self._thing("symbols" if self.has_symbols else "pilots"),
+                f"pages of {_size(self.page_shape)} symbols",
+                f"{_size(profile.page_shape)} (profile {profile.name})",
+            )
+
+    def differences(self, profile: Profile) -> list[str]:
+        """What the recording's own nominal profile says otherwise than `profile`, a line each.
+
+        Empty where it has none that can be read: another program's notes are no reason to stop.
+        """
+        try:
+            own = None if self._profile_text is None else parse_profile(self._profile_text, "profile of the recording")
+        except ProfileError:
+            own = None
+        if own is None:
+            return []
+        told, wanted = own.model_dump(), profile.model_dump()
+        return [
+            f"{table}.{key} = {value} (profile {profile.name}: {wanted[table][key]})"
+            for table, values in told.items()
+            if isinstance(values, dict)
+            for key, value in values.items()
+            if wanted[table][key] != value
+        ]
+
+    def _thing(self, name: str) -> str:
+        return f"recording {self.path}: {name}"
+
+    def _attribute(self, name: str, default: object = None) -> Any:
+        """A root attribute as a plain Python value."""
+        value = self._file.attrs.get(name, default)
+        if isinstance(value, (np.generic, np.ndarray)) and value.size == 1:
+            value = value.item()
+        return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+
+    def _whole(self, name: str, default: int | None = None) -> int:
+        value = self._attribute(name, default)
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise RecordingError(
+                self._thing(f"attribute '{name}'"), "none" if value is None else repr(value), "a whole number"
+            )
+        return value
+
+    def _check_header(self) -> None:
+        format_name = self._attribute("format")
+        if format_name != FORMAT:
+            got = "none" if format_name is None else repr(format_name)
+            raise RecordingError(self._thing("attribute 'format'"), got, repr(FORMAT))
+        version = self._whole("version")
+        if version != VERSION:
+            raise RecordingError(self._thing("attribute 'version'"), version, f"version {VERSION}")
+        self._bit_depth = self._whole("camera_bit_depth")
+        if not MIN_BIT_DEPTH <= self._bit_depth <= MAX_BIT_DEPTH:
+            raise RecordingError(
+                self._thing("attribute 'camera_bit_depth'"), self._bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}"
+            )
+        self._levels = self._whole("levels", MAX_LEVELS)
+        if not MIN_LEVELS <= self._levels <= MAX_LEVELS:
+            raise RecordingError(
+                self._thing("attribute 'levels'"), self._levels, f"a whole number from {MIN_LEVELS} to {MAX_LEVELS}"
+            )
+        self._black_level = self._whole("black_level", 0)
+        full_scale = 2**self._bit_depth - 1
+        if not 0 <= self._black_level < full_scale:
+            raise RecordingError(
+                self._thing("attribute 'black_level'"), self._black_level, f"0 to {full_scale - 1} counts"
+            )
+        text = self._attribute("profile")
+        if text is not None and not isinstance(text, str):
+            raise RecordingError(self._thing("attribute 'profile'"), type(text).__name__, "TOML text")
+        self._profile_text: str | None = text
+
+    def _dataset(self, name: str, dimensions: int) -> h5py.Dataset:
+        found = self._file.get(name)
+        if not isinstance(found, h5py.Dataset):
+            raise RecordingError(
+                self._thing(f"dataset '{name}'"),
+                "none" if found is None else "a group",
+                f"an array of {dimensions} dimensions",
+            )
+        if found.ndim != dimensions:
+            raise RecordingError(self._thing(f"dataset '{name}'"), f"shape {found.shape}", f"{dimensions} dimensions")
+        return found
+
+    def _check_frames(self) -> None:
+        first = self._dataset("in_phase", 3)
+        wanted_type = frame_type(self._bit_depth)
+        for name, shape in {
+            "in_phase": first.shape,
+            "quadrature": first.shape,
+            "reference_in_phase": first.shape[1:],
+            "reference_quadrature": first.shape[1:],
+        }.items():
+            dataset = self._dataset(name, len(shape))
+            thing = self._thing(f"dataset '{name}'")
+            # 8-bit counts may come in either type; more bits fit into uint16 only.
+            fits = dataset.dtype.kind == "u" and wanted_type.itemsize <= dataset.dtype.itemsize <= 2
+            if not fits:
+                raise RecordingError(thing, f"type {dataset.dtype}", f"{wanted_type} for {self._bit_depth} bits")
+            if dataset.shape != shape:
+                raise RecordingError(thing, f"shape {dataset.shape}", f"shape {shape}, as 'in_phase' has")
+            if 0 in dataset.shape:
+                raise RecordingError(thing, f"shape {dataset.shape}", "at least one page and one pixel")
+
+    def _check_page(self) -> None:
+        if "pilots" in self._file:
+            pilots = self._dataset("pilots", 2)
+            if pilots.dtype.kind not in "bui":
+                raise RecordingError(self._thing("dataset 'pilots'"), f"type {pilots.dtype}", "booleans")
+            known = np.count_nonzero(self._read("pilots", ()))
+            if not 0 < known < pilots.size:
+                raise RecordingError(
+                    self._thing("dataset 'pilots'"), f"{known} pilots of {pilots.size} symbols", "some of them, not all"
+                )
+        if not self.has_symbols:
+            return
+        symbols = self._dataset("symbols", 3)
+        thing = self._thing("dataset 'symbols'")
+        if symbols.dtype != np.uint8:
+            raise RecordingError(thing, f"type {symbols.dtype}", "uint8")
+        if symbols.shape[0] != self.pages or 0 in symbols.shape[1:]:
+            raise RecordingError(thing, f"shape {symbols.shape}", f"shape ({self.pages}, ny, nx), as 'in_phase' has")
+        if "pilots" in self._file and self._file["pilots"].shape != symbols.shape[1:]:
+            raise RecordingError(
+                self._thing("dataset 'pilots'"),
+                f"shape {self._file['pilots'].shape}",
+                f"shape {symbols.shape[1:]}, as 'symbols' has",
+            )
+        for start in range(0, self.pages, _SYMBOL_PAGES_AT_ONCE):
+            chunk = self._read("symbols", slice(start, start + _SYMBOL_PAGES_AT_ONCE))
+            if int(chunk.max()) >= self._levels:
+                raise RecordingError(
+                    thing, f"a symbol of {chunk.max()}", f"0 to {self._levels - 1}, since levels = {self._levels}"
+                )
+
+    def _read_page(self, name: str, page: int) -> NDArray[Any]:
+        if not 0 <= page < self.pages:
+            raise RecordingError(self._thing("page"), page, f"0 to {self.pages - 1}")
+        frame = self._read(name, page)
+        if name in FRAMES:
+            self._check_counts(name, frame, f" page {page}")
+            frame = self._without_black(frame)
+        return frame
+
+    def _read(self, name: str, where: Any) -> NDArray[Any]:
+        try:
+            data: NDArray[Any] = np.asarray(self._file[name][where])
+        except OSError as error:
+            raise RecordingError(self._thing(f"dataset '{name}'"), error, "data that can be read") from None
+        data = data.astype(data.dtype.newbyteorder("="), copy=False)  # torch takes no other byte order
+        if name in REFERENCES:
+            self._check_counts(name, data, "")
+            data = self._without_black(data)
+        return data
+
+    def _without_black(self, frame: NDArray[Any]) -> NDArray[Any]:
+        """Counts above the black level, of the same type; noise below it becomes 0, full scale stays: it is clipped."""
+        if self._black_level == 0:
+            return frame
+        black, full_scale = frame.dtype.type(self._black_level), 2**self._bit_depth - 1
+        return np.where(frame == full_scale, frame, np.maximum(frame, black) - black)
+
+    def _check_counts(self, name: str, frame: NDArray[Any], where: str) -> None:
+        full_scale = 2**self._bit_depth - 1
+        if int(frame.max()) > full_scale:
+            raise RecordingError(
+                self._thing(f"dataset '{name}'{where}"),
+                f"a count of {frame.max()}",
+                f"at most {full_scale}, since camera_bit_depth = {self._bit_depth}",
+            )
+
+
+def _size(shape: tuple[int, int] | None) -> str:
+    return "unknown" if shape is None else f"{shape[0]} x {shape[1]}"

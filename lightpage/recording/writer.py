@@ -1,0 +1,311 @@
+"""Writing a recording page by page, so that an interruption loses nothing and nothing half-written is ever loaded."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lightpage.device.profile import Profile
+from lightpage.errors import PageError, RecordingError
+from lightpage.files import move_into_place
+from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.recording.layout import FORMAT, FRAMES, MAX_BIT_DEPTH, MIN_BIT_DEPTH, VERSION, FramePair, frame_type
+
+
+def partial_path(path: Path) -> Path:
+    """Where a recording lies until it is complete and gets its name `path`."""
+    return path.with_name(path.name + ".partial")
+
+
+def discard_partial(path: Path) -> None:
+    """Remove the unfinished pages of the recording `path`, if there are any.
+
+    Raises:
+        RecordingError: another process is writing them, or they cannot be removed.
+    """
+    _take(partial_path(path), remove=True)
+
+
+def _take(partial: Path, *, remove: bool) -> bool:
+    """Whether `partial` is there, writable and written by nobody else; `remove` unlinks it while that is certain.
+
+    HDF5 holds this same lock on a file as long as it is open for writing.
+    """
+    thing = f"recording {partial}"
+    try:
+        with partial.open("rb+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if remove:
+                partial.unlink()
+    except FileNotFoundError:
+        return False
+    except BlockingIOError:
+        raise RecordingError(
+            thing, "pages that another process is writing now", "another name, or to wait for its end"
+        ) from None
+    except OSError as error:
+        raise RecordingError(thing, error, "a file that can be read and written") from None
+    return True
+
+
+class RecordingWriter:
+    """Writes a recording page by page to `<path>.partial`, and moves it to `path` when the `with` statement ends well.
+
+    After an exception, Ctrl-C included, the partial file stays behind, complete up to the last page appended;
+    `RecordingWriter.resume` goes on from there. A half-written file is never found under the final name.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        profile: Profile,
+        levels: int,
+        bit_depth: int,
+        references: FramePair,
+        pilots: ArrayLike | None = None,
+    ) -> None:
+        """Start a new recording; a partial file of the same name that nobody is writing is overwritten.
+
+        Args:
+            path: final name.
+            profile: nominal profile; fixes the shapes and is kept as TOML text.
+            levels: M, 2 to 256.
+            bit_depth: bits of a camera count, 8 to 16.
+            references: reference-only frames.
+            pilots: boolean [ny, nx]; None leaves the profile's default positions in force.
+
+        Raises:
+            RecordingError: wrong bit depth, frames or pilots, or the file cannot be written or is being written.
+            PageError: a level count outside 2..256.
+        """
+        self._prepare(path, profile, levels, bit_depth)
+        self._create(references, pilots)
+
+    @classmethod
+    def resume(
+        cls,
+        path: str | Path,
+        profile: Profile,
+        levels: int,
+        bit_depth: int,
+        references: FramePair,
+        pilots: ArrayLike | None = None,
+    ) -> Self:
+        """Go on with `<path>.partial` if it was started with the same arguments, else start anew.
+
+        `pages` tells how many pages are there already. Arguments and errors as for the constructor.
+        """
+        writer = cls.__new__(cls)
+        writer._prepare(path, profile, levels, bit_depth)
+        if not writer._continue(references, pilots):
+            writer._create(references, pilots)
+        return writer
+
+    @property
+    def pages(self) -> int:
+        """Pages written so far."""
+        return self._pages
+
+    @property
+    def partial_path(self) -> Path:
+        """The file that is being written."""
+        return self._partial
+
+    def append(
+        self, symbols: ArrayLike | None, frames: FramePair, truth: Mapping[str, NDArray[Any]] | None = None
+    ) -> None:
+        """Append one page and flush it to the disk.
+
+        Args:
+            symbols: [ny, nx], or None when they are unknown; either for all pages or for none.
+            frames: counts [row, column] within the bit depth.
+            truth: what only a simulator knows, one array a name, of the same shape and type on every page.
+
+        Raises:
+            RecordingError: wrong frames, symbols or truth on some pages only, or a page that cannot be written.
+            PageError: symbols of the wrong shape or range.
+        """
+        data = {name: self._checked(name, getattr(frames, name)) for name in FRAMES}
+        if symbols is not None:
+            data["symbols"] = check_symbols(symbols, self._profile.page_shape, self._levels, f"{self._thing}: symbols")
+            if data["symbols"].ndim != 2:
+                raise PageError(f"{self._thing}: symbols", f"shape {data['symbols'].shape}", "one page [ny, nx]")
+        data |= {f"truth/{name}": np.asarray(value) for name, value in (truth or {}).items()}
+        self._check_same_datasets(data)
+        try:
+            for name, value in data.items():
+                self._write_page(name, value)
+            # The count comes last: pages beyond it were cut off in the middle, and resuming drops them.
+            self._file.attrs["pages_complete"] = self._pages + 1
+            self._file.flush()
+        except OSError as error:
+            raise RecordingError(f"{self._thing}: page {self._pages}", error, "room for it on the disk") from None
+        self._pages += 1
+
+    def set_truth(self, device_toml: str) -> None:
+        """Keep the true state of a simulated device as TOML text, where no decoder looks."""
+        self._file.require_group("truth").attrs["device"] = device_toml
+        self._file.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.commit()
+        else:
+            self.abandon()
+
+    def commit(self) -> None:
+        """Close the file and give it its final name.
+
+        Raises:
+            RecordingError: the file cannot be completed or renamed.
+        """
+        try:
+            if "pages_complete" in self._file.attrs:
+                del self._file.attrs["pages_complete"]
+            self._file.close()
+            move_into_place(self._partial, self.path)
+        except OSError as error:
+            raise RecordingError(self._thing, error, "a file that can be completed") from None
+
+    def abandon(self) -> None:
+        """Close the partial file and leave it for `resume`."""
+        self._file.close()
+
+    def _prepare(self, path: str | Path, profile: Profile, levels: int, bit_depth: int) -> None:
+        self.path = Path(path)
+        self._thing = f"recording {self.path}"
+        self._partial = partial_path(self.path)
+        check_levels(levels, f"{self._thing}: levels")
+        if not MIN_BIT_DEPTH <= bit_depth <= MAX_BIT_DEPTH:
+            raise RecordingError(f"{self._thing}: bit depth", bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}")
+        self._profile, self._levels, self._bit_depth = profile, levels, bit_depth
+        self._pages = 0
+
+    def _header(self) -> dict[str, Any]:
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "camera_bit_depth": self._bit_depth,
+            "levels": self._levels,
+            "profile": self._profile.to_toml(),
+        }
+
+    def _checked(self, name: str, frame: NDArray[Any]) -> NDArray[Any]:
+        frame = np.asarray(frame)
+        thing = f"{self._thing}: {name}"
+        if frame.dtype.kind not in "ui":
+            raise RecordingError(thing, f"type {frame.dtype}", "whole counts")
+        if frame.shape != self._profile.frame_shape:
+            raise RecordingError(thing, f"shape {frame.shape}", f"shape {self._profile.frame_shape}")
+        full_scale = 2**self._bit_depth - 1
+        if int(frame.min()) < 0 or int(frame.max()) > full_scale:
+            raise RecordingError(thing, f"counts from {frame.min()} to {frame.max()}", f"0 to {full_scale}")
+        return frame.astype(frame_type(self._bit_depth), copy=False)
+
+    def _checked_fixed(self, references: FramePair, pilots: ArrayLike | None) -> dict[str, NDArray[Any]]:
+        """The datasets that do not grow."""
+        fixed = {f"reference_{name}": self._checked(f"reference_{name}", getattr(references, name)) for name in FRAMES}
+        if pilots is not None:
+            mask = np.asarray(pilots)
+            if mask.dtype != np.bool_ or mask.shape != self._profile.page_shape:
+                raise RecordingError(
+                    f"{self._thing}: pilots",
+                    f"{mask.dtype} of shape {mask.shape}",
+                    f"bool of shape {self._profile.page_shape}",
+                )
+            fixed["pilots"] = mask
+        return fixed
+
+    def _create(self, references: FramePair, pilots: ArrayLike | None) -> None:
+        fixed = self._checked_fixed(references, pilots)
+        discard_partial(self.path)
+        try:
+            self._file = h5py.File(str(self._partial), "w-")
+        except OSError as error:
+            raise RecordingError(f"recording {self._partial}", error, "a file that can be written") from None
+        for name, value in self._header().items():
+            self._file.attrs[name] = value
+        for name, value in fixed.items():
+            self._file.create_dataset(name, data=value)
+        for name in FRAMES:
+            self._grow(name, self._profile.frame_shape, frame_type(self._bit_depth))
+        self._file.attrs["pages_complete"] = 0
+        self._file.flush()
+
+    def _continue(self, references: FramePair, pilots: ArrayLike | None) -> bool:
+        """Open the partial file if it is sound and was started with the same arguments.
+
+        Raises:
+            RecordingError: another process is writing it, or the system does not let it be read.
+        """
+        fixed = self._checked_fixed(references, pilots)
+        if not _take(self._partial, remove=False):
+            return False
+        try:
+            file = h5py.File(str(self._partial), "r+")
+        except OSError as error:
+            if error.errno is None:  # not the system but HDF5: the file was cut off or is none of its own
+                return False
+            raise RecordingError(f"recording {self._partial}", error, "a file that can be read and written") from None
+        try:
+            # Without its count a file was interrupted while it was completed: all of its pages are there.
+            pages = int(file.attrs.get("pages_complete", file[FRAMES[0]].shape[0]))
+            same = (
+                all(file.attrs[name] == value for name, value in self._header().items())
+                and all(np.array_equal(file[name][()], value) for name, value in fixed.items())
+                and ("pilots" in file) == ("pilots" in fixed)
+            )
+            if same:
+                self._file = file
+                for name in self._growing():
+                    if file[name].shape[0] < pages:
+                        same = False
+                    file[name].resize(pages, axis=0)
+        except (OSError, KeyError, TypeError, ValueError):
+            same = False
+        if same:
+            self._pages = pages
+        else:
+            file.close()
+        return same
+
+    def _growing(self) -> list[str]:
+        """The datasets that grow by one with each page."""
+        names = [name for name in (*FRAMES, "symbols") if name in self._file]
+        truth = self._file.get("truth")
+        return names + ([f"truth/{name}" for name in truth] if isinstance(truth, h5py.Group) else [])
+
+    def _check_same_datasets(self, data: Mapping[str, NDArray[Any]]) -> None:
+        if self._pages and set(self._growing()) != set(data):
+            raise RecordingError(
+                f"{self._thing}: page {self._pages}",
+                f"datasets {', '.join(sorted(data))}",
+                f"{', '.join(sorted(self._growing()))}, as on the pages before",
+            )
+        for name, value in data.items():
+            if name in self._file and self._file[name].shape[1:] != value.shape:
+                raise RecordingError(
+                    f"{self._thing}: {name}", f"shape {value.shape}", f"shape {self._file[name].shape[1:]}"
+                )
+
+    def _grow(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> h5py.Dataset:
+        return self._file.create_dataset(
+            name, shape=(0, *shape), maxshape=(None, *shape), chunks=(1, *shape), dtype=dtype
+        )
+
+    def _write_page(self, name: str, value: NDArray[Any]) -> None:
+        dataset = self._file[name] if name in self._file else self._grow(name, value.shape, value.dtype)
+        dataset.resize(self._pages + 1, axis=0)
+        dataset[self._pages] = value

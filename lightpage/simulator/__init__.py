@@ -1,0 +1,1 @@
+"""A simulated device that records pages."""

@@ -1,0 +1,83 @@
+"""From a field and a reference beam to camera counts: interference, pose of each camera, exposure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lightpage.device.profile import Camera
+from lightpage.device.state import CameraPose, Sensor
+
+Real = NDArray[np.floating]
+Complex = NDArray[np.complexfloating]
+
+
+def in_phase_intensity(field: Complex, reference: Complex) -> Real:
+    """|E + R|^2: the s-polarised port of the homodyne detector (supplement S12, eq. 3-4, up to its constant)."""
+    return np.asarray(np.abs(field + reference) ** 2)
+
+
+def quadrature_intensity(field: Complex, reference: Complex, error: float = 0.0, sign: int = 1) -> Real:
+    """|E + i R|^2: the p-polarised port, where the quarter-wave plate has turned the signal against the reference.
+
+    Args:
+        field: signal E, any shape.
+        reference: reference R, same shape.
+        error: deviation of the turn from 90 degrees, radians.
+        sign: -1 when the wave plate is mounted the other way and the turn is -90 degrees.
+    """
+    return np.asarray(np.abs(field + sign * 1j * np.exp(1j * error) * reference) ** 2)
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """Where the pixels of one camera look on the common camera plane.
+
+    Args:
+        camera: sensor size and pitch.
+        pose: similarity transform of the sensor.
+        distortion_relative: relative radial displacement of the image at `distortion_radius_m`.
+        distortion_radius_m: normalising radius.
+    """
+
+    camera: Camera
+    pose: CameraPose
+    distortion_relative: float
+    distortion_radius_m: float
+
+    def positions_m(self) -> tuple[Real, Real]:
+        """Points (x, y) of the camera plane that land on the pixels, two arrays [rows, columns], metres."""
+        column = np.arange(self.camera.columns_px) - (self.camera.columns_px - 1) / 2 - self.pose.shift_x_px
+        row = np.arange(self.camera.rows_px) - (self.camera.rows_px - 1) / 2 - self.pose.shift_y_px
+        turn = np.deg2rad(self.pose.rotation_deg)
+        per_px = self.camera.pitch_m / (1 + self.pose.scale_relative_error)
+        x = per_px * (np.cos(turn) * column[None, :] + np.sin(turn) * row[:, None])
+        y = per_px * (-np.sin(turn) * column[None, :] + np.cos(turn) * row[:, None])
+        shrink = 1 - self.distortion_relative * (x**2 + y**2) / self.distortion_radius_m**2
+        return x * shrink, y * shrink
+
+
+def resample(image: Real, x_m: Real, y_m: Real, at_x_m: Real, at_y_m: Real) -> Real:
+    """Cubic-spline values of `image`, sampled on the uniform axes (y_m, x_m), at scattered points, float32."""
+    rows = (at_y_m - y_m[0]) / (y_m[1] - y_m[0])
+    columns = (at_x_m - x_m[0]) / (x_m[1] - x_m[0])
+    return np.asarray(
+        ndimage.map_coordinates(image.astype(np.float32), [rows, columns], order=3, mode="nearest", prefilter=True)
+    )
+
+
+def expose(intensity: Real, electrons_per_unit: float, sensor: Sensor, rng: np.random.Generator) -> NDArray[np.uint16]:
+    """Shot noise, read noise, clipping at the full well and quantisation; counts of the sensor's bit depth."""
+    expected = np.clip(intensity * electrons_per_unit, 0, None)
+    electrons = rng.poisson(expected) + sensor.read_noise_e * rng.standard_normal(intensity.shape, dtype=np.float32)
+    return to_counts(electrons, sensor)
+
+
+def to_counts(electrons: Real, sensor: Sensor) -> NDArray[np.uint16]:
+    """Electrons to counts: full scale is the full well."""
+    top = 2**sensor.bit_depth - 1
+    counts = np.clip(np.rint(electrons * (top / sensor.full_well_e)), 0, top)
+    return np.asarray(counts, dtype=np.uint16)

@@ -1,0 +1,94 @@
+"""A recording of a simulated device, made page by page, so that an interruption loses nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from lightpage.device.profile import Profile, to_toml
+from lightpage.device.state import Device
+from lightpage.errors import InvalidInputError
+from lightpage.page.symbols import random_symbols
+from lightpage.recording.reader import RecordingWriter
+from lightpage.recording.writer import discard_partial, partial_path
+from lightpage.simulator.simulator import LIGHT, Simulator
+
+_SYMBOLS = 3
+"""Random stream of the pages' symbols, beside those of the simulator."""
+
+
+class RecordingJob:
+    """One recording to make. Beside the partial file lie the settings that it is made with, until it is complete.
+
+    Args:
+        profile: the nominal device.
+        device: its true state.
+        levels: M.
+        seed: of symbols, noise and drift.
+        truth: whether to keep what only a simulator knows beside the pages.
+        out: the recording.
+    """
+
+    def __init__(self, profile: Profile, device: Device, levels: int, seed: int, truth: bool, out: Path) -> None:
+        self.profile, self.device, self.levels, self.seed, self.truth = profile, device, levels, seed, truth
+        self.out = out
+        self._simulator = Simulator(profile, device, levels, seed)
+        self.partial = partial_path(out)
+        self.settings = out.with_name(out.name + ".partial.toml")
+
+    def claim(self, force: bool) -> None:
+        """Note the settings, unless pages begun with others are there.
+
+        Raises:
+            InvalidInputError: they are there and `force` is not given, they are being written, or the folder cannot be.
+        """
+        # references alone would not tell two devices apart: the pipe does not show in them
+        text = f"light = {LIGHT}\nlevels = {self.levels}\nseed = {self.seed}\ntruth = {str(self.truth).lower()}\n"
+        text += f"{to_toml(self.device)}\n# profile\n{self.profile.to_toml()}"
+        try:
+            begun = self.settings.read_text("utf-8") if self.settings.exists() else None
+            if self.partial.exists() and begun != text:
+                if not force:
+                    raise InvalidInputError(
+                        f"--out {self.out}",
+                        f"pages begun with other settings ({self.partial.name})",
+                        "the same settings, to go on with them, or --force, to start anew",
+                    )
+                discard_partial(self.out)
+            self.settings.write_text(text, "utf-8")
+        except OSError as error:
+            raise InvalidInputError(f"--out {self.out}", error, "a place that can be written") from None
+
+    def run(self, pages: int) -> None:
+        """Simulate what is missing of `pages` pages, with a progress bar, and give the file its final name.
+
+        Raises:
+            InvalidInputError: more pages are there already.
+            RecordingError: the file cannot be written.
+        """
+        simulator = self._simulator
+        bits = self.device.sensor.bit_depth
+        with RecordingWriter.resume(self.out, self.profile, self.levels, bits, simulator.references()) as writer:
+            if writer.pages > pages:
+                raise InvalidInputError("--pages", pages, f"at least the {writer.pages} pages that are there already")
+            if self.truth:
+                writer.set_truth(to_toml(self.device))
+            simulator.skip(writer.pages)
+            for page in tqdm(
+                range(writer.pages, pages), initial=writer.pages, total=pages, unit="page", desc="simulate"
+            ):
+                self._append(writer, simulator, page)
+        self.settings.unlink(missing_ok=True)
+
+    def _append(self, writer: RecordingWriter, simulator: Simulator, page: int) -> None:
+        rng = np.random.default_rng([self.seed, _SYMBOLS, page])
+        symbols = random_symbols(self.profile, self.levels, 1, rng)[0]
+        seen = simulator.simulate(symbols)
+        truth = {
+            "exit_field": np.asarray(seen.exit_field, dtype=np.complex64),
+            "piston": np.array(seen.piston),
+            "shift_px": np.array(seen.shift_px),
+        }
+        writer.append(symbols, seen.pair, truth if self.truth else None)

@@ -1,0 +1,1 @@
+"""Light through lenses and pipe."""

@@ -1,1 +1,0 @@
-"""The storage device as physics: profile, page, waves, cameras, simulator, recording, registration. No torch here."""

@@ -1,1 +1,0 @@
-"""Measuring a device against known pages and fitting its geometry with a twin."""

@@ -1,0 +1,1 @@
+"""Many pages of one device: what a bundle is worth on them."""

@@ -1,0 +1,59 @@
+"""Pages that could not be decoded: they are kept out of the figures, told, and end a command with an error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+from lightpage.errors import InvalidInputError, LightpageError
+from runtime.errors import LostPageError
+
+_TOLD = 5
+"""Pages named in the error; the JSON file has all of them."""
+
+WORTH_NOTHING = (
+    "by what the bundle believes, these pages carry nothing: the device may have drifted far (lightpage recalibrate), "
+    "be another one, have its cameras the other way round, or its symbols another number of levels or other pages"
+)
+"""Said of pages on which what is right in a decoder's claims adds up to nothing."""
+
+
+@dataclass(frozen=True)
+class RefusedPage:
+    """A page that was not given out.
+
+    Attributes:
+        page: its number, None where only the service knows it.
+        reason: why, for people.
+        unconfirmed: whether it was decoded, and its pilots did not bear out the result.
+        loss: why, for programs: the name of a `runtime.errors.Reason`; None of a page that was not decoded.
+        recalibration_due: whether it shows that the device has changed since it was calibrated.
+    """
+
+    page: int | None
+    reason: str
+    unconfirmed: bool = False
+    loss: str | None = None
+    recalibration_due: bool = False
+
+    @classmethod
+    def of(cls, page: int | None, error: LightpageError) -> Self:
+        """The page that an error is about."""
+        if not isinstance(error, LostPageError):
+            return cls(page, str(error))
+        return cls(page, str(error), True, error.reason.value, error.recalibration_due)
+
+
+def unconfirmed(refused: Sequence[RefusedPage]) -> int:
+    """How many of the pages were decoded and not confirmed."""
+    return sum(page.unconfirmed for page in refused)
+
+
+def refusal(thing: str, refused: Sequence[RefusedPage], pages: int) -> InvalidInputError:
+    """The error that a command ends with when `refused` of its `pages` pages of `thing` could not be decoded."""
+    told = "; ".join(f"page {'unknown' if r.page is None else r.page}: {r.reason}" for r in refused[:_TOLD])
+    more = f"; and {len(refused) - _TOLD} more" if len(refused) > _TOLD else ""
+    return InvalidInputError(
+        thing, f"{len(refused)} of {pages} pages that were refused ({told}{more})", "pages that can be decoded"
+    )

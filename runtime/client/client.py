@@ -1,0 +1,320 @@
+"""A Python client of the service; its errors are of the same classes that the service raised."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import grpc
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import FrameError, LightpageError
+from lightpage.recording.reader import FramePair
+from runtime.decoding.decoder import ImagePosition
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from runtime.service.limits import CHUNK_BYTES, REPLY_BYTES
+from runtime.wire.address import check_address
+from runtime.wire.convert import (
+    PIXEL_CODES,
+    PIXEL_TYPES,
+    KnownPilots,
+    RemotePage,
+    image_of,
+    pilots_message,
+    remote_page,
+)
+from runtime.wire.status import error_of
+
+CALL_S = 60.0
+"""Deadline of a call where none is given."""
+
+RECALIBRATION_S = 600.0
+"""Deadline of a recalibration where none is given."""
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """A model that the service holds."""
+
+    name: str
+    version: str
+    created: str
+    current: bool
+    metrics: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a service is."""
+
+    service_version: str
+    model: ModelInfo
+    frame_shape: tuple[int, int]
+    frame_dtype: str
+    bit_depth: int
+    page_shape: tuple[int, int]
+    source: str
+    source_levels: int
+    profile_toml: str
+    calibration_toml: str
+    pilot_mask: NDArray[np.bool_]
+    pilot_phases: NDArray[np.float32] | None
+    """Radians, one a True of `pilot_mask` in row order; None for the profile's pattern."""
+
+
+@dataclass(frozen=True)
+class Recalibrated:
+    """The result of a recalibration: AIR in bits per symbol on held-back pages; None where the fit does not say."""
+
+    model_version: str
+    previous_version: str
+    pages_used: int
+    pages_held_back: int
+    air_before: float
+    air_after: float
+    angle_deg: float | None
+    coherence_before: float | None
+    coherence_after: float | None
+    seconds: float
+    pages_lost_before: int = 0
+    image: ImagePosition | None = None
+
+
+class LightpageClient:
+    """Talks to the service at `target` (HOST:PORT). Use it in a `with` statement, or `close` it.
+
+    Every method raises the `LightpageError` that the service raised, or one that says why there was no answer.
+
+    Args:
+        target: where the service is.
+        timeout_s: deadline of a call.
+    """
+
+    def __init__(self, target: str, timeout_s: float = CALL_S) -> None:
+        check_address("target", target)
+        self.target, self._timeout = target, timeout_s
+        self._channel = grpc.insecure_channel(
+            target,
+            options=(
+                ("grpc.max_receive_message_length", REPLY_BYTES),
+                ("grpc.enable_http_proxy", 0),  # the device is on the local network
+            ),
+        )
+        self._stub = pb_grpc.LightpageStub(self._channel)  # type: ignore[no-untyped-call]
+        self._description: Description | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all calls and close the connection."""
+        self._channel.close()
+
+    def describe(self) -> Description:
+        """What the service is now.
+
+        Raises:
+            LightpageError: no answer.
+        """
+        reply: pb.DescribeReply = self._unary(self._stub.Describe, pb.DescribeRequest())
+        self._description = Description(
+            service_version=reply.service_version,
+            model=_model(reply.model),
+            frame_shape=(reply.camera.rows_px, reply.camera.columns_px),
+            frame_dtype=PIXEL_TYPES.get(reply.camera.pixel_type, "unknown"),
+            bit_depth=reply.camera.bit_depth,
+            page_shape=(reply.page.rows, reply.page.columns),
+            source=reply.source,
+            source_levels=reply.source_levels,
+            profile_toml=reply.profile_toml,
+            calibration_toml=reply.calibration_toml,
+            pilot_mask=np.frombuffer(reply.pilot_mask, np.uint8).reshape(reply.page.rows, reply.page.columns) != 0,
+            pilot_phases=np.array(reply.pilot_phases, np.float32) if reply.pilot_phases else None,
+        )
+        return self._description
+
+    def decode(
+        self,
+        pair: FramePair,
+        levels: int = 256,
+        *,
+        bit_depth: int | None = None,
+        pilots: KnownPilots | None = None,
+        want_concentration: bool = False,
+        want_phase: bool = False,
+        quantised: bool = False,
+    ) -> RemotePage:
+        """Send a frame pair and get its symbols.
+
+        Args:
+            pair: both frames, uint8 or uint16.
+            levels: M, 2..256.
+            bit_depth: bits of a camera count; by default those of the service's camera.
+            pilots: known symbols, where they differ from the device's pilots.
+            want_concentration: also get kappa.
+            want_phase: also get the phase.
+            quantised: get the confidence in one byte a symbol.
+
+        Raises:
+            FrameError: frames that cannot be sent, or that the service refuses.
+            PageError: an impossible level count, or pilots that do not fit the page.
+            SlotsTakenError: the service had no free slot until the deadline.
+        """
+        if bit_depth is None:
+            bit_depth = (self._description or self.describe()).bit_depth
+        frames = [np.asarray(pair.in_phase), np.asarray(pair.quadrature)]
+        for name, frame in zip(("in-phase frame", "quadrature frame"), frames, strict=True):
+            if frame.dtype.name not in PIXEL_CODES or frame.ndim != 2 or frame.shape != frames[0].shape:
+                raise FrameError(
+                    name, f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the other"
+                )
+        if frames[0].dtype != frames[1].dtype:
+            raise FrameError("quadrature frame", f"type {frames[1].dtype}", f"type {frames[0].dtype}, as in-phase")
+        header = pb.DecodeHeader(
+            rows_px=frames[0].shape[0],
+            columns_px=frames[0].shape[1],
+            pixel_type=PIXEL_CODES[frames[0].dtype.name],
+            bit_depth=bit_depth,
+            options=_options(levels, want_concentration, want_phase, quantised),
+            pilots=pilots_message(pilots) if pilots is not None else None,
+        )
+        reply: pb.DecodeReply = self._unary(self._stub.DecodeFrames, _parts(header, frames))
+        return remote_page(reply)
+
+    def read_page(
+        self,
+        page: int | None = None,
+        levels: int | None = None,
+        *,
+        want_concentration: bool = False,
+        want_phase: bool = False,
+        want_written: bool = False,
+        quantised: bool = False,
+    ) -> RemotePage:
+        """Have the service read a page from its source; None stands for the next page and the source's levels.
+
+        Raises:
+            SourceError: the service has no source, or one that is damaged or dark.
+            PageError: no such page, or an impossible level count.
+            SlotsTakenError: the service had no free slot until the deadline.
+        """
+        request = pb.ReadPageRequest(
+            options=_options(levels or 0, want_concentration, want_phase, quantised), want_written=want_written
+        )
+        if page is not None:
+            request.page = page
+        reply: pb.ReadPageReply = self._unary(self._stub.ReadPage, request)
+        return remote_page(reply.decoded, reply)
+
+    def recalibrate(
+        self,
+        *,
+        count: int = 0,
+        pages: Sequence[int] = (),
+        recording: str | None = None,
+        progress: Callable[[str, float], None] = lambda step, fraction: None,
+        timeout_s: float = RECALIBRATION_S,
+    ) -> Recalibrated:
+        """Recalibrate with pages of the source (`pages`, or the next `count`) or with a recording on the server.
+
+        Of a recording the first `count` pages are used, all of them where it is 0.
+
+        Raises:
+            RecalibrationRefusedError: the new model would not be better; the old one stays.
+            BusyError: another recalibration runs.
+            LimitError: more pages than the service takes.
+            InvalidInputError: no such pages or recording, too few pages, the same one twice, or unknown symbols.
+            SourceError: the service has no source or recordings, or damaged ones, or no symbols of its own pages.
+            StoppingError: the service is being stopped.
+            BundleError: the new model cannot be written or noted; the old one stays.
+        """
+        request = pb.RecalibrateRequest()
+        if recording is not None:
+            request.recording, request.recording_count = recording, count
+        else:
+            request.source.CopyFrom(pb.SourcePages(count=count, pages=pages))
+        call = self._stub.Recalibrate(request, timeout=timeout_s)
+        try:
+            result = None
+            for reply in call:  # to its end: a call that is left early counts as cancelled
+                if reply.WhichOneof("step") == "result":
+                    result = _recalibrated(reply.result)
+                else:
+                    progress(reply.progress.step, reply.progress.fraction)
+        except grpc.RpcError as error:
+            raise error_of(error, self.target) from None
+        finally:
+            call.cancel()
+        if result is None:
+            raise LightpageError(f"service at {self.target}", "an end without a result", "a recalibration's result")
+        return result
+
+    def rollback(self) -> tuple[str, str]:
+        """Go back to the model before; returns the versions (now current, dropped).
+
+        Raises:
+            BundleError: there is none, or the change cannot be noted in the service's store; then nothing changes.
+        """
+        reply: pb.RollbackReply = self._unary(self._stub.Rollback, pb.RollbackRequest())
+        return reply.model_version, reply.previous_version
+
+    def models(self) -> list[ModelInfo]:
+        """All models that the service holds, the oldest first.
+
+        Raises:
+            LightpageError: no answer.
+        """
+        reply: pb.ListModelsReply = self._unary(self._stub.ListModels, pb.ListModelsRequest())
+        return [_model(model) for model in reply.models]
+
+    def _unary(self, method: Callable[..., Any], request: object) -> Any:
+        try:
+            return method(request, timeout=self._timeout)
+        except grpc.RpcError as error:
+            raise error_of(error, self.target) from None
+
+
+def _parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> Iterator[pb.DecodeFramesRequest]:
+    yield pb.DecodeFramesRequest(header=header)
+    for frame in frames:
+        data = np.ascontiguousarray(frame, frame.dtype.newbyteorder("<")).view(np.uint8).reshape(-1)
+        for start in range(0, data.size, CHUNK_BYTES):
+            yield pb.DecodeFramesRequest(chunk=data[start : start + CHUNK_BYTES].tobytes())
+
+
+def _options(levels: int, concentration: bool, phase: bool, quantised: bool) -> pb.DecodeOptions:
+    code = pb.CONFIDENCE_FORMAT_UINT8 if quantised else pb.CONFIDENCE_FORMAT_FLOAT32
+    return pb.DecodeOptions(levels=levels, confidence_format=code, want_concentration=concentration, want_phase=phase)
+
+
+def _model(model: pb.Model) -> ModelInfo:
+    return ModelInfo(model.name, model.version, model.created, model.current, dict(model.metrics))
+
+
+def _recalibrated(result: pb.RecalibrationResult) -> Recalibrated:
+    def optional(name: str) -> float | None:
+        return float(getattr(result, name)) if result.HasField(name) else None
+
+    return Recalibrated(
+        model_version=result.model_version,
+        previous_version=result.previous_version,
+        pages_used=result.pages_used,
+        pages_held_back=result.pages_held_back,
+        air_before=result.air_before,
+        air_after=result.air_after,
+        angle_deg=optional("angle_deg"),
+        coherence_before=optional("coherence_before"),
+        coherence_after=optional("coherence_after"),
+        seconds=result.seconds,
+        pages_lost_before=result.pages_lost_before,
+        image=image_of(result.image) if result.HasField("image") else None,
+    )

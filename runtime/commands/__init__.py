@@ -1,0 +1,1 @@
+"""Subcommands of `lightpage` that need no torch."""

@@ -1,0 +1,64 @@
+"""`lightpage bench`: how long a page takes, inference alone, decoded, and through gRPC, timed side by side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import numpy as np
+from tqdm import tqdm
+
+from lightpage.files import OutputFile, write_json
+from runtime.bundle.shipped import DEFAULT, bundle_path
+from runtime.client.client import LightpageClient
+from runtime.decoding.decoder import Decoder
+from runtime.execution.cpus import available_cpus
+from runtime.recalibration.refit import refit
+from runtime.rpc.server import LightpageServer
+from runtime.service.dataplane import DataPlane
+from runtime.service.recalibrator import Recalibrator
+from runtime.service.registry import ModelRegistry
+
+LEVELS = 16
+WARM_UP = 2
+
+
+@click.command()
+@click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+@click.option("--rounds", default=20, show_default=True, type=click.IntRange(3, 1000), help="Timed rounds.")
+@click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def bench(bundle: str, rounds: int, threads: int | None, json_path: Path | None) -> None:
+    """Time one page three ways in turn, so that a machine whose speed drifts does not tilt the comparison."""
+    decoder = Decoder.load(bundle_path(bundle), threads)
+    pair = decoder.bundle.golden.pair
+    plane = DataPlane(ModelRegistry(decoder))
+    with LightpageServer(plane, Recalibrator(plane, refit, None)) as server, LightpageClient(server.target) as client:
+        client.describe()
+        ways: dict[str, Callable[[], object]] = {
+            "inference": lambda: decoder.infer(pair),
+            "decode": lambda: decoder.decode(pair, LEVELS),
+            "grpc": lambda: client.decode(pair, LEVELS),
+        }
+        seconds: dict[str, list[float]] = {name: [] for name in ways}
+        for turn in tqdm(range(rounds + WARM_UP), desc="bench", unit="round"):
+            for name, way in ways.items():
+                start = time.perf_counter()
+                way()
+                if turn >= WARM_UP:
+                    seconds[name].append(time.perf_counter() - start)
+    median = {name: float(np.median(values)) for name, values in seconds.items()}
+    figures = {
+        "bundle_version": decoder.version,
+        "threads": threads or available_cpus(),
+        "rounds": rounds,
+        **{f"{name}_p50_seconds": value for name, value in median.items()},
+        "decode_over_inference": median["decode"] / median["inference"],
+        "grpc_over_inference": median["grpc"] / median["inference"],
+    }
+    if json_path is not None:
+        write_json(json_path, figures)
+    for name, label in (("inference", "ONNX Runtime alone"), ("decode", "whole decode"), ("grpc", "through gRPC")):
+        click.echo(f"{label:<20} p50 {1e3 * median[name]:8.1f} ms   {median[name] / median['inference']:5.2f} x")

@@ -1,0 +1,72 @@
+"""`lightpage evaluate`: what a bundle is worth on a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+from tqdm import tqdm
+
+from lightpage.files import OutputFile, write_json
+from lightpage.progress import warn
+from lightpage.recording.reader import Recording
+from runtime.bulk.evaluation import Evaluation, NothingReadError
+from runtime.bulk.evaluation import evaluate as evaluate_recording
+from runtime.bulk.refused import WORTH_NOTHING, refusal, unconfirmed
+from runtime.bundle.shipped import DEFAULT, bundle_path
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.image_tracker import tracker_for
+from runtime.decoding.tracking import NoTracker
+
+
+@click.command()
+@click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+@click.option("--recording", required=True, type=click.Path(), help="HDF5 recording with known symbols.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+@click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
+@click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
+def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int | None, tracking: bool) -> None:
+    """Measure a bundle on the pages of a recording that it has not seen.
+
+    Pages that cannot be decoded, or whose pilots do not confirm the result, are left out of the figures, named, and
+    make the exit status 2.
+    """
+    decoder = Decoder.load(bundle_path(bundle), threads)
+    with Recording.open(recording) as pages, tqdm(total=pages.pages, unit="page", desc="evaluate") as bar:
+        tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
+        try:
+            count, result = pages.pages, evaluate_recording(decoder, pages, tracker, bar.update)
+        except NothingReadError as error:
+            if json_path is not None:
+                write_json(json_path, error.figures)
+            raise
+    if json_path is not None:
+        write_json(json_path, result.to_json())
+    click.echo(describe(result))
+    if result.figures.air_bits_per_symbol <= 0:
+        warn(WORTH_NOTHING)
+    if result.refused:
+        raise refusal(f"recording {recording}", result.refused, count)
+
+
+def describe(result: Evaluation) -> str:
+    """The figures as a table for people."""
+    figures = result.figures
+    gmi, lost = figures.gmi_bits_per_symbol, unconfirmed(result.refused)
+    rows = [
+        ("bundle", result.bundle_version),
+        ("pages", f"{result.pages} of {figures.levels} levels"),
+        ("left out", f"{result.pages_left_out} that the bundle was calibrated or trained on"),
+        ("refused", f"{len(result.refused) - lost} that cannot be decoded"),
+        ("not confirmed", f"{lost} whose pilots do not bear out what is claimed"),
+        ("data symbols a page", f"{result.symbols_per_page}"),
+        ("AIR", f"{figures.air_bits_per_symbol:.3f} bit/symbol"),
+        ("own MI", f"{figures.own_mi_bits_per_symbol:.3f} bit/symbol"),
+        ("over-claim", f"{figures.over_claim_bits_per_symbol:.3f} bit/symbol"),
+        ("GMI", "no Gray labels" if gmi is None else f"{gmi:.3f} bit/symbol"),
+        ("page", f"{result.page_kb:.3f} kB"),
+        ("symbol error rate", f"{figures.symbol_error_rate:.4f}"),
+        ("ECE", f"{figures.ece:.4f}"),
+        ("decode", f"{1e3 * result.seconds_per_page:.1f} ms a page (median)"),
+    ]
+    return "\n".join(f"{name:<20} {value}" for name, value in rows)

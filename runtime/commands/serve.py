@@ -1,0 +1,146 @@
+"""`lightpage serve`: the service until it is told to stop."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lightpage.errors import BundleError, CalibrationError, InvalidInputError
+from runtime.acquisition.sources import open_source
+from runtime.bundle.shipped import DEFAULT, bundle_path
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.image_tracker import tracker_for
+from runtime.recalibration.refit import refit
+from runtime.rpc.server import LightpageServer
+from runtime.service.dataplane import DataPlane
+from runtime.service.metrics import MetricsServer, ServiceMetrics
+from runtime.service.recalibrator import Recalibrator
+from runtime.service.registry import ModelRegistry
+from runtime.service.store import ModelStore
+from runtime.wire.address import check_address
+
+ADDRESS = "127.0.0.1:50051"
+
+_log = logging.getLogger(__name__)
+
+
+@click.command()
+@click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+@click.option("--source", help="simulator:PROFILE, recording:FILE or camera:...; without it only sent frames decode.")
+@click.option("--address", default=ADDRESS, show_default=True, help="HOST:PORT to listen on; port 0 takes a free one.")
+@click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus figures on this port.")
+@click.option("--metrics-host", default="127.0.0.1", show_default=True, help="Where the figures are shown.")
+@click.option(
+    "--store",
+    type=click.Path(file_okay=False, path_type=Path),
+    envvar="LIGHTPAGE_STORE",
+    show_envvar=True,
+    help="Folder for recalibrated bundles; the one in service is used again after a restart.",
+)
+@click.option(
+    "--recordings",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder whose recordings a caller may name to recalibrate with.",
+)
+@click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
+@click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
+def serve(
+    bundle: str,
+    source: str | None,
+    address: str,
+    metrics_port: int | None,
+    metrics_host: str,
+    store: Path | None,
+    recordings: Path | None,
+    threads: int | None,
+    tracking: bool,
+) -> None:
+    """Run the service until SIGTERM or Ctrl-C; calls in flight are finished first."""
+    check_address("--address", address, least_port=0)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
+    with stop_signals() as wait_for_stop:
+        base = Decoder.load(bundle_path(bundle), threads)
+        models = ModelStore(store, base.bundle) if store is not None else None
+        registry = ModelRegistry(base, tracker_for) if tracking else ModelRegistry(base)
+        if models is not None:
+            _resume(registry, models, threads)
+        pages = open_source(source) if source is not None else None
+        metrics = ServiceMetrics()
+        try:
+            plane = DataPlane(registry, pages, models, metrics=metrics)
+            with (
+                _shown(metrics, metrics_port, metrics_host),
+                LightpageServer(plane, Recalibrator(plane, refit, recordings), address) as server,
+            ):
+                version, source_name = registry.current.version, pages.name if pages is not None else "no source"
+                click.echo(f"serving {version} from {source_name} at {server.target}")
+                wait_for_stop()
+                click.echo("stopping")
+        finally:
+            if pages is not None:
+                pages.close()
+
+
+@contextmanager
+def stop_signals() -> Iterator[Callable[[], None]]:
+    """Yields what waits for SIGTERM or SIGINT; a second one of either ends the process the usual way.
+
+    It waits for the byte that the interpreter's own handler writes. Waiting for a lock that a Python handler releases
+    would miss a signal that comes between the last look for one and the sleep.
+    """
+    before: dict[int, Any] = {}
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+
+    def no_more(number: int, _: object) -> None:
+        for kind in before:
+            signal.signal(kind, signal.SIG_DFL)
+
+    def wait() -> None:
+        while receiver.recv(1)[0] not in before:
+            pass
+
+    with receiver, sender:
+        waking = signal.set_wakeup_fd(sender.fileno())
+        try:
+            for kind in (signal.SIGTERM, signal.SIGINT):
+                before[kind] = signal.signal(kind, no_more)
+            yield wait
+        finally:
+            signal.set_wakeup_fd(waking)
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def _resume(registry: ModelRegistry, store: ModelStore, threads: int | None) -> None:
+    """Put the model back in service that was recalibrated from this bundle before a restart, if it can be used."""
+    path = store.last()
+    if path is None:
+        return
+    try:
+        registry.swap(Decoder.load(path, threads))
+    except (BundleError, CalibrationError) as error:
+        _log.warning("serving %s as it was given: %s", registry.current.version, error)
+
+
+@contextmanager
+def _shown(metrics: ServiceMetrics, port: int | None, host: str) -> Iterator[None]:
+    if port is None:
+        yield
+        return
+    try:
+        server = MetricsServer.start(metrics, port, host)
+    except OSError as error:
+        raise InvalidInputError(f"--metrics-port {port}", error, "a free port of this machine") from None
+    click.echo(f"metrics at http://{host}:{server.port}/metrics")
+    try:
+        yield
+    finally:
+        server.close()

@@ -1,0 +1,1 @@
+"""From a frame pair to symbols, page after page."""

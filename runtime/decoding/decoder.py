@@ -1,0 +1,423 @@
+"""Decodes frame pairs with a bundle: checks, one ONNX run, piston from the pilots, decision with confidence."""
+
+from __future__ import annotations
+
+import time
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.device.profile import Profile
+from lightpage.errors import BundleError, FrameError, InvalidInputError
+from lightpage.metrics.information import decide_with_confidence
+from lightpage.page.pilots import PilotCheck, Pilots, read_pilots, remove_piston
+from lightpage.page.symbols import MAX_LEVELS, check_levels
+from lightpage.recording.reader import FramePair
+from lightpage.waves.grid import field_grid
+from runtime.bundle.bundle import Bundle, Table
+from runtime.bundle.manifest import DECODER, FIELD, GOLDEN
+from runtime.decoding.frames import check_pair
+from runtime.execution.constant_table import GraphFile
+from runtime.execution.session import Port, Session, open_session
+
+OUTPUTS = ("p", "phase", "concentration")
+FIELD_OUTPUTS = ("field", "unexplained")
+"""Outputs of the field graph, or of a decoder that shows them, [2, Gy, Gx] each: the recovered field, and what is left
+of the homodyne equations."""
+PAGE_INPUTS = frozenset(["registration"])
+"""Table inputs that may differ from page to page, as the image shifts."""
+_LARGE_WITH_REAL_LENSES = frozenset(["parameters"])
+"""Table inputs from which gigabytes follow, with lenses that are not ideal: no sooner read than made again."""
+GOLDEN_TOLERANCE = 1e-3
+"""Largest error of p on the golden page, relative to its norm: room for another CPU's rounding, not for another net."""
+
+
+def inputs_left(profile: Profile) -> frozenset[str]:
+    """Table inputs of a device's decoder that are not built into its graph."""
+    return PAGE_INPUTS if profile.ideal_lenses else PAGE_INPUTS | _LARGE_WITH_REAL_LENSES
+
+
+@dataclass(frozen=True)
+class Inference:
+    """What the graph says of a page: p float32 [2, ny, nx], its angle and its length [ny, nx]; piston still in it."""
+
+    p: NDArray[np.float32]
+    phase: NDArray[np.float32]
+    concentration: NDArray[np.float32]
+
+    def turned(self, by: NDArray[np.floating]) -> Inference:
+        """The same with `by` (radians [ny, nx]) added to the phases."""
+        phase = (self.phase + by).astype(np.float32)
+        p = self.concentration * np.stack([np.cos(phase), np.sin(phase)])
+        return Inference(p, phase, self.concentration)
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Wall-clock seconds of one page, every attempt at it counted.
+
+    Attributes:
+        check_s: checks of the frames.
+        inference_s: runs of the graph.
+        decision_s: piston, tracking and decision.
+        search_s: looking for the image.
+    """
+
+    check_s: float
+    inference_s: float
+    decision_s: float
+    search_s: float = 0.0
+
+    @property
+    def total_s(self) -> float:
+        """All of it."""
+        return self.check_s + self.inference_s + self.decision_s + self.search_s
+
+
+@dataclass(frozen=True)
+class ImagePosition:
+    """Where the image of a page lay on the cameras.
+
+    Attributes:
+        shift_x_px, shift_y_px: against where calibration saw it, camera pixels, on both cameras.
+        tilt_x_rad, tilt_y_rad: of the signal against the reference since calibration, radians at the right and lower
+            edge of the page's image.
+        searched: whether it was looked for.
+        found: whether the search found it; False where none was made.
+    """
+
+    shift_x_px: float
+    shift_y_px: float
+    tilt_x_rad: float = 0.0
+    tilt_y_rad: float = 0.0
+    searched: bool = False
+    found: bool = False
+
+
+@dataclass(frozen=True)
+class DecodedPage:
+    """A page of symbols with what is known about each.
+
+    Attributes:
+        symbols: uint8 [ny, nx], 0..levels-1.
+        confidence: float32 [ny, nx], posterior probability of each symbol among the levels.
+        concentration: float32 [ny, nx], von Mises kappa as far as the pilots bear it out.
+        phase: float32 [ny, nx], radians, piston removed.
+        levels: M.
+        piston_rad: what was removed.
+        pilot_coherence: how far the pilots agree on it, 0..1.
+        pilot_trust: share of the network's claimed concentration that they bear out, 0..1; low after a drift.
+        check: information that is claimed of the pilots, and what of it they confirm.
+        timings: seconds.
+        image: where the image lies as this page shows it, None where it is not followed.
+    """
+
+    symbols: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    concentration: NDArray[np.float32]
+    phase: NDArray[np.float32]
+    levels: int
+    piston_rad: float
+    pilot_coherence: float
+    pilot_trust: float
+    check: PilotCheck
+    timings: Timings
+    image: ImagePosition | None = None
+
+
+class Decoder:
+    """The decoder of one bundle. Its methods may be called from many threads at once.
+
+    Args:
+        bundle: an opened bundle.
+        threads: threads of one inference; by default the cores that this process may use.
+
+    Raises:
+        BundleError: the graph is not a decoder of this profile, table or pilots do not fit it, or the golden page
+            comes out differently.
+    """
+
+    def __init__(self, bundle: Bundle, threads: int | None = None) -> None:
+        self.bundle, self.threads = bundle, threads
+        self._thing = f"{bundle.thing}: {DECODER}"
+        graph = GraphFile(bundle.files[DECODER], self._thing)
+        self._graph, self._ports = graph, graph.table_inputs
+        if set(self._ports) != set(bundle.manifest.table_inputs):
+            wanted = sorted(bundle.manifest.table_inputs)
+            raise BundleError(f"{self._thing}: table inputs", sorted(self._ports), wanted)
+        self._build_in(graph, self._checked_defaults(bundle.table))
+        self._check_graph(self._session)
+        residual = bundle.manifest.residual_output
+        self._outputs = [*OUTPUTS, *([residual] if residual else [])]
+        self._pilots: dict[int, Pilots] = {}
+        self.pilots(MAX_LEVELS)  # damaged pilots are noticed now, not with the first page
+        self._check_golden()
+
+    @classmethod
+    def load(cls, path: str | Path, threads: int | None = None) -> Decoder:
+        """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
+        return cls(Bundle.open(path), threads)
+
+    def with_table(self, table: Table) -> Decoder:
+        """This decoder with other tensors in its table, by name; those left out stay. The golden page is not looked at.
+
+        Raises:
+            InvalidInputError: a table that does not fit.
+        """
+        self.check_table(table)
+        other = copy(self)
+        other._build_in(self._graph, {**self._table, **table})
+        return other
+
+    def of_bundle(self, bundle: Bundle) -> Decoder:
+        """This decoder with the table of a bundle of the same graphs, whose golden page is not looked at.
+
+        Raises:
+            BundleError: its table does not fit.
+        """
+        other = copy(self)
+        other.bundle = bundle
+        other._build_in(self._graph, {**self._table, **other._checked_defaults(bundle.table)})
+        return other
+
+    def table_value(self, name: str) -> NDArray[Any]:
+        """A tensor of the table as this decoder decodes with it.
+
+        Raises:
+            InvalidInputError: no such tensor.
+        """
+        if name not in self._ports:
+            raise InvalidInputError("table", repr(name), f"one of {sorted(self._ports)}")
+        return self._table[name] if name in self._table else self._graph.default(name)
+
+    @property
+    def references(self) -> FramePair:
+        """The reference-only frames that this decoder decodes with.
+
+        Raises:
+            InvalidInputError: its table holds none.
+        """
+        in_phase, quadrature = (self.table_value(f"reference_{name}") for name in ("in_phase", "quadrature"))
+        return FramePair(in_phase, quadrature)
+
+    @property
+    def version(self) -> str:
+        """The bundle's version."""
+        return self.bundle.version
+
+    @property
+    def table_shapes(self) -> dict[str, tuple[int | None, ...]]:
+        """Shape of every tensor of the table."""
+        return {name: port.shape for name, port in self._ports.items()}
+
+    def pilots(self, levels: int, mask: NDArray[np.bool_] | None = None) -> Pilots:
+        """The pilots that this device's pages carry at `levels` levels.
+
+        The device's own phases where the bundle holds them, whatever `levels` is, else the profile's seeded pattern.
+
+        Args:
+            levels: M.
+            mask: where a page's pilots are, bool [ny, nx], if not where the bundle has them: then the pattern holds.
+        """
+        if mask is not None and not np.array_equal(mask, self.bundle.pilot_mask):
+            return Pilots.of_profile(self.bundle.profile, levels, mask)
+        if levels not in self._pilots:
+            # Two threads may both do this; the results are equal and either may stay.
+            own, phases = self.bundle.pilot_mask, self.bundle.pilot_phases
+            self._pilots[levels] = (
+                Pilots.of_profile(self.bundle.profile, levels, own)
+                if phases is None
+                else Pilots(own, phases.astype(np.float64))
+            )
+        return self._pilots[levels]
+
+    def check(self, pair: FramePair) -> None:
+        """Check a frame pair against the camera of this bundle.
+
+        Raises:
+            FrameError: wrong size, type or bit depth, black or saturated.
+        """
+        manifest = self.bundle.manifest
+        check_pair(pair, self.bundle.profile.frame_shape, manifest.frame_dtype, manifest.camera_bit_depth)
+
+    def check_table(self, table: Table) -> None:
+        """Check tensors that are to stand in the table instead of the graph's defaults.
+
+        Raises:
+            InvalidInputError: an unknown name, a wrong type or shape, or values that are not finite.
+        """
+        for name, value in table.items():
+            port = self._ports.get(name)
+            if port is None:
+                raise InvalidInputError("table", repr(name), f"one of {sorted(self._ports)}")
+            if not port.admits(str(value.dtype), value.shape):
+                raise InvalidInputError(f"table {name}", f"{value.dtype} {value.shape}", f"{port.dtype} {port.shape}")
+            if not np.isfinite(value).all():
+                raise InvalidInputError(f"table {name}", "NaN or infinity", "finite numbers")
+
+    def infer(self, pair: FramePair, table: Table | None = None) -> Inference:
+        """Run the graph on a checked pair.
+
+        Args:
+            pair: both frames, as `check` accepts them.
+            table: tensors for this page alone, of `PAGE_INPUTS`; all others take `with_table`.
+
+        Raises:
+            InvalidInputError: a table that does not fit.
+            FrameError: the frames contradict the homodyne equations beyond the bundle's limit.
+        """
+        table = table or {}
+        self.check_table(table)
+        if others := set(table) - PAGE_INPUTS:
+            raise InvalidInputError("table of a page", ", ".join(sorted(others)), f"only {', '.join(PAGE_INPUTS)}")
+        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **self._fed, **table}
+        p, phase, concentration, *rest = self._session.run(self._outputs, feeds)
+        limit = self.bundle.manifest.residual_limit
+        if rest and limit is not None and not (residual := float(np.max(rest[0]))) <= limit:
+            raise FrameError(
+                "frame pair",
+                f"frames that contradict each other (residual {residual:.3g})",
+                f"an in-phase and a quadrature frame of one shot, not swapped, and cameras where they were calibrated "
+                f"(residual up to {limit:.3g}; where frames are right, recalibrate)",
+            )
+        return Inference(p, phase, concentration)
+
+    def recover_field(
+        self,
+        pair: FramePair,
+        references: FramePair,
+        registration: NDArray[np.float32],
+        homodyne: NDArray[np.float32],
+    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+        """The field behind a frame pair (`lightpage.calibration.interfaces.FieldSolver`), whatever its residual is.
+
+        Raises:
+            BundleError: no graph shows the field.
+            InvalidInputError: a tensor that does not fit.
+        """
+        session = self._field_session
+        if missing := set(FIELD_OUTPUTS) - {node.name for node in session.get_outputs()}:
+            raise BundleError(f"{self._thing}: outputs", f"no {', '.join(sorted(missing))}", "a graph with its field")
+        table: Table = {
+            "reference_in_phase": references.in_phase,
+            "reference_quadrature": references.quadrature,
+            "registration": registration,
+            "homodyne": homodyne,
+        }
+        self.check_table(table)
+        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
+        if FIELD not in self.bundle.files:
+            feeds = {**self._table, **feeds}
+        (real, imaginary), left = session.run(FIELD_OUTPUTS, feeds)
+        if real.shape != (wanted := field_grid(self.bundle.profile).shape):
+            raise BundleError(
+                f"{self._thing}: output field", f"shape {real.shape}", f"{wanted}, or a {FIELD} beside it"
+            )
+        return np.asarray(real + 1j * imaginary, np.complex64), left
+
+    @property
+    def has_field_graph(self) -> bool:
+        """Whether `recover_field` runs the field alone, and not all of the decoder."""
+        return FIELD in self.bundle.files
+
+    @cached_property
+    def _field_session(self) -> Session:
+        """The field's own graph, which does no more than is asked for; without one, the decoder's, all of it fed."""
+        name = FIELD if FIELD in self.bundle.files else DECODER
+        return open_session(self.bundle.files[name], f"{self.bundle.thing}: {name}", self.threads)
+
+    def decode(
+        self, pair: FramePair, levels: int = 256, table: Table | None = None, pilots: Pilots | None = None
+    ) -> DecodedPage:
+        """Decode a frame pair into symbols of `levels` levels.
+
+        Args:
+            pair: both frames.
+            levels: M, 2..256.
+            table: as for `infer`.
+            pilots: the known symbols of this page, where they differ from this device's pattern.
+
+        Raises:
+            FrameError, PageError, InvalidInputError: see `check`, `check_levels` and `infer`.
+        """
+        start = time.perf_counter()
+        check_levels(levels)
+        self.check(pair)
+        checked = time.perf_counter()
+        inference = self.infer(pair, table)
+        inferred = time.perf_counter()
+        page = self.post_process(inference, levels, pilots)
+        return replace(page, timings=Timings(checked - start, inferred - checked, time.perf_counter() - inferred))
+
+    def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        """Piston, trust and decision: everything behind the graph, timings left at zero."""
+        reading = read_pilots(inference.p, pilots or self.pilots(levels))
+        phase = remove_piston(inference.phase, reading.piston.angle_rad)
+        concentration = inference.concentration * np.float32(reading.trust)
+        symbols, confidence = decide_with_confidence(phase, concentration, levels)
+        return DecodedPage(
+            symbols=symbols,
+            confidence=confidence,
+            concentration=concentration,
+            phase=phase,
+            levels=levels,
+            piston_rad=reading.piston.angle_rad,
+            pilot_coherence=reading.piston.coherence,
+            pilot_trust=reading.trust,
+            check=reading.check,
+            timings=Timings(0.0, 0.0, 0.0),
+        )
+
+    def _build_in(self, graph: GraphFile, table: Table) -> None:
+        """Open the graph with this table, which was checked."""
+        fed = inputs_left(self.bundle.profile)
+        self._table, self._fed = table, {name: value for name, value in table.items() if name in fed}
+        self._session = open_session(graph.built_in(table, fed), self._thing, self.threads)
+
+    def _check_graph(self, session: Session) -> None:
+        """Check names, types and shapes of the frames and of what the graph says of them."""
+        manifest, profile = self.bundle.manifest, self.bundle.profile
+        inputs = {node.name: Port.of(node) for node in session.get_inputs()}
+        if set(inputs) != {"in_phase", "quadrature"}:
+            raise BundleError(f"{self._thing}: inputs", sorted(inputs), "in_phase and quadrature")
+        for name, port in inputs.items():
+            if not port.admits(manifest.frame_dtype, profile.frame_shape):
+                wanted = f"{manifest.frame_dtype} {profile.frame_shape}"
+                raise BundleError(f"{self._thing}: input {name}", f"{port.dtype} {port.shape}", wanted)
+        outputs = {node.name: Port.of(node) for node in session.get_outputs()}
+        shapes = {"p": (2, *profile.page_shape), "phase": profile.page_shape, "concentration": profile.page_shape}
+        for name, shape in shapes.items():
+            if name not in outputs or not outputs[name].admits("float32", shape):
+                got = f"{outputs[name].dtype} {outputs[name].shape}" if name in outputs else "nothing"
+                raise BundleError(f"{self._thing}: output {name}", got, f"float32 {shape}")
+        if manifest.residual_output is not None and manifest.residual_output not in outputs:
+            raise BundleError(f"{self._thing}: output {manifest.residual_output}", "nothing", "a scalar residual")
+
+    def _checked_defaults(self, table: Table) -> Table:
+        try:
+            self.check_table(table)
+        except InvalidInputError as error:
+            raise BundleError(f"{self.bundle.thing}: {error.thing}", error.got, error.wanted) from None
+        return table
+
+    def _check_golden(self) -> None:
+        golden, thing = self.bundle.golden, f"{self.bundle.thing}: {GOLDEN}"
+        try:
+            self.check(golden.pair)
+            p = self.infer(golden.pair).p
+        except BundleError:
+            raise
+        except Exception as error:  # onnxruntime's errors share no base class
+            raise BundleError(thing, error, "a golden page that decodes") from None
+        if golden.p.shape != p.shape:
+            raise BundleError(f"{thing}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
+        error_norm = float(np.linalg.norm(p - golden.p) / max(float(np.linalg.norm(golden.p)), 1e-30))
+        if not error_norm <= GOLDEN_TOLERANCE:
+            raise BundleError(
+                thing, f"an answer off by {error_norm:.3g} of its norm", f"the expected p within {GOLDEN_TOLERANCE:g}"
+            )

@@ -1,0 +1,99 @@
+"""Pages of one device in their order, and the rule that none is given out that its pilots do not confirm."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from lightpage.calibration.image_search import REACH_PX, FoundImage
+from lightpage.page.pilots import LEAST_CONFIRMED_SHARE, Pilots
+from lightpage.recording.reader import FramePair
+from runtime.decoding.decoder import DecodedPage, Decoder
+from runtime.errors import Reason, UnconfirmedPageError
+
+
+class Tracker(Protocol):
+    """Decodes the pages of one device in their order; calls come from many threads."""
+
+    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        """Decode a page.
+
+        Args:
+            pair, levels, pilots: as for `Decoder.decode`.
+
+        Raises:
+            UnconfirmedPageError: the page's pilots do not bear out what the decoder claims of it.
+            FrameError, PageError, InvalidInputError: see `Decoder.decode`.
+        """
+
+    @property
+    def image_px(self) -> tuple[float, float]:
+        """Where the image of the last page lay against calibration, (x, y), camera pixels."""
+
+    def fork(self) -> Tracker:
+        """Another one that has learnt the same, and learns on its own from there."""
+
+    def refitted(self, decoder: Decoder) -> Tracker:
+        """A new one for the decoder of a re-fitted bundle of the same device.
+
+        Raises:
+            BundleError, CalibrationError: as for `tracker_for`.
+        """
+
+
+class NoTracker:
+    """Follows nothing: the bundle's own table for every page.
+
+    Args:
+        decoder: decodes every page.
+    """
+
+    def __init__(self, decoder: Decoder) -> None:
+        self._decoder = decoder
+
+    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        """See `Tracker`."""
+        return confirmed(self._decoder.decode(pair, levels, pilots=pilots))
+
+    @property
+    def image_px(self) -> tuple[float, float]:
+        """Where calibration saw it."""
+        return 0.0, 0.0
+
+    def fork(self) -> NoTracker:
+        """Itself: it learns nothing."""
+        return self
+
+    def refitted(self, decoder: Decoder) -> NoTracker:
+        """See `Tracker`."""
+        return NoTracker(decoder)
+
+
+def confirmed(page: DecodedPage, found: FoundImage | None = None) -> DecodedPage:
+    """The page itself, if its pilots bear out what is claimed of it.
+
+    Args:
+        page: decoded.
+        found: outcome of a search for its image, None where none was made.
+
+    Raises:
+        UnconfirmedPageError: they do not.
+    """
+    check = page.check
+    if check.confirmed:
+        return page
+    lost = found is not None and not found.found
+    looked = f"; its image was looked for within {REACH_PX:g} px and {'not ' if lost else ''}found" if found else ""
+    told = f"{max(0.0, check.confirmed_bits):.2f} of {check.claimed_bits:.2f} claimed bits a symbol confirmed{looked}"
+    if check.agrees:
+        reason = Reason.TOO_FEW_PILOTS
+        told = f"{check.pilots} that tell {check.pilots * max(0.0, check.confirmed_bits):.0f} bits together{looked}"
+        wanted = "more pilots, or more light: as much may be chance"
+    else:
+        reason = Reason.IMAGE_NOT_FOUND if lost else Reason.PILOTS_DISAGREE
+        wanted = (
+            f"at least {LEAST_CONFIRMED_SHARE:.0%} of them: frames and pilots of this device, as it was calibrated (if "
+            "it has changed, recalibrate)"
+        )
+    error = UnconfirmedPageError("pilots", told, wanted, reason, check.recalibration_due)
+    error.page = page
+    raise error

@@ -1,0 +1,44 @@
+"""The picture of the demo: frames and their page, then maps of confidence and AIR in each state of the device."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from runtime.demo.demo import LEVELS, DemoResult
+
+_LEAST_BITS, _MOST_BITS = 0.0, 8.0
+
+
+def write_figure(result: DemoResult, path: Path) -> None:
+    """Write the picture as PNG."""
+    figure = Figure(figsize=(14, 10), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(3, 3)
+    frames = (("in-phase frame", result.frames.in_phase), ("quadrature frame", result.frames.quadrature))
+    for axis, (name, frame) in zip(axes[0], frames, strict=False):
+        axis.imshow(frame, cmap="gray")
+        axis.set_title(name)
+    shown = axes[0, 2].imshow(
+        result.symbols, vmin=-0.5, vmax=LEVELS - 0.5, cmap=colormaps["twilight"].resampled(LEVELS)
+    )
+    axes[0, 2].set_title("their page, decoded")
+    figure.colorbar(shown, ax=axes[0, :], shrink=0.8, label="symbol")
+    for axis, phase in zip(axes[1], result.phases, strict=True):
+        confidence = axis.imshow(phase.confidence, vmin=0, vmax=1, cmap="viridis")
+        axis.set_title(f"{phase.name}: confidence {phase.confidence.mean():.3f}")
+    figure.colorbar(confidence, ax=axes[1, :], shrink=0.8, label="confidence")
+    for axis, phase in zip(axes[2], result.phases, strict=True):
+        # an unlikely symbol costs many bits; the colour tells losses apart, not their depth
+        rate = axis.imshow(np.clip(phase.air, _LEAST_BITS, _MOST_BITS), vmin=_LEAST_BITS, vmax=_MOST_BITS, cmap="magma")
+        axis.set_title(f"{phase.name}: AIR {phase.air_bits_per_symbol:.2f} bit/symbol")
+    figure.colorbar(rate, ax=axes[2, :], shrink=0.8, label="AIR, bit/symbol")
+    for axis in axes.ravel():
+        axis.set_xticks([])
+        axis.set_yticks([])
+    # no date in the file: the same demo gives the same bytes
+    figure.savefig(path, dpi=110, metadata={"Software": None})

@@ -1,0 +1,1 @@
+"""A drifted device's geometry, fitted again."""

@@ -1,0 +1,130 @@
+"""Re-fits the device's geometry with the exported twin and re-traces the sampling table."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
+from lightpage.calibration.document import Calibration
+from lightpage.calibration.interfaces import Twin
+from lightpage.calibration.parameters import NAMES
+from lightpage.calibration.sampling_table import sampling_table
+from lightpage.errors import BundleError, CalibrationError
+from lightpage.page.pilots import Pilots
+from lightpage.page.symbols import symbol_phases
+from lightpage.progress import Progress
+from lightpage.recording.reader import FramePair, hash_frames
+from runtime.bundle.bundle import Bundle
+from runtime.bundle.calibrated import calibration_of
+from runtime.decoding.decoder import Decoder, ImagePosition
+from runtime.decoding.image_search import BundleSearch
+from runtime.execution.twin import TWIN_THREADS, OnnxTwin
+from runtime.recalibration.recalibration import FitReport, FitResult, KnownPages
+
+Real = NDArray[np.float64]
+
+_REFITTED = frozenset({"places", "parameters"})
+"""Inputs that a re-fitted geometry is fed to, by one of which a decoder knows it."""
+_SEARCHED_SYMBOLS = 300
+"""Known symbols by which the image is looked for: enough in any light that can be calibrated in, and soon done."""
+
+
+def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> FitResult:
+    """Fit on `pages`, starting from the bundle's calibration, moved to where their image is found.
+
+    The table holds the re-traced geometry and the reference frames that it was fitted with.
+
+    Args:
+        bundle: whose calibration and twin.
+        pages: known pages; the first finds the geometry, the coherences are the mean of all.
+        progress: told of every stage.
+        decoder: the bundle's, whose graph recovers the field.
+
+    Raises:
+        CalibrationError: the pages fit no geometry near the earlier calibration, there are no reference frames, or the
+            bundle holds no calibration to start from.
+        BundleError: the bundle's graphs do not show the field, or hold a geometry that cannot be fed instead.
+    """
+    profile, earlier = bundle.profile, calibration_of(bundle)
+    if not _REFITTED & decoder.table_shapes.keys():
+        among = f"{' or '.join(sorted(_REFITTED))} among them"
+        wanted = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
+        raise BundleError(f"{bundle.thing}: table inputs", sorted(decoder.table_shapes), wanted)
+    references = pages.references or _kept_references(bundle)
+    if references is None:
+        raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
+    twin = OnnxTwin(bundle, TWIN_THREADS)
+    progress("find the image", 0.0)
+    image = _find(decoder, twin, pages, references)
+    start = moved_cameras(earlier.vector, image)
+    known = [
+        KnownPage(pair, np.exp(1j * symbol_phases(symbols, pages.levels)))
+        for pair, symbols in zip(pages.pairs, pages.symbols, strict=True)
+    ]
+    registered = refine(
+        twin,
+        decoder.recover_field,
+        profile,
+        references,
+        known,
+        start=start,
+        turn=earlier.turn_rad,
+        progress=progress,
+    )
+    if registered.coherence_after < LEAST_KEPT * earlier.reference_coherence:
+        raise CalibrationError(
+            "re-fit, outcome",
+            f"a coherence of {registered.coherence_after:.3f}",
+            f"at least {LEAST_KEPT:.0%} of the {earlier.reference_coherence:.3f} when it was calibrated: this device, "
+            "drifted a little; else calibrate anew",
+        )
+    hashes = [hash_frames(pair) for pair in pages.pairs]
+    fitted = earlier.followed_by(Calibration.from_registered(registered, profile, hashes))
+    table = {
+        "reference_in_phase": references.in_phase,
+        "reference_quadrature": references.quadrature,
+        **sampling_table(twin, registered.parameters, registered.turn, profile),
+    }
+    return FitResult(
+        table={name: value for name, value in table.items() if name in decoder.table_shapes},
+        calibration_toml=fitted.to_toml(),
+        report=FitReport(
+            angle_deg=fitted.angle_deg(profile),
+            coherence_before=fitted.coherence_before,
+            coherence_after=fitted.coherence_after,
+            image=image,
+            details={"turn_deg": float(np.rad2deg(fitted.turn_rad)), "cost": fitted.cost},
+        ),
+    )
+
+
+def _find(decoder: Decoder, twin: Twin, pages: KnownPages, references: FramePair) -> ImagePosition | None:
+    """Where the image of the first page lies against the earlier calibration; None where the search does not find it.
+
+    It is looked for there and where the service saw it last.
+
+    All symbols are known here, and an even share of them stands for all.
+    """
+    symbols, mask = pages.symbols[0], np.zeros(pages.symbols[0].size, bool)
+    mask[:: max(1, mask.size // _SEARCHED_SYMBOLS)] = True
+    pilots = Pilots.of_symbols(mask.reshape(symbols.shape), symbols, pages.levels)
+    around = np.array([(0.0, 0.0), pages.image_px])
+    found = BundleSearch(decoder, twin).find(pages.pairs[0], pilots, around, references)
+    x, y = map(float, found.shift_px)
+    return ImagePosition(x, y, searched=True, found=True) if found.found else None
+
+
+def moved_cameras(parameters: Real, image: ImagePosition | None) -> Real:
+    """A device's parameters [P] with both cameras where the image was found."""
+    moved = parameters.copy()
+    if image is not None:
+        for camera in ("in_phase", "quadrature"):
+            moved[NAMES.index(f"{camera}_shift_x_px")] += image.shift_x_px
+            moved[NAMES.index(f"{camera}_shift_y_px")] += image.shift_y_px
+    return moved
+
+
+def _kept_references(bundle: Bundle) -> FramePair | None:
+    kept = [bundle.table.get(name) for name in ("reference_in_phase", "reference_quadrature")]
+    return None if kept[0] is None or kept[1] is None else FramePair(kept[0], kept[1])

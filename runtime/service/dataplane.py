@@ -1,0 +1,239 @@
+"""What the service does, without a word of gRPC: decode, read pages, hand over to recalibration, change models."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import FrameError, InvalidInputError
+from lightpage.page.pilots import Pilots
+from lightpage.recording.reader import FramePair
+from runtime.acquisition.sources import FrameSource, SourcePage, own_fault
+from runtime.decoding.decoder import DecodedPage, Decoder
+from runtime.errors import LostPageError, SlotsTakenError, SourceError
+from runtime.service.caller import Caller
+from runtime.service.limits import Limits
+from runtime.service.metrics import ServiceMetrics
+from runtime.service.receiver import PairReceiver
+from runtime.service.registry import Model, ModelRegistry
+from runtime.service.store import ModelStore
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A decoded page with the model that decoded it and the seconds that the service spent."""
+
+    page: DecodedPage
+    model_version: str
+    receive_s: float
+    total_s: float
+
+
+@dataclass(frozen=True)
+class ReadAnswer:
+    """An answer for a page of the source, with what the source knows of it."""
+
+    answer: Answer
+    source_page: SourcePage
+    pilot_mask: NDArray[np.bool_]
+
+
+class DataPlane:
+    """The service's logic. Every method may be called from many threads.
+
+    Args:
+        registry: the models.
+        source: where `read_page` reads from, or None.
+        store: remembers which model is in service, or None.
+        limits: what is accepted.
+        metrics: what is counted.
+
+    Raises:
+        InvalidInputError: the source is not for this device.
+    """
+
+    def __init__(
+        self,
+        registry: ModelRegistry,
+        source: FrameSource | None = None,
+        store: ModelStore | None = None,
+        limits: Limits | None = None,
+        metrics: ServiceMetrics | None = None,
+    ) -> None:
+        self.registry, self.store = registry, store
+        self.limits = limits or Limits()
+        self.metrics = metrics or ServiceMetrics()
+        self._source = source
+        if source is not None:
+            _check_source(source, registry.current.decoder)
+        self._receives = threading.BoundedSemaphore(self.limits.concurrent_receives)
+        self._decodes = threading.BoundedSemaphore(self.limits.concurrent_decodes)
+        self.metrics.in_service(registry.current.version)
+
+    @property
+    def source(self) -> FrameSource:
+        """The source of pages.
+
+        Raises:
+            SourceError: this service has none.
+        """
+        if self._source is None:
+            raise SourceError("source", "none", "a service started with --source")
+        return self._source
+
+    @property
+    def has_source(self) -> bool:
+        """Whether `read_page` can work."""
+        return self._source is not None
+
+    @contextmanager
+    def receiving(self, shape: tuple[int, int], dtype: str, bit_depth: int, caller: Caller) -> Iterator[PairReceiver]:
+        """A receiver for one pair, checked against the camera before a byte is allocated.
+
+        Raises:
+            LimitError: the pair is larger than the service accepts.
+            FrameError: not this device's size, type or bit depth.
+            SlotsTakenError: too many are being received until the caller's time is up.
+        """
+        # Size first: a header may claim anything, and a limit is the service's, not the camera's.
+        if 2 * shape[0] * shape[1] * np.dtype(dtype).itemsize > self.limits.pair_bytes:
+            PairReceiver(shape, dtype, self.limits.pair_bytes)
+        bundle = self.registry.current.decoder.bundle
+        wanted = (bundle.profile.frame_shape, bundle.manifest.frame_dtype, bundle.manifest.camera_bit_depth)
+        if (shape, dtype, bit_depth) != wanted:
+            raise FrameError(
+                "frame pair",
+                f"{shape[0]}x{shape[1]} pixels, {dtype}, {bit_depth} bits",
+                f"{wanted[0][0]}x{wanted[0][1]} pixels, {wanted[1]}, {wanted[2]} bits",
+            )
+        with self._slot(self._receives, "receives", caller):
+            yield PairReceiver(shape, dtype, self.limits.pair_bytes)
+
+    def decode(
+        self,
+        pair: FramePair,
+        levels: int,
+        caller: Caller,
+        pilots: Pilots | None = None,
+        *,
+        start: float | None = None,
+        received: float | None = None,
+    ) -> Answer:
+        """Decode a pair with the model in service.
+
+        Args:
+            pair: both frames.
+            levels: M.
+            caller: who waits; nothing is computed for one who has gone.
+            pilots: known symbols where they differ from the device's pattern.
+            start: when the call began, in `time.perf_counter` seconds.
+            received: when the pair was complete, likewise.
+
+        Raises:
+            SlotsTakenError: no slot until the caller's time is up.
+            CallerLeft: the caller has gone.
+            UnconfirmedPageError, FrameError, PageError: see `Tracker.decode`.
+        """
+        now = time.perf_counter()
+        start = now if start is None else start
+        received = now if received is None else received
+        with self._slot(self._decodes, "decodes", caller):
+            caller.check()
+            # Taken once: a swap in the meantime changes the next request, not this one.
+            model = self.registry.current
+            page = self._decode(model, pair, levels, pilots, "frame pair")
+        return Answer(page, model.version, received - start, time.perf_counter() - start)
+
+    def read_page(self, page: int | None, levels: int | None, caller: Caller) -> ReadAnswer:
+        """Read a page from the source and decode it; `levels` None stands for the source's own.
+
+        Raises:
+            SourceError: no source, or one that is damaged or dark.
+            PageError: no such page, or an impossible level count; else as `decode`.
+        """
+        start = time.perf_counter()
+        source = self.source
+        levels = source.levels if levels is None else levels
+        # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
+        with self._slot(self._decodes, "decodes", caller):
+            caller.check()
+            model, begun = self.registry.current, time.perf_counter()
+            with own_fault():
+                found = source.read(page)
+            received = time.perf_counter()
+            mask = self._mask(found, model.decoder)
+            # Pilots are what was written, whatever level count the caller wants to see.
+            if found.symbols is not None:
+                pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
+            else:
+                pilots = model.decoder.pilots(source.levels, mask)
+            thing = f"page {found.page_index} of {source.name}"
+            with own_fault(f"{thing}: "):
+                decoded = self._decode(model, found.pair, levels, pilots, thing)
+        answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start)
+        return ReadAnswer(answer, found, mask)
+
+    def adopt(self, decoder: Decoder, expected: Model | None = None) -> Model:
+        """Remember a loaded decoder and put it in service: both or neither.
+
+        Raises:
+            BundleError: it cannot be remembered, or see `ModelRegistry.swap`.
+            RecalibrationRefusedError: see `ModelRegistry.swap`.
+        """
+        return self.registry.swap(decoder, expected, self._remember)
+
+    def rollback(self) -> tuple[Model, Model]:
+        """Remember the model before and go back to it; returns (now current, dropped).
+
+        Raises:
+            BundleError: there is none, or it cannot be remembered; then nothing changes.
+        """
+        return self.registry.rollback(self._remember)
+
+    def _remember(self, model: Model) -> None:
+        path = model.decoder.bundle.path
+        if self.store is not None:
+            self.store.remember(path if path.parent == self.store.folder else None)
+        self.metrics.in_service(model.version)
+
+    @staticmethod
+    def _mask(found: SourcePage, decoder: Decoder) -> NDArray[np.bool_]:
+        return decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
+
+    def _decode(self, model: Model, pair: FramePair, levels: int, pilots: Pilots | None, thing: str) -> DecodedPage:
+        """Decode with a model that was taken once, and count the page, which an error calls `thing`."""
+        try:
+            page = model.tracker.decode(pair, levels, pilots)
+        except LostPageError as error:
+            self.metrics.lost(error)
+            raise error.about(thing) from None
+        self.metrics.page(page, model.version)
+        return page
+
+    @contextmanager
+    def _slot(self, slots: threading.BoundedSemaphore, what: str, caller: Caller) -> Iterator[None]:
+        """Hold one of `slots`, waiting as long as the caller does, but not for one who has gone."""
+        until = time.monotonic() + min(caller.seconds_left(), self.limits.deadline_s)
+        while not slots.acquire(timeout=min(0.5, max(0.0, until - time.monotonic()))):
+            caller.check()
+            if time.monotonic() >= until:
+                raise SlotsTakenError(
+                    f"concurrent {what}", "all taken", "a free one within the deadline; try again later"
+                )
+        try:
+            yield
+        finally:
+            slots.release()
+
+
+def _check_source(source: FrameSource, decoder: Decoder) -> None:
+    source.check_against(decoder.bundle.profile)
+    depth = decoder.bundle.manifest.camera_bit_depth
+    if source.bit_depth != depth:
+        raise InvalidInputError(f"source {source.name}", f"{source.bit_depth} bits", f"{depth} bits, as the bundle")

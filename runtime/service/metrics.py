@@ -1,0 +1,99 @@
+"""What the operator watches: counters and gauges in the Prometheus format, one registry per service."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
+
+from runtime.decoding.decoder import DecodedPage
+from runtime.errors import LostPageError, UnconfirmedPageError
+
+if TYPE_CHECKING:
+    from threading import Thread
+    from wsgiref.simple_server import WSGIServer
+
+_SECONDS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+
+
+class ServiceMetrics:
+    """The figures of one service."""
+
+    def __init__(self) -> None:
+        self.registry = own = CollectorRegistry()
+        self.calls = Counter("lightpage_calls", "Finished calls.", ["method", "code"], registry=own)
+        self.in_flight = Gauge("lightpage_calls_in_flight", "Calls being served.", registry=own)
+        self.pages = Counter("lightpage_pages", "Decoded pages.", ["model_version"], registry=own)
+        self.decode = Histogram("lightpage_decode_seconds", "Decode of one page.", buckets=_SECONDS, registry=own)
+        self.confidence = Gauge("lightpage_confidence_mean", "Mean confidence of the last page.", registry=own)
+        self.concentration = Gauge("lightpage_concentration_mean", "Mean kappa of the last page.", registry=own)
+        self.piston = Gauge("lightpage_piston_radians", "Piston of the last page.", registry=own)
+        self.pilots = Gauge("lightpage_pilot_coherence", "Agreement of the last pilots, 0..1.", registry=own)
+        self.trust = Gauge("lightpage_pilot_trust", "Claim that the last pilots bear out, 0..1.", registry=own)
+        self.share = Gauge("lightpage_pilot_share", "Claimed information that the last pilots confirm.", registry=own)
+        self.due = Gauge("lightpage_recalibration_due", "1 where they confirm too little of it.", registry=own)
+        self.lost_pages = Counter("lightpage_pages_lost", "Pages not given out.", ["reason"], registry=own)
+        self.searches = Counter("lightpage_image_searches", "Pages searched for.", ["found"], registry=own)
+        self.image = Gauge("lightpage_image_shift_px", "Of the last page since calibration.", ["axis"], registry=own)
+        self.recalibrations = Counter("lightpage_recalibrations", "By their end.", ["result"], registry=own)
+        self.model = Gauge("lightpage_model_info", "1 for the model in service.", ["version"], registry=own)
+
+    def page(self, page: DecodedPage, version: str) -> None:
+        """Count one decoded page."""
+        self.pages.labels(version).inc()
+        self.decode.observe(page.timings.total_s)
+        self.confidence.set(float(page.confidence.mean()))
+        self.concentration.set(float(page.concentration.mean()))
+        self.piston.set(page.piston_rad)
+        self.pilots.set(page.pilot_coherence)
+        self.trust.set(page.pilot_trust)
+        self._check(page)
+        if page.image is not None:
+            self.image.labels("x").set(page.image.shift_x_px)
+            self.image.labels("y").set(page.image.shift_y_px)
+
+    def lost(self, error: LostPageError) -> None:
+        """Count a page that was not given out, which is a sign of drift too."""
+        self.lost_pages.labels(error.reason.value).inc()
+        if isinstance(error, UnconfirmedPageError):
+            self._check(error.decoded)
+
+    def _check(self, page: DecodedPage) -> None:
+        self.share.set(page.check.share)
+        self.due.set(page.check.recalibration_due)
+        if page.image is not None and page.image.searched:
+            self.searches.labels(str(page.image.found).lower()).inc()
+
+    def in_service(self, version: str) -> None:
+        """Say which model decodes now."""
+        self.model.clear()
+        self.model.labels(version).set(1)
+
+
+@dataclass
+class MetricsServer:
+    """The HTTP server that shows the figures; `close` ends it."""
+
+    server: WSGIServer
+    thread: Thread
+
+    @classmethod
+    def start(cls, metrics: ServiceMetrics, port: int, host: str = "127.0.0.1") -> MetricsServer:
+        """Show `metrics` at http://host:port/metrics; port 0 takes a free one.
+
+        Raises:
+            OSError: the port is taken.
+        """
+        return cls(*start_http_server(port, host, metrics.registry))
+
+    @property
+    def port(self) -> int:
+        """The port that it listens on."""
+        return int(self.server.server_port)
+
+    def close(self) -> None:
+        """Stop listening and wait for the thread."""
+        self.server.shutdown()
+        self.server.server_close()
+        self.thread.join()

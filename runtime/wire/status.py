@@ -1,0 +1,111 @@
+"""The one place where errors become gRPC status codes, and on the client's side errors again."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import grpc
+
+from lightpage import errors
+from lightpage.errors import (
+    BundleError,
+    BusyError,
+    CalibrationError,
+    InvalidInputError,
+    LightpageError,
+    LimitError,
+    RecalibrationRefusedError,
+)
+from runtime import errors as service_errors
+from runtime.errors import LostPageError, Reason, SlotsTakenError, SourceError, StoppingError
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.service.caller import CallerLeft
+
+DETAIL_KEY = "lightpage-error-bin"
+
+_CODES: tuple[tuple[type[BaseException], grpc.StatusCode], ...] = (
+    (InvalidInputError, grpc.StatusCode.INVALID_ARGUMENT),
+    (LimitError, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    (LostPageError, grpc.StatusCode.DATA_LOSS),
+    (SlotsTakenError, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    (BusyError, grpc.StatusCode.ABORTED),
+    (SourceError, grpc.StatusCode.FAILED_PRECONDITION),
+    (StoppingError, grpc.StatusCode.UNAVAILABLE),
+    (BundleError, grpc.StatusCode.FAILED_PRECONDITION),
+    (RecalibrationRefusedError, grpc.StatusCode.FAILED_PRECONDITION),
+    (CalibrationError, grpc.StatusCode.FAILED_PRECONDITION),
+    (CallerLeft, grpc.StatusCode.CANCELLED),
+    (grpc.RpcError, grpc.StatusCode.CANCELLED),  # raised while reading a request whose sender has gone
+)
+
+_BY_NAME: dict[str, type[LightpageError]] = {
+    name: kind
+    for name, kind in {**vars(errors), **vars(service_errors)}.items()
+    if isinstance(kind, type) and issubclass(kind, LightpageError)
+}
+
+_REASONS = {
+    Reason.UNSPECIFIED: pb.LOSS_REASON_UNSPECIFIED,
+    Reason.PILOTS_DISAGREE: pb.LOSS_REASON_PILOTS_DISAGREE,
+    Reason.IMAGE_NOT_FOUND: pb.LOSS_REASON_IMAGE_NOT_FOUND,
+    Reason.TOO_FEW_PILOTS: pb.LOSS_REASON_TOO_FEW_PILOTS,
+}
+
+_FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")
+"""The folders of an absolute path, up to its last name."""
+
+
+def status_of(error: BaseException) -> grpc.StatusCode:
+    """The status code for an error; INTERNAL for what nobody foresaw."""
+    for kind, code in _CODES:
+        if isinstance(error, kind):
+            return code
+    return grpc.StatusCode.INTERNAL
+
+
+def without_folders(text: str) -> str:
+    """`text` with every absolute path in it cut to its last name: where the service keeps its files is its own."""
+    return _FOLDERS.sub("", text)
+
+
+def abort(context: grpc.ServicerContext, error: BaseException) -> None:
+    """End the call with the status of `error`. Always raises, as `context.abort` does.
+
+    A foreseen error names files without their folders. An unforeseen one gives its class only: its text may hold
+    anything.
+    """
+    code = status_of(error)
+    if isinstance(error, LightpageError):
+        thing, got, wanted = (without_folders(text)[:1000] for text in (error.thing, error.got, error.wanted))
+        detail = pb.ErrorDetail(kind=type(error).__name__, thing=thing, got=got, wanted=wanted)
+        if isinstance(error, LostPageError):
+            detail.reason = _REASONS[error.reason]
+            detail.recalibration_due = error.recalibration_due
+        context.set_trailing_metadata(((DETAIL_KEY, detail.SerializeToString()),))
+        context.abort(code, f"{thing}: got {got}, wanted {wanted}"[:2000])
+    context.abort(code, f"{type(error).__name__} in the service; its log says more")
+
+
+def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
+    """The error that the service at `target` meant, of the same class wherever it said which."""
+    call: Any = rpc
+    for key, value in call.trailing_metadata() or ():
+        if key == DETAIL_KEY:
+            detail = pb.ErrorDetail.FromString(value)
+            kind, told = _BY_NAME.get(detail.kind, LightpageError), (detail.thing, detail.got, detail.wanted)
+            if issubclass(kind, LostPageError):
+                return kind(*told, _reason(detail.reason), detail.recalibration_due)
+            return kind(*told)
+    code, text = call.code(), call.details() or "no details"
+    thing = f"service at {target}"
+    if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
+        return LimitError(thing, text, "a smaller or a later request")
+    if code == grpc.StatusCode.UNAVAILABLE:
+        return LightpageError(thing, f"no connection ({text})", "a running Lightpage service at this address")
+    return LightpageError(thing, f"{code.name}: {text}", "an answer")
+
+
+def _reason(code: pb.LossReason) -> Reason:
+    """A reason from the wire; one that this version does not know is unspecified."""
+    return next((reason for reason, known in _REASONS.items() if known == code), Reason.UNSPECIFIED)

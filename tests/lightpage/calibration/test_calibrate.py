@@ -1,0 +1,56 @@
+"""Claims about registration on pages smaller than the shipped devices': how far it gets, and what it says then."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lightpage.calibration.calibrate import KnownPage, calibrate
+from lightpage.device.profile import PageLayout, load_profile
+from lightpage.device.state import Device
+from lightpage.errors import CalibrationError
+from lightpage.page.symbols import symbol_phases
+from lightpage.progress import Progress
+from lightpage.simulator.simulator import Simulator
+from train.models.field import FieldRecovery, TorchFieldSolver
+from train.models.twin import RayTwin, TorchTwin
+
+
+def begin(progress: Progress) -> None:
+    """Calibrate on a page that hardly meets the walls."""
+    bench = load_profile("bench")
+    profile = bench.model_copy(
+        update={
+            "page": PageLayout(columns=30, rows=20, symbol_size_px=4),
+            "camera": bench.camera.model_copy(update={"columns_px": 560, "rows_px": 400}),
+        }
+    )
+    simulator = Simulator(profile, Device(), levels=16, seed=3)
+    symbols = np.random.default_rng(0).integers(16, size=profile.page_shape).astype(np.uint8)
+    page = KnownPage(simulator.page(symbols), np.exp(1j * symbol_phases(symbols, 16)))
+    twin, solver = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
+    calibrate(twin, solver, profile, simulator.references(), [page], progress)
+
+
+def test_a_page_that_hardly_meets_the_walls_is_found_directly_and_then_named_as_too_narrow() -> None:
+    shares = list[float]()
+    with pytest.raises(CalibrationError, match=r"'find the reflections'.*wide enough for its light to meet the pipe's"):
+        begin(lambda stage, share: shares.append(share))
+    assert shares == sorted(shares)
+    assert shares[-1] < 1
+
+
+def test_a_calibration_ends_where_it_is_stopped_at_any_patch() -> None:
+    class Stopped(Exception):
+        pass
+
+    told = list[str]()
+
+    def stop_at_the_third_patch(stage: str, share: float) -> None:
+        told.append(stage)
+        if told.count(stage) > 3:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        begin(stop_at_the_third_patch)
+    assert set(told) == {"find the direct image"}

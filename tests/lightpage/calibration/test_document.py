@@ -1,0 +1,173 @@
+"""The calibration document: read back as written, wrong documents refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lightpage.calibration.calibrate import KnownPage, Registered, calibrate, check_found
+from lightpage.calibration.document import Calibration, load_calibration, parse_calibration
+from lightpage.calibration.known_pages import known_pages
+from lightpage.calibration.parameters import NAMES, PRIORS
+from lightpage.device.profile import load_profile
+from lightpage.errors import CalibrationError, InvalidInputError, ProfileError, RecordingError
+from lightpage.recording.reader import FramePair, Recording, RecordingWriter
+from tests.lightpage.calibration.flat_twin import FlatTwin
+
+PROFILE = load_profile("bench")
+HASHES = ("0123456789abcdef" * 4, "f" * 64)
+
+
+@pytest.fixture
+def calibration() -> Calibration:
+    rng = np.random.default_rng(1)
+    registered = Registered(
+        parameters=rng.normal(size=len(NAMES)) * PRIORS,
+        deviations=PRIORS / 30,
+        turn=-1.55,
+        coherence_before=0.01,
+        coherence_after=0.8,
+        cost=1.3,
+        significant=0.7,
+    )
+    return Calibration.from_registered(registered, PROFILE, HASHES)
+
+
+def test_a_calibration_is_read_back_as_it_was_written(calibration: Calibration, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.toml"
+    path.write_text("an older one")
+    calibration.save(path)
+    assert load_calibration(path) == calibration
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_the_vector_is_the_fitted_one_to_the_last_bit(calibration: Calibration) -> None:
+    expected = np.random.default_rng(1).normal(size=len(NAMES)) * PRIORS
+    np.testing.assert_array_equal(parse_calibration(calibration.to_toml()).vector, expected)
+
+
+def test_the_angle_is_the_profiles_and_the_fitted_one(calibration: Calibration) -> None:
+    tilted = PROFILE.model_copy(update={"pipe": PROFILE.pipe.model_copy(update={"angle_deg": 2.0})})
+    fitted = np.rad2deg(calibration.parameters["pipe_angle_rad"])
+    assert calibration.angle_deg(tilted) == pytest.approx(2.0 + fitted, abs=1e-12)
+
+
+def test_a_calibration_of_another_profile_is_refused(calibration: Calibration) -> None:
+    calibration.check_profile(PROFILE)
+    with pytest.raises(ProfileError, match="'bench', wanted 'paper'"):
+        calibration.check_profile(load_profile("paper"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("pipe_roll_rad", "pipe_rool_rad", r"\[parameters\]: got no pipe_roll_rad; unknown pipe_rool_rad"),
+        ("turn_rad = -1.55", "turn_rad = nan", r"turn_rad = nan"),
+        ("coherence_after = 0.8", "coherence_after = 1.8", r"coherence_after = 1.8"),
+        ("schema_version = 1", "schema_version = 2", r"schema_version = 2"),
+        ("cost = ", "costs = ", "got no cost; unknown costs, wanted"),
+        (HASHES[1], "../../etc/passwd", r"calibrated_pages.1 = '../../etc/passwd'"),
+        ("schema_version = 1", "schema_version = ", "not TOML"),
+        ("[deviations]", "[variances]", "no deviations; unknown variances"),
+    ],
+)
+def test_a_wrong_document_is_refused_by_the_name_of_its_key(
+    calibration: Calibration, old: str, new: str, complaint: str
+) -> None:
+    text = calibration.to_toml()
+    assert old in text
+    with pytest.raises(ProfileError, match=complaint):
+        parse_calibration(text.replace(old, new, 1))
+
+
+def test_a_parameter_that_is_no_number_is_refused(calibration: Calibration) -> None:
+    value = repr(calibration.parameters["pipe_roll_rad"])
+    with pytest.raises(ProfileError, match=r"parameters\.pipe_roll_rad = inf"):
+        parse_calibration(calibration.to_toml().replace(value, "inf", 1))
+
+
+def test_a_file_that_is_not_there_and_a_folder_that_is_not_there_are_named(
+    calibration: Calibration, tmp_path: Path
+) -> None:
+    with pytest.raises(ProfileError, match=r"absent\.toml"):
+        load_calibration(tmp_path / "absent.toml")
+    with pytest.raises(InvalidInputError, match="nowhere"):
+        calibration.save(tmp_path / "nowhere" / "calibration.toml")
+
+
+def _record(path: Path, levels: int, symbols: np.ndarray | None) -> None:
+    frame = np.full(PROFILE.frame_shape, 7, dtype=np.uint8)
+    pair = FramePair(frame, frame)
+    with RecordingWriter(path, PROFILE, levels, 8, pair) as writer:
+        for index in range(2):
+            writer.append(None if symbols is None else symbols[index], pair)
+
+
+def test_known_pages_hold_the_phasors_at_the_recordings_level_count(tmp_path: Path) -> None:
+    symbols = np.random.default_rng(0).integers(0, 8, (2, *PROFILE.page_shape), dtype=np.uint8)
+    _record(tmp_path / "r.h5", 8, symbols)
+    with Recording.open(tmp_path / "r.h5") as recording:
+        (page,) = known_pages(recording, PROFILE, [1])
+    np.testing.assert_allclose(page.symbols, np.exp(2j * np.pi * symbols[1] / 8), atol=1e-12)
+
+
+def test_pages_without_symbols_are_not_known(tmp_path: Path) -> None:
+    _record(tmp_path / "r.h5", 256, None)
+    with Recording.open(tmp_path / "r.h5") as recording, pytest.raises(RecordingError, match="'symbols': got none"):
+        known_pages(recording, PROFILE, [0])
+
+
+BENCH_SYMBOLS = 56 * 87
+
+
+@pytest.mark.parametrize(("coherence", "significant"), [(0.49, 0.51), (0.26, 0.25)])
+def test_a_device_that_was_found_is_accepted(coherence: float, significant: float) -> None:
+    check_found(coherence, significant, BENCH_SYMBOLS, {"x": 0.6, "y": 0.15})
+
+
+@pytest.mark.parametrize(
+    ("coherence", "significant"),
+    [(0.0165, 0.5), (0.033, 0.5), (0.49, 0.03), (float("nan"), 0.5)],
+    ids=["unrelated symbols", "nominal geometry", "a few patches by chance", "nothing at all"],
+)
+def test_an_outcome_near_chance_is_no_calibration(coherence: float, significant: float) -> None:
+    with pytest.raises(CalibrationError, match="calibration, outcome"):
+        check_found(coherence, significant, BENCH_SYMBOLS, {"x": 0.6, "y": 0.3})
+
+
+@pytest.mark.parametrize("branch", ["x", "y"])
+def test_a_reflection_that_is_not_found_leaves_the_device_unknown(branch: str) -> None:
+    reflected = {"x": 0.6, "y": 0.3} | {branch: 0.02}
+    with pytest.raises(CalibrationError, match=f"light that the pipe reflects along {branch}: got 2%"):
+        check_found(0.43, 0.37, BENCH_SYMBOLS, reflected)
+
+
+def test_a_page_too_small_to_be_found_is_refused_before_anything_is_searched() -> None:
+    profile = PROFILE.model_copy(update={"page": PROFILE.page.model_copy(update={"columns": 20, "rows": 24})})
+    frame = np.ones(profile.frame_shape, np.uint8)
+    page = KnownPage(FramePair(frame, frame), np.ones(profile.page_shape, complex))
+
+    def solve(*_: object) -> tuple[np.ndarray, np.ndarray]:
+        raise AssertionError("nothing may be computed")
+
+    with pytest.raises(
+        CalibrationError,
+        match=r"profile bench: got a page of 20 x 24 symbols, which makes 4 patches to look for, wanted at least 5",
+    ):
+        calibrate(FlatTwin(profile), solve, profile, page.pair, [page])
+
+
+def test_a_re_fit_remembers_where_the_device_began(calibration: Calibration) -> None:
+    def later(coherence: float, page: str) -> Calibration:
+        update = {"coherence_after": coherence, "calibrated_pages": (page * 64,), "turn_rad": -1.5}
+        return calibration.model_copy(update=update)
+
+    assert calibration.reference_coherence == 0.8
+    assert "coherence_at_first" not in calibration.to_toml()
+    second = calibration.followed_by(later(0.75, "1"))
+    third = second.followed_by(later(0.7, "2"))
+    assert parse_calibration(third.to_toml()) == third
+    assert (third.coherence_after, third.reference_coherence, third.turn_rad) == (0.7, 0.8, -1.5)
+    assert third.calibrated_pages == (*HASHES, "1" * 64, "2" * 64)

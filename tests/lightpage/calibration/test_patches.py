@@ -1,0 +1,223 @@
+"""Claims about local measurements: a patch finds the shift, phase and slope put in, and knows light that is not its."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lightpage.calibration import patches as module
+from lightpage.calibration.calibrate import SIGNIFICANT
+from lightpage.calibration.parameters import nominal
+from lightpage.calibration.patches import (
+    Measurement,
+    Patch,
+    Sampler,
+    measure,
+    middle_patches,
+    patch_edge,
+    patches,
+    search_window,
+)
+from lightpage.device.profile import Profile, load_profile
+from lightpage.waves.grid import symbol_samples
+from tests.lightpage.calibration.flat_twin import FlatTwin, Picture
+from tests.lightpage.small import random_phases, small_profile
+
+PROFILE = small_profile()
+SYMBOLS = np.exp(1j * random_phases(PROFILE, 1))
+PITCH = PROFILE.symbol_pitch_m
+PIXEL = PROFILE.camera.pitch_m
+MIDDLE = patches(PROFILE)[5]
+FINE = PROFILE.with_symbols_of(2)
+FINE_SYMBOLS = np.exp(1j * random_phases(FINE, 1))
+
+
+def look(
+    sampler: Sampler,
+    patch: Patch = MIDDLE,
+    symbols: np.ndarray = SYMBOLS,
+    reach_px: float = 12,
+    step_px: float = 3,
+    ramp: tuple[float, float] = (0.0, 0.0),
+    profile: Profile = PROFILE,
+) -> Measurement:
+    twin, window = FlatTwin(profile, ramp), search_window(reach_px * PIXEL, step_px * PIXEL)
+    samples = symbol_samples(profile)
+    return measure(sampler, twin, nominal(), profile, patch, symbols, ("direct",), window, samples)[0]
+
+
+class TestCutting:
+    @pytest.mark.parametrize("size_px", [1, 2, 4, 16])
+    def test_patches_cover_the_page_once(self, size_px: int) -> None:
+        profile = PROFILE.with_symbols_of(size_px)
+        seen = np.zeros(profile.page_shape, int)
+        for patch in patches(profile):
+            seen[patch.rows, patch.columns] += 1
+        assert (seen == 1).all()
+
+    def test_their_centres_are_those_of_their_symbols(self) -> None:
+        rows, columns = PROFILE.page_shape
+        x = (np.arange(columns) - (columns - 1) / 2) * PITCH
+        y = (np.arange(rows) - (rows - 1) / 2) * PITCH
+        for patch in patches(PROFILE):
+            expected = (x[patch.columns].mean(), y[patch.rows].mean())
+            assert patch.centre_m == pytest.approx(expected, abs=1e-12)
+
+    @pytest.mark.parametrize(("size_px", "edge"), [(1, 40), (2, 20), (4, 10), (16, 10)])
+    def test_they_hold_enough_symbols_and_enough_light(self, size_px: int, edge: int) -> None:
+        profile = load_profile("paper").with_symbols_of(size_px)
+        assert patch_edge(profile) == edge
+        for patch in patches(profile):
+            assert 0.8 * edge <= patch.rows.stop - patch.rows.start <= 1.2 * edge
+            assert 0.8 * edge <= patch.columns.stop - patch.columns.start <= 1.2 * edge
+
+    @pytest.mark.parametrize(
+        ("columns", "rows", "count"), [(87, 56, 6), (60, 40, 8), (48, 32, 9), (44, 28, 6), (30, 30, 9), (20, 20, 4)]
+    )
+    def test_the_middle_is_widened_by_whole_rings_until_it_holds_enough(
+        self, columns: int, rows: int, count: int
+    ) -> None:
+        page = PROFILE.page.model_copy(update={"columns": columns, "rows": rows})
+        profile = PROFILE.model_copy(update={"page": page})
+        everywhere = patches(profile)
+        middle = middle_patches(profile, everywhere, 5)
+        assert len(middle) == count
+        assert len(middle) >= min(5, len(everywhere))
+        assert np.abs(np.mean([patch.centre_m for patch in middle], axis=0)).max() < 0.5 * profile.symbol_pitch_m
+
+    def test_the_window_is_a_square_lattice_about_nothing_that_reaches_far_enough(self) -> None:
+        window = search_window(10e-6, 3e-6)
+        assert window.shape == (81, 2)
+        assert np.abs(window).max(0) == pytest.approx([12e-6, 12e-6])
+        assert np.abs(window.mean(0)).max() < 1e-18
+        assert len(np.unique(window.round(9), axis=0)) == 81
+        np.testing.assert_allclose(window[1] - window[0], [3e-6, 0])
+
+
+class TestFinding:
+    @pytest.mark.parametrize("shift_px", [(0.0, 0.0), (5.3, -2.2), (-7.9, 9.4)])
+    def test_an_injected_shift_is_found(self, shift_px: tuple[float, float]) -> None:
+        found = look(Picture(PROFILE, SYMBOLS, (shift_px[0] * PIXEL, shift_px[1] * PIXEL)))
+        expected = np.array(MIDDLE.centre_m) / PIXEL + [341.5, 227.5]
+        assert found.read_at == pytest.approx(np.stack([expected] * 2))
+        assert found.pixels == pytest.approx(np.stack([expected + shift_px] * 2), abs=0.3)
+        assert found.significance > 0.9 * found.symbols
+
+    @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.4, -0.25), (-1.6, 1.1)])
+    def test_an_injected_slope_is_found(self, slope: tuple[float, float]) -> None:
+        ramp = (slope[0] / PITCH, slope[1] / PITCH)
+        found = look(Picture(PROFILE, SYMBOLS, ramp=ramp))
+        # the peak over slopes is read by a parabola, which on slopes 0.3 rad a symbol apart errs by up to 0.02
+        assert found.slope * PITCH == pytest.approx(slope, abs=0.025)
+        assert found.significance > 0.85 * found.symbols
+
+    def test_of_small_symbols_too(self) -> None:
+        """A ramp that the page's centre or a length makes is as steep on the page, whatever its symbols' size."""
+        steep = (-1.6 / PITCH, 1.1 / PITCH)
+        picture, patch = Picture(FINE, FINE_SYMBOLS, (4 * PIXEL, -5 * PIXEL), steep), patches(FINE)[5]
+        found = look(picture, patch, FINE_SYMBOLS, ramp=(0.0, 0.0), profile=FINE)
+        assert (found.pixels - found.read_at)[0] == pytest.approx([4, -5], abs=0.3)
+        assert found.slope * PITCH == pytest.approx([-1.6, 1.1], abs=0.03)
+        # two samples a symbol see the soft squares less evenly than four
+        assert found.significance > 0.8 * found.symbols > 300
+
+    def test_shift_and_slope_are_found_together(self) -> None:
+        found = look(Picture(PROFILE, SYMBOLS, (4 * PIXEL, -5 * PIXEL), (0.5 / PITCH, 0.7 / PITCH)))
+        moved = (found.pixels - found.read_at)[0]
+        assert moved == pytest.approx([4, -5], abs=0.3)
+        assert found.slope * PITCH == pytest.approx([0.5, 0.7], abs=0.03)
+
+    @pytest.mark.parametrize("piston", [0.0, 2.0, -1.3])
+    def test_the_phase_is_that_of_the_light_against_the_symbols(self, piston: float) -> None:
+        found = look(Picture(PROFILE, SYMBOLS, piston=piston))
+        assert np.exp(1j * found.phase) == pytest.approx(np.exp(1j * piston), abs=0.02)
+
+    def test_what_the_twin_already_says_is_added_back(self) -> None:
+        ramp = (0.9 / PITCH, -0.6 / PITCH)
+        found = look(Picture(PROFILE, SYMBOLS, ramp=ramp, piston=0.4), ramp=ramp)
+        blind = look(Picture(PROFILE, SYMBOLS, ramp=ramp, piston=0.4))
+        expected = np.array(MIDDLE.centre_m) @ ramp + 0.4
+        assert np.exp(1j * found.phase) == pytest.approx(np.exp(1j * expected), abs=0.02)
+        assert np.exp(1j * blind.phase) == pytest.approx(np.exp(1j * expected), abs=0.05)
+        assert found.slope * PITCH == pytest.approx([0.9, -0.6], abs=0.01)
+        assert found.significance > blind.significance
+
+    def test_the_carrier_is_how_the_phase_changes_with_the_place_of_reading(self) -> None:
+        """Light that leaves through one side of the facet carries a phase ramp on the camera plane."""
+        picture, per_px = Picture(PROFILE, SYMBOLS), np.array([0.11, -0.07])
+
+        def tilted(places: np.ndarray) -> np.ndarray:
+            away = places - np.array(MIDDLE.centre_m)
+            return picture(places) * np.exp(1j * (away / PIXEL) @ per_px)
+
+        found = look(tilted)
+        assert found.carrier == pytest.approx(per_px, abs=0.01)
+        assert look(picture).carrier == pytest.approx([0, 0], abs=0.005)
+
+    def test_a_real_signal_is_enough_for_the_place(self) -> None:
+        picture = Picture(PROFILE, SYMBOLS, (6 * PIXEL, 3 * PIXEL))
+        found = look(lambda places: picture(places).real)
+        assert (found.pixels - found.read_at)[0] == pytest.approx([6, 3], abs=0.5)
+
+    def test_labels_are_handed_on(self) -> None:
+        window, twin = search_window(0, 1), FlatTwin(PROFILE)
+        found = measure(
+            Picture(PROFILE, SYMBOLS),
+            twin,
+            nominal(),
+            PROFILE,
+            MIDDLE,
+            SYMBOLS,
+            ("y", "direct"),
+            window,
+            samples=4,
+            cameras=(1,),
+        )
+        assert [(m.branch, m.cameras) for m in found] == [("y", (1,)), ("direct", (1,))]
+
+
+class TestSignificance:
+    def test_right_symbols_reach_their_number(self) -> None:
+        for patch in patches(PROFILE):
+            found = look(Picture(PROFILE, SYMBOLS), patch, reach_px=0)
+            assert found.symbols == (patch.rows.stop - patch.rows.start) * (patch.columns.stop - patch.columns.start)
+            assert 0.9 * found.symbols < found.significance <= found.symbols * (1 + 1e-5)
+
+    def test_unrelated_symbols_have_about_one_when_nothing_is_searched(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(module, "_SLOPES", np.array([-1e-9, 0, 1e-9]))
+        seen = self._unrelated(reach_px=0, pages=30)
+        assert len(seen) == 360
+        assert np.mean(seen) == pytest.approx(1, abs=5 / np.sqrt(len(seen)))
+
+    @pytest.mark.parametrize(("reach_px", "pages", "mistaken"), [(2, 18, 0.01), (24, 9, 0.05)])
+    @pytest.mark.parametrize(("profile", "samples"), [(PROFILE, 2), (FINE, 1)], ids=["4 px", "2 px"])
+    def test_a_search_among_unrelated_symbols_rarely_passes_for_a_find(
+        self, reach_px: float, pages: int, mistaken: float, profile: Profile, samples: int
+    ) -> None:
+        seen = self._unrelated(reach_px, pages, samples, profile)
+        assert np.mean(np.array(seen) > SIGNIFICANT) <= mistaken
+        # the best of many trials, so above one
+        assert np.mean(seen) > 4
+
+    def test_half_the_light_from_elsewhere_costs_significance(self) -> None:
+        own, other = Picture(PROFILE, SYMBOLS), Picture(PROFILE, np.exp(1j * random_phases(PROFILE, 9)))
+        mixed = look(lambda places: own(places) + other(places))
+        assert 0.3 * mixed.symbols < mixed.significance < 0.7 * mixed.symbols
+
+    def test_darkness_is_not_significant(self) -> None:
+        found = look(lambda places: np.zeros(places.shape[:-1], complex))
+        assert found.significance < 1
+        assert np.isfinite([*found.pixels.ravel(), found.phase, *found.slope, *found.carrier]).all()
+
+    @staticmethod
+    def _unrelated(reach_px: float, pages: int, samples: int = 4, profile: Profile = PROFILE) -> list[float]:
+        picture = Picture(profile, np.exp(1j * random_phases(profile, 1)))
+        window = search_window(reach_px * PIXEL, 4 * PIXEL)
+        found = []
+        for page in range(pages):
+            symbols = np.exp(1j * random_phases(profile, 100 + page))
+            for patch in patches(profile):
+                found += measure(
+                    picture, FlatTwin(profile), nominal(), profile, patch, symbols, ("direct",), window, samples
+                )
+        return [m.significance for m in found]

@@ -1,0 +1,87 @@
+"""Claims about samplers: one camera's frame is the field's projection on its reference, the field sampler the field."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lightpage.calibration.samplers import FieldSampler, FrameSampler
+from lightpage.device.state import CameraPose, Homodyne, Reference, Sensor
+from lightpage.simulator.simulator import Simulator, resample, true_parameters
+from lightpage.waves.grid import field_grid
+from tests.lightpage.small import perfect_device, small_profile
+from train.models.twin import RayTwin, TorchTwin
+
+PROFILE = small_profile()
+TWIN = TorchTwin(RayTwin(PROFILE))
+
+
+class TestFieldSampler:
+    def test_it_returns_the_fields_own_samples(self) -> None:
+        grid = field_grid(PROFILE)
+        rng = np.random.default_rng(0)
+        field = (rng.standard_normal(grid.shape) + 1j * rng.standard_normal(grid.shape)).astype(np.complex64)
+        rows, columns = rng.integers(20, 200, 50), rng.integers(20, 300, 50)
+        places = np.stack([grid.x_m[columns], grid.y_m[rows]], axis=-1)
+        np.testing.assert_allclose(FieldSampler(field, grid)(places), field[rows, columns], atol=1e-4)
+
+    def test_between_samples_it_follows_a_wave_of_the_pipes_band(self) -> None:
+        grid = field_grid(PROFILE)
+        edge = PROFILE.pipe.width_m / 2 / (PROFILE.light.wavelength_m * PROFILE.lens.focal_length_m)
+        k = 2 * np.pi * 0.9 * edge * np.array([0.8, -0.6])
+
+        def wave(places: np.ndarray) -> np.ndarray:
+            return np.exp(1j * places @ k)
+
+        x, y = np.meshgrid(grid.x_m, grid.y_m)
+        sampler = FieldSampler(wave(np.stack([x, y], axis=-1)).astype(np.complex64), grid)
+        places = np.random.default_rng(1).uniform(-0.4e-3, 0.4e-3, (3, 70, 2))
+        got = sampler(places)
+        assert got.shape == (3, 70)
+        assert np.abs(got - wave(places)).max() < 0.02
+
+    def test_there_is_no_light_outside_the_grid(self) -> None:
+        grid = field_grid(PROFILE)
+        sampler = FieldSampler(np.ones(grid.shape, np.complex64), grid)
+        assert abs(sampler(np.array([[1.0, 1.0]]))[0]) == 0
+
+
+class TestFrameSampler:
+    @pytest.mark.parametrize("camera", [0, 1])
+    def test_a_frame_shows_the_field_against_its_reference_where_the_twin_says(self, camera: int) -> None:
+        device = perfect_device(
+            in_phase_camera=CameraPose(scale_relative_error=0.01, rotation_deg=0.3, shift_x_px=5, shift_y_px=-8),
+            quadrature_camera=CameraPose(scale_relative_error=-0.01, rotation_deg=-0.2, shift_x_px=-9, shift_y_px=3),
+            reference=Reference(amplitude_ratio=4, ripple_relative=0.05, tilt_x_rad=2, tilt_y_rad=-1, curvature_rad=1),
+            homodyne=Homodyne(quadrature_error_deg=0, quadrature_gain=0.9, quadrature_sign=-1),
+            sensor=Sensor(full_well_e=1e9, read_noise_e=0, bit_depth=16),
+        )
+        simulator = Simulator(PROFILE, device, seed=1, steps=1)
+        symbols = np.random.default_rng(0).integers(256, size=PROFILE.page_shape).astype(np.uint8)
+        page, references, optics = simulator.simulate(symbols), simulator.references(), simulator.optics
+        frame, reference = (
+            (page.pair.in_phase, references.in_phase),
+            (page.pair.quadrature, references.quadrature),
+        )[camera]
+        sampler = FrameSampler(frame, reference, camera, TWIN, true_parameters(PROFILE, device))
+        half = 0.9 * np.array([PROFILE.page_width_m, PROFILE.page_height_m]) / 2
+        places = np.random.default_rng(2).uniform(-half, half, (2000, 2))
+        beam = optics.reference()
+        against = optics.camera_field(page.exit_field) * np.exp(1j * (page.piston - np.angle(beam)))
+        # Q is mounted the other way round, so it shows minus the imaginary part
+        part = against.real if camera == 0 else -against.imag
+        expected = resample(part, *optics.camera_axes_m, *places.T)
+        seen = sampler(places)
+        assert np.corrcoef(seen, expected)[0, 1] > 0.9
+        other = resample(against.imag if camera == 0 else against.real, *optics.camera_axes_m, *places.T)
+        assert abs(np.corrcoef(seen, other)[0, 1]) < 0.1
+
+    def test_a_frame_that_is_only_reference_shows_nothing(self) -> None:
+        reference = np.full(PROFILE.frame_shape, 120, np.uint8)
+        sampler = FrameSampler(reference, reference, 0, TWIN, true_parameters(PROFILE, perfect_device()))
+        assert np.abs(sampler(np.zeros((4, 2)))).max() < 1e-6
+
+    def test_a_dark_reference_gives_no_nan(self) -> None:
+        dark = np.zeros(PROFILE.frame_shape, np.uint8)
+        sampler = FrameSampler(dark + 3, dark, 1, TWIN, true_parameters(PROFILE, perfect_device()))
+        assert np.isfinite(sampler(np.zeros((4, 2)))).all()

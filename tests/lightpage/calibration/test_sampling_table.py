@@ -1,0 +1,106 @@
+"""Claims about the sampling table: rebuilt from it, every sample of every symbol lies where the twin would trace it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lightpage.calibration.interfaces import BRANCHES
+from lightpage.calibration.parameters import NAMES, PRIORS
+from lightpage.calibration.sampling_table import (
+    SAMPLING_TABLE,
+    monomial_powers,
+    registration_coefficients,
+    sampling_table,
+    symbol_centres,
+)
+from lightpage.device.profile import Profile, load_profile
+from lightpage.waves.grid import field_grid
+from tests.lightpage.small import small_profile
+from train.models.twin import RayTwin, TorchTwin
+
+TURN = -1.5
+
+
+def some_device() -> np.ndarray:
+    """Off nominal everywhere, with the shear and distortion of a device at the edge of its range."""
+    vector = 0.5 * PRIORS * np.random.default_rng(0).standard_normal(len(PRIORS))
+    vector[NAMES.index("pipe_angle_rad")] = -0.015
+    vector[NAMES.index("distortion_relative")] = 0.003
+    return vector
+
+
+def test_centres_run_row_by_row_about_the_pages_centre() -> None:
+    profile = small_profile()
+    rows, columns = profile.page_shape
+    centres = symbol_centres(profile).reshape(rows, columns, 2)
+    assert np.abs(centres.mean((0, 1))).max() < 1e-15
+    np.testing.assert_allclose(centres[0, 1] - centres[0, 0], [profile.symbol_pitch_m, 0], atol=1e-15)
+    np.testing.assert_allclose(centres[1, 0] - centres[0, 0], [0, profile.symbol_pitch_m], atol=1e-15)
+
+
+@pytest.mark.parametrize("profile", [small_profile(), load_profile("bench")], ids=lambda p: p.name)
+def test_four_by_four_samples_rebuilt_from_it_are_those_that_the_twin_traces(profile: Profile) -> None:
+    twin, parameters, grid = TorchTwin(RayTwin(profile)), some_device(), field_grid(profile)
+    table = sampling_table(twin, parameters, TURN, profile)
+    centres = symbol_centres(profile)
+    shape = (len(BRANCHES), *profile.page_shape)
+    for dx in (-0.375, -0.125, 0.125, 0.375):
+        for dy in (-0.375, 0.125):
+            rays = twin.trace(parameters, centres + np.array([dx, dy]) * profile.symbol_pitch_m, centres)
+            place, slope = table["places"].astype(float), table["place_gradients"].astype(float)
+            column = place[:, 0] + slope[:, 0] * dx + slope[:, 1] * dy
+            row = place[:, 1] + slope[:, 2] * dx + slope[:, 3] * dy
+            expected = (rays.places - [grid.x_m[0], grid.y_m[0]]) / grid.pitch_m
+            np.testing.assert_allclose(column, expected[..., 0].reshape(shape), rtol=0, atol=1e-3)
+            np.testing.assert_allclose(row, expected[..., 1].reshape(shape), rtol=0, atol=1e-3)
+            p = np.moveaxis(table["phases"].astype(float), 1, 0)
+            phase = p[0] + p[1] * dx + p[2] * dy + p[3] * dx**2 / 2 + p[4] * dx * dy + p[5] * dy**2 / 2
+            turned = np.angle(np.exp(1j * (phase - rays.phases.reshape(shape))))
+            assert np.abs(turned).max() < 2e-3
+
+
+def test_its_maps_have_the_names_and_shapes_that_a_decoder_takes() -> None:
+    profile = small_profile()
+    table = sampling_table(TorchTwin(RayTwin(profile)), some_device(), TURN, profile)
+    branches, page = len(BRANCHES), profile.page_shape
+    assert tuple(table) == SAMPLING_TABLE
+    assert {name: array.shape for name, array in table.items()} == {
+        "registration": (2, 2, 10),
+        "homodyne": (2,),
+        "parameters": (len(NAMES),),
+        "places": (branches, 2, *page),
+        "place_gradients": (branches, 4, *page),
+        "phases": (branches, 6, *page),
+        "positions": (2, *page),
+    }
+    assert {array.dtype for array in table.values()} == {np.dtype(np.float32)}
+    np.testing.assert_allclose(table["homodyne"], [np.cos(TURN), np.sin(TURN)], rtol=1e-6)
+    assert np.abs(table["phases"][:, 0]).max() <= np.pi + 1e-6
+
+
+def test_positions_are_the_exit_centroids_of_the_symbols() -> None:
+    profile = small_profile()
+    twin, parameters = TorchTwin(RayTwin(profile)), some_device()
+    positions = sampling_table(twin, parameters, TURN, profile)["positions"]
+    expected = twin.trace(parameters, symbol_centres(profile)).positions
+    np.testing.assert_allclose(positions[0], expected[:, 0].reshape(profile.page_shape), atol=1e-6)
+    np.testing.assert_allclose(positions[1], expected[:, 1].reshape(profile.page_shape), atol=1e-6)
+
+
+def test_a_cubic_holds_the_pixels_of_the_whole_grid() -> None:
+    profile = small_profile()
+    twin, parameters, grid = TorchTwin(RayTwin(profile)), some_device(), field_grid(profile)
+    coefficients = registration_coefficients(twin, parameters, profile).astype(float)
+    rng = np.random.default_rng(1)
+    places = np.stack([rng.choice(grid.x_m, 500), rng.choice(grid.y_m, 500)], axis=-1)
+    u, v = places.T / (np.hypot(profile.page_width_m, profile.page_height_m) / 2)
+    terms = np.stack([u**i * v**j for i, j in monomial_powers()])
+    rebuilt = np.moveaxis(coefficients @ terms, 1, -1)
+    assert np.abs(rebuilt - twin.pixels(parameters, places)).max() < 1e-3
+
+
+def test_a_cubic_has_ten_terms_each_once() -> None:
+    powers = monomial_powers()
+    assert len(set(powers)) == len(powers) == 10
+    assert max(i + j for i, j in powers) == 3

@@ -1,0 +1,160 @@
+"""Claims about the fit to waves: a known page places both cameras and tells the device, with honest deviations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lightpage.calibration import wave_fit
+from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
+from lightpage.calibration.wave_fit import WaveFit
+from lightpage.device.profile import Profile
+from lightpage.device.state import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor, draw_device
+from lightpage.page.symbols import symbol_phases
+from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.waves.grid import field_grid
+from tests.lightpage.small import THICK, small_profile
+from train.models.twin import RayTwin, TorchTwin
+
+PROFILE = small_profile()
+TWIN = TorchTwin(RayTwin(PROFILE))
+TURN = np.deg2rad(-90 + 3)
+EVERY = tuple(dict.fromkeys(parameter.group for parameter in PARAMETERS))
+
+
+def seen_by(device: Device, seed: int, profile: Profile = PROFILE) -> WaveFit:
+    """The fit of one random page of a device."""
+    simulator = Simulator(profile, device, seed=seed)
+    symbols = np.random.default_rng(seed).integers(256, size=profile.page_shape).astype(np.uint8)
+    pair, references = simulator.page(symbols), simulator.references()
+    twin = TWIN if profile is PROFILE else TorchTwin(RayTwin(profile))
+    return WaveFit(twin, profile, pair, references, np.exp(1j * symbol_phases(symbols, 256)))
+
+
+@pytest.mark.parametrize(("ratio", "full_well_e"), [(1.3, 15_000.0), (3.0, 15_000.0), (1.6, 100.0)])
+def test_both_cameras_and_the_angle_between_the_arms_come_back(ratio: float, full_well_e: float) -> None:
+    device = Device(
+        in_phase_camera=CameraPose(scale_relative_error=2e-3, rotation_deg=0.1, shift_x_px=1.0),
+        quadrature_camera=CameraPose(scale_relative_error=-1e-3, rotation_deg=-0.1, shift_y_px=-2.0),
+        aberration=Aberration(distortion_relative=0),
+        reference=Reference(amplitude_ratio=ratio),
+        homodyne=Homodyne(quadrature_error_deg=3, quadrature_sign=-1, quadrature_gain=0.9),
+        sensor=Sensor(full_well_e=full_well_e),
+        drift=Drift(shift_px=0),
+    )
+    truth = true_parameters(PROFILE, device)
+    start = truth.copy()
+    start[indices("in_phase")] += [0.3, 0.1, 1e-3, 0, 1e-3, 0]
+    start[indices("quadrature")] += [-0.4, 0.2, -1e-3, 1e-3, 0, 2e-3]
+    result = seen_by(device, 1).fit(start, TURN + np.deg2rad(8), ("in_phase", "quadrature"))
+    found, turn = result.parameters, result.turn
+
+    grid = field_grid(PROFILE)
+    half = np.array([PROFILE.page_width_m, PROFILE.page_height_m]) / 2
+    places = np.stack(np.meshgrid(grid.x_m, grid.y_m), axis=-1).reshape(-1, 2)
+    places = places[np.all(np.abs(places) < half, axis=1)]
+
+    def off(parameters: np.ndarray) -> np.ndarray:
+        """Largest error of either camera's place, pixels."""
+        errors = TWIN.pixels(parameters, places) - TWIN.pixels(truth, places)
+        return np.asarray(np.linalg.norm(errors, axis=-1).max(axis=1))
+
+    assert np.all(off(start) > 0.4)
+    assert np.all(off(found) < 0.1)
+    assert abs(np.rad2deg(turn - TURN)) < 0.3
+    poses = np.r_[indices("in_phase"), indices("quadrature")]
+    assert np.array_equal(np.delete(found, poses), np.delete(truth, poses))
+    assert np.array_equal(np.flatnonzero(result.deviations), np.sort(poses))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_realistic_device_is_told_from_near_it_with_honest_deviations(seed: int) -> None:
+    device = draw_device(np.random.default_rng(seed))
+    truth = true_parameters(PROFILE, device)
+    rng, angle = np.random.default_rng([seed, 1]), NAMES.index("pipe_angle_rad")
+    start = truth + 0.02 * PRIORS * rng.standard_normal(len(PRIORS))
+    start[angle] = truth[angle] + 4e-4
+    found = seen_by(device, seed).fit(start, device.homodyne.turn_rad, EVERY)
+    assert abs(found.parameters[angle] - truth[angle]) < 5e-5
+    assert found.deviations[angle] < 2e-4
+    assert np.rad2deg(abs(found.turn - device.homodyne.turn_rad)) < 0.3
+    moving = indices("in_phase", "quadrature")[::6], indices("in_phase", "quadrature")[1::6]
+    lenses = NAMES.index("lens_path_relative")
+    assert found.deviations[lenses] == 0  # these are ideal, and it does nothing
+    known = [i for i in range(len(PRIORS)) if i not in (*np.ravel(moving), lenses)]  # the image has moved since
+    off = (found.parameters - truth)[known] / found.deviations[known]
+    assert np.sqrt(np.mean(off**2)) < 2
+
+
+def test_a_derivative_that_has_all_but_converged_serves_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked, taken = list[float](), list[int]()
+
+    def counted(fit: WaveFit, *arguments: Any, slopes: Any = WaveFit._slopes) -> Any:
+        taken.append(len(looked))
+        return slopes(fit, *arguments)
+
+    def noted(fit: WaveFit, *arguments: Any, equations: Any = WaveFit._equations) -> Any:
+        columns, left = equations(fit, *arguments)
+        looked.append(float(np.sqrt(np.mean(left**2))))
+        return columns, left
+
+    monkeypatch.setattr(WaveFit, "_slopes", counted)
+    monkeypatch.setattr(WaveFit, "_equations", noted)
+    monkeypatch.setattr(wave_fit, "_CONVERGED", 0.0)  # as long as anything is gained
+    device = Device(drift=Drift(shift_px=0))
+    start = true_parameters(PROFILE, device)
+    start[indices("in_phase")] += [0.03, 0.01, 1e-4, 0, 1e-4, 0]
+    seen_by(device, 1).fit(start, device.homodyne.turn_rad, ("in_phase", "quadrature"))
+    assert len(looked) > wave_fit._CHORD  # rounds enough for a second derivative
+    assert looked[3] > (1 - wave_fit._NEARLY) * looked[2]
+    assert taken == [0]
+
+
+def test_a_fit_tells_of_every_round_and_derivative_and_ends_where_it_is_stopped() -> None:
+    class Stopped(Exception):
+        pass
+
+    device, told = Device(drift=Drift(shift_px=0)), list[float]()
+
+    def stop_in_the_derivative(share: float) -> None:
+        told.append(share)
+        if len(told) == 10:
+            raise Stopped
+
+    fit, start = seen_by(device, 1), true_parameters(PROFILE, device)
+    with pytest.raises(Stopped):
+        fit.fit(start, device.homodyne.turn_rad, EVERY, progress=stop_in_the_derivative)
+    assert 0 < told[-1] < 1 / wave_fit._ROUNDS  # in the first round, a derivative of every parameter of the light
+    shares = list[float]()
+    fit.fit(start, device.homodyne.turn_rad, ("in_phase", "angle"), progress=shares.append)
+    assert told == sorted(told)
+    assert shares == sorted(shares)
+    assert {0, 1 / wave_fit._ROUNDS} <= set(shares) <= {n / wave_fit._ROUNDS for n in range(wave_fit._ROUNDS)}
+
+
+def test_how_much_path_real_lenses_add_comes_back() -> None:
+    index = NAMES.index("lens_path_relative")
+    thick = PROFILE.model_copy(update={"lens_path": THICK.times(0.25)})  # a quarter as much takes a tenth of the time
+    device = Device(aberration=Aberration(lens_path_relative_error=0.1))
+    truth = true_parameters(thick, device)
+    start = truth.copy()
+    start[index] = 0
+    found = seen_by(device, 4, thick).fit(start, device.homodyne.turn_rad, EVERY)
+    assert 0 < found.deviations[index] < 0.02
+    assert found.parameters[index] == pytest.approx(0.1, abs=3 * found.deviations[index])
+
+
+def test_held_parameters_keep_their_values_and_priors_hold_the_others() -> None:
+    device = draw_device(np.random.default_rng(3))
+    truth = true_parameters(PROFILE, device)
+    fit, start = seen_by(device, 3), truth.copy()
+    angle = NAMES.index("pipe_angle_rad")
+    start[angle] += 4e-4
+    free = fit.fit(start, device.homodyne.turn_rad, ("angle",))
+    held = fit.fit(start, device.homodyne.turn_rad, ("angle",), centre=start, prior_scale=1e-4)
+    assert np.array_equal(np.flatnonzero(free.parameters - start), [angle])
+    assert abs(free.parameters[angle] - truth[angle]) < 1e-4
+    assert abs(held.parameters[angle] - start[angle]) < 1e-5
+    assert free.residual < held.residual

@@ -1,0 +1,207 @@
+"""`lightpage simulate`: reproducible, interruptible, and careful with files that are there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lightpage.cli.simulate import simulate
+from lightpage.device.profile import Camera, PageLayout, load_profile
+from lightpage.device.state import Device, load_device
+from lightpage.errors import InvalidInputError, ProfileError, RecordingError
+from lightpage.recording.reader import FramePair, Recording, RecordingWriter
+from lightpage.simulator import recording_job
+from lightpage.simulator.simulator import LIGHT, SimulatedPage, Simulator
+
+PAGES = 3
+
+
+@pytest.fixture(scope="module")
+def profile_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A corner of the bench device's page, quick to compute."""
+    bench = load_profile("bench")
+    tiny = bench.model_copy(
+        update={
+            "name": "tiny",
+            "page": PageLayout(columns=12, rows=9, symbol_size_px=4),
+            "camera": Camera(columns_px=240, rows_px=180, pitch_m=bench.camera.pitch_m),
+        }
+    )
+    path = tmp_path_factory.mktemp("profile") / "tiny.toml"
+    path.write_text(tiny.to_toml())
+    return path
+
+
+def run(profile: Path, out: Path, *more: str, pages: int = PAGES) -> None:
+    arguments = ["--profile", str(profile), "--pages", str(pages), "--out", str(out), "--levels", "16", "--seed", "7"]
+    result = CliRunner().invoke(simulate, [*arguments, *more], standalone_mode=False)
+    if result.exception is not None:
+        raise result.exception
+
+
+def contents(path: Path) -> dict[str, np.ndarray]:
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+@pytest.fixture(scope="module")
+def whole(profile_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("whole") / "R.h5"
+    run(profile_file, out)
+    return out
+
+
+def interrupt_after(pages: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C in the middle of the page after `pages`."""
+    original, count = Simulator.simulate, iter(range(100))
+
+    def interrupted(self: Simulator, symbols: np.ndarray) -> SimulatedPage:
+        if next(count) == pages:
+            raise KeyboardInterrupt
+        return original(self, symbols)
+
+    monkeypatch.setattr(recording_job.Simulator, "simulate", interrupted)
+
+
+def test_a_recording_opens_with_its_profile_levels_and_symbols(whole: Path, profile_file: Path) -> None:
+    profile = load_profile(profile_file)
+    with Recording.open(whole) as recording:
+        recording.check_against(profile)
+        symbols = recording.symbols(0)
+        assert (recording.pages, recording.levels, recording.profile_text) == (PAGES, 16, profile.to_toml())
+    assert symbols is not None
+    assert set(np.unique(symbols)) <= set(range(16))
+    assert len(np.unique(symbols)) > 8
+    assert sorted(entry.name for entry in whole.parent.iterdir()) == ["R.h5"]
+
+
+def test_the_truth_lies_beside_the_pages_and_can_be_left_out(whole: Path, profile_file: Path, tmp_path: Path) -> None:
+    with h5py.File(whole) as file:
+        (tmp_path / "device.toml").write_text(file["truth"].attrs["device"])
+        assert set(file["truth"]) == {"exit_field", "piston", "shift_px"}
+        pistons = file["truth/piston"][()]
+    assert load_device(tmp_path / "device.toml") == Device()
+    assert np.ptp(pistons) > 0
+    run(profile_file, tmp_path / "bare.h5", "--no-truth", pages=1)
+    with h5py.File(tmp_path / "bare.h5") as file:
+        assert "truth" not in file
+
+
+def test_an_interrupted_recording_goes_on_to_what_it_would_have_been(
+    whole: Path, profile_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "R.h5"
+    with monkeypatch.context() as patch:
+        interrupt_after(2, patch)
+        with pytest.raises(click.Abort):
+            run(profile_file, out)
+    assert not out.exists()
+    with h5py.File(tmp_path / "R.h5.partial") as file:
+        assert file.attrs["pages_complete"] == 2
+    run(profile_file, out)
+    expected, found = contents(whole), contents(out)
+    assert set(found) == set(expected)
+    for name, value in expected.items():
+        np.testing.assert_array_equal(found[name], value, err_msg=name)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["R.h5"]
+
+
+def test_pages_of_another_device_are_not_mixed_in(
+    profile_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, other = tmp_path / "R.h5", ("--set", "geometry.pipe_angle_deg=0.5")
+    with monkeypatch.context() as patch:
+        interrupt_after(1, patch)
+        with pytest.raises(click.Abort):
+            run(profile_file, out)
+    with pytest.raises(InvalidInputError, match="pages begun with other settings"):
+        run(profile_file, out, *other)
+    with pytest.raises(InvalidInputError, match="pages begun with other settings"):
+        run(profile_file, out, "--no-truth")
+    with monkeypatch.context() as patch:
+        patch.setattr(recording_job, "LIGHT", LIGHT + 1)
+        with pytest.raises(InvalidInputError, match="pages begun with other settings"):
+            run(profile_file, out)
+    run(profile_file, out, *other, "--force", pages=1)
+    with h5py.File(out) as file:
+        assert "pipe_angle_deg = 0.5" in file["truth"].attrs["device"]
+
+
+def test_pages_that_are_being_written_are_not_destroyed_even_if_forced(profile_file: Path, tmp_path: Path) -> None:
+    out, profile = tmp_path / "R.h5", load_profile(profile_file)
+    frame = np.ones(profile.frame_shape, np.uint8)
+    with RecordingWriter(out, profile, 16, 8, FramePair(frame, frame)) as running:
+        running.append(None, FramePair(frame, frame))
+        with pytest.raises(RecordingError, match="another process is writing now"):
+            run(profile_file, out, "--force", pages=1)
+    with Recording.open(out) as recording:
+        assert recording.pages == 1
+
+
+def test_a_profile_that_cannot_be_simulated_leaves_nothing_behind(profile_file: Path, tmp_path: Path) -> None:
+    coarse = tmp_path / "coarse.toml"
+    coarse.write_text(profile_file.read_text().replace("pitch_m = 2.4e-06", "pitch_m = 4.8e-06"))
+    with pytest.raises(ProfileError, match=r"camera\.pitch_m: got 4\.8e-06 m"):
+        run(coarse, tmp_path / "R.h5")
+    assert list(tmp_path.iterdir()) == [coarse]
+
+
+def test_a_file_that_exists_is_kept_unless_forced(profile_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "R.h5"
+    out.write_bytes(b"precious")
+    with pytest.raises(InvalidInputError, match="--force"):
+        run(profile_file, out, pages=1)
+    assert out.read_bytes() == b"precious"
+    run(profile_file, out, "--force", pages=1)
+    with Recording.open(out) as recording:
+        assert recording.pages == 1
+
+
+def test_settings_and_a_device_file_make_the_device(profile_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "device.toml").write_text("[sensor]\nbit_depth = 12\n[drift]\npiston_rad = 0.4\n")
+    run(
+        profile_file,
+        tmp_path / "R.h5",
+        "--device",
+        str(tmp_path / "device.toml"),
+        "--set",
+        "drift.piston_rad=0.0",
+        pages=2,
+    )
+    with Recording.open(tmp_path / "R.h5") as recording:
+        assert recording.bit_depth == 12
+    assert np.ptp(contents(tmp_path / "R.h5")["truth/piston"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("more", "complaint"),
+    [
+        (("--set", "geometry.angle=1"), r"geometry\.angle"),
+        (("--set", "sensor.bit_depth=3"), r"sensor\.bit_depth = 3"),
+        (("--device", "absent.toml"), r"absent\.toml"),
+    ],
+)
+def test_a_wrong_setting_is_named_and_nothing_is_written(
+    profile_file: Path, tmp_path: Path, more: tuple[str, ...], complaint: str
+) -> None:
+    with pytest.raises(ProfileError, match=complaint):
+        run(profile_file, tmp_path / "R.h5", *more)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_skipped_pages_leave_the_device_where_simulated_ones_would(profile_file: Path) -> None:
+    profile = load_profile(profile_file)
+    symbols = np.zeros(profile.page_shape, dtype=np.uint8)
+    seen, skipped = (Simulator(profile, Device(), 16, seed=3) for _ in range(2))
+    seen.simulate(symbols)
+    skipped.skip(1)
+    one, other = seen.simulate(symbols), skipped.simulate(symbols)
+    assert (one.piston, one.shift_px) == (other.piston, other.shift_px)
+    np.testing.assert_array_equal(one.pair.in_phase, other.pair.in_phase)

@@ -1,0 +1,175 @@
+"""Claims about rates and confidence, against numerical integration and draws from von Mises densities."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import i0e, logsumexp, softmax
+from scipy.stats import entropy
+
+from lightpage.errors import PageError
+from lightpage.metrics import information as measures
+
+
+def drawn_page(levels: int, kappa: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """True symbols and decoded phases whose errors do follow the concentrations."""
+    rng = np.random.default_rng(seed)
+    symbols = rng.integers(levels, size=kappa.shape)
+    return symbols, symbols * 2 * np.pi / levels + rng.vonmises(0.0, kappa)
+
+
+@pytest.mark.parametrize("kappa", [0.1, 1.0, 7.0, 60.0, 900.0])
+def test_own_information_of_many_levels_is_the_integral_of_the_density(kappa: float) -> None:
+    def integrand(error: float) -> float:
+        density = np.exp(kappa * (np.cos(error) - 1)) / (2 * np.pi * i0e(kappa))
+        return float(density * np.log2(2 * np.pi * max(density, 1e-300)))
+
+    expected = quad(integrand, -np.pi, np.pi, points=[-0.1, 0.1], limit=400)[0]
+    assert measures.own_information(np.array([0.3]), np.array([kappa]), 256)[0] == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.parametrize("levels", [2, 3, 16, 25, 26, 100, 256])
+def test_own_information_is_what_the_posterior_leaves_unknown(levels: int) -> None:
+    rng = np.random.default_rng(levels)
+    kappa, mu = 10 ** rng.uniform(-3, 6, 400), rng.uniform(-20, 20, 400)
+    logits = kappa[:, None] * (np.cos(np.arange(levels) * 2 * np.pi / levels - mu[:, None]) - 1)
+    expected = np.log2(levels) - entropy(softmax(logits, axis=1), base=2, axis=1)
+    np.testing.assert_allclose(measures.own_information(mu, kappa, levels), expected, atol=1e-8)
+
+
+def test_own_information_is_nothing_without_concentration_and_never_more_than_the_levels_hold() -> None:
+    bits = measures.own_information(np.zeros(3), np.array([0.0, 1e4, 1e30]), levels=16)
+    np.testing.assert_allclose(bits, [0, 4, 4], atol=1e-12)
+
+
+@pytest.mark.parametrize("levels", [2, 3, 5, 16, 25, 26, 32, 100, 256])
+def test_posterior_equals_the_plain_softmax(levels: int) -> None:
+    rng = np.random.default_rng(levels)
+    kappa = 10 ** rng.uniform(-3, 6, 400)
+    mu = rng.uniform(-20, 20, 400)
+    symbols = np.where(rng.random(400) < 0.5, measures.decide(mu, levels), rng.integers(levels, size=400))
+    logits = kappa[:, None] * (np.cos(np.arange(levels) * 2 * np.pi / levels - mu[:, None]) - 1)
+    expected = logits[np.arange(400), symbols] - logsumexp(logits, axis=1)
+    # float64 knows a phase of 20 rad to 4e-15 and kappa multiplies that, so part of the allowance grows with kappa.
+    difference = np.abs(measures.log_posterior(mu, kappa, symbols, levels) - expected)
+    assert (difference <= 1e-9 + 1e-13 * kappa).all()
+
+
+@pytest.mark.parametrize("levels", [2, 7, 256])
+def test_decision_is_the_nearest_level_whatever_the_winding(levels: int) -> None:
+    symbols = np.arange(levels)
+    mu = symbols * 2 * np.pi / levels + 0.49 * 2 * np.pi / levels
+    for turns in (-3, 0, 2):
+        assert np.array_equal(measures.decide(mu + 2 * np.pi * turns, levels), symbols)
+
+
+@pytest.mark.parametrize("levels", [3, 4, 8, 16, 256])
+def test_air_of_honest_beliefs_equals_own_information(levels: int) -> None:
+    kappa = np.random.default_rng(0).lognormal(np.log(10), 1, 200_000)
+    symbols, mu = drawn_page(levels, kappa, 1)
+    air = measures.achievable_rate(mu, kappa, symbols, levels).mean()
+    assert air == pytest.approx(measures.own_information(mu, kappa, levels).mean(), abs=0.01)
+
+
+def test_air_at_256_levels_agrees_with_the_continuous_form() -> None:
+    kappa = np.full(1000, 30.0)
+    symbols, mu = drawn_page(256, kappa, 2)
+    error = symbols * 2 * np.pi / 256 - mu
+    continuous = np.log2(2 * np.pi) + (kappa * (np.cos(error) - 1) - np.log(2 * np.pi * i0e(kappa))) / np.log(2)
+    np.testing.assert_allclose(measures.achievable_rate(mu, kappa, symbols, 256), continuous, atol=1e-9)
+
+
+def test_overconfident_beliefs_claim_more_than_they_achieve() -> None:
+    kappa = np.full(50_000, 8.0)
+    symbols, mu = drawn_page(16, kappa, 3)
+    honest = measures.measure(mu, kappa, symbols, 16)
+    boastful = measures.measure(mu, 6 * kappa, symbols, 16)
+    assert boastful.air_bits_per_symbol < honest.air_bits_per_symbol - 0.3
+    assert boastful.over_claim_bits_per_symbol > honest.over_claim_bits_per_symbol + 1
+    assert boastful.ece > 0.1 > 0.01 > honest.ece
+
+
+def test_gray_rate_is_a_brute_force_bit_posterior_and_never_above_air() -> None:
+    kappa = np.full(3000, 12.0)
+    symbols, mu = drawn_page(8, kappa, 4)
+    theta = np.arange(8) * 2 * np.pi / 8
+    weight = np.exp(kappa[:, None] * np.cos(theta - mu[:, None]))
+    weight /= weight.sum(1, keepdims=True)
+    labels = np.array([0b000, 0b001, 0b011, 0b010, 0b110, 0b111, 0b101, 0b100])
+    expected = np.zeros(3000)
+    for bit in range(3):
+        alike = (labels >> bit & 1)[None, :] == (labels[symbols] >> bit & 1)[:, None]
+        expected += 1 + np.log2((weight * alike).sum(1))
+    got = measures.gray_rate(mu, kappa, symbols, 8)
+    np.testing.assert_allclose(got, expected, atol=1e-9)
+    assert got.mean() <= measures.achievable_rate(mu, kappa, symbols, 8).mean()
+
+
+def test_gray_labels_need_a_power_of_two_and_the_page_measure_says_none_without() -> None:
+    kappa = np.full(100, 12.0)
+    symbols, mu = drawn_page(6, kappa, 5)
+    with pytest.raises(PageError, match="power of two"):
+        measures.gray_rate(mu, kappa, symbols, 6)
+    assert measures.measure(mu, kappa, symbols, 6).gmi_bits_per_symbol is None
+
+
+def test_ece_is_the_gap_between_claim_and_accuracy() -> None:
+    confidence = np.full(1000, 0.9)
+    assert measures.expected_calibration_error(confidence, np.arange(1000) < 600) == pytest.approx(0.3)
+    two_bins = np.repeat([0.95, 0.55], 500)
+    correct = np.concatenate([np.arange(500) < 450, np.arange(500) < 300])
+    assert measures.expected_calibration_error(two_bins, correct) == pytest.approx(0.05)
+
+
+def test_bins_of_confidence_hold_every_symbol_once_with_its_claim_and_outcome() -> None:
+    confidence = np.repeat([0.95, 0.55, 1.0, 0.25], [500, 400, 100, 1])
+    bins = measures.reliability(confidence, np.arange(1001) % 4 > 0, bins=10)
+    counted = [(round(b.low, 9), round(b.high, 9), b.count) for b in bins]
+    assert counted == [(0.2, 0.3, 1), (0.5, 0.6, 400), (0.9, 1.0, 600)]
+    assert [b.confidence for b in bins] == pytest.approx([0.25, 0.55, (500 * 0.95 + 100) / 600])
+    assert [b.accuracy for b in bins] == [0, 0.75, 0.75]
+    with pytest.raises(PageError, match="confidences"):
+        measures.reliability(np.empty(0), np.empty(0, bool))
+
+
+def test_maps_average_to_the_figures_of_the_page() -> None:
+    data = np.random.default_rng(8).random((5, 7)) > 0.2
+    kappa = np.random.default_rng(9).gamma(2.0, 20.0, (3, np.count_nonzero(data)))
+    symbols, mu = drawn_page(64, kappa, 10)
+    maps, figures = measures.symbol_maps(mu, kappa, symbols, 64, data), measures.measure(mu, kappa, symbols, 64)
+    assert np.nanmean(maps.air) == pytest.approx(figures.air_bits_per_symbol)
+    assert np.nanmean(maps.own_mi) == pytest.approx(figures.own_mi_bits_per_symbol)
+    for page in (maps.air, maps.own_mi, maps.error_rad):
+        assert np.array_equal(np.isfinite(page), data)
+    # each symbol's errors stay at its own place, whatever the winding
+    off = symbols * (2 * np.pi / 64) + np.arange(kappa.shape[1]) * 0.01 * np.array([1, -1, 1])[:, None] + 4 * np.pi
+    assert measures.symbol_maps(off, kappa, symbols, 64, data).error_rad[data] == pytest.approx(
+        np.arange(kappa.shape[1]) * 0.01
+    )
+    with pytest.raises(PageError, match="data symbols"):
+        measures.symbol_maps(mu[:, 1:], kappa[:, 1:], symbols[:, 1:], 64, data)
+
+
+def test_confidence_lies_between_a_guess_and_certainty() -> None:
+    _, confidence = measures.decide_with_confidence(np.zeros(3), np.array([0.0, 3.0, 1e12]), 4)
+    assert confidence.dtype == np.float32
+    assert confidence[0] == pytest.approx(0.25)
+    assert confidence[0] < confidence[1] < confidence[2] == 1
+
+
+@pytest.mark.parametrize(
+    ("mu", "kappa", "symbols", "levels", "named"),
+    [
+        (np.zeros(2), np.ones(2), np.zeros(2, int), 1, "levels"),
+        (np.zeros(2), np.ones(2), np.zeros(2, int), 257, "levels"),
+        (np.zeros(2), np.ones(3), np.zeros(2, int), 4, "equal shapes"),
+        (np.zeros(2), np.array([1, np.nan]), np.zeros(2, int), 4, "concentration"),
+        (np.zeros(2), np.array([1, -1.0]), np.zeros(2, int), 4, "concentration"),
+        (np.array([0, np.inf]), np.ones(2), np.zeros(2, int), 4, "phase"),
+        (np.zeros(2), np.ones(2), np.array([0, 4]), 4, "symbols"),
+    ],
+)
+def test_nonsense_is_named(mu: np.ndarray, kappa: np.ndarray, symbols: np.ndarray, levels: int, named: str) -> None:
+    with pytest.raises(PageError, match=named):
+        measures.log_posterior(mu, kappa, symbols, levels)

@@ -1,0 +1,85 @@
+"""Files that are whole, and options that name files to write."""
+
+import os
+import stat
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from lightpage.errors import InvalidInputError
+from lightpage.files import OutputFile, replace_file, replace_text
+
+
+@click.command()
+@click.option("--json", "path", type=OutputFile())
+def write(path: Path) -> None:
+    """A command with nothing but a result."""
+    replace_text(path, "text")
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("", r"--json .*got a folder, wanted a file"), ("missing/F", r"--json .*F: got No such file or directory")],
+)
+def test_a_path_that_cannot_be_written_is_known_before_the_work(tmp_path: Path, name: str, said: str) -> None:
+    with pytest.raises(InvalidInputError, match=said):
+        CliRunner().invoke(write, ["--json", str(tmp_path / name)], catch_exceptions=False)
+
+
+def test_a_path_that_can_be_written_leaves_nothing_beside_the_result(tmp_path: Path) -> None:
+    (tmp_path / "F").write_text("earlier")
+    result = CliRunner().invoke(write, ["--json", str(tmp_path / "F")], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["F"]
+    assert (tmp_path / "F").read_text() == "text"
+
+
+def test_content_and_name_are_on_the_disk_before_a_file_is_said_to_be_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    rename = os.replace
+
+    def synced(descriptor: int) -> None:
+        state = os.fstat(descriptor)
+        folder = stat.S_ISDIR(state.st_mode)
+        assert os.path.samestat(state, tmp_path.stat()) if folder else state.st_size == 4
+        done.append("folder" if folder else "content")
+
+    def renamed(old: str, new: Path) -> None:
+        rename(old, new)
+        done.append("name")
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", renamed)
+    replace_text(tmp_path / "F", "text")
+    assert done == ["content", "name", "folder"]
+    assert (tmp_path / "F").stat().st_mode & 0o777 == 0o644
+
+
+def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "F").write_text("earlier")
+    with pytest.raises(InvalidInputError, match="F: got No space left"):
+        replace_file(tmp_path / "F", full)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InvalidInputError, match="F: got No space left"):
+        replace_text(tmp_path / "F", "text")
+    assert [path.name for path in tmp_path.iterdir()] == ["F"]
+    assert (tmp_path / "F").read_text() == "earlier"
+
+
+def test_a_file_system_that_cannot_sync_a_folder_keeps_files_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(22, "Invalid argument")
+
+    monkeypatch.setattr(os, "fsync", refused)
+    replace_text(tmp_path / "F", "text")
+    assert (tmp_path / "F").read_text() == "text"

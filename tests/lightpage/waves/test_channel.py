@@ -1,0 +1,325 @@
+"""Claims about the waves: what the pipe and the lenses keep, undo and image, against direct sums and other methods."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import fft, integrate, linalg, ndimage
+
+from lightpage.device.lens_path import SeidelTerms
+from lightpage.waves import channel as waves
+from lightpage.waves.channel import (
+    FourierLens,
+    PipePropagator,
+    WaveChannel,
+    WaveGeometry,
+    cells_for,
+    modes_for,
+    sine_matrix,
+)
+
+DEVICE = WaveGeometry(
+    wavelength_m=532e-9,
+    focal_length_m=10e-3,
+    pipe_length_m=9.375e-3,
+    pipe_width_m=0.444815e-3,
+    refractive_index=1.461,
+)
+GLASS = DEVICE.refractive_index * DEVICE.wave_number
+CELLS = (46, 61)
+
+
+def device(angle_deg: float = 0.0, roll_deg: float = 0.0, length_m: float = DEVICE.pipe_length_m) -> WaveGeometry:
+    return replace(DEVICE, pipe_angle=np.deg2rad(angle_deg), pipe_roll=np.deg2rad(roll_deg), pipe_length_m=length_m)
+
+
+def noise(*shape: int, seed: int = 0) -> np.ndarray:
+    """Complex white noise in single precision, the precision of the waves."""
+    rng = np.random.default_rng(seed)
+    return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
+
+
+def off(a: np.ndarray, b: np.ndarray) -> float:
+    """Relative distance of `a` from `b`."""
+    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
+
+
+def axis(count: int, pitch_m: float) -> np.ndarray:
+    return (np.arange(count) - (count - 1) / 2) * pitch_m
+
+
+@pytest.fixture(scope="module")
+def facet() -> np.ndarray:
+    """A field on the entrance facet that fills every mode."""
+    return noise(CELLS[0] - 1, CELLS[1] - 1)
+
+
+@pytest.fixture(scope="module")
+def page_at_entrance() -> np.ndarray:
+    """The light of a page of random symbols on the entrance facet: pages leave the top of the band dark."""
+    page = np.exp(2j * np.pi * np.kron(np.random.default_rng(1).random((12, 16)), np.ones((4, 4))))
+    pitch = 2.2 * 9.2e-6 / 4
+    return FourierLens(DEVICE, axis(64, pitch), axis(48, pitch), CELLS).to_facet(page)
+
+
+class TestPipe:
+    @pytest.mark.parametrize("steps", [1, 7, 64])
+    @pytest.mark.parametrize("angle_deg", [0.0, -0.6, 3.0])
+    def test_power_is_kept_by_any_shear_and_number_of_steps(
+        self, angle_deg: float, steps: int, facet: np.ndarray
+    ) -> None:
+        left = PipePropagator(device(angle_deg), CELLS, steps).forward(facet)
+        assert np.linalg.norm(left) == pytest.approx(np.linalg.norm(facet), rel=3e-6)
+
+    @pytest.mark.parametrize("angle_deg", [0.0, -0.6, 3.0])
+    def test_the_adjoint_undoes_the_pipe(self, angle_deg: float, facet: np.ndarray) -> None:
+        pipe = PipePropagator(device(angle_deg), CELLS, 16)
+        assert off(pipe.forward(facet), facet) > 1
+        assert off(pipe.adjoint(pipe.forward(facet)), facet) < 1e-5
+
+    def test_the_adjoint_is_the_transposed_conjugate(self, facet: np.ndarray) -> None:
+        pipe, other = PipePropagator(device(-0.6), CELLS, 8), noise(*facet.shape, seed=2)
+        assert np.vdot(other, pipe.forward(facet)) == pytest.approx(np.vdot(pipe.adjoint(other), facet), rel=1e-4)
+
+    def test_sine_matrix_is_the_orthonormal_dst(self) -> None:
+        assert np.abs(sine_matrix(37) - fft.dst(np.eye(36), type=1, norm="ortho")).max() < 1e-13
+
+    def test_the_square_pipe_equals_free_glass_for_the_odd_extension(self, facet: np.ndarray) -> None:
+        rows, columns = (2 * n for n in CELLS)
+        mirrored = np.zeros((rows, columns), complex)
+        mirrored[1 : CELLS[0], 1 : CELLS[1]] = facet
+        # odd about both walls: x -> -x with a change of sign, and so in y
+        mirrored -= np.roll(mirrored[::-1], 1, axis=0)
+        mirrored -= np.roll(mirrored[:, ::-1], 1, axis=1)
+        turns_y = np.fft.fftfreq(rows, DEVICE.pipe_width_m / CELLS[0])
+        turns_x = np.fft.fftfreq(columns, DEVICE.pipe_width_m / CELLS[1])
+        transverse = (2 * np.pi) ** 2 * (turns_y[:, None] ** 2 + turns_x[None, :] ** 2)
+        travel = np.exp(1j * (np.sqrt(GLASS**2 - transverse) - GLASS) * DEVICE.pipe_length_m)
+        expected = np.fft.ifft2(np.fft.fft2(mirrored) * travel)[1 : CELLS[0], 1 : CELLS[1]]
+        assert off(PipePropagator(DEVICE, CELLS, 1).forward(facet), expected) < 1e-5
+
+    def test_the_sheared_pipe_goes_over_into_the_square_one(self, facet: np.ndarray) -> None:
+        square = PipePropagator(DEVICE, CELLS, 16).forward(facet)
+        sheared = [off(PipePropagator(device(angle), CELLS, 16).forward(facet), square) for angle in (1e-7, 0.01, 0.02)]
+        assert sheared[0] < 1e-5
+        assert sheared[2] == pytest.approx(2 * sheared[1], rel=0.05)
+
+    def test_steps_converge_to_second_order(self, page_at_entrance: np.ndarray) -> None:
+        fields = {n: PipePropagator(device(-0.6), CELLS, n).forward(page_at_entrance) for n in (16, 32, 64, 128)}
+        errors = [off(fields[n], fields[2 * n]) for n in (16, 32, 64)]
+        assert errors[2] ** 2 < 1e-4
+        assert errors[0] / errors[1] == pytest.approx(4, rel=0.25)
+
+    @pytest.mark.parametrize(
+        ("angle_deg", "length_m", "kept"), [(-10.0, 7e-5, 1.0), (20.0, 7e-5, 1.0), (4.0, 1e-3, 0.5)]
+    )
+    def test_a_step_is_the_matrix_exponential_of_the_cross_term_between_half_steps(
+        self, angle_deg: float, length_m: float, kept: float
+    ) -> None:
+        cells, w = (8, 11), 30e-6
+        geometry = replace(device(angle_deg, length_m=length_m), pipe_width_m=w)
+        derivatives, coupled = [], []
+        for n in cells:
+            squares = (np.pi * np.arange(1, n) / w) ** 2
+            apart = np.abs(squares[:, None] - squares) * length_m / (2 * GLASS)
+            derivative = _derivative_between_sines(n - 1) / w
+            derivatives.append(derivative * np.clip(3 - apart / (0.4 * np.pi), 0, 1))
+            coupled.append(np.linalg.norm(derivatives[-1]) / np.linalg.norm(derivative))
+        assert min(coupled) == pytest.approx(kept, abs=0.25 if kept < 1 else 1e-12)
+        laplacian = 2 * np.sin(geometry.pipe_angle) * np.kron(*derivatives)
+        step = linalg.expm(1j * geometry.pipe_length_m / (2 * GLASS) * laplacian)
+        numbers = [np.pi * np.arange(1, n) / w for n in cells]
+        transverse = numbers[0][:, None] ** 2 + numbers[1][None, :] ** 2
+        half = np.exp(0.5j * (np.sqrt(GLASS**2 - transverse) - GLASS) * geometry.pipe_length_m).ravel()
+        field = noise(cells[0] - 1, cells[1] - 1)
+        modes = fft.dstn(field, type=1, norm="ortho").ravel()
+        expected = fft.dstn((half * (step @ (half * modes))).reshape(field.shape), type=1, norm="ortho")
+        assert off(step, np.eye(len(step))) > 0.1
+        assert off(PipePropagator(geometry, cells, 1).forward(field), expected) < 1e-5
+
+    @pytest.mark.parametrize("angle_deg", [-0.6, -3.0])
+    def test_without_kicks_between_modes_that_fall_apart_a_field_errs_several_times_less(
+        self, angle_deg: float, page_at_entrance: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        geometry = device(angle_deg, length_m=8 * DEVICE.pipe_length_m)
+
+        def field(steps: int) -> np.ndarray:
+            return PipePropagator(geometry, CELLS, steps).forward(page_at_entrance)
+
+        exact, without = field(512), field(16)
+        waves._parity_basis.cache_clear()
+        monkeypatch.setattr(waves, "_UNCOUPLED", (1e9, 1e8))
+        kicked = field(16)
+        waves._parity_basis.cache_clear()
+        assert off(without, exact) < off(kicked, exact) / 7
+        assert off(kicked, exact) < 0.15
+
+    def test_modes_that_the_glass_cannot_carry_are_refused(self) -> None:
+        with pytest.raises(ValueError, match="wanted below"):
+            PipePropagator(replace(DEVICE, pipe_width_m=10e-6), (80, 8), 1)
+
+
+def _derivative_between_sines(count: int) -> np.ndarray:
+    """(2/w) times the integral of sin(m pi x/w) d/dx sin(n pi x/w) over the width, times w, by quadrature."""
+    u = np.linspace(0, 1, 2001)
+    number = np.arange(1, count + 1)
+    sines = np.sin(np.pi * np.outer(number, u))
+    slopes = np.pi * number[:, None] * np.cos(np.pi * np.outer(number, u))
+    return np.array([[2 * integrate.simpson(s * d, x=u) for d in slopes] for s in sines])
+
+
+class TestLens:
+    @pytest.mark.parametrize("angle_deg", [0.0, -2.0])
+    def test_light_of_the_facet_loses_nothing_on_a_plane_that_spans_the_band(
+        self, angle_deg: float, facet: np.ndarray
+    ) -> None:
+        geometry = device(angle_deg)
+        counts = (90, 104)
+        reach = DEVICE.wavelength_m * DEVICE.focal_length_m / DEVICE.pipe_width_m
+        y = axis(counts[0], reach * CELLS[0] / counts[0] * np.cos(geometry.pipe_angle))
+        x = axis(counts[1], reach * CELLS[1] / counts[1])
+        lens = FourierLens(geometry, x, y, CELLS)
+        on_plane = lens.to_plane(facet)
+        assert np.linalg.norm(on_plane) == pytest.approx(np.linalg.norm(facet), rel=1e-5)
+        assert off(lens.to_facet(on_plane), facet) < 1e-5
+
+    def test_the_two_directions_are_adjoint(self, facet: np.ndarray) -> None:
+        lens = FourierLens(device(-0.6, roll_deg=0.4), axis(70, 9e-6) + 2e-5, axis(50, 9e-6), CELLS)
+        plane = noise(50, 70, seed=3)
+        assert np.vdot(facet, lens.to_facet(plane)) == pytest.approx(np.vdot(lens.to_plane(facet), plane), rel=1e-4)
+
+    @pytest.mark.parametrize(("angle_deg", "roll_deg"), [(0.0, 0.0), (-0.6, 0.0), (0.0, 0.4), (-0.6, -0.4), (3.0, 5.0)])
+    def test_the_low_rank_expansion_equals_the_kernel_summed_directly(self, angle_deg: float, roll_deg: float) -> None:
+        geometry = device(angle_deg, roll_deg)
+        x, y = axis(60, 27e-6) + 18e-6, axis(44, 23e-6) - 30e-6
+        plane = noise(44, 60)
+        got = FourierLens(geometry, x, y, CELLS).to_facet(plane)
+        rng, t, r = np.random.default_rng(4), geometry.pipe_angle, geometry.pipe_roll
+        for _ in range(20):
+            row, column = int(rng.integers(CELLS[0] - 1)), int(rng.integers(CELLS[1] - 1))
+            # from the facet's oblique coordinates to the pipe's square ones, then rolled against the page
+            across = ((column + 1) / CELLS[1] - 0.5) * geometry.pipe_width_m
+            up = (((row + 1) / CELLS[0] - 0.5) * geometry.pipe_width_m - across * np.sin(t)) / np.cos(t)
+            at_x, at_y = across * np.cos(r) - up * np.sin(r), across * np.sin(r) + up * np.cos(r)
+            wave = np.exp(-1j * geometry.wave_number / geometry.focal_length_m * (x[None] * at_x + y[:, None] * at_y))
+            cell = geometry.pipe_width_m**2 / CELLS[0] / CELLS[1] / np.cos(t)
+            sample = (x[1] - x[0]) * (y[1] - y[0])
+            expected = np.sum(plane * wave) * np.sqrt(cell * sample) / geometry.wavelength_m / geometry.focal_length_m
+            assert abs(got[row, column] - expected) < 2e-5 * np.abs(got).max()
+
+    @pytest.mark.parametrize("second", [False, True])
+    def test_a_real_lens_adds_its_path_to_every_ray_between_plane_and_facet(self, second: bool) -> None:
+        page, wall = 0.95e-3, DEVICE.pipe_width_m / 2
+        radians = {(4, 0): -5, (3, 1): -4, (2, 2): -3, (1, 3): -1.5, (0, 4): -1}
+        of = {powers: value / page ** powers[0] / wall ** powers[1] for powers, value in radians.items()}
+        terms = SeidelTerms(of[4, 0], of[3, 1], of[2, 2], -of[2, 2], of[1, 3], of[0, 4])
+        geometry = replace(device(-0.6, 0.2), lens_path=terms)
+        x, y = axis(60, 27e-6) + 18e-6, axis(44, 23e-6) - 30e-6
+        plane, rng = noise(44, 60), np.random.default_rng(4)
+        lens, ideal = (FourierLens(g, x, y, CELLS, second=second) for g in (geometry, device(-0.6, 0.2)))
+        got = lens.to_facet(plane)
+        assert off(ideal.to_facet(plane), got) > 0.5
+        t, r = geometry.pipe_angle, geometry.pipe_roll
+        for _ in range(20):
+            row, column = int(rng.integers(CELLS[0] - 1)), int(rng.integers(CELLS[1] - 1))
+            across = ((column + 1) / CELLS[1] - 0.5) * geometry.pipe_width_m
+            up = (((row + 1) / CELLS[0] - 0.5) * geometry.pipe_width_m - across * np.sin(t)) / np.cos(t)
+            at_x, at_y = across * np.cos(r) - up * np.sin(r), across * np.sin(r) + up * np.cos(r)
+            # the mirror image of a lens sends the same path the other way: through the facet's point to -x, -y
+            sign = -1 if second else 1
+            r2, aperture2 = x[None] ** 2 + y[:, None] ** 2, at_x**2 + at_y**2
+            product = sign * (x[None] * at_x + y[:, None] * at_y)
+            powers = r2**2, r2 * product, product**2, r2 * aperture2, aperture2 * product, aperture2**2
+            path = sum(term * power for term, power in zip(terms, powers, strict=True))
+            wave = np.exp(-1j * geometry.wave_number / geometry.focal_length_m * (x[None] * at_x + y[:, None] * at_y))
+            cell = geometry.pipe_width_m**2 / CELLS[0] / CELLS[1] / np.cos(t)
+            sample = (x[1] - x[0]) * (y[1] - y[0])
+            unit = np.sqrt(cell * sample) / geometry.wavelength_m / geometry.focal_length_m
+            expected = np.sum(plane * wave * np.exp(1j * sign * path)) * unit
+            assert abs(got[row, column] - expected) < 4e-3 * np.abs(got).max()
+
+    def test_the_modes_counted_for_an_edge_reach_the_light_of_that_edge(self) -> None:
+        edge = 0.6e-3
+        x, y = axis(2, 2 * edge), axis(20, 9.2e-6)
+        point = np.zeros((20, 2))
+        point[10, 1] = 1
+        cells = modes_for(edge, DEVICE, 1.03)
+        light = FourierLens(DEVICE, x, y, (60, cells)).to_facet(point)
+        by_mode = np.abs(sine_matrix(cells) @ light.T).sum(axis=1)
+        strongest = 1 + int(np.argmax(by_mode))
+        assert 0.95 * cells < strongest < cells
+        # a mode is half a period in the pipe's width
+        mode_edge = strongest * DEVICE.wavelength_m * DEVICE.focal_length_m / (2 * DEVICE.pipe_width_m)
+        assert mode_edge == pytest.approx(edge, rel=0.01)
+
+    def test_the_cells_reach_past_the_page_by_what_shear_roll_and_shift_add(self) -> None:
+        x, y = axis(87, 36.8e-6), axis(56, 36.8e-6)
+        straight = cells_for(device(0.0), x, y, 0.0, 0.0)
+        turned = cells_for(device(-3.0, 0.4), x, y, 0.0, 0.0)
+        moved = cells_for(device(0.0), x + 60e-6, y - 40e-6, 0.0, 0.0)
+        half_x, half_y = float(x[-1]), float(y[-1])
+        shear = np.deg2rad(0.4 + 2 * 3.0)
+        for cells, reach_y, reach_x in (
+            (straight, half_y, half_x),
+            (turned, half_y + shear * half_x, half_x + shear * half_y),
+            (moved, half_y + 40e-6, half_x + 60e-6),
+        ):
+            assert cells == (modes_for(reach_y, DEVICE, 1.04), modes_for(reach_x, DEVICE, 1.04))
+
+    def test_the_cells_keep_the_next_image_of_the_page_out_of_what_is_seen(self) -> None:
+        x, y, seen = axis(44, 36.8e-6), axis(28, 36.8e-6), 0.8e-3
+        cells, _ = cells_for(DEVICE, x, y, 0.0, seen)
+        # the facet's sampling repeats the camera plane with this period
+        period = cells * DEVICE.wavelength_m * DEVICE.focal_length_m / DEVICE.pipe_width_m
+        assert period - float(y[-1]) >= seen
+
+
+class TestChannel:
+    @pytest.mark.parametrize(("angle_deg", "roll_deg"), [(0.0, 0.0), (-0.6, 0.3)])
+    def test_without_a_pipe_the_page_is_imaged_upright_onto_itself(self, angle_deg: float, roll_deg: float) -> None:
+        x, y = axis(160, 4e-6) + 8e-6, axis(120, 4e-6) - 12e-6
+        # a lopsided pair of spots with different phases, inside the band
+        page = np.exp(-((x[None] - 1.2e-4) ** 2 + (y[:, None] - 0.7e-4) ** 2) / (25e-6) ** 2)
+        page = page + 0.6j * np.exp(-((x[None] + 0.9e-4) ** 2 + (y[:, None] - 1.1e-4) ** 2) / (25e-6) ** 2)
+        geometry = device(angle_deg, roll_deg, length_m=0.0)
+        channel = WaveChannel(geometry, x, y, x, y, cells=(46, 61), steps=4)
+        assert off(channel.forward(page), page) < 0.01
+
+    def test_the_pixel_envelope_is_that_of_square_pixels(self) -> None:
+        pitch, fine = 9.2e-6, 5
+        page = noise(16, 20)
+        coarse = WaveChannel(
+            device(-2.0), axis(20, pitch), axis(16, pitch), axis(9, pitch), axis(9, pitch), CELLS, 1, pitch
+        )
+        finer = WaveChannel(
+            device(-2.0),
+            axis(20 * fine, pitch / fine),
+            axis(16 * fine, pitch / fine),
+            axis(9, pitch),
+            axis(9, pitch),
+            CELLS,
+            1,
+            pitch / fine,
+        )
+        split = np.kron(page, np.ones((fine, fine))) / fine
+        assert off(coarse.exit_field(page), finer.exit_field(split)) < 1e-5
+
+    def test_the_blur_is_a_gaussian_of_its_width(self) -> None:
+        pitch, blur_px = 2.3e-6, 2.0
+        page = np.zeros((80, 80), np.complex64)
+        page[30:50, 30:50] = noise(20, 20)
+        sharp = WaveChannel(DEVICE, axis(80, pitch), axis(80, pitch), axis(9, pitch), axis(9, pitch), CELLS, steps=4)
+        blurred = replace(sharp, blur_m=blur_px * pitch)
+        by_hand = ndimage.gaussian_filter(page.real, blur_px, truncate=6) + 1j * ndimage.gaussian_filter(
+            page.imag, blur_px, truncate=6
+        )
+        assert off(blurred.exit_field(page), sharp.exit_field(by_hand)) < 1e-4
+
+    def test_the_chain_is_undone_by_its_adjoint_inside_the_band(self) -> None:
+        x, y = axis(160, 4e-6), axis(120, 4e-6)
+        page = np.exp(-((x[None] - 1e-4) ** 2 + (y[:, None] - 0.5e-4) ** 2) / (30e-6) ** 2)
+        wide_x, wide_y = axis(182, 4e-6), axis(137, 4e-6)
+        channel = WaveChannel(device(-0.6, 0.2), x, y, wide_x, wide_y, cells=(46, 61), steps=16)
+        assert off(channel.adjoint(channel.forward(page)), page) < 0.01

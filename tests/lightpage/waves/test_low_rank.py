@@ -1,0 +1,64 @@
+"""Claims about expansions: their terms sum to the phase's phasor, about as well as asked, with few terms or many."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lightpage.waves import low_rank as expansion
+from lightpage.waves.low_rank import Expansion, Interpolation, Phase, Real
+
+TOLERANCE = 1e-4
+FIRST = np.linspace(-1.0, 1.2, 31), np.linspace(-0.8, 0.8, 23)
+SECOND = np.linspace(-0.5, 0.5, 29), np.linspace(-0.6, 0.7, 19)
+
+
+def phase_of(strength: float) -> Phase:
+    """Radians between two planes, of the kind that a lens adds."""
+
+    def phase(x: Real, y: Real, across: Real, up: Real) -> Real:
+        return np.asarray(strength * (x * across + y * up) * (x * x + y * y + 0.5 * across))
+
+    return phase
+
+
+def exact(phase: Phase) -> np.ndarray:
+    (x, y), (across, up) = FIRST, SECOND
+    at = phase(x[None, :, None, None], y[:, None, None, None], across[None, None, None, :], up[None, None, :, None])
+    return np.exp(1j * at)
+
+
+@pytest.mark.parametrize(("strength", "rank"), [(0.5, 10), (6.0, 60), (12.0, 132)])
+def test_the_terms_are_the_leading_ones_however_many_they_are(
+    strength: float, rank: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # (measured) of few, many and more than are looked for at first; what is dropped is below the tolerance each
+    phase = phase_of(strength)
+    errors = []
+    for looked_for_at_first in (expansion._SKETCH, 10**9):
+        monkeypatch.setattr(expansion, "_SKETCH", looked_for_at_first)
+        found = Expansion.of(phase, FIRST, SECOND, TOLERANCE)
+        assert len(found.first) == rank
+        total = sum(np.multiply.outer(first, second) for first, second in found.terms())
+        errors.append(np.linalg.norm(total - exact(phase)) / np.linalg.norm(exact(phase)))
+    assert errors[0] < 1.01 * errors[1] < TOLERANCE * rank
+
+
+def test_a_tolerance_near_rounding_is_kept() -> None:
+    phase = phase_of(3.0)
+    found = Expansion.of(phase, FIRST, SECOND, 1e-6)
+    total = sum(np.multiply.outer(first, second) for first, second in found.terms())
+    assert np.linalg.norm(total - exact(phase)) / np.linalg.norm(exact(phase)) < 1e-5
+
+
+@pytest.mark.parametrize("strength", [0.5, 6.0])
+def test_a_phasor_is_interpolated_from_its_nodes(strength: float) -> None:
+    phases = [phase_of(strength), phase_of(1.05 * strength)]
+    terms = Interpolation.of(phases, FIRST, SECOND, TOLERANCE)
+    (across, up), nodes = SECOND, terms.nodes[:, :, None, None]
+    weights = terms.axes[0] @ terms.weights @ terms.axes[1].T
+    for phase in (*phases, phase_of(1.02 * strength)):
+        at_nodes = np.exp(1j * phase(nodes[:, 0], nodes[:, 1], across[None, None, :], up[None, :, None]))
+        total = np.tensordot(weights, at_nodes, ([0], [0]))
+        # interpolation amplifies what the basis lacks by up to the number of its nodes
+        assert np.linalg.norm(total - exact(phase)) / np.linalg.norm(exact(phase)) < TOLERANCE * len(nodes)

@@ -1,0 +1,110 @@
+"""Pages come from recordings and simulated devices, by number or in turn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lightpage.device.profile import load_profile
+from lightpage.device.state import Device
+from lightpage.errors import InvalidInputError, LightpageError, PageError, RecordingError
+from lightpage.page.symbols import pilot_mask
+from lightpage.recording.reader import FramePair
+from runtime.acquisition.sources import RecordingSource, SimulatorSource, open_source
+from tests.runtime import toy
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> tuple[Path, np.ndarray]:
+    return tmp_path / "r.h5", toy.write_toy_recording(tmp_path / "r.h5", toy.ToyDevice(), 16, 3)
+
+
+def test_a_recording_is_read_in_turn_again_and_again_or_by_number(recording: tuple[Path, np.ndarray]) -> None:
+    path, symbols = recording
+    source = open_source(f"recording:{path}")
+    source.check_against(toy.PROFILE)
+    assert source.levels == 16
+    assert [source.read().page_index for _ in range(5)] == [0, 1, 2, 0, 1]
+    page = source.read(2)
+    assert (page.symbols == symbols[2]).all()
+    assert page.pair.in_phase.shape == toy.SHAPE
+    references = source.references()
+    assert references is not None
+    assert references.in_phase[0, 0] == toy.OFFSETS[0]
+    for wrong in (-1, 3):
+        with pytest.raises(PageError, match=r"0\.\.2"):
+            source.read(wrong)
+    source.close()
+
+
+def test_a_recording_of_another_device_is_refused(recording: tuple[Path, np.ndarray]) -> None:
+    source = RecordingSource(recording[0])
+    with pytest.raises(RecordingError):
+        source.check_against(load_profile("bench"))
+    source.close()
+
+
+class FakeSimulator:
+    """Stands in for the wave simulator, which takes seconds a page."""
+
+    def __init__(self, profile: object, device: Device, levels: int, seed: int) -> None:
+        self.device = device
+
+    def set_device(self, device: Device) -> None:
+        self.device = device
+
+    def page(self, symbols: np.ndarray) -> FramePair:
+        return FramePair(symbols, symbols)
+
+    def references(self) -> FramePair:
+        return FramePair(np.zeros((1, 1), np.uint8), np.zeros((1, 1), np.uint8))
+
+
+def test_a_simulated_page_depends_on_seed_and_number_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lightpage.simulator.simulator.Simulator", FakeSimulator)
+    one, same, other = (SimulatorSource(toy.PROFILE, Device(), 8, seed) for seed in (1, 1, 2))
+    first = [one.read() for _ in range(3)]
+    assert [page.page_index for page in first] == [0, 1, 2]
+    again = same.read(2)
+    assert again.symbols is not None
+    assert first[2].symbols is not None
+    assert (again.symbols == first[2].symbols).all()
+    assert (other.read(2).symbols != again.symbols).any()
+    assert again.symbols.max() < 8
+    assert (again.pilot_mask == pilot_mask(toy.PROFILE)).all()
+    with pytest.raises(PageError):
+        one.read(-1)
+    with pytest.raises(InvalidInputError, match="frames and pages"):
+        one.check_against(load_profile("bench"))
+
+
+def test_a_simulator_is_opened_by_name_with_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("lightpage.simulator.simulator.Simulator", FakeSimulator)
+    (tmp_path / "device.toml").write_text("[geometry]\npipe_angle_deg = 0.25\n")
+    source = open_source(f"simulator:bench?levels=4&seed=9&device={tmp_path / 'device.toml'}")
+    assert isinstance(source, SimulatorSource)
+    assert source.levels == 4
+    assert source._simulator.device.geometry.pipe_angle_deg == 0.25  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("spec", "named"),
+    [
+        ("", "recording:FILE"),
+        ("bench", "recording:FILE"),
+        ("recording:", "recording:FILE"),
+        ("recording:/nonexistent.h5", "nonexistent"),
+        ("simulator:nonexistent", "nonexistent"),
+        ("simulator:bench?levels=many", "whole numbers"),
+        ("simulator:bench?colour=red", "colour"),
+        ("simulator:bench?seed=-1", "at least 0"),
+        ("camera:0", "camera extra"),
+        ("tape:1", "recording:FILE"),
+    ],
+)
+def test_what_is_no_source_is_refused_by_name(spec: str, named: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lightpage.simulator.simulator.Simulator", FakeSimulator)
+    with pytest.raises(LightpageError, match=named):
+        open_source(spec)

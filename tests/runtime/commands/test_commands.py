@@ -1,0 +1,750 @@
+"""The command line: loads little, says much, ends in one line, and stops when told."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import click
+import h5py
+import numpy as np
+import pytest
+
+from lightpage.cli.main import RESUME_KEY, LazyGroup, lightpage
+from lightpage.errors import CalibrationError
+from lightpage.page.pilots import Pilots
+from lightpage.recording.reader import FramePair, Recording, RecordingWriter
+from runtime import cli, cli_recalibrate
+from runtime.acquisition.sources import open_source
+from runtime.bundle.bundle import Bundle
+from runtime.client.client import LightpageClient
+from runtime.commands.serve import _resume
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.tracking import NoTracker
+from runtime.rpc.server import LightpageServer
+from runtime.service.dataplane import DataPlane
+from runtime.service.recalibrator import Recalibrator
+from runtime.service.registry import ModelRegistry
+from runtime.service.store import ModelStore
+from tests.runtime import toy
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(arguments: Sequence[str | Path], group: click.Group = lightpage) -> int:
+    return cli.run(group, [str(argument) for argument in arguments])
+
+
+@click.command()
+def interrupted() -> None:
+    click.get_current_context().meta[RESUME_KEY] = "call it with --resume"
+    raise KeyboardInterrupt
+
+
+@click.command()
+def plainly_interrupted() -> None:
+    raise KeyboardInterrupt
+
+
+@click.command()
+def terminated() -> None:
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(5)
+
+
+@click.command()
+def needs_torch() -> None:
+    raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+
+@click.command()
+def hungry() -> None:
+    raise MemoryError("Unable to allocate 7 TiB")
+
+
+@click.command()
+def broken() -> None:
+    raise ZeroDivisionError
+
+
+def group_of(**points: str) -> LazyGroup:
+    return LazyGroup([EntryPoint(name, value, cli.GROUP) for name, value in points.items()], name="lightpage")
+
+
+HERE = "tests.runtime.commands.test_commands"
+CODES = ("OK", "CANCELLED")
+
+
+def test_the_overview_imports_no_command(capsys: pytest.CaptureFixture[str]) -> None:
+    group = group_of(train="no_such_package.cli:train", serve="no_such_package.cli:serve")
+    assert run(["--help"], group) == 0
+    shown = capsys.readouterr().out
+    assert "Train a decoder" in shown
+    assert "Run the service" in shown
+
+
+def test_a_missing_extra_is_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "wants_torch.py").write_text("import torch.not_there\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    assert run(["train"], group_of(train="wants_torch:train")) == 2
+    assert "pip install 'lightpage[train]'" in capsys.readouterr().err
+    assert run(["x"], group_of(x=f"{HERE}:needs_torch")) == 2
+    assert "pip install 'lightpage[train]'" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_with_130_and_says_how_to_go_on(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["x"], group_of(x=f"{HERE}:interrupted")) == 130
+    assert "interrupted; call it with --resume" in capsys.readouterr().err
+    assert run(["x"], group_of(x=f"{HERE}:plainly_interrupted")) == 130
+    assert "run the same command again" in capsys.readouterr().err
+
+
+def test_sigterm_interrupts_too_and_is_told_apart(capsys: pytest.CaptureFixture[str]) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    assert run(["x"], group_of(x=f"{HERE}:terminated")) == 143
+    assert "interrupted; run the same command again" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_too_little_memory_is_an_error_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["hungry"], group_of(hungry=f"{HERE}:hungry")) == 2
+    assert "memory: got Unable to allocate 7 TiB" in capsys.readouterr().err
+
+
+def test_nothing_that_is_read_is_written_and_nothing_is_written_twice(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, other = recording[0].read_bytes(), tmp_path / "folder" / ".." / recording[0].name
+    (tmp_path / "folder").mkdir()
+    both = tmp_path / "both"
+    for arguments, named in (
+        (["evaluate", "--bundle", toy_zip, "--recording", recording[0], "--json", other], "--json"),
+        (["decode", "--target", "127.0.0.1:1", "--recording", recording[0], "--out", recording[0]], "--out"),
+        (["recalibrate", "--bundle", toy_zip, "--recording", recording[0], "--out", both, "--json", both], "--out"),
+        (["recalibrate", "--bundle", toy_zip, "--recording", recording[0], "--json", toy_zip], "--json"),
+    ):
+        assert run(arguments) == 2
+        assert f"error: {named}" in (said := capsys.readouterr().err)
+        assert "wanted a file of its own" in said
+    assert recording[0].read_bytes() == before
+    assert not both.exists()
+
+
+def test_an_unforeseen_error_keeps_its_traceback() -> None:
+    with pytest.raises(ZeroDivisionError):
+        run(["x"], group_of(x=f"{HERE}:broken"))
+
+
+def test_wrong_usage_is_status_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["nonsense"]) == 2
+    assert run(["evaluate"]) == 2
+    assert "--recording" in capsys.readouterr().err
+
+
+def test_the_installed_command_finds_the_runtimes_subcommands() -> None:
+    assert {"serve", "decode", "evaluate", "recalibrate", "rollback"} <= set(lightpage.points)  # type: ignore[attr-defined]
+    for name in ("serve", "decode", "evaluate", "recalibrate", "rollback"):
+        assert isinstance(lightpage.points[name].load(), click.Command)  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> tuple[Path, np.ndarray]:
+    return tmp_path / "r.h5", toy.write_toy_recording(tmp_path / "r.h5", toy.ToyDevice(noise=30.0), 16, 4)
+
+
+def evaluate(bundle: Path, recording: Path, out: Path) -> dict[str, Any]:
+    assert run(["evaluate", "--bundle", bundle, "--recording", recording, "--json", out, "--threads", "1"]) == 0
+    data: dict[str, Any] = json.loads(out.read_text())
+    return data
+
+
+def test_evaluate_writes_the_promised_figures(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = evaluate(toy_zip, recording[0], tmp_path / "e.json")
+    data_symbols = toy.PAGE[0] * toy.PAGE[1] - int(Bundle.open(toy_zip).pilot_mask.sum())
+    assert (data["pages"], data["pages_left_out"], data["levels"]) == (4, 0, 16)
+    assert data["symbols_per_page"] == data_symbols
+    air = data["air_bits_per_symbol"]
+    assert isinstance(air, float)
+    assert 2 < air <= 4
+    assert data["page_kB"] == pytest.approx(air * data_symbols / 8000)
+    for key in ("own_mi_bits_per_symbol", "gmi_bits_per_symbol", "symbol_error_rate", "ece", "seconds_per_page"):
+        assert isinstance(data[key], float)
+    assert "AIR" in capsys.readouterr().out
+
+
+def test_evaluate_leaves_out_pages_that_the_bundle_has_seen_and_says_so(
+    recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Recording.open(recording[0]) as file:
+        hashes = [file.page_hash(index) for index in range(4)]
+    some = toy.write_toy_bundle(tmp_path / "some.zip", calibrated_pages=hashes[:1], trained_pages=hashes[1:2])
+    data = evaluate(some, recording[0], tmp_path / "e.json")
+    assert (data["pages"], data["pages_left_out"]) == (2, 2)
+    assert "2 that the bundle was calibrated or trained on" in capsys.readouterr().out
+    every = toy.write_toy_bundle(tmp_path / "all.zip", trained_pages=hashes)
+    assert run(["evaluate", "--bundle", every, "--recording", recording[0]]) == 2
+    assert "has not seen" in capsys.readouterr().err
+
+
+def test_evaluate_takes_eight_bit_counts_in_sixteen_bits(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    wide = tmp_path / "wide.h5"
+    with h5py.File(recording[0]) as old, h5py.File(wide, "w") as new:
+        new.attrs.update(dict(old.attrs))
+        for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature", "symbols"):
+            new[name] = old[name][()].astype(np.uint8 if name == "symbols" else np.uint16)
+    narrow = evaluate(toy_zip, recording[0], tmp_path / "n.json")
+    assert evaluate(toy_zip, wide, tmp_path / "w.json")["air_bits_per_symbol"] == narrow["air_bits_per_symbol"]
+
+
+def test_evaluate_uses_the_recordings_own_pilots(toy_zip: Path, tmp_path: Path) -> None:
+    """A device whose symbols know nothing of the seeded pattern."""
+    symbols = np.random.default_rng(3).integers(16, size=(2, *toy.PAGE)).astype(np.uint8)
+    mask = np.zeros(toy.PAGE, bool)
+    mask[::5, ::5] = True
+    device = toy.ToyDevice()
+    pairs = [device.page(page, 16, 1.0 + index) for index, page in enumerate(symbols)]
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file.attrs.update({"format": "lightpage-recording", "version": 1, "camera_bit_depth": 8, "levels": 16})
+        file["symbols"], file["pilots"] = symbols, mask
+        file["in_phase"] = np.stack([pair.in_phase for pair in pairs])
+        file["quadrature"] = np.stack([pair.quadrature for pair in pairs])
+        references = device.references()
+        file["reference_in_phase"], file["reference_quadrature"] = references.in_phase, references.quadrature
+    data = evaluate(toy_zip, tmp_path / "foreign.h5", tmp_path / "e.json")
+    assert data["symbol_error_rate"] == 0
+    assert data["symbols_per_page"] == int((~mask).sum())
+
+
+@pytest.mark.parametrize(
+    ("edit", "named"),
+    [
+        ("symbols", "no symbols"),
+        ("depth", "10 bits"),
+        ("truncate", "HDF5"),
+        ("black", "page 1: quad.*black"),
+        ("shape", "pixels"),
+    ],
+)
+def test_evaluate_refuses_what_it_cannot_measure_in_one_line(
+    edit: str,
+    named: str,
+    toy_zip: Path,
+    recording: tuple[Path, np.ndarray],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path, out = recording[0], tmp_path / "e.json"
+    if edit == "truncate":
+        path.write_bytes(path.read_bytes()[:5000])
+    else:
+        with h5py.File(path, "r+") as file:
+            if edit == "symbols":
+                del file["symbols"]
+            elif edit == "black":
+                file["quadrature"][...] = 0
+            elif edit == "shape":
+                for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+                    data = file[name][..., :90]
+                    del file[name]
+                    file[name] = data
+            else:
+                file.attrs["camera_bit_depth"] = 10
+                for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+                    data = file[name][()].astype(np.uint16)
+                    del file[name]
+                    file[name] = data
+    assert run(["evaluate", "--bundle", toy_zip, "--recording", path, "--json", out]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if "error:" in line]
+    assert len(lines) == 1
+    assert re.search(named, lines[0])
+    if edit == "black":  # each page was looked at, and the reasons are kept
+        assert [page["page"] for page in json.loads(out.read_text())["refused_pages"]] == [0, 1, 2, 3]
+    else:
+        assert not out.exists()
+
+
+def test_evaluate_warns_where_a_bundle_reads_nothing(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(toy_zip, recording[0], tmp_path / "e.json")["air_bits_per_symbol"] > 0
+    assert "warning" not in capsys.readouterr().err
+    with h5py.File(recording[0], "r+") as file:
+        shuffle_data(file)
+    assert evaluate(toy_zip, recording[0], tmp_path / "f.json")["air_bits_per_symbol"] < 0
+    assert "these pages carry nothing" in capsys.readouterr().err
+
+
+def shuffle_data(file: h5py.File) -> None:
+    """Write down other symbols than were written, the pilots left as they are."""
+    symbols, data = file["symbols"][()], ~Pilots.of_profile(toy.PROFILE, 16).mask
+    symbols[:, data] = np.random.default_rng(0).permutation(symbols[:, data], axis=1)
+    file["symbols"][...] = symbols
+
+
+def test_evaluate_names_and_counts_pages_whose_pilots_contradict_what_was_decoded(
+    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with h5py.File(recording[0], "r+") as file:
+        symbols = file["symbols"][()]
+        symbols[1] = np.random.default_rng(0).integers(16, size=toy.PAGE)
+        file["symbols"][...] = symbols
+        pages = len(symbols)
+    where, report = ["--bundle", toy_zip, "--recording", recording[0]], tmp_path / "e.json"
+    assert run(["evaluate", *where, "--json", report]) == 2
+    printed = capsys.readouterr()
+    assert "1 whose pilots do not bear out what is claimed" in printed.out
+    assert f"1 of {pages} pages that were refused (page 1: pilots: got 0.0" in printed.err
+    figures = json.loads(report.read_text())
+    assert (figures["pages"], figures["pages_unconfirmed"]) == (pages - 1, 1)
+    refused = [(page["page"], page["loss"], page["recalibration_due"]) for page in figures["refused_pages"]]
+    assert refused == [(1, "PILOTS_DISAGREE", True)]
+    assert figures["air_bits_per_symbol"] > 2
+    with h5py.File(recording[0], "r+") as file:
+        file["symbols"][...] = np.random.default_rng(0).integers(16, size=(pages, *toy.PAGE))
+    assert run(["evaluate", *where, "--json", report]) == 2
+    figures = json.loads(report.read_text())
+    assert (figures["pages"], figures["pages_unconfirmed"], len(figures["refused_pages"])) == (0, pages, pages)
+
+
+@pytest.fixture
+def with_bad_pages(recording: tuple[Path, np.ndarray]) -> Path:
+    """The recording with a black page and one whose counts lie in no 8 bits."""
+    with h5py.File(recording[0], "r+") as file:
+        for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
+            data = file[name][()].astype(np.uint16)
+            del file[name]
+            file[name] = data
+        file["quadrature"][1] = 0
+        file["in_phase"][3, 5, 5] = 256
+    return recording[0]
+
+
+def test_evaluate_goes_on_after_bad_pages_and_ends_with_their_names(
+    toy_zip: Path, with_bad_pages: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "e.json"
+    assert run(["evaluate", "--bundle", toy_zip, "--recording", with_bad_pages, "--json", out, "--threads", "1"]) == 2
+    data = json.loads(out.read_text())
+    assert (data["pages"], data["pages_left_out"], len(data["air_per_page"])) == (2, 0, 2)
+    assert [page["page"] for page in data["refused_pages"]] == [1, 3]
+    assert "black" in data["refused_pages"][0]["reason"]
+    assert "256" in data["refused_pages"][1]["reason"]
+    shown = capsys.readouterr()
+    assert "AIR" in shown.out
+    assert f"recording {with_bad_pages}: got 2 of 4 pages that were refused (page 1: " in shown.err
+    assert "; page 3: " in shown.err
+
+
+def test_offline_recalibration_writes_a_better_bundle(
+    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli_recalibrate, "refit", toy.fit_references)
+    toy.write_toy_recording(tmp_path / "d.h5", toy.ToyDevice((150.0, 62.0)), 16, 5)
+    arguments = ["recalibrate", "--bundle", toy_zip, "--recording", tmp_path / "d.h5", "--out", tmp_path / "new.zip"]
+    assert run([*arguments, "--json", tmp_path / "r.json"]) == 0
+    data = json.loads((tmp_path / "r.json").read_text())
+    assert (data["version"], data["pages_used"], data["angle_deg"]) == ("toy-1+r1", 2, 0.5)
+    assert (data["coherence_before"], data["coherence_after"]) == (0.4, 0.9)
+    assert data["seconds"] > 0
+    before = evaluate(toy_zip, tmp_path / "d.h5", tmp_path / "b.json")
+    after = evaluate(tmp_path / "new.zip", tmp_path / "d.h5", tmp_path / "a.json")
+    assert after["pages_left_out"] == 2
+    assert after["air_bits_per_symbol"] > before["air_bits_per_symbol"] + 0.5  # type: ignore[operator]
+    assert run(arguments) == 2  # never overwrites
+
+
+def test_offline_recalibration_with_wrong_pilots_is_refused(
+    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli_recalibrate, "refit", toy.fit_references)
+    toy.write_toy_recording(tmp_path / "d.h5", toy.ToyDevice(), 16, 3)
+    with h5py.File(tmp_path / "d.h5", "r+") as file:
+        file["symbols"][...] = np.random.default_rng(0).integers(16, size=file["symbols"].shape)
+    arguments = ["recalibrate", "--bundle", toy_zip, "--recording", tmp_path / "d.h5", "--out", tmp_path / "new.zip"]
+    assert run(arguments) == 2
+    assert "does not match" in capsys.readouterr().err
+    assert not (tmp_path / "new.zip").exists()
+
+
+def test_an_impossible_version_is_refused_before_anything_is_read(
+    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def never(path: object) -> None:
+        raise AssertionError("read")
+
+    monkeypatch.setattr(cli_recalibrate.Decoder, "load", never)
+    arguments = ["recalibrate", "--bundle", toy_zip, "--recording", tmp_path / "d.h5", "--out", tmp_path / "new.zip"]
+    assert run([*arguments, "--version", "v 2"]) == 2
+    assert "--version: got 'v 2'" in capsys.readouterr().err
+
+
+@pytest.fixture
+def service(toy_zip: Path) -> Iterator[LightpageServer]:
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), toy.ToySource(toy.ToyDevice()))
+    with LightpageServer(plane, Recalibrator(plane, toy.fit_references)) as server:
+        yield server
+
+
+def test_decode_sends_a_recording_and_keeps_the_symbols(
+    service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, report = tmp_path / "decoded.h5", tmp_path / "d.json"
+    where = ["--target", service.target, "--recording", recording[0]]
+    assert run(["decode", *where, "--out", out, "--json", report]) == 0
+    with h5py.File(out) as file:
+        assert file["symbols"].shape == file["confidence"].shape == (4, *toy.PAGE)
+        assert (file["symbols"][()] == recording[1]).mean() > 0.9
+        assert dict(file.attrs) == {"format": "lightpage-decoded", "version": 1, "levels": 16}
+        assert set(file) == {"symbols", "confidence", "pages", "model_versions"}
+        assert file["pages"][()].tolist() == [0, 1, 2, 3]
+        assert file["model_versions"].asstr()[()].tolist() == ["toy-1"] * 4
+    assert out.stat().st_mode & 0o777 == 0o644
+    pages = json.loads(report.read_text())["pages"]
+    assert [page["page"] for page in pages] == [0, 1, 2, 3]
+    assert all(0 < page["air_bits_per_symbol"] <= 4 and page["total_s"] > 0 for page in pages)
+    assert "toy-1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("bad", [False, True])
+def test_decode_leaves_the_pages_of_an_interrupted_recording_of_that_name_alone(
+    bad: bool, service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    references = toy.ToyDevice().references()
+    begun = RecordingWriter(tmp_path / "out.h5", toy.PROFILE, 16, 8, references)
+    begun.append(None, references)
+    begun.abandon()
+    if bad:
+        with h5py.File(recording[0], "r+") as file:
+            file["quadrature"][...] = 0
+    where = ["--target", service.target, "--recording", recording[0]]
+    assert run(["decode", *where, "--out", tmp_path / "out.h5"]) == (2 if bad else 0)
+    written = [] if bad else ["out.h5"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [*written, "out.h5.partial", "r.h5"]
+    resumed = RecordingWriter.resume(tmp_path / "out.h5", toy.PROFILE, 16, 8, references)
+    assert resumed.pages == 1
+    resumed.abandon()
+
+
+def test_decode_goes_on_after_bad_pages_and_ends_with_their_names(
+    service: LightpageServer, with_bad_pages: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, report = tmp_path / "decoded.h5", tmp_path / "d.json"
+    where = ["--target", service.target, "--recording", with_bad_pages]
+    assert run(["decode", *where, "--out", out, "--json", report]) == 2
+    data = json.loads(report.read_text())
+    assert [page["page"] for page in data["pages"]] == [0, 2]
+    assert [page["page"] for page in data["refused_pages"]] == [1, 3]
+    with h5py.File(out) as file:
+        assert file["symbols"].shape == (2, *toy.PAGE)
+        assert list(file["pages"]) == [0, 2]
+    assert f"recording {with_bad_pages}: got 2 of 4 pages that were refused (page 1: " in capsys.readouterr().err
+
+
+def test_decode_of_bad_pages_alone_writes_what_was_refused_and_no_symbols(
+    service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with h5py.File(recording[0], "r+") as file:
+        file["quadrature"][...] = 0
+    where = ["--target", service.target, "--recording", recording[0]]
+    assert run(["decode", *where, "--out", tmp_path / "decoded.h5", "--json", tmp_path / "d.json"]) == 2
+    assert "4 of 4 pages" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["d.json", "r.h5"]
+    told = json.loads((tmp_path / "d.json").read_text())
+    assert (told["pages"], len(told["refused_pages"]), told["pages_unconfirmed"]) == ([], 4, 0)
+
+
+def test_decode_names_pages_that_a_recording_does_not_have(
+    service: LightpageServer, recording: tuple[Path, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["decode", "--target", service.target, "--recording", recording[0], "--pages", "9"]) == 2
+    assert "got 4 pages, wanted at least 9" in capsys.readouterr().err
+
+
+def test_decode_warns_of_symbols_that_are_not_the_pages_and_refuses_those_of_another_page_shape(
+    service: LightpageServer, recording: tuple[Path, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ["decode", "--target", service.target, "--recording", recording[0]]
+    with h5py.File(recording[0], "r+") as file:
+        symbols = file["symbols"][()]
+        shuffle_data(file)
+    assert run(where) == 0
+    assert "warning: by what the bundle believes, these pages carry nothing" in capsys.readouterr().err
+    with h5py.File(recording[0], "r+") as file:
+        del file["symbols"]
+        file["symbols"] = symbols[:, 1:]
+    assert run(where) == 2
+    assert f"pages of {symbols.shape[1] - 1} x {symbols.shape[2]} symbols, wanted" in capsys.readouterr().err
+
+
+def test_decode_reads_the_services_source(service: LightpageServer, tmp_path: Path) -> None:
+    report = tmp_path / "d.json"
+    assert run(["decode", "--target", service.target, "--source", "--pages", "3", "--json", report]) == 0
+    pages = json.loads(report.read_text())["pages"]
+    assert [page["page"] for page in pages] == [0, 1, 2]
+    assert all(page["symbol_error_rate"] == 0 for page in pages)
+
+
+def test_decode_uses_the_devices_own_pilots_and_refuses_pages_where_they_disagree(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Pages of a device whose pilots are fixed phases, sent and read, without a word of what was written."""
+    device, path = toy.ToyDevice(noise=2.0), tmp_path / "own.h5"
+    symbols = np.random.default_rng(3).integers(16, size=(2, *toy.PAGE)).astype(np.uint8)
+    good = toy.own_pilots_page(device, symbols[0], 16, 2.0)
+    lost = device.page(symbols[1], 16, 2.0)
+    with RecordingWriter(path, toy.PROFILE, 16, 8, device.references()) as writer:
+        for page, pair in zip(symbols, (good, lost), strict=True):
+            writer.append(page, pair)
+    with h5py.File(path, "r+") as file:
+        for name in ("symbols", "pilots"):
+            if name in file:
+                del file[name]
+    decoder = Decoder.load(toy.write_own_pilots_bundle(tmp_path / "own.zip"), threads=1)
+    plane = DataPlane(ModelRegistry(decoder), open_source(f"recording:{path}"))
+    out = tmp_path / "out.h5"
+    with LightpageServer(plane, Recalibrator(plane, toy.fit_references)) as server:
+        for where in (["--recording", path], ["--source", "--pages", "2"]):
+            assert run(["decode", "--target", server.target, *where, "--out", out]) == 2
+            with h5py.File(out) as file:
+                assert (file["symbols"][0] == symbols[0])[~toy.OWN_MASK].all()
+                assert list(file["pages"]) == [0]
+            errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("lightpage: error")]
+            assert len(errors) == 1
+            assert "1 of 2 pages that were refused" in errors[0]
+            assert "page 1" in errors[0]
+            assert "claimed bits a symbol confirmed" in errors[0]
+
+
+def test_recalibrate_and_rollback_work_on_a_running_service(service: LightpageServer, tmp_path: Path) -> None:
+    report = tmp_path / "r.json"
+    assert run(["recalibrate", "--target", service.target, "--pages", "2", "--json", report]) == 0
+    assert json.loads(report.read_text())["version"] == "toy-1+r1"
+    calls = service._plane.metrics.registry.get_sample_value
+    ended = {code: calls("lightpage_calls_total", {"method": "Recalibrate", "code": code}) for code in CODES}
+    assert ended == {"OK": 1, "CANCELLED": None}  # its client heard it to its end
+    assert run(["rollback", "--target", service.target]) == 0
+    assert run(["rollback", "--target", service.target]) == 2
+
+
+def test_recalibrate_asks_a_service_for_as_many_pages_of_a_recording_as_it_is_told(
+    toy_zip: Path, tmp_path: Path
+) -> None:
+    toy.write_toy_recording(tmp_path / "known.h5", toy.ToyDevice((150.0, 62.0)), 16, 5)
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)))
+    report = tmp_path / "r.json"
+    with LightpageServer(plane, Recalibrator(plane, toy.fit_references, tmp_path)) as server:
+        where = ["--target", server.target, "--recording", "known.h5"]
+        assert run(["recalibrate", *where, "--pages", "3", "--json", report]) == 0
+    assert json.loads(report.read_text())["pages_used"] == 3
+
+
+def test_recalibrate_waits_for_a_service_as_long_as_it_is_told(
+    toy_zip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    go = threading.Event()
+
+    def waits(*arguments: object) -> object:
+        go.wait(20)
+        return toy.fit_references(*arguments)  # type: ignore[arg-type]
+
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), toy.ToySource(toy.ToyDevice()))
+    with LightpageServer(plane, Recalibrator(plane, waits)) as server:  # type: ignore[arg-type]
+        arguments = ["recalibrate", "--target", server.target, "--timeout"]
+        assert run([*arguments, "0.5"]) == 2
+        assert "DEADLINE_EXCEEDED" in capsys.readouterr().err
+        assert run([*arguments, "0"]) == 2
+        go.set()
+    assert run(["recalibrate", "--bundle", toy_zip, "--timeout", "5"]) == 2
+    assert "--timeout: got without --target" in capsys.readouterr().err
+
+
+def test_an_interrupted_decode_leaves_nothing_half_written(
+    service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = Recording.frames
+
+    def interrupting(self: Recording, page: int) -> FramePair:
+        if page == 2:
+            raise KeyboardInterrupt
+        return frames(self, page)
+
+    monkeypatch.setattr(Recording, "frames", interrupting)
+    where = ["--target", service.target, "--recording", recording[0]]
+    assert run(["decode", *where, "--out", tmp_path / "decoded.h5", "--json", tmp_path / "d.json"]) == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
+
+
+def test_an_interrupted_evaluation_leaves_nothing(
+    recording: tuple[Path, np.ndarray], toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupting(self: Recording, page: int) -> FramePair:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Recording, "frames", interrupting)
+    arguments = ["evaluate", "--bundle", toy_zip, "--recording", recording[0], "--json", tmp_path / "e.json"]
+    assert run(arguments) == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
+
+
+@pytest.mark.parametrize("command", ["demo", "bench"])
+def test_an_interrupted_measurement_leaves_no_figures(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupting(self: LightpageServer) -> LightpageServer:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(LightpageServer, "start", interrupting)
+    assert run([command, "--json", tmp_path / "figures.json"]) == 130
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_a_command_without_a_service_or_a_choice_says_so(
+    recording: tuple[Path, np.ndarray], toy_zip: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["decode", "--target", "127.0.0.1:9", "--recording", recording[0]]) == 2
+    assert "no connection" in capsys.readouterr().err
+    assert run(["decode", "--target", "127.0.0.1:9"]) == 2
+    assert "neither --recording nor --source, wanted one of them" in capsys.readouterr().err
+    assert run(["recalibrate", "--bundle", toy_zip]) == 2
+    assert "--out" in capsys.readouterr().err
+
+
+class Served:
+    """`lightpage serve` in a process of its own."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        command = [
+            sys.executable,
+            "-m",
+            "lightpage.cli.main",
+            "serve",
+            "--address",
+            "127.0.0.1:0",
+            *map(str, arguments),
+        ]
+        self.process = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        )
+
+    def target(self) -> str:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if found := re.search(r"serving .* at (\S+)", line):
+                return found[1]
+        raise AssertionError(self.process.communicate(timeout=10)[1])
+
+    def end(self, kind: signal.Signals) -> tuple[int, str, str]:
+        self.process.send_signal(kind)
+        out, err = self.process.communicate(timeout=30)
+        return self.process.returncode, out, err
+
+
+@pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGINT])
+def test_serve_decodes_until_it_is_told_to_stop(
+    kind: signal.Signals, toy_zip: Path, recording: tuple[Path, np.ndarray]
+) -> None:
+    served = Served("--bundle", toy_zip, "--source", f"recording:{recording[0]}", "--metrics-port", "0")
+    try:
+        with LightpageClient(served.target(), timeout_s=20) as client:
+            assert (client.read_page(want_written=True).symbols == recording[1][0]).mean() > 0.9
+        start = time.monotonic()
+        status, out, err = served.end(kind)
+        assert status == 0, err
+        assert "stopping" in out
+        assert "Traceback" not in err
+        assert time.monotonic() - start < 10
+    finally:
+        served.process.kill()
+        served.process.wait()
+
+
+_STOPPED_AT_ANY_MOMENT = """
+import os, random, signal, threading, time
+from runtime.commands.serve import stop_signals
+
+def ask(go, delay_s):
+    go.wait()
+    until = time.perf_counter() + delay_s
+    while time.perf_counter() < until:
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+draw = random.Random(7)
+for _ in range(2000):
+    with stop_signals() as wait_for_stop:
+        go = threading.Event()
+        asking = threading.Thread(target=ask, args=(go, draw.random() * 1e-4), daemon=True)
+        asking.start()
+        go.set()
+        wait_for_stop()
+        asking.join()
+"""
+
+
+def test_a_signal_is_never_missed_whenever_it_comes() -> None:
+    stopped = subprocess.run([sys.executable, "-c", _STOPPED_AT_ANY_MOMENT], cwd=ROOT, timeout=60, check=False)
+    assert stopped.returncode == 0
+
+
+def test_a_restarted_service_uses_the_model_that_was_in_service(toy_zip: Path, tmp_path: Path) -> None:
+    store = ModelStore(tmp_path / "store", Bundle.open(toy_zip))
+    store.remember(toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1"))
+    served = Served("--bundle", toy_zip, "--store", tmp_path / "store")
+    try:
+        with LightpageClient(served.target(), timeout_s=20) as client:
+            assert client.describe().model.version == "toy-1+r1"
+            assert client.rollback()[0] == "toy-1"
+        assert served.end(signal.SIGTERM)[0] == 0
+    finally:
+        served.process.kill()
+        served.process.wait()
+    assert store.last() is None
+
+
+def test_a_stored_model_whose_calibration_is_bad_leaves_the_base_in_service(
+    decoder: Decoder, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def tracker(made: Decoder) -> NoTracker:
+        if made is not decoder:
+            raise CalibrationError("bundle toy-1+r1: calibration", "no table", "a calibration document")
+        return NoTracker(made)
+
+    store, registry = ModelStore(tmp_path / "store", decoder.bundle), ModelRegistry(decoder, tracker)
+    store.remember(toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1"))
+    _resume(registry, store, 1)
+    assert [model.version for model in registry.models] == ["toy-1"]
+    assert "serving toy-1 as it was given: bundle toy-1+r1: calibration" in caplog.text
+
+
+def test_serve_refuses_a_damaged_bundle_in_one_line(toy_zip: Path, tmp_path: Path) -> None:
+    data = bytearray(toy_zip.read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "damaged.zip").write_bytes(data)
+    served = Served("--bundle", tmp_path / "damaged.zip")
+    out, err = served.process.communicate(timeout=60)
+    assert served.process.returncode == 2
+    assert out == ""
+    assert len(err.strip().splitlines()) == 1

@@ -1,0 +1,107 @@
+"""The health probe says yes only to a server that serves."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from concurrent import futures
+from dataclasses import dataclass
+
+import grpc
+import pytest
+from click.testing import CliRunner
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+
+from runtime.commands.healthcheck import is_serving, main
+
+SERVING = health_pb2.HealthCheckResponse.SERVING
+NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
+
+
+@dataclass(frozen=True)
+class HealthServer:
+    """A server on loopback that has nothing but its health."""
+
+    target: str
+    servicer: health.HealthServicer
+
+
+@pytest.fixture
+def server() -> Iterator[HealthServer]:
+    grpc_server = grpc.server(futures.ThreadPoolExecutor(max_workers=2))
+    servicer = health.HealthServicer()
+    health_pb2_grpc.add_HealthServicer_to_server(servicer, grpc_server)
+    port = grpc_server.add_insecure_port("127.0.0.1:0")
+    grpc_server.start()
+    yield HealthServer(f"127.0.0.1:{port}", servicer)
+    grpc_server.stop(grace=None).wait(5)
+
+
+def test_a_serving_server_is_healthy(server: HealthServer) -> None:
+    server.servicer.set("", SERVING)
+    assert is_serving(server.target) == (True, f"{server.target}: SERVING")
+
+
+def test_a_server_that_stopped_serving_is_not_healthy(server: HealthServer) -> None:
+    server.servicer.set("", NOT_SERVING)
+    serving, said = is_serving(server.target)
+    assert not serving
+    assert said.endswith("NOT_SERVING")
+
+
+def test_health_is_per_service(server: HealthServer) -> None:
+    server.servicer.set("lightpage.v1.Decoder", NOT_SERVING)
+    assert is_serving(server.target)[0]
+    assert not is_serving(server.target, service="lightpage.v1.Decoder")[0]
+
+
+def test_an_unknown_service_is_not_healthy(server: HealthServer) -> None:
+    serving, said = is_serving(server.target, service="nobody.v1.Nothing")
+    assert not serving
+    assert "SERVICE_UNKNOWN" in said
+
+
+def test_a_full_server_is_healthy() -> None:
+    grpc_server = grpc.server(futures.ThreadPoolExecutor(max_workers=2), maximum_concurrent_rpcs=1)
+    servicer = health.HealthServicer(experimental_non_blocking=False)  # a watcher takes its place like any call
+    servicer.set("", SERVING)
+    health_pb2_grpc.add_HealthServicer_to_server(servicer, grpc_server)
+    target = f"127.0.0.1:{grpc_server.add_insecure_port('127.0.0.1:0')}"
+    grpc_server.start()
+    with grpc.insecure_channel(target) as channel:
+        watching = health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest(), timeout=20)
+        assert next(watching).status == SERVING
+        assert is_serving(target) == (True, f"{target}: RESOURCE_EXHAUSTED: Concurrent RPC limit exceeded!")
+        watching.cancel()
+    grpc_server.stop(grace=None).wait(5)
+
+
+def test_nobody_at_home_is_not_healthy() -> None:
+    with socket.socket() as held:  # bound and not listening: nothing else can take the port meanwhile
+        held.bind(("127.0.0.1", 0))
+        serving, said = is_serving(f"127.0.0.1:{held.getsockname()[1]}", timeout_s=2.0)
+    assert not serving
+    assert "UNAVAILABLE" in said or "DEADLINE_EXCEEDED" in said
+
+
+def test_a_silent_server_is_not_healthy_and_is_not_waited_for() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        hangup = threading.Timer(10.0, silent.close)
+        hangup.start()
+        began = time.monotonic()
+        serving, _ = is_serving(f"127.0.0.1:{silent.getsockname()[1]}", timeout_s=0.5)
+        took_s = time.monotonic() - began
+        hangup.cancel()
+    assert not serving
+    assert took_s < 5
+
+
+def test_the_exit_code_is_the_answer(server: HealthServer) -> None:
+    runner = CliRunner()
+    assert runner.invoke(main, ["--target", server.target]).exit_code == 0
+    by_environment = {"LIGHTPAGE_HEALTH_TARGET": server.target}
+    assert runner.invoke(main, env=by_environment).exit_code == 0
+    server.servicer.set("", NOT_SERVING)
+    assert runner.invoke(main, env=by_environment).exit_code == 1

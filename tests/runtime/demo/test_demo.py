@@ -1,0 +1,89 @@
+"""The demo: decoding fails by drift and comes back by recalibration, with figures that say so."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lightpage.device.state import Device
+from lightpage.errors import BundleError, CalibrationError, InvalidInputError
+from lightpage.page.symbols import pilot_mask, symbol_phases
+from runtime.commands.demo import demo
+from runtime.decoding.decoder import Decoder
+from runtime.demo.demo import drifted, run_demo, summarise
+from runtime.recalibration.recalibration import KnownPages
+from runtime.recalibration.refit import refit
+from runtime.wire.convert import RemotePage, RemoteTimings
+from tests.runtime import toy
+
+TIMINGS = RemoteTimings(0.0, 0.2, 0.1, 0.3)
+
+
+def remote(errors: int = 0, kappa: float = 400.0) -> RemotePage:
+    """A page whose first data symbols came out wrong by one level."""
+    written = toy.symbols_of(16, 5)[0]
+    mask = pilot_mask(toy.PROFILE)
+    symbols = written.copy()
+    where = np.argwhere(~mask)[:errors]
+    symbols[tuple(where.T)] = (symbols[tuple(where.T)] + 1) % 16
+    full = np.full(toy.PAGE, kappa, np.float32)
+    phase = symbol_phases(symbols, 16).astype(np.float32)
+    confidence = np.ones(toy.PAGE, np.float32)
+    return RemotePage(symbols, confidence, full, phase, 16, 0.0, 1.0, "toy-1", TIMINGS, 0, written, mask)
+
+
+def test_figures_count_data_symbols_alone() -> None:
+    right, wrong = summarise("right", [remote()]), summarise("wrong", [remote(errors=10)])
+    data = np.count_nonzero(~pilot_mask(toy.PROFILE))
+    assert right.symbol_error_rate == 0
+    assert wrong.symbol_error_rate == pytest.approx(10 / data)
+    assert np.count_nonzero(np.isnan(right.air)) == toy.PAGE[0] * toy.PAGE[1] - data
+    # a von Mises density of concentration 400 is a normal one of 0.05 rad, wider than a level of 256
+    assert right.air_bits_per_symbol == pytest.approx(np.log2(2 * np.pi / (0.05 * np.sqrt(2 * np.pi))), abs=0.01)
+    assert wrong.air_bits_per_symbol < right.air_bits_per_symbol - 1
+
+
+def test_a_page_without_what_was_written_is_no_evidence() -> None:
+    page = RemotePage(**{**remote().__dict__, "written": None})
+    with pytest.raises(InvalidInputError, match="what was written"):
+        summarise("x", [page])
+
+
+def test_drift_leaves_what_cannot_drift() -> None:
+    before, after = Device(), drifted(Device())
+    assert after.geometry.pipe_angle_deg == pytest.approx(before.geometry.pipe_angle_deg + 0.03)
+    assert after.geometry.page_shift_x_px == before.geometry.page_shift_x_px
+    assert (after.sensor, after.slm, after.reference) == (before.sensor, before.slm, before.reference)
+
+
+def test_a_bundle_without_field_or_calibration_cannot_be_refitted(decoder: Decoder) -> None:
+    device = toy.ToyDevice()
+    symbols = toy.symbols_of(16, 1)[0]
+    pair = device.page(symbols, 16)
+    with pytest.raises(CalibrationError, match="calibration"):
+        refit(decoder.bundle, KnownPages((pair,), (symbols,), 16, device.references()), lambda *_: None, decoder)
+    with pytest.raises(BundleError, match="no field, unexplained"):
+        decoder.recover_field(pair, pair, np.zeros((2, 2, 10), np.float32), np.ones(2, np.float32))
+
+
+def test_no_pages_are_no_demo(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="at least 1"):
+        run_demo(tmp_path / "b.zip", 0, 0)
+
+
+@pytest.mark.slow
+def test_drift_is_lost_and_won_back_with_the_shipped_bundle(tmp_path: Path) -> None:
+    result = CliRunner().invoke(demo, ["--out", str(tmp_path), "--pages", "3"], standalone_mode=False)
+    assert result.exception is None
+    figures = json.loads((tmp_path / "demo.json").read_text())
+    fresh, lost, again = figures["phases"]
+    assert figures["recalibration"]["pages_used"] <= 2
+    assert lost["air_bits_per_symbol"] < 0.8 * fresh["air_bits_per_symbol"]
+    assert lost["mean_confidence"] < fresh["mean_confidence"]
+    assert again["air_bits_per_symbol"] >= 0.98 * fresh["air_bits_per_symbol"]
+    assert again["model_version"] != fresh["model_version"] == lost["model_version"]
+    assert (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")

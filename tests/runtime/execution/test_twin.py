@@ -1,0 +1,93 @@
+"""The exported twin answers as registration asks, in float64, and a foreign graph is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from lightpage.calibration.parameters import NAMES
+from lightpage.errors import BundleError
+from runtime.bundle.bundle import Bundle, write_bundle
+from runtime.bundle.manifest import TWIN
+from runtime.execution.twin import OnnxTwin
+from tests.runtime import toy
+
+
+def twin_graph(parameters: int = len(NAMES), left_out: str = "") -> bytes:
+    """Places are points plus the first two parameters, phases the anchors' x, pixels places of both cameras."""
+    double = TensorProto.DOUBLE
+    shapes = {"places": [1, "n", 2], "phases": [1, "n"], "positions": ["n", 2], "pixels": [2, "m", 2]}
+    graph = helper.make_graph(
+        [
+            helper.make_node("Gather", ["parameters", "two"], ["shift"]),
+            helper.make_node("Add", ["points", "shift"], ["moved"]),
+            helper.make_node("Unsqueeze", ["moved", "front"], ["places"]),
+            helper.make_node("Gather", ["anchors", "zero"], ["x"], axis=1),
+            helper.make_node("Unsqueeze", ["x", "front"], ["phases"]),
+            helper.make_node("Identity", ["points"], ["positions"]),
+            helper.make_node("Add", ["camera_places", "shift"], ["seen"]),
+            helper.make_node("Unsqueeze", ["seen", "front"], ["one"]),
+            helper.make_node("Concat", ["one", "one"], ["pixels"], axis=0),
+        ],
+        "twin",
+        [
+            helper.make_tensor_value_info("parameters", double, [parameters]),
+            helper.make_tensor_value_info("points", double, ["n", 2]),
+            helper.make_tensor_value_info("anchors", double, ["n", 2]),
+            helper.make_tensor_value_info("camera_places", double, ["m", 2]),
+        ],
+        [helper.make_tensor_value_info(name, double, shape) for name, shape in shapes.items() if name != left_out],
+        [
+            numpy_helper.from_array(np.array([0, 1], np.int64), "two"),
+            numpy_helper.from_array(np.array(0, np.int64), "zero"),
+            numpy_helper.from_array(np.array([0], np.int64), "front"),
+        ],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString())
+
+
+def bundle_with(path: Path, graph: bytes) -> Bundle:
+    return Bundle.open(write_bundle(path, toy.manifest(), toy.files() | {TWIN: graph}))
+
+
+def test_rays_and_pixels_come_back_to_the_last_digit_of_float64(tmp_path: Path) -> None:
+    twin = OnnxTwin(bundle_with(tmp_path / "b.zip", twin_graph()), threads=1)
+    parameters = np.zeros(len(NAMES))
+    parameters[0] = 1e-9
+    points = np.array([[1e-3, 2e-3], [5e-4, -1e-3]])
+    rays = twin.trace(parameters, points, points + 1.0)
+    np.testing.assert_array_equal(rays.places[0], points + parameters[:2])
+    np.testing.assert_array_equal(rays.phases[0], points[:, 0] + 1.0)
+    np.testing.assert_array_equal(twin.trace(parameters, points).phases[0], points[:, 0])
+    np.testing.assert_array_equal(twin.pixels(parameters, points[:1])[1], points[:1] + parameters[:2])
+
+
+def test_many_devices_at_once_are_each_device_by_itself(tmp_path: Path) -> None:
+    twin = OnnxTwin(bundle_with(tmp_path / "b.zip", twin_graph()), threads=1)
+    devices = np.random.default_rng(0).normal(size=(3, len(NAMES)))
+    points = np.random.default_rng(1).normal(size=(5, 2))
+    together = twin.trace(devices, points)
+    assert together.places.shape == (3, 1, 5, 2)
+    for index, device in enumerate(devices):
+        for part, alone in zip(together, twin.trace(device, points), strict=True):
+            np.testing.assert_array_equal(part[index], alone)
+        np.testing.assert_array_equal(twin.pixels(devices, points)[index], twin.pixels(device, points))
+
+
+@pytest.mark.parametrize(
+    ("graph", "complaint"),
+    [
+        (toy.decoder_onnx(), "inputs"),
+        (twin_graph(parameters=len(NAMES) - 1), "parameters"),
+        (twin_graph(left_out="pixels"), "no pixels"),
+    ],
+)
+def test_a_foreign_graph_is_refused(tmp_path: Path, graph: bytes, complaint: str) -> None:
+    with pytest.raises(BundleError, match=complaint):
+        OnnxTwin(bundle_with(tmp_path / "b.zip", graph), threads=1)

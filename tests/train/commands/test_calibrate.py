@@ -1,0 +1,191 @@
+"""`lightpage calibrate`: finds the device, or says that it found nothing, and never writes a guess."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import train.commands.calibrate
+from lightpage.calibration.calibrate import Registered
+from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.parameters import NAMES, PRIORS
+from lightpage.device.profile import Profile, load_profile
+from lightpage.device.state import Device
+from lightpage.errors import CalibrationError, FrameError, InvalidInputError, LightpageError, RecordingError
+from lightpage.page.symbols import random_symbols
+from lightpage.recording.reader import FramePair, Recording, RecordingWriter
+from lightpage.simulator.simulator import Simulator, true_parameters
+from train.commands.calibrate import calibrate
+
+
+def run(recording: Path, out: Path, *more: str, profile: str = "bench") -> str:
+    arguments = ["--profile", profile, "--recording", str(recording), "--out", str(out), *more]
+    result = CliRunner().invoke(calibrate, arguments, standalone_mode=False)
+    if result.exception is not None:
+        raise result.exception
+    return result.output
+
+
+def flat_recording(
+    path: Path, level: int, pages: int = 2, with_symbols: bool = True, dark: int = 0, reference: int | None = None
+) -> Path:
+    """A bench recording whose frames are all one count, behind some pages without light."""
+    profile = load_profile("bench")
+    symbols = np.random.default_rng(0).integers(0, 16, profile.page_shape, dtype=np.uint8)
+
+    def pair(count: int) -> FramePair:
+        frame = np.full(profile.frame_shape, count, dtype=np.uint8)
+        return FramePair(frame, frame)
+
+    with RecordingWriter(path, profile, 16, 8, pair(level if reference is None else reference)) as writer:
+        for count in [0] * dark + [level] * pages:
+            writer.append(symbols if with_symbols else None, pair(count))
+    return path
+
+
+def fake_registration(monkeypatch: pytest.MonkeyPatch, outcome: Registered | BaseException) -> None:
+    def register(*_: object) -> Registered:
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return outcome
+
+    monkeypatch.setattr(train.cli_calibrate, "register", register)
+
+
+REGISTERED = Registered(
+    parameters=np.where(np.array(NAMES) == "pipe_angle_rad", np.deg2rad(-0.6), 0.001 * PRIORS),
+    deviations=PRIORS / 50,
+    turn=np.deg2rad(-88.0),
+    coherence_before=0.02,
+    coherence_after=0.71,
+    cost=1.0,
+    significant=0.5,
+)
+
+
+def test_a_realistic_device_is_found_from_nominal(bench_calibration: tuple[Profile, Path, Calibration]) -> None:
+    profile, recording, calibration = bench_calibration
+    truth = true_parameters(profile, Device())
+    assert abs(calibration.angle_deg(profile) - Device().geometry.pipe_angle_deg) < 0.03
+    for name in ("page_centre_x_m", "page_centre_y_m"):
+        assert abs(calibration.parameters[name] - truth[NAMES.index(name)]) < 1e-6, name
+    assert abs(np.rad2deg(calibration.turn_rad) - 93) < 1
+    assert calibration.coherence_after > 10 * calibration.coherence_before
+    with Recording.open(recording) as pages:
+        assert calibration.calibrated_pages == (pages.page_hash(0), pages.page_hash(1))
+
+
+def test_symbols_that_were_not_written_find_nothing(bench_recording: Path, tmp_path: Path) -> None:
+    shuffled = tmp_path / "shuffled.h5"
+    shutil.copy(bench_recording, shuffled)
+    with h5py.File(shuffled, "r+") as file:
+        symbols = file["symbols"][()]
+        file["symbols"][...] = np.random.default_rng(0).permutation(symbols.ravel()).reshape(symbols.shape)
+    with pytest.raises(CalibrationError):
+        run(shuffled, tmp_path / "calibration.toml", "--pages", "1")
+    assert not (tmp_path / "calibration.toml").exists()
+
+
+@pytest.mark.parametrize(("level", "words"), [(0, "black"), (255, "saturated")])
+def test_black_and_saturated_frames_are_named(tmp_path: Path, level: int, words: str) -> None:
+    with pytest.raises(FrameError, match=f"reference, in-phase frame: got {words}"):
+        run(flat_recording(tmp_path / "R.h5", 100, reference=level), tmp_path / "calibration.toml")
+    with pytest.raises(RecordingError, match="got 2 pages, 2 of them black or saturated, wanted at least 2 that show"):
+        run(flat_recording(tmp_path / "R2.h5", level, reference=100), tmp_path / "calibration.toml")
+    assert not (tmp_path / "calibration.toml").exists()
+
+
+def test_pages_without_light_are_named_and_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_registration(monkeypatch, REGISTERED)
+    path = flat_recording(tmp_path / "R.h5", 100, pages=2, dark=2)
+    text = run(path, tmp_path / "calibration.toml")
+    for page in (0, 1):
+        assert f"warning: left out: recording {path}, page {page}, in-phase frame: got black" in text
+    with Recording.open(path) as recording:
+        expected = tuple(recording.page_hash(page) for page in (2, 3))
+    assert load_calibration(tmp_path / "calibration.toml").calibrated_pages == expected
+
+
+def test_symbols_whose_light_misses_a_camera_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    aside = np.where(np.array(NAMES) == "in_phase_shift_x_px", 100.0, REGISTERED.parameters)
+    fake_registration(monkeypatch, replace(REGISTERED, parameters=aside))
+    figures = tmp_path / "figures.json"
+    text = run(flat_recording(tmp_path / "R.h5", 100), tmp_path / "calibration.toml", "--json", str(figures))
+    lost = json.loads(figures.read_text())["symbols_beside_cameras"]
+    assert lost == 5 * 56  # columns at 24, 39, 55, 70 and 86 pixels are moved beyond the camera's edge
+    assert f"warning: {lost} of 4872 symbols" in text
+
+
+def test_the_table_is_for_people_and_the_json_for_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_registration(monkeypatch, REGISTERED)
+    out, figures = tmp_path / "calibration.toml", tmp_path / "figures.json"
+    text = run(flat_recording(tmp_path / "R.h5", 100), out, "--json", str(figures))
+    data = json.loads(figures.read_text())
+    calibration = load_calibration(out)
+    assert data["angle_deg"] == pytest.approx(-0.6)
+    assert data["turn_deg"] == pytest.approx(-88)
+    assert (data["pages_used"], data["coherence_before"], data["coherence_after"]) == (2, 0.02, 0.71)
+    assert data["seconds"] > 0
+    assert data["parameters"] == calibration.parameters
+    assert data["symbols_beside_cameras"] == 0
+    assert "warning" not in text
+    rows = {line[:32].strip(): line[32:].split() for line in text.splitlines()}
+    assert rows["pipe angle, degree"][0] == "-0.6"
+    assert rows["focal length, mm"] == ["20", "0.0008", "20"]
+    assert set(NAMES[4:]) <= set(rows)
+
+
+@pytest.mark.parametrize(
+    ("pages", "with_symbols", "profile", "complaint"),
+    [
+        (2, False, "bench", "'symbols': got none"),
+        (1, True, "bench", r"1 pages, wanted at least 2 that show light \(--pages\)"),
+        (2, True, "paper", r"912 x 1368 pixels, wanted 3648 x 5472 \(profile paper\)"),
+    ],
+)
+def test_a_recording_that_cannot_serve_is_refused_by_name(
+    tmp_path: Path, pages: int, with_symbols: bool, profile: str, complaint: str
+) -> None:
+    recording = flat_recording(tmp_path / "R.h5", 100, pages, with_symbols)
+    with pytest.raises(RecordingError, match=complaint):
+        run(recording, tmp_path / "calibration.toml", profile=profile)
+
+
+def test_a_folder_that_is_not_there_is_named_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="nowhere"):
+        run(tmp_path / "R.h5", tmp_path / "nowhere" / "calibration.toml")
+
+
+def test_a_device_outside_the_capture_range_is_not_guessed_at(tmp_path: Path) -> None:
+    """Takes its seconds: a whole search. At 4.5 degrees all light but that of the y walls lies where it would at 0."""
+    profile, rng = load_profile("bench"), np.random.default_rng(0)
+    device = Device().with_settings(["geometry.pipe_angle_deg=4.5"])
+    simulator = Simulator(profile, device, 256, 0)
+    with RecordingWriter(tmp_path / "R.h5", profile, 256, device.sensor.bit_depth, simulator.references()) as writer:
+        symbols = random_symbols(profile, 256, 1, rng)[0]
+        writer.append(symbols, simulator.page(symbols))
+    out = tmp_path / "calibration.toml"
+    with pytest.raises(CalibrationError, match=r"reflects along y.*wanted .*a device in the capture range"):
+        run(tmp_path / "R.h5", out, "--pages", "1")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), CalibrationError("calibration", "nothing", "something")])
+def test_a_calibration_that_is_stopped_leaves_the_earlier_one_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: BaseException
+) -> None:
+    fake_registration(monkeypatch, stop)
+    recording, out = flat_recording(tmp_path / "R.h5", 100), tmp_path / "calibration.toml"
+    out.write_text("the earlier one")
+    with pytest.raises((click.Abort, LightpageError)):
+        run(recording, out, "--json", str(tmp_path / "figures.json"))
+    assert out.read_text() == "the earlier one"
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["R.h5", "calibration.toml"]

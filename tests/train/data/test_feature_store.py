@@ -1,0 +1,88 @@
+"""Features on disk: what an interruption left is taken up, what belongs to something else is not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from train.data import feature_store
+from train.data.feature_store import FeatureStore, fill
+from train.data.features import PageFeatures, PageState
+
+
+class Pages:
+    """Makes numbered pages and writes down which; stops like Ctrl-C before page `stop`."""
+
+    def __init__(self, stop: int | None = None) -> None:
+        self.made: list[int] = []
+        self.shifts: list[tuple[float, float]] = []
+        self._stop = stop
+
+    def __call__(self, first: int, shift: tuple[float, float]) -> Iterator[PageFeatures]:
+        self.shifts.append(shift)
+        for number in range(first, 100):
+            if number == self._stop:
+                raise KeyboardInterrupt
+            self.made.append(number)
+            yield PageFeatures(
+                np.full((2, 3, 4, 5, 6), number, np.float16),
+                np.full((2, 5, 6), number, np.float32),
+                np.full((5, 6), number, np.float32),
+                PageState((number + 0.5, -number), 0.25),
+            )
+
+
+def test_it_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        fill(tmp_path, "device", 5, Pages(stop=3), "pages")
+    rest = Pages()
+    fill(tmp_path, "device", 5, rest, "pages")
+    assert rest.made[:2] == [3, 4]
+    assert rest.shifts == [(2.5, -2)]
+    store = FeatureStore(tmp_path)
+    assert len(store) == 5
+    for number in range(5):
+        light, positions, phases = store[number]
+        assert light.shape == (24, 5, 6)
+        for part in (light, positions, phases):
+            assert torch.all(part == number)
+
+
+def test_what_is_complete_is_not_made_again(tmp_path: Path) -> None:
+    fill(tmp_path, "device", 3, Pages(), "pages")
+    again = Pages()
+    fill(tmp_path, "device", 3, again, "pages")
+    assert again.made == []
+
+
+def test_further_processes_wait_for_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feature_store, "_PATIENCE_S", 0.5)
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    other = Pages()
+    with pytest.raises(TimeoutError, match="0 of 3 pages, and no more"):
+        fill(tmp_path, "device", 3, other, "pages")
+    monkeypatch.delenv("LOCAL_RANK")
+    fill(tmp_path, "device", 3, Pages(), "pages")
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    fill(tmp_path, "device", 3, other, "pages")
+    assert other.made == []
+
+
+@pytest.mark.parametrize(("key", "count"), [("another device", 3), ("device", 2), ("device", 4)])
+def test_pages_of_something_else_are_made_anew(tmp_path: Path, key: str, count: int) -> None:
+    fill(tmp_path, "device", 3, Pages(), "pages")
+    again = Pages()
+    fill(tmp_path, key, count, again, "pages")
+    assert again.made[:count] == list(range(count))
+    assert len(FeatureStore(tmp_path)) == count
+
+
+def test_a_part_of_the_pages_is_numbered_from_zero(tmp_path: Path) -> None:
+    fill(tmp_path, "device", 5, Pages(), "pages")
+    part = FeatureStore(tmp_path, range(3, 5))
+    assert len(part) == 2
+    assert torch.all(part[0][2] == 3)

@@ -1,0 +1,97 @@
+"""Synthetic pages are like the recorded ones of the device that they are made after."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from lightpage.calibration.calibrate import KnownPage
+from lightpage.calibration.parameters import NAMES
+from lightpage.device.state import Device, SlmDefects
+from lightpage.page.symbols import random_symbols, symbol_phases
+from lightpage.simulator.simulator import Simulator, true_parameters
+from tests.lightpage.small import small_profile
+from train.data.features import FeatureExtractor, PageFeatures
+from train.data.known_light import explained
+from train.data.synthetic import MOST_NOISE, PAGES_PER_STATE, Likeness, SyntheticPages, likeness
+from train.models.localizers.coherent import CoherentLocalizer
+
+SEED = 5
+FALLOFF = 0.25
+PROFILE = small_profile()
+DEVICE = Device(slm=SlmDefects(falloff_relative=FALLOFF))
+TRUTH = true_parameters(PROFILE, DEVICE)
+
+
+class Recorded(NamedTuple):
+    features: PageFeatures
+    extractor: FeatureExtractor
+    page: KnownPage
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Recorded:
+    """One recorded page."""
+    simulator = Simulator(PROFILE, DEVICE, seed=SEED)
+    phases = symbol_phases(random_symbols(PROFILE, 256, 1, np.random.default_rng(SEED))[0], 256)
+    pair = simulator.page(np.rint(phases / (2 * np.pi) * 256).astype(np.uint8))
+    turn = DEVICE.homodyne.turn_rad
+    extractor = FeatureExtractor(PROFILE, TRUTH, turn, simulator.references())
+    features, _ = extractor.page(extractor.field(pair), phases, np.zeros(2))
+    return Recorded(features, extractor, KnownPage(pair, np.exp(1j * phases)))
+
+
+@pytest.fixture(scope="module")
+def like(recorded: Recorded) -> Likeness:
+    return likeness(explained(recorded.extractor, PROFILE, TRUTH, [recorded.page]))
+
+
+def agreement(page: PageFeatures) -> float:
+    """Coherence of the direct branch with what was written, over the page."""
+    light = page.light.astype(np.float64)[:, 0].mean(1)
+    z = (light[0] + 1j * light[1]) * np.exp(-1j * page.phases)
+    return float(abs(z.mean()) / np.sqrt(np.mean(np.abs(z) ** 2)))
+
+
+def test_the_fitted_waves_explain_the_recorded_light_and_its_fall_off(like: Likeness) -> None:
+    assert like.noise < 0.05
+    constant, _, _, x2, _, y2 = like.illumination
+    assert constant == pytest.approx(1)
+    # the simulator's fall-off is quadratic in the radius, and reaches its full at the corner (1, 1)
+    assert -(x2 + y2).real == pytest.approx(FALLOFF, abs=0.03)
+
+
+def test_other_symbols_explain_nothing_and_another_angle_less(like: Likeness, recorded: Recorded) -> None:
+    others = replace(recorded.page, symbols=recorded.page.symbols[::-1])
+    assert likeness(explained(recorded.extractor, PROFILE, TRUTH, [others])).noise > MOST_NOISE
+    other = TRUTH.copy()
+    other[NAMES.index("pipe_angle_rad")] += np.deg2rad(0.5)
+    assert likeness(explained(recorded.extractor, PROFILE, other, [recorded.page])).noise > 3 * like.noise
+
+
+def test_synthetic_light_shows_its_symbols_as_the_recorded_light_does(like: Likeness, recorded: Recorded) -> None:
+    pages = list(islice(SyntheticPages(PROFILE, TRUTH, like, CoherentLocalizer(PROFILE), SEED).pages(), 4))
+    found = np.array([agreement(page) for page in pages])
+    # pages of this size differ by their symbols' chance neighbours
+    assert found.mean() == pytest.approx(agreement(recorded.features), rel=0.06)
+    assert pages[0].light.shape == recorded.features.light.shape
+
+
+def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: Likeness) -> None:
+    made = SyntheticPages(PROFILE, TRUTH, like, CoherentLocalizer(PROFILE), SEED)
+    count = PAGES_PER_STATE + 2
+    all_pages = list(islice(made.pages(), count))
+    again = next(islice(made.pages(PAGES_PER_STATE + 1), 1))
+    np.testing.assert_array_equal(again.light, all_pages[-1].light)
+    np.testing.assert_array_equal(again.phases, all_pages[-1].phases)
+    np.testing.assert_array_equal(all_pages[0].positions, all_pages[1].positions)
+    assert np.abs(all_pages[0].positions - all_pages[-1].positions).max() > 1e-5
+
+
+def test_the_wave_localizer_has_synthetic_pages_too(like: Likeness) -> None:
+    page = next(SyntheticPages(PROFILE, TRUTH, like, None, SEED).pages())
+    assert agreement(page) > 0.85

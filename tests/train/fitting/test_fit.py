@@ -1,0 +1,137 @@
+"""Training: it learns, takes up its last checkpoint, and counts no pilot as data."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import TensorDataset
+
+from lightpage.errors import InvalidInputError
+from lightpage.metrics.information import achievable_rate
+from train.fitting.fit import (
+    CHECKPOINTS,
+    FITTED,
+    FITTED_WEIGHTS,
+    Hyperparameters,
+    best_kappa_scale,
+    decode_pages,
+    fit_network,
+    held_out_air,
+    most_likely_factor,
+)
+
+PAGE = (8, 12)
+LEVELS = 256
+CHOICES = Hyperparameters(channels=16, blocks=1, steps=120, batch=2, precision="32-true", learning_rate=5e-3)
+
+
+def test_pages_that_a_run_is_shown_count_patches_for_their_share() -> None:
+    choices = Hyperparameters(steps=100, batch=4, patch=96)
+    assert choices.drawn((56, 87)) == 400
+    assert choices.drawn((192, 64)) == 200
+    assert choices.drawn((192, 384)) == 50
+
+
+def pages(count: int, seed: int, noise: float | np.ndarray = 0.2) -> TensorDataset:
+    """Light that shows its symbol, in noise."""
+    rng = np.random.default_rng(seed)
+    phases = rng.uniform(0, 2 * np.pi, (count, *PAGE))
+    light = np.stack([np.cos(phases), np.sin(phases)], axis=1)[:, :, None, None]
+    light = light + noise * rng.standard_normal(light.shape)
+    light = torch.from_numpy(light.astype(np.float16)).flatten(1, 3)
+    return TensorDataset(light, torch.zeros(count, 2, *PAGE), torch.from_numpy(phases.astype(np.float32)))
+
+
+@pytest.fixture
+def mask() -> np.ndarray:
+    mask = np.zeros(PAGE, dtype=bool)
+    mask[::4, ::4] = True
+    return mask
+
+
+def test_it_learns_and_is_not_trained_twice(tmp_path: Path, mask: np.ndarray) -> None:
+    training, validation = pages(12, 0), pages(3, 1)
+    run = tmp_path / "run"
+    first = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    assert first.validation_air > 1.0
+    kept = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    assert (kept.validation_air, kept.seconds, kept.curves) == (first.validation_air, first.seconds, first.curves)
+    assert kept.curves["val_air"][-1][1] == pytest.approx(first.validation_air, abs=0.1)
+    torch.testing.assert_close(kept.module.network.state_dict(), first.module.network.state_dict())
+    (run / FITTED).unlink()  # interrupted after its last step, and moved
+    run = run.rename(tmp_path / "moved")
+    again = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    assert again.validation_air == pytest.approx(first.validation_air, abs=1e-6)
+    for one, other in zip(first.module.parameters(), again.module.parameters(), strict=True):
+        torch.testing.assert_close(one, other)
+    # the time of the earlier stretch, up to its last checkpoint, and not that of looking at it again
+    assert 0.5 * first.seconds < again.seconds <= first.seconds
+    checkpoint = torch.load(run / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=False)
+    assert checkpoint["global_step"] == CHOICES.steps
+    shutil.rmtree(run / CHECKPOINTS)
+    without = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    assert without.validation_air == again.validation_air
+    assert not (run / CHECKPOINTS).exists()
+
+
+@pytest.mark.parametrize("damaged", [FITTED, FITTED_WEIGHTS])
+def test_what_a_finished_training_kept_is_named_when_it_is_damaged(
+    damaged: str, tmp_path: Path, mask: np.ndarray
+) -> None:
+    choices = replace(CHOICES, steps=10)
+    fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1), progress=False)
+    with pytest.raises(InvalidInputError, match=FITTED_WEIGHTS):  # of another size
+        fit_network(tmp_path, replace(choices, channels=8), mask, LEVELS, pages(2, 0), pages(1, 1), progress=False)
+    (tmp_path / damaged).write_bytes(b"")
+    with pytest.raises(InvalidInputError, match=damaged):
+        fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1), progress=False)
+
+
+def test_few_steps_teach_large_confidences_and_small_ones(tmp_path: Path, mask: np.ndarray) -> None:
+    noise = np.where(np.arange(PAGE[1]) < PAGE[1] // 2, 0.03, 0.6)
+    training, validation = pages(12, 0, noise), pages(8, 1, noise)
+    module = fit_network(tmp_path, CHOICES, mask, LEVELS, training, validation, progress=False).module
+    p, phases = decode_pages(module, validation)
+    mu, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])
+    clear, noisy = np.split(kappa, 2, axis=2)
+    assert np.median(clear) > 20 * np.median(noisy)
+    level = (np.rint(phases * (LEVELS / (2 * np.pi))) % LEVELS).astype(np.uint8)
+    assert achievable_rate(mu, kappa, level, LEVELS)[..., : PAGE[1] // 2].mean() > 3.6
+
+
+def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarray) -> None:
+    training, validation = pages(12, 0), pages(3, 1)
+    choices = replace(CHOICES, steps=60)
+    module = fit_network(tmp_path, choices, mask, LEVELS, training, validation, progress=False).module
+    honest = best_kappa_scale(module, validation, mask)
+    with torch.no_grad():
+        assert module.network.head.bias is not None
+        for value in (module.network.head.weight, module.network.head.bias):
+            value[:2] *= 3
+    assert best_kappa_scale(module, validation, mask) == pytest.approx(honest / 3, rel=0.02)
+
+
+def test_a_factor_at_the_end_of_the_search_is_said_to_be_there(capsys: pytest.CaptureFixture[str]) -> None:
+    assert most_likely_factor(lambda factor: (math.log(factor) - 1) ** 2) == pytest.approx(math.e, rel=1e-4)
+    assert capsys.readouterr().err == ""
+    most_likely_factor(lambda factor: -factor)
+    assert "more honest still beyond the factor 20" in capsys.readouterr().err
+
+
+def test_air_does_not_see_the_piston_and_leaves_pilots_out(mask: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 2 * np.pi, (1, *PAGE)).astype(np.float32)
+    p = 30 * np.stack([np.cos(truth + 1.0), np.sin(truth + 1.0)], axis=1).astype(np.float32)
+    exact = held_out_air(p, truth, mask, LEVELS)
+    wrong_data, wrong_pilots = truth.copy(), p.copy()
+    wrong_data[0][~mask] = rng.uniform(0, 2 * np.pi, int((~mask).sum()))
+    wrong_pilots[0, :, mask] *= 0.5
+    assert exact > 3.5
+    assert held_out_air(wrong_pilots, truth, mask, LEVELS) == pytest.approx(exact, abs=0.02)
+    assert held_out_air(p, wrong_data, mask, LEVELS) < 0

@@ -1,0 +1,115 @@
+"""`lightpage calibrate`: from nominal geometry to this device, with a few pages whose symbols are known."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+import numpy as np
+
+from lightpage.calibration.calibrate import calibrate as register
+from lightpage.calibration.coherence import seen_share
+from lightpage.calibration.document import Calibration
+from lightpage.calibration.known_pages import first_lit_pages, known_pages
+from lightpage.device.profile import Profile, load_profile
+from lightpage.files import OutputFile, write_json
+from lightpage.progress import Progress, percent_bar, warn
+from lightpage.recording.reader import Recording
+from train.models.field import FieldRecovery, TorchFieldSolver
+from train.models.twin import RayTwin, TorchTwin
+
+DEFAULT_PAGES = 2
+MAX_PAGES = 4
+"""More cost time and add nothing that a decoder would notice."""
+
+
+@click.command()
+@click.option("--profile", "profile_name", required=True, metavar="P", help="Nominal device: a shipped name or a file.")
+@click.option("--recording", required=True, type=click.Path(path_type=Path), help="Pages with known symbols, R.h5.")
+@click.option("--out", required=True, type=OutputFile(), help="Where the calibration goes, TOML.")
+@click.option(
+    "--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(1, MAX_PAGES), help="Pages used."
+)
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def calibrate(profile_name: str, recording: Path, out: Path, pages: int, json_path: Path | None) -> None:
+    """Find this device's geometry, from nominal, with the first pages of a recording that show light."""
+    profile = load_profile(profile_name)
+    start = time.perf_counter()
+    with Recording.open(recording) as file, percent_bar() as progress:
+        file.check_against(profile)
+        calibration = calibrate_recording(file, profile, first_lit_pages(file, pages, warn), progress)
+    seconds = time.perf_counter() - start
+    calibration.save(out)
+    lost = int(np.sum(seen_share(TorchTwin(RayTwin(profile)), calibration.vector, profile) < 0.5))
+    if json_path is not None:
+        write_json(json_path, figures(calibration, profile, seconds, lost))
+    click.echo(table(calibration, profile))
+    if lost:
+        total = profile.page.columns * profile.page.rows
+        what = f"{lost} of {total} symbols: most of their light misses a camera, so little of them can be read"
+        warn(what)
+    click.echo(
+        f"\ncoherence {calibration.coherence_before:.3f} -> {calibration.coherence_after:.3f}, "
+        f"{calibration.pages_used} known pages, {seconds:.0f} s; written to {out}"
+    )
+
+
+def calibrate_recording(
+    recording: Recording, profile: Profile, pages: Sequence[int], progress: Progress
+) -> Calibration:
+    """Calibrate from nominal with some pages of a recording.
+
+    Raises:
+        RecordingError: no symbols, no such page, or shapes that are not the profile's.
+        CalibrationError: nothing within the capture range explains the frames.
+    """
+    recording.check_against(profile)
+    if others := recording.differences(profile):
+        warn(f"recording {recording.path} says of its device: {'; '.join(others)}")
+    known = known_pages(recording, profile, pages)
+    registered = register(
+        TorchTwin(RayTwin(profile)),
+        TorchFieldSolver(FieldRecovery(profile)),
+        profile,
+        recording.references(),
+        known,
+        progress,
+    )
+    return Calibration.from_registered(registered, profile, [recording.page_hash(page) for page in pages])
+
+
+def figures(calibration: Calibration, profile: Profile, seconds: float, lost: int) -> dict[str, object]:
+    """The result under the names that other programs read; `lost` symbols have most of their light beside a camera."""
+    return {
+        "angle_deg": calibration.angle_deg(profile),
+        "pages_used": calibration.pages_used,
+        "seconds": seconds,
+        "coherence_before": calibration.coherence_before,
+        "coherence_after": calibration.coherence_after,
+        "turn_deg": float(np.rad2deg(calibration.turn_rad)),
+        "parameters": calibration.parameters,
+        "symbols_beside_cameras": lost,
+    }
+
+
+def table(calibration: Calibration, profile: Profile) -> str:
+    """Fitted values with their standard deviations beside the nominal ones, for people."""
+    shown = {
+        "pipe_angle_rad": ("pipe angle, degree", profile.pipe.angle_deg, 180 / np.pi),
+        "focal_length_relative": ("focal length, mm", 1e3 * profile.lens.focal_length_m, None),
+        "pipe_length_relative": ("pipe length, mm", 1e3 * profile.pipe.length_m, None),
+        "pipe_width_relative": ("pipe width, mm", 1e3 * profile.pipe.width_m, None),
+    }
+    lines = [f"{'':<32}{'fitted':>12}   {'+-':<10}{'nominal':>10}"]
+    for name, value in calibration.parameters.items():
+        if name not in calibration.fitted:
+            continue
+        label, nominal, unit = shown.get(name, (name, 0.0, 1.0))
+        factor = nominal if unit is None else unit
+        fitted, deviation = nominal + factor * value, factor * calibration.deviations[name]
+        lines.append(f"{label:<32}{fitted:>12.6g}   {deviation:<10.2g}{nominal:>10.6g}")
+    turn = np.rad2deg(calibration.turn_rad)
+    lines.append(f"{'between the arms, degree':<32}{turn:>12.6g}   {'':<10}{'+90 or -90':>10}")
+    return "\n".join(lines)

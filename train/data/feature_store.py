@@ -1,0 +1,144 @@
+"""Page features on disk, kept page by page: interrupted work goes on where it was, and training reads what it needs."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.lib.format import open_memmap
+from torch.utils.data import Dataset
+from tqdm import tqdm
+
+from lightpage.files import replace_text
+from train.data.features import PageFeatures, PageState
+from train.fitting.fit import Page
+from train.fitting.processes import is_first_process
+
+_STATE = "state.json"
+_SHOWN = ("light", "positions", "belief", "phases")
+"""Arrays of `PageFeatures`, in the order in which a page's item has them."""
+_PAGE_STATE = "page_states"
+_PATIENCE_S, _LOOK_S = 1800.0, 0.2
+"""How long a process waits for the next page of another, and how often it looks."""
+
+Maker = Callable[[int, tuple[float, float]], Iterator[PageFeatures]]
+"""Makes the features from a page number on; told of the shift of the page before it."""
+
+
+class FeatureStore(Dataset[Page]):
+    """Pages of features in a folder, as arrays that are mapped and not loaded.
+
+    An item is a page's light [2 C, ny, nx] float16, positions [2, ny, nx], what an earlier look believed [2, ny, nx]
+    if there was one, and true phases [ny, nx].
+
+    Args:
+        folder: with arrays that `fill` has completed.
+        pages: which of them, all if left out.
+    """
+
+    def __init__(self, folder: Path, pages: range | None = None) -> None:
+        names = [name for name in _SHOWN if (folder / f"{name}.npy").exists()]
+        self._arrays = [np.load(folder / f"{name}.npy", mmap_mode="r") for name in names]
+        self._states = np.load(folder / f"{_PAGE_STATE}.npy", mmap_mode="r")
+        self._pages = range(len(self._states)) if pages is None else pages
+
+    def __len__(self) -> int:
+        """Pages."""
+        return len(self._pages)
+
+    def __getitem__(self, index: int) -> Page:
+        """One page."""
+        return self.part(index, slice(None), slice(None))
+
+    def part(self, index: int, rows: slice, columns: slice) -> Page:
+        """Some rows and columns of a page; no more is read."""
+        number = self._pages[index]
+        light, *others = (torch.from_numpy(np.array(array[number][..., rows, columns])) for array in self._arrays)
+        return light.flatten(0, -3), *others
+
+    def state(self, index: int) -> PageState:
+        """Image shift and piston that were taken off a page."""
+        x, y, piston = map(float, self._states[self._pages[index]])
+        return PageState((x, y), piston)
+
+
+def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
+    """Make the features of `count` pages and keep them in `folder`, or go on with those that are there.
+
+    Of several processes the first makes them, and the others wait.
+
+    Returns:
+        Seconds that it took, all stretches together.
+
+    Args:
+        folder: made if missing; what it holds under another key is made anew.
+        key: everything that the features depend on.
+        count: pages.
+        make: makes them, from a page on.
+        what: for the progress bar.
+
+    Raises:
+        TimeoutError: the first process has made no page for half an hour.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    key = f"{count} pages {key}"
+    if not is_first_process():
+        _wait(folder, key, count)
+    done, shift, before = _kept(folder, key)
+    if done >= count:
+        return before
+    start, seconds = time.monotonic() - before, before
+    if done == 0:
+        (folder / _STATE).unlink(missing_ok=True)  # before its arrays are
+        for old in folder.glob("*.npy"):
+            old.unlink()
+    arrays: dict[str, np.memmap[Any, Any]] = {}
+    with torch.inference_mode():
+        pages = tqdm(make(done, shift), desc=what, unit="page", initial=done, total=count)
+        for number, page in zip(range(done, count), pages, strict=False):
+            values = {name: getattr(page, name) for name in _SHOWN}
+            values[_PAGE_STATE] = np.array([*page.state.shift_px, page.state.piston_rad])
+            for name, value in values.items():
+                if value is None:
+                    continue
+                if name not in arrays:
+                    path = folder / f"{name}.npy"
+                    arrays[name] = (
+                        open_memmap(path, "r+")
+                        if number
+                        else open_memmap(path, "w+", dtype=value.dtype, shape=(count, *value.shape))
+                    )
+                arrays[name][number] = value
+                arrays[name].flush()
+            seconds = time.monotonic() - start
+            state = {"key": key, "done": number + 1, "shift_px": page.state.shift_px, "seconds": seconds}
+            replace_text(folder / _STATE, json.dumps(state), "state of the features")
+    return seconds
+
+
+def _wait(folder: Path, key: str, count: int) -> None:
+    """Until another process has made all pages, so long as it makes any."""
+    seen, since = -1, time.monotonic()
+    while (done := _kept(folder, key)[0]) < count:
+        if done != seen:
+            seen, since = done, time.monotonic()
+        if time.monotonic() - since > _PATIENCE_S:
+            raise TimeoutError(f"features in {folder}: {done} of {count} pages, and no more for {_PATIENCE_S:.0f} s")
+        time.sleep(_LOOK_S)
+
+
+def _kept(folder: Path, key: str) -> tuple[int, tuple[float, float], float]:
+    """Pages that an earlier call completed under the same key, the last one's shift, and the seconds that they took."""
+    try:
+        state = json.loads((folder / _STATE).read_text())
+        if state["key"] == key:
+            shift = float(state["shift_px"][0]), float(state["shift_px"][1])
+            return int(state["done"]), shift, float(state["seconds"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return 0, (0.0, 0.0), 0.0

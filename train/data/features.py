@@ -1,0 +1,242 @@
+"""Features of recorded pages: field, page by page piston and shift from the known symbols, localized light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+
+from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, least_coherence
+from lightpage.calibration.coherence import COHERENT_BRANCHES, branch_shares, page_coherence
+from lightpage.calibration.interfaces import BRANCHES
+from lightpage.calibration.samplers import FieldSampler
+from lightpage.calibration.sampling_table import Table, sampling_table, shifted
+from lightpage.device.profile import Profile
+from lightpage.errors import CalibrationError
+from lightpage.page.symbols import symbol_phases
+from lightpage.recording.reader import FramePair, Recording
+from lightpage.waves.grid import GRID_STEP_PX, FieldGrid
+from train.models.field import ROUNDS, FieldRecovery, Measured, TorchFieldSolver
+from train.models.localizers.coherent import CoherentLocalizer
+from train.models.localizers.wave import WaveLocalizer
+from train.models.parts import stacked
+from train.models.twin import RayTwin, TorchTwin
+
+Real = NDArray[np.float64]
+
+_PROBE_PX = 0.3
+_LARGEST_STEP_PX = 0.5
+
+
+@dataclass(frozen=True)
+class PageState:
+    """What differs from page to page and no symbol explains.
+
+    Attributes:
+        shift_px: how far the image has moved (x, y) since calibration, camera pixels.
+        piston_rad: phase common to all symbols.
+    """
+
+    shift_px: tuple[float, float]
+    piston_rad: float
+
+
+@dataclass(frozen=True)
+class PageFeatures:
+    """One page as a network sees it.
+
+    Attributes:
+        light: demodulated samples [2, B, S, ny, nx], float16, piston taken off.
+        positions: exit centroids [2, ny, nx], float32, over the pipe's width.
+        phases: true phases [ny, nx], float32, radians.
+        state: image shift and piston of the page that were taken off.
+        belief: p [2, ny, nx], float32, that an earlier look came to and this one starts from; None for the first look.
+    """
+
+    light: NDArray[np.float16]
+    positions: NDArray[np.float32]
+    phases: NDArray[np.float32]
+    state: PageState
+    belief: NDArray[np.float32] | None = None
+
+
+class FeatureExtractor:
+    """Turns frame pairs of one calibrated device into features.
+
+    Args:
+        profile: the nominal device.
+        parameters: [P] fitted parameters.
+        turn: angle between the homodyne arms, radians.
+        references: reference-only frames.
+        localizer: `coherent` or `wave`.
+        with_signal_power, rounds, binning: see `FieldRecovery`.
+        coherent: the coherent localizer, where it is not the usual one.
+        grid: the common grid, where it is not the usual one.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        parameters: Real,
+        turn: float,
+        references: FramePair,
+        localizer: str = "coherent",
+        *,
+        with_signal_power: bool = True,
+        rounds: int = ROUNDS,
+        binning: int = 1,
+        coherent: CoherentLocalizer | None = None,
+        grid: FieldGrid | None = None,
+    ) -> None:
+        self._profile, self._parameters, self._twin = profile, parameters, TorchTwin(RayTwin(profile))
+        self.table: Table = sampling_table(self._twin, parameters, turn, profile)
+        self.recovery = FieldRecovery(
+            profile, with_signal_power=with_signal_power, rounds=rounds, binning=binning, grid=grid
+        )
+        self._solve = TorchFieldSolver(self.recovery)
+        self._coherent = coherent or CoherentLocalizer(profile, grid=grid)
+        self._wave = WaveLocalizer(profile, parameters, grid) if localizer == "wave" else None
+        self._references = references
+        shares = branch_shares(self.table["positions"].reshape(2, -1).T.astype(float))
+        self._shares = shares.reshape(len(COHERENT_BRANCHES), *profile.page_shape)
+        self._chosen = [BRANCHES.index(name) for name in COHERENT_BRANCHES]
+
+    @property
+    def grid(self) -> FieldGrid:
+        """The common grid."""
+        return self.recovery.grid
+
+    def field(self, pair: FramePair) -> NDArray[np.complex64]:
+        """Recovered field on the common grid."""
+        return self._solve(pair, self._references, self.table["registration"], self.table["homodyne"])[0]
+
+    def look(self, pair: FramePair, shift_px: tuple[float, float]) -> tuple[Measured, Tensor]:
+        """What was measured on the calibrated grid of a page whose image has moved by (x, y), and its field there."""
+        registration = shifted(self.table["registration"], np.array(shift_px))
+        seen = (pair.in_phase, pair.quadrature, self._references.in_phase, self._references.quadrature)
+        tensors = [*(frame.astype(np.float32) for frame in seen), registration, self.table["homodyne"]]
+        measured = self.recovery.measure(*map(torch.from_numpy, tensors))
+        return measured, self.recovery.solve(measured)[0]
+
+    def check(self, page: KnownPage, calibrated: float) -> None:
+        """Check that a known page shows its symbols where this calibration says.
+
+        Args:
+            page: of the recording.
+            calibrated: coherence of the pages that were calibrated on.
+
+        Raises:
+            CalibrationError: it shows hardly more of them than chance does, or clearly less than those pages.
+        """
+        field = self.known_field(page.pair, np.angle(page.symbols))
+        sampler = FieldSampler(field, self.grid)
+        found = page_coherence(sampler, self._twin, self._parameters, self._profile, page.symbols)
+        least = max(least_coherence(page.symbols.size), LEAST_KEPT * calibrated)
+        if not found >= least:
+            raise CalibrationError(
+                "calibration against the recording",
+                f"a coherence of {found:.3f}",
+                f"at least {least:.3f}: the calibration of the device that was recorded, and the symbols of its pages",
+            )
+
+    def known_field(self, pair: FramePair, phases: Real) -> NDArray[np.complex64]:
+        """Recovered field of a known page, its image shift taken off."""
+        field = self.field(pair)
+        return self._moved(field, np.array(self.page(field, phases, np.zeros(2))[0].state.shift_px))
+
+    def pages(
+        self, recording: Recording, indices: Sequence[int], shift_px: tuple[float, float] = (0.0, 0.0)
+    ) -> Iterator[PageFeatures]:
+        """Features of the given pages, in order; the shift is followed from page to page, from `shift_px` on."""
+        shift = np.array(shift_px)
+        for index in indices:
+            symbols = recording.symbols(index)
+            assert symbols is not None
+            phases = symbol_phases(symbols, recording.levels)
+            page, shift = self.page(self.field(recording.frames(index)), phases, shift)
+            yield page
+
+    def page(self, field: NDArray[np.complex64], phases: Real, shift: Real) -> tuple[PageFeatures, Real]:
+        """Features of one page, and its shift, found from the known phases [ny, nx] starting from `shift` (x, y)."""
+        state = self.state(field, phases, shift)
+        shift, piston = np.array(state.shift_px), state.piston_rad
+        light = self._light(field, shift) if self._wave is None else localized(self._wave, self._moved(field, shift))
+        if self._wave is not None:
+            centre = light[:, 0].mean(1)
+            piston = float(np.angle(np.sum((centre[0] + 1j * centre[1]) * np.exp(-1j * phases))))
+        cos, sin = np.cos(piston), np.sin(piston)
+        turned = np.stack([light[0] * cos + light[1] * sin, light[1] * cos - light[0] * sin])
+        features = PageFeatures(
+            turned.astype(np.float16),
+            self.table["positions"],
+            phases.astype(np.float32),
+            PageState(state.shift_px, piston),
+        )
+        return features, shift
+
+    def state(self, field: NDArray[np.complex64], phases: Real, shift: Real) -> PageState:
+        """Shift and piston of a page with known phases [ny, nx]; the shift is looked for from `shift` (x, y) on."""
+        known = np.exp(-1j * phases)
+        for _ in range(2):
+            shift = shift + self._shift_step(field, known, shift)
+        piston = float(np.angle(self._agreement(self._light(field, shift), known)))
+        return PageState((float(shift[0]), float(shift[1])), piston)
+
+    def _moved(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.complex64]:
+        return moved(field, shift * self._profile.camera.pitch_m / self.grid.pitch_m)
+
+    def _light(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.float32]:
+        return demodulate(self._coherent, field, self.table, shift)
+
+    def _agreement(self, light: NDArray[np.float32], known: NDArray[np.complex128]) -> complex:
+        """Coherent sum of the branches' light with the known symbols over the page."""
+        centre = light[:, self._chosen].mean(2)
+        return complex(np.sum(self._shares * (centre[0] + 1j * centre[1]) * known))
+
+    def _shift_step(self, field: NDArray[np.complex64], known: NDArray[np.complex128], shift: Real) -> Real:
+        """Vertex of the parabola of coherent power along x and along y."""
+        here = abs(self._agreement(self._light(field, shift), known)) ** 2
+        step = np.zeros(2)
+        for axis in (0, 1):
+            probe = _PROBE_PX * np.eye(2)[axis]
+            plus = abs(self._agreement(self._light(field, shift + probe), known)) ** 2
+            minus = abs(self._agreement(self._light(field, shift - probe), known)) ** 2
+            bend = plus - 2 * here + minus
+            if bend < 0:
+                step[axis] = -_PROBE_PX * (plus - minus) / (2 * bend)
+        return np.clip(step, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
+
+
+def demodulate(
+    localizer: CoherentLocalizer, field: NDArray[np.complexfloating], table: Table, shift: Real | None = None
+) -> NDArray[np.float32]:
+    """The coherent localizer's light [2, B, S, ny, nx] of a field [Gy, Gx], seen `shift` (x, y) camera pixels on."""
+    places = table["places"]
+    if shift is not None:
+        places = places + (shift / GRID_STEP_PX).astype(np.float32)[None, :, None, None]
+    with torch.no_grad():
+        light: NDArray[np.float32] = localizer(
+            stacked(field),
+            torch.from_numpy(places),
+            torch.from_numpy(table["place_gradients"]),
+            torch.from_numpy(table["phases"]),
+        ).numpy()
+    return light
+
+
+def localized(waves: WaveLocalizer, field: NDArray[np.complexfloating]) -> NDArray[np.float32]:
+    """The wave localizer's light [2, 1, S, ny, nx] of a field [Gy, Gx]."""
+    with torch.no_grad():
+        light: NDArray[np.float32] = waves(stacked(field)).numpy()
+    return light
+
+
+def moved(field: NDArray[np.complex64], shift: Real) -> NDArray[np.complex64]:
+    """The field as seen `shift` (x, y) samples further on."""
+    real, imaginary = (ndimage.shift(part, -shift[::-1], order=3) for part in (field.real, field.imag))
+    return np.asarray(real + 1j * imaginary, dtype=np.complex64)

@@ -1,0 +1,82 @@
+"""What known pages show, against what the fitted waves say of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from lightpage.calibration.calibrate import KnownPage
+from lightpage.calibration.wave_model import FittedWaves, illumination_terms, on_modulator
+from lightpage.device.profile import Profile
+from lightpage.waves.grid import symbol_samples
+from train.data.features import FeatureExtractor
+from train.models.field import Measured
+from train.models.waves import ACCURACY
+
+_EQUATIONS = 100_000
+"""About how many samples of the common grid say by which factors the illumination varies: six unknowns."""
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+
+@dataclass(frozen=True)
+class Explained:
+    """A known page as it was measured, its image shift taken off, and as the fitted waves explain it.
+
+    Attributes:
+        measured: both equations of the field.
+        field: that solves them, complex [Gy, Gx].
+        illumination: factors of `illumination_terms` over the first, complex [6], with which the waves explain most.
+        expected: what they say then, complex [Gy, Gx], of the field's strength and piston.
+    """
+
+    measured: Measured
+    field: Complex
+    illumination: Complex
+    expected: Complex
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Where both cameras look at the common grid, bool [Gy, Gx]."""
+        return self.measured.lit.numpy().astype(bool)
+
+
+def explained(
+    extractor: FeatureExtractor, profile: Profile, parameters: Real, pages: Sequence[KnownPage]
+) -> list[Explained]:
+    """Known pages as the calibrated device measured them and its fitted waves explain them, by least squares.
+
+    The waves are as exact as those of a decoder that looks again.
+
+    Args:
+        extractor: of the device.
+        profile: the nominal device.
+        parameters: [P] fitted.
+        pages: of the device.
+    """
+    samples = symbol_samples(profile)
+    grid = extractor.grid
+    waves = FittedWaves(profile, parameters, samples, filled=True, accuracy=ACCURACY, grid=grid)
+    terms = np.stack(illumination_terms(waves.x, waves.y))
+    stride = max(1, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
+    at_few = FittedWaves(profile, parameters, samples, filled=True, stride=stride, accuracy=ACCURACY, grid=grid)
+    found = []
+    for page in tqdm(pages, desc="light of known pages", unit="page"):
+        phases = np.angle(page.symbols)
+        state = extractor.state(extractor.field(page.pair), phases, np.zeros(2))
+        with torch.no_grad():
+            measured, solved = extractor.look(page.pair, state.shift_px)
+        field, seen = solved[0].numpy() + 1j * solved[1].numpy(), measured.lit.numpy().astype(bool)
+        written = on_modulator(phases, samples)
+        few = seen[::stride, ::stride]
+        shown = np.stack([at_few.to_camera(written * term)[few] for term in terms], axis=-1)
+        factors = np.linalg.lstsq(shown, field[::stride, ::stride][few], rcond=None)[0]
+        expected = waves.to_camera(written * np.tensordot(factors, terms, 1))
+        found.append(Explained(measured, field, factors / factors[0], expected))
+    return found

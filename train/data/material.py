@@ -1,0 +1,62 @@
+"""What every way of training a decoder starts from, and what it comes to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lightpage.calibration.document import Calibration
+from lightpage.device.profile import Profile
+from lightpage.recording.reader import Recording
+from train.data.features import FeatureExtractor
+
+
+@dataclass(frozen=True)
+class Material:
+    """A recording of a calibrated device, split.
+
+    Attributes:
+        out: folder of the run.
+        recording: with symbols, open.
+        profile: the nominal device.
+        calibration: the fitted device.
+        extractor: of the calibrated device, for the run's localizer.
+        training, validation: page numbers.
+        pilot_mask: bool [ny, nx].
+        key: digest of profile, recording and calibration.
+        devices: GPUs or processes, "auto" for what is there.
+    """
+
+    out: Path
+    recording: Recording
+    profile: Profile
+    calibration: Calibration
+    extractor: FeatureExtractor
+    training: list[int]
+    validation: list[int]
+    pilot_mask: NDArray[np.bool_]
+    key: str
+    devices: int | str
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A trained decoder.
+
+    Attributes:
+        weights: by name.
+        validation_air: bits per data symbol.
+        kappa_scale: factor on p that makes the claimed concentration honest on the validation pages.
+        seconds: preparing the pages and training, all stretches together.
+        synthetic_pages: trained on beside the recorded ones.
+    """
+
+    weights: dict[str, Tensor]
+    validation_air: float
+    kappa_scale: float
+    seconds: float
+    synthetic_pages: int = 0

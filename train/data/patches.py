@@ -1,0 +1,93 @@
+"""Pages to train on, and parts of large ones: a step then sees symbols from more places and pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from lightpage.errors import InvalidInputError
+from train.data.feature_store import FeatureStore
+from train.fitting.fit import Hyperparameters, Page
+from train.models.network import reach, with_page_coordinates
+
+
+def training_pages(stores: Sequence[FeatureStore], mask: NDArray[np.bool_], choices: Hyperparameters) -> Dataset[Page]:
+    """What a network at symbol pitch trains on: whole pages, or patches where they are larger than those.
+
+    Args:
+        stores: pages of one shape.
+        mask: pilots, bool [ny, nx].
+        choices: say how large patches are, and the network.
+
+    Raises:
+        InvalidInputError: patches in which the network would not see the neighbours of a single symbol.
+    """
+    return Patches(stores, mask, choices.patch, reach(choices.blocks, choices.levels), 2**choices.levels)
+
+
+class Patches(Dataset[Page]):
+    """Patches of pages, at a place drawn anew each time; whole pages where they are no larger.
+
+    An item is a page's as of `FeatureStore`, cut; its positions also hold column and row on the page (see
+    `with_page_coordinates`), and phases that are not to be learnt from are NaN: pilots, and a rim.
+
+    Args:
+        stores, mask: as for `training_pages`.
+        side: symbols along an edge.
+        rim: symbols along a patch's edge that are shown and not asked for: the network misses their neighbours.
+        step: places lie on multiples of it, as the network's lower levels do.
+
+    Raises:
+        InvalidInputError: patches that are all rim.
+    """
+
+    def __init__(
+        self, stores: Sequence[FeatureStore], mask: NDArray[np.bool_], side: int, rim: int, step: int = 1
+    ) -> None:
+        self._rim, self._step = rim, step
+        self._places = [(store, index) for store in stores for index in range(len(store))]
+        self._shape = mask.shape
+        # the last place lies on the step too
+        self._sides = tuple(min(count, side - (side - count) % step) for count in mask.shape)
+        if any(own < count and own <= 2 * rim for own, count in zip(self._sides, mask.shape, strict=True)):
+            wanted = f"at least {2 * rim + step}: more than twice what the network sees"
+            raise InvalidInputError("patch", f"{side} symbols", wanted)
+        self._mask = torch.from_numpy(mask)
+        self._each = int(np.prod([np.ceil(count / side) for count in mask.shape]))
+
+    def __len__(self) -> int:
+        """As many as cover all pages."""
+        return len(self._places) * self._each
+
+    def __getitem__(self, index: int) -> Page:
+        """A patch of page `index // patches of a page`."""
+        store, page = self._places[index // self._each]
+        starts = [self._start(count, side) for count, side in zip(self._shape, self._sides, strict=True)]
+        rows, columns = (slice(start, start + side) for start, side in zip(starts, self._sides, strict=True))
+        light, positions, *belief, phases = store.part(page, rows, columns)
+        where = with_page_coordinates(positions, self._shape, (rows, columns))
+        return light, where, *belief, torch.where(self._asked(rows, columns), phases, torch.nan)
+
+    def _start(self, count: int, side: int) -> int:
+        """Where a patch begins on an axis: drawn from beyond the page too, so that its edge is asked for as often."""
+        if side == count:
+            return 0
+        beyond = max(0, side - 2 * self._rim - 1)  # an axis shorter than that has one place
+        drawn = int(torch.randint(-beyond, count - side + beyond + 1, ()))
+        return min(max(drawn, 0), count - side) // self._step * self._step
+
+    def _asked(self, rows: slice, columns: slice) -> Tensor:
+        """Symbols of a patch that are data and have their neighbours, or the page's edge, around them."""
+        asked = ~self._mask[rows, columns]
+        for axis, (part, count) in enumerate(zip((rows, columns), self._shape, strict=True)):
+            along = asked if axis == 0 else asked.T
+            if part.start > 0:
+                along[: self._rim] = False
+            if part.stop < count:
+                along[-self._rim :] = False
+        return asked

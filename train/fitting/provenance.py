@@ -1,0 +1,60 @@
+"""Where a trained artefact comes from."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from lightpage.files import replace_text
+
+CHANGED = "+changes"
+"""Follows the commit where files that it holds are changed."""
+_FIRST = "begun_by.json"
+
+
+def provenance() -> dict[str, Any]:
+    """The command that is running, and the commit of this source tree when first asked for, empty without one."""
+    return {"command": f"{_program()} {shlex.join(sys.argv[1:])}".strip(), "commit": _commit()}
+
+
+def provenance_of(folder: Path) -> dict[str, Any]:
+    """The same of work that goes on in a folder: also the commit that it was begun with, where that was another.
+
+    Asked for before the work, it notes there who begins it.
+    """
+    now, path = provenance(), folder / _FIRST
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        replace_text(path, json.dumps(now) + "\n", "origin of a training")
+    begun = json.loads(path.read_text("utf-8"))["commit"]
+    return now if begun == now["commit"] else now | {"begun_at_commit": begun}
+
+
+def _program() -> str:
+    """How the running program was started."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    return f"python -m {spec.name}" if spec is not None else Path(sys.argv[0]).name
+
+
+@cache
+def _commit() -> str:
+    """Asked for once: what is committed while a process works is not what it runs."""
+    tree = Path(__file__).parent.parent
+    toplevel, _, commit = _git(tree, "rev-parse", "--show-toplevel", "HEAD").partition("\n")
+    if not commit or Path(toplevel) != tree.resolve():
+        return ""
+    return commit + (CHANGED if _git(tree, "status", "--porcelain", "--untracked-files=no") else "")
+
+
+def _git(tree: Path, *arguments: str) -> str:
+    """What git answers, empty where there is none or it refuses."""
+    try:
+        done = subprocess.run(["git", "-C", str(tree), *arguments], capture_output=True, text=True, check=False)
+    except OSError:
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""

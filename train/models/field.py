@@ -1,0 +1,286 @@
+"""Two camera frames to one complex field: resampling to the common grid and solving the |E|^2 term.
+
+With the reference-only frame R of a camera and e = E/r, E the signal against a reference of amplitude r,
+
+    A = (I - R_I) / (2 R_I) = Re e + |e|^2 / 2
+    B = (Q - R_Q) / (2 R_Q) = Re(e exp(-i turn)) + |e|^2 / 2
+
+where `turn` is +90 or -90 degrees, by the sign of Q, plus the quadrature error. The cameras' gains cancel.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lightpage.calibration.sampling_table import monomial_powers
+from lightpage.calibration.wave_fit import READ_NOISE
+from lightpage.device.profile import Profile
+from lightpage.errors import InvalidInputError
+from lightpage.recording.reader import FramePair
+from lightpage.waves.grid import FieldGrid, field_grid
+from train.models.filters import SeparableFilter
+
+ROUNDS = 6
+"""Of descent; beyond these the band filter's ripple adds up."""
+_STEP = 0.9
+"""Along the weighted gradient: the weights bound the curvature by 2, and step times curvature must stay below 2."""
+_MOMENTUM = 0.5
+_CUBIC = 3
+_REFERENCE_BLOCK_PX = 4
+"""Side of the blocks of pixels whose mean stands for a reference."""
+_REFERENCE_STEP = 4
+"""Grid samples from one place to the next where those are read."""
+_FLOOR = 0.1
+"""Least reference, as a share of its mean, that frames are divided by: outside the beam there is nothing to learn."""
+
+
+class Measured(NamedTuple):
+    """What the cameras measured on the common grid, [ny, nx] each but the turn's cosine and sine.
+
+    Attributes:
+        a, b: left sides of the two equations, zero where a camera has no reference.
+        cos, sin: of the turn between the arms.
+        amplitude: the reference's over its mean, by which e becomes E.
+        lit: one where both cameras have a reference, else zero.
+    """
+
+    a: Tensor
+    b: Tensor
+    cos: Tensor
+    sin: Tensor
+    amplitude: Tensor
+    lit: Tensor
+
+    def left(self, e: Tensor) -> tuple[Tensor, Tensor]:
+        """What is left of the two equations at e, [2, ny, nx] real and imaginary part."""
+        real, imaginary = e[0], e[1]
+        half_power = (real * real + imaginary * imaginary) / 2
+        return self.a - real - half_power, self.b - self.cos * real - self.sin * imaginary - half_power
+
+    def pull(self, e: Tensor, floor: Tensor | float) -> Tensor:
+        """How the measurements pull at e: the gradient of their likelihood, [2, ny, nx].
+
+        An equation's variance is that of its camera's photons, |1 + e|^2 or |exp(i turn) + e|^2, and of its
+        electronics, the `floor`. The first is also the squared length of its gradient, so a step along the sum needs
+        no matrix.
+        """
+        left_a, left_b = self.left(e)
+        a_re, a_im, b_re, b_im = 1 + e[0], e[1], self.cos + e[0], self.sin + e[1]
+        pull_a = left_a / (a_re * a_re + a_im * a_im + floor)
+        pull_b = left_b / (b_re * b_re + b_im * b_im + floor)
+        return torch.stack([a_re * pull_a + b_re * pull_b, a_im * pull_a + b_im * pull_b])
+
+
+class FieldRecovery(nn.Module):
+    """Frames and references to the field on the common grid.
+
+    Args:
+        profile: the nominal device.
+        with_signal_power: whether the frames hold |E|^2; an oracle takes it off beforehand, and the equations are then
+            linear.
+        rounds: of descent.
+        binning: camera pixels along each axis whose mean is sampled; one filters the frames first instead, which takes
+            longer and loses less.
+        grid: the common grid, where it is not the usual one.
+
+    Raises:
+        InvalidInputError: a binning that the blocks of the reference are no multiple of.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        *,
+        with_signal_power: bool = True,
+        rounds: int = ROUNDS,
+        binning: int = 1,
+        grid: FieldGrid | None = None,
+    ) -> None:
+        super().__init__()
+        if binning < 1 or _REFERENCE_BLOCK_PX % binning:
+            raise InvalidInputError("binning, camera pixels", binning, f"a divisor of {_REFERENCE_BLOCK_PX}")
+        self.with_signal_power, self.rounds, self.binning = with_signal_power, rounds, binning
+        grid = grid or field_grid(profile)
+        self.grid = grid
+        self.rows_px, self.columns_px = profile.frame_shape
+        # the outer pixels' centres, where blocks' outer edges lie at -1 and 1
+        blocked = [(count, -(-count // binning) * binning) for count in profile.frame_shape]
+        self._edge = min(min(1 - 1 / extent, (2 * count - 1) / extent - 1) for count, extent in blocked)
+        corner = profile.corner_m
+        self.prefilter = SeparableFilter(grid.prefilter)
+        self.band = SeparableFilter(grid.band)
+        self.u: Tensor
+        self.v: Tensor
+        self.between_x: Tensor
+        self.between_y: Tensor
+        for power_name, between, axis in (("u", "between_x", grid.x_m), ("v", "between_y", grid.y_m)):
+            powers = np.stack([(axis / corner) ** power for power in range(_CUBIC + 1)])
+            self.register_buffer(power_name, torch.tensor(powers, dtype=torch.float32))
+            self.register_buffer(between, torch.tensor(_interpolation(len(axis)), dtype=torch.float32))
+
+    def forward(self, *seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Recover the field; arguments as for `measure`, results as of `solve`."""
+        return self.solve(self.measure(*seen))
+
+    def measure(
+        self,
+        in_phase: Tensor,
+        quadrature: Tensor,
+        reference_in_phase: Tensor,
+        reference_quadrature: Tensor,
+        registration: Tensor,
+        homodyne: Tensor,
+    ) -> Measured:
+        """Both cameras' measurements on the common grid.
+
+        Args:
+            in_phase, quadrature: raw frames [H, W], any number type.
+            reference_in_phase, reference_quadrature: reference-only frames [H, W], counts.
+            registration: [2, 2, 10], pixel (column, row) of each camera as a cubic in the grid's (x, y), each over
+                the page's corner radius.
+            homodyne: [2], cosine and sine of the turn between the two arms.
+        """
+        frames = _block_means(torch.stack([in_phase, quadrature]).to(torch.float32), self.binning)
+        references = _block_means(
+            torch.stack([reference_in_phase, reference_quadrature]).to(torch.float32), self.binning
+        )
+        where = self._where(registration, self.binning)
+        beyond = frames - references
+        if self.binning == 1:
+            beyond = self.prefilter(beyond)
+        gained = _sampled(beyond, where)
+        reference = self._reference(references, registration)
+        floor = _FLOOR * references.mean(dim=(1, 2))[:, None, None]
+        seen = (where.abs().amax(dim=-1) <= self._edge) & (reference > floor)
+        lit = (seen[0] & seen[1]).to(torch.float32)
+        reference = torch.maximum(reference, floor)
+        a, b = lit * gained / (2 * reference)
+        amplitude = torch.sqrt(reference[0])
+        return Measured(a, b, homodyne[0], homodyne[1], amplitude / amplitude.mean(), lit)
+
+    def solve(self, measured: Measured) -> tuple[Tensor, Tensor]:
+        """Solve what was measured.
+
+        Returns:
+            field: [2, ny, nx], real and imaginary part of E over the reference amplitude's mean on the grid.
+            residual: [2, ny, nx], what is left of the two equations inside the pipe's band, over the mean reference
+                amplitude; large against the field when the frames do not belong to this calibration.
+        """
+        e = self._solve(measured)
+        residual = self.band(torch.stack(measured.left(e)) * measured.amplitude)
+        return e * measured.amplitude, residual
+
+    def innovation(self, measured: Measured, field: Tensor, floor: Tensor | float) -> Tensor:
+        """What was measured beyond what a predicted field would show, as a change of the field.
+
+        Args:
+            measured: of the frames.
+            field: predicted E [2, ny, nx], as `solve` returns it.
+            floor: see `Measured.pull`.
+
+        Returns:
+            [2, ny, nx], inside the pipe's band; the sum over both equations, each weighted by what it tells.
+        """
+        pull = measured.lit * measured.pull(field / measured.amplitude, floor)
+        return torch.as_tensor(self.band(pull * measured.amplitude))
+
+    def _solve(self, measured: Measured) -> Tensor:
+        """Solve the two equations for e, [2, ny, nx].
+
+        Each sample alone is a quadratic with two roots, which meet where the signal outshines the reference. So: the
+        closed root nearer to the linear estimate, then descent with momentum towards the most likely field in the
+        pipe's band.
+        """
+        a, b, cos, sin, amplitude, _ = measured
+        start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) / amplitude
+        if not self.with_signal_power:
+            return torch.as_tensor(start)
+        # Im e = slope Re e - offset, from the difference of the equations; then a quadratic in Re e
+        slope, offset = (1 - cos) / sin, (a - b) / sin
+        quadratic = 1 + slope * slope
+        linear = 1 - slope * offset
+        discriminant = linear * linear - quadratic * (offset * offset - 2 * a)
+        middle = -linear / quadratic
+        real = middle + torch.sign(start[0] - middle) * torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
+        before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) / amplitude
+        for _ in range(self.rounds):
+            ahead = estimate + _MOMENTUM * (estimate - before)
+            step = _STEP * measured.pull(ahead, READ_NOISE)
+            before, estimate = estimate, self.band((ahead + step) * amplitude) / amplitude
+        return torch.as_tensor(estimate)
+
+    def _where(self, registration: Tensor, side: int, step: int = 1) -> Tensor:
+        """Where every `step`-th grid sample lies in frames of blocks of pixels, [2, ny, nx, 2] for grid_sample.
+
+        From -1 to 1 between the outer edges of the blocks.
+        """
+        size = registration.new_tensor([-(-count // side) * side for count in (self.columns_px, self.rows_px)])
+        cubic = 2 * registration / size[:, None]
+        centre = (1 / size - 1)[:, None].expand(2, 2, 1)
+        cubic = torch.cat([cubic[..., :1] + centre, cubic[..., 1:], torch.zeros_like(cubic[..., :1])], dim=-1)
+        powers = monomial_powers()
+        absent = len(powers)
+        table = [
+            [powers.index((i, j)) if (i, j) in powers else absent for i in range(_CUBIC + 1)] for j in range(_CUBIC + 1)
+        ]
+        by_power = cubic[..., torch.tensor(table, device=cubic.device)]  # [2, 2, powers of y, powers of x]
+        along_rows = (by_power @ self.u[:, ::step]).permute(0, 2, 3, 1)
+        places = self.v[:, ::step].T @ along_rows.flatten(2)
+        return places.reshape(*places.shape[:2], -1, 2)
+
+    def _reference(self, references: Tensor, registration: Tensor) -> Tensor:
+        """Binned references on the grid, [2, ny, nx]: beams are smooth, so few places are looked at."""
+        coarse = self._where(registration, _REFERENCE_BLOCK_PX, _REFERENCE_STEP)
+        blocks = _block_means(references, _REFERENCE_BLOCK_PX // self.binning)
+        return self.between_y @ _sampled(blocks, coarse) @ self.between_x.T
+
+
+def _block_means(images: Tensor, side: int) -> Tensor:
+    """Means of blocks of pixels of images [2, H, W]."""
+    if side == 1:
+        return images
+    return functional.avg_pool2d(images[:, None], side, ceil_mode=True, count_include_pad=False)[:, 0]
+
+
+def _sampled(images: Tensor, where: Tensor) -> Tensor:
+    """Images [2, H, W] interpolated where `FieldRecovery._where` says, [2, ny, nx]."""
+    seen = functional.grid_sample(images[:, None], where, mode="bilinear", padding_mode="border", align_corners=False)
+    return seen[:, 0]
+
+
+def _interpolation(count: int) -> NDArray[np.float64]:
+    """Linear interpolation from every `_REFERENCE_STEP`-th of so many samples to all, [count, coarse]."""
+    coarse = np.arange(0, count, _REFERENCE_STEP)
+    return np.stack([np.interp(np.arange(count), coarse, unit) for unit in np.eye(len(coarse))], axis=1)
+
+
+def relative_power(residual: Tensor, field: Tensor) -> Tensor:
+    """Power of the residual over that of the field, scalar."""
+    return (residual * residual).mean() / (field * field).mean()
+
+
+class TorchFieldSolver:
+    """`FieldRecovery` behind the numpy interface that registration takes (`FieldSolver`)."""
+
+    def __init__(self, recovery: FieldRecovery) -> None:
+        self._recovery = recovery
+
+    def __call__(
+        self, pair: FramePair, references: FramePair, registration: NDArray[np.float32], homodyne: NDArray[np.float32]
+    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+        """See `lightpage.calibration.interfaces.FieldSolver`."""
+        frames = (pair.in_phase, pair.quadrature, references.in_phase, references.quadrature)
+        with torch.no_grad():
+            field, residual = self._recovery(
+                *(torch.from_numpy(frame.astype(np.float32)) for frame in frames),
+                torch.from_numpy(registration),
+                torch.from_numpy(homodyne),
+            )
+        real, imaginary = field.numpy()
+        return np.asarray(real + 1j * imaginary, dtype=np.complex64), residual.numpy()

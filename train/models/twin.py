@@ -1,0 +1,222 @@
+"""The differentiable ray twin: where each branch of a page point lands on the cameras, and with what phase.
+
+A collimated beam leaves SLM point (x, y) with transverse wave vector k = -(k0/f)(x, y). Each wall n.r = c that it meets
+maps k to k - 2(k.n)n and adds the phase 2(k.n)c + pi; the glass adds (kz - nk0)L; the beam lands at -f k'/k0.
+A real lens adds a phase to each ray: a phase and a tilt, about the middle of the part of the facet that a branch fills.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.polynomial.legendre import leggauss
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from lightpage.calibration.interfaces import BRANCHES, Rays
+from lightpage.calibration.parameters import NAMES
+from lightpage.calibration.phases import camera_phase, launch_phase
+from lightpage.device.lens_path import SeidelTerms
+from lightpage.device.profile import Profile
+
+_WIDEST_SPREAD = 1.05
+"""Headroom on the nominal exit centroid when counting how many walls a beam can meet."""
+_LANDINGS = 3
+"""Rounds in which a place and the second lens's tilt there are made to agree: each leaves a hundredth of the error."""
+_NODES = 8
+"""Places along an axis of the facet that stand for a symbol's light there."""
+_DARK = 1e-12
+"""Light below which a part of the facet has no middle, over what the symbol sends at most."""
+
+Real = NDArray[np.float64]
+
+
+class RayTwin(nn.Module):
+    """Ray tracer of one nominal device; all that can deviate comes in as `parameters`.
+
+    Computes in float64: phases run to thousands of radians.
+
+    Args:
+        profile: the nominal device.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        super().__init__()
+        self.wave_number = 2 * math.pi / profile.light.wavelength_m
+        self.index = profile.pipe.refractive_index
+        self.focal_length = profile.lens.focal_length_m
+        self.pipe_length = profile.pipe.length_m
+        self.pipe_width = profile.pipe.width_m
+        self.pipe_angle = math.radians(profile.pipe.angle_deg)
+        self.half_width = profile.page_width_m / 2
+        self.half_height = profile.page_height_m / 2
+        self.corner = profile.corner_m
+        self.seidel_terms = profile.seidel_terms
+        self.ideal_lenses = profile.ideal_lenses
+        self.symbol_pitch = profile.symbol_pitch_m
+        self.camera_pitch = profile.camera.pitch_m
+        self.camera_centre = ((profile.camera.columns_px - 1) / 2, (profile.camera.rows_px - 1) / 2)
+        spread = self.pipe_length / self.focal_length / self.index / self.pipe_width * _WIDEST_SPREAD
+        self.walls_met = math.ceil(max(self.half_width, self.half_height) * spread) + 1
+
+    def forward(
+        self, parameters: Tensor, points: Tensor, anchors: Tensor, places: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Both questions at once: rays of page points, and pixels of camera-plane places.
+
+        Args:
+            parameters: [P] float64.
+            points: [N, 2] page points (x, y), metres from the page's centre.
+            anchors: [N, 2] points that decide the cells.
+            places: [M, 2] camera-plane points, metres.
+
+        Returns:
+            places [B, N, 2], phases [B, N], positions [N, 2], pixels [2, M, 2].
+        """
+        value = dict(zip(NAMES, parameters.unbind(0), strict=True))
+        return (*self._trace(value, points, anchors), self._pixels(value, places))
+
+    def _trace(self, value: dict[str, Tensor], points: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        focal = self.focal_length * (1 + value["focal_length_relative"])
+        length = self.pipe_length * (1 + value["pipe_length_relative"])
+        width = self.pipe_width * (1 + value["pipe_width_relative"])
+        angle = self.pipe_angle + value["pipe_angle_rad"]
+        roll = value["pipe_roll_rad"]
+        centre = torch.stack([value["page_centre_x_m"], value["page_centre_y_m"]])
+        wall_offset = torch.stack([value["pipe_centre_x_m"], value["pipe_centre_y_m"]])
+        nk = self.index * self.wave_number
+        zero, one = torch.zeros_like(angle), torch.ones_like(angle)
+        normals = {"x": torch.stack([one, zero]), "y": torch.stack([torch.sin(angle), torch.cos(angle)])}
+
+        def in_pipe(at: Tensor) -> Tensor:
+            return _turn(at + centre, -roll)
+
+        def exit_centroid(k: Tensor) -> Tensor:
+            kz = torch.sqrt(nk**2 - (k * k).sum(-1))
+            reach = length / width / kz
+            return torch.stack([k @ normals["x"] * reach, k @ normals["y"] * reach], dim=-1)
+
+        def bent_by(path: SeidelTerms, field: Tensor, facet: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
+            """What a lens's path adds to k, and to the phase, of light that fills a part of the facet: [N, 2] and [N].
+
+            The part has its middle at `facet`, as (X, Y'), and the variance `spread` along either axis, [N, 2].
+            """
+            x, y = facet[:, 0], (facet[:, 1] - facet[:, 0] * torch.sin(angle)) / torch.cos(angle)
+            at = field[:, 0], field[:, 1], x, y
+            (slope_x, slope_y), (bend_x, bend_y) = path.slope(*at), path.bend(*at)
+            middle = path.of_field(field[:, 0], field[:, 1]) + path.of_both(*at)
+            mean = middle + (bend_x * spread[:, 0] + bend_y * spread[:, 1]) / 2
+            return torch.stack([slope_x, slope_y], dim=-1), mean - slope_x * x - slope_y * y
+
+        per_metre = self.wave_number / focal
+        path = self.seidel_terms(1 + value["lens_path_relative"])
+        starts = in_pipe(points)
+        straight = -per_metre * starts
+        positions = exit_centroid(straight)
+        at_launch = launch_phase(value, points[:, 0] / self.corner, points[:, 1] / self.corner)
+        cells = exit_centroid(-per_metre * in_pipe(anchors)).detach()
+        even = 2 * torch.round(cells / 2)
+        odd = 2 * torch.floor(cells / 2) + 1
+
+        landings, phases = [], []
+        for branch in BRANCHES:
+            crossed = {"x": (odd if "x" in branch else even)[:, 0], "y": (odd if "y" in branch else even)[:, 1]}
+            k, phase = straight, at_launch
+            met = torch.stack([crossed["x"], crossed["y"]], dim=-1)
+            if not self.ideal_lenses:
+                entrance, leaves, spread = self._filled(met, positions, width, focal)
+                tilt, more = bent_by(path, starts, entrance, spread)
+                k, phase = k + tilt, phase + more
+            squared = (k * k).sum(-1)
+            phase = phase - squared / (torch.sqrt(nk**2 - squared) + nk) * length
+            for name in "yx" if branch == "yx" else "xy":
+                k, phase = self._reflect(k, phase, normals[name], crossed[name], width, wall_offset["xy".index(name)])
+            landing = -k / per_metre
+            if not self.ideal_lenses:
+                for _ in range(_LANDINGS):
+                    tilt, more = bent_by(path.mirrored(), landing, leaves, spread)
+                    landing = (tilt - k) / per_metre
+                phase = phase - more
+            landing = _turn(landing, roll)
+            landings.append(landing)
+            x, y = landing[:, 0] / self.corner, landing[:, 1] / self.corner
+            edges = self.half_width / self.corner, self.half_height / self.corner
+            phases.append(phase + camera_phase(value, x, y, *edges))
+        return torch.stack(landings), torch.stack(phases), positions
+
+    def _filled(self, met: Tensor, positions: Tensor, width: Tensor, focal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Where light that leaves through the cells `met` enters and leaves, for exit centroids `positions`, [N, 2].
+
+        Returns:
+            Mean places at entrance and exit, and variance along either axis, [N, 2]; weighted by a symbol's light.
+        """
+        shifted = torch.clamp(met - positions, -1, 1)
+        low, high = torch.clamp(shifted - 0.5, min=-0.5), torch.clamp(shifted + 0.5, max=0.5)
+        u, weight = (torch.from_numpy(array).to(met.device) for array in leggauss(_NODES))
+        places = width * ((low + high)[..., None] / 2 + (high - low)[..., None] / 2 * u)
+        light = weight * torch.sinc(places * self.symbol_pitch * self.wave_number / (2 * math.pi * focal)) ** 2
+        total = light.sum(-1) + _DARK
+        mean = (light * places).sum(-1) / total
+        leaves = torch.where(torch.remainder(met, 2) == 0, 1, -1) * (mean - width * shifted)
+        return mean, leaves, (light * places**2).sum(-1) / total - mean**2
+
+    def _reflect(
+        self, k: Tensor, phase: Tensor, normal: Tensor, cells: Tensor, width: Tensor, offset: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Reflect |cells| times on the pair of walls with `normal`, starting with the wall on the cells' side."""
+        for met in range(self.walls_met):
+            hit = (torch.abs(cells) > met).to(k.dtype)
+            wall = torch.sign(cells) * (width / 2) * (-1) ** met + offset
+            along = (k @ normal) * hit
+            phase = phase + 2 * along * wall + math.pi * hit
+            k = k - 2 * along[:, None] * normal
+        return k, phase
+
+    def _pixels(self, value: dict[str, Tensor], places: Tensor) -> Tensor:
+        radius2 = (places * places).sum(-1, keepdim=True) / self.corner**2
+        seen = places * (1 + value["distortion_relative"] * radius2) / self.camera_pitch
+        x, y = seen[:, 0], seen[:, 1]
+        cameras = []
+        for camera in ("in_phase", "quadrature"):
+            column = (1 + value[f"{camera}_scale_x_relative"]) * x + value[f"{camera}_turn_xy_slope"] * y
+            row = value[f"{camera}_turn_yx_slope"] * x + (1 + value[f"{camera}_scale_y_relative"]) * y
+            column = column + value[f"{camera}_shift_x_px"] + self.camera_centre[0]
+            row = row + value[f"{camera}_shift_y_px"] + self.camera_centre[1]
+            cameras.append(torch.stack([column, row], dim=-1))
+        return torch.stack(cameras)
+
+
+def _turn(points: Tensor, angle: Tensor) -> Tensor:
+    """Rotate [N, 2] from x towards y."""
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    x, y = points[:, 0], points[:, 1]
+    return torch.stack([x * cos - y * sin, x * sin + y * cos], dim=-1)
+
+
+class TorchTwin:
+    """`RayTwin` behind the numpy interface that registration takes (`lightpage.calibration.interfaces.Twin`)."""
+
+    def __init__(self, twin: RayTwin) -> None:
+        self.module = twin
+
+    def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
+        """See `lightpage.calibration.interfaces.Twin`."""
+        decided_by = points if anchors is None else anchors
+        places, phases, positions, _ = self._run(parameters, points, decided_by, points[:1])
+        return Rays(places, phases, positions)
+
+    def pixels(self, parameters: Real, places: Real) -> Real:
+        """See `lightpage.calibration.interfaces.Twin`."""
+        return self._run(parameters, places[:1], places[:1], places)[3]
+
+    def _run(self, parameters: Real, *inputs: Real) -> tuple[Real, ...]:
+        vector = torch.tensor(parameters, dtype=torch.float64)
+        tensors = [torch.tensor(array, dtype=torch.float64) for array in inputs]
+        with torch.no_grad():
+            if vector.ndim == 1:
+                outputs = self.module(vector, *tensors)
+            else:
+                outputs = torch.func.vmap(self.module, in_dims=(0, *(None for _ in tensors)))(vector, *tensors)
+        return tuple(output.numpy() for output in outputs)

@@ -1,0 +1,1 @@
+"""How a decoder comes to be, from recording to run."""

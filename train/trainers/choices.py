@@ -1,0 +1,231 @@
+"""What `lightpage train` lets one choose of a decoder and its training: one table, read by the command."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from lightpage.device.profile import Profile, load_profile
+from lightpage.errors import InvalidInputError
+from lightpage.waves.grid import GRID_STEP_PX
+from train.fitting.fit import Hyperparameters
+from train.models.decoder import LOCALIZERS, WAVE
+from train.models.localizers.coherent import BICUBIC, BILINEAR
+from train.published.decoder import LENS_CHOICES
+from train.published.localizers import NAMES as PUBLISHED
+from train.published.recipe import PublishedRecipe, published_choices
+from train.published.training import PublishedChoices
+from train.trainers.symbols import USUAL_REFINEMENTS, SymbolRecipe, default_synthetic_pages
+
+_ALL = (*PUBLISHED, *LOCALIZERS)
+_COHERENT = tuple(name for name in LOCALIZERS if name != WAVE)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """An option that says how to train.
+
+    Attributes:
+        flag: on the command line.
+        type: click's.
+        what: it does.
+        default: what holds without it at symbol pitch; the value of `Hyperparameters` if left out.
+        published: what holds without it for the published decoders, where they have it.
+        localizers: that have it.
+    """
+
+    flag: str
+    type: click.ParamType[Any] | type
+    what: str
+    default: object = None
+    published: object = None
+    localizers: tuple[str, ...] = _ALL
+
+    @property
+    def name(self) -> str:
+        """Of the parameter."""
+        return self.flag.removeprefix("--").replace("-", "_")
+
+    @property
+    def help(self) -> str:
+        """With what holds without it."""
+        if self.localizers == PUBLISHED:
+            return f"{self.what} [default: {self.published}; only with {', '.join(PUBLISHED)}]"
+        value = getattr(Hyperparameters, self.name) if self.default is None else self.default
+        usual = format(value, "g") if isinstance(value, float) else value
+        if self.localizers != _ALL:
+            return f"{self.what} [default: {usual}; only with {', '.join(self.localizers)}]"
+        return f"{self.what} [default: {usual}" + (f"; published: {self.published}]" if self.published else "]")
+
+
+CHOICES = (
+    Choice(
+        "--steps",
+        click.IntRange(min=10),
+        "Optimiser steps: 300 for a first try, thousands for all that a device gives.",
+        published="50 passes over the pages, fewer for symbols larger than 4x4",
+    ),
+    Choice(
+        "--batch", click.IntRange(min=1), "Pages, or patches of large ones, a step.", published=PublishedChoices.batch
+    ),
+    Choice(
+        "--patch",
+        click.IntRange(min=16),
+        "Larger pages are trained on in patches with so many symbols along an edge.",
+        localizers=LOCALIZERS,
+    ),
+    Choice(
+        "--channels",
+        click.IntRange(min=4),
+        "Of the network.",
+        published="32, and twice as many below sample pitch",
+    ),
+    Choice(
+        "--blocks",
+        click.IntRange(min=1),
+        "Residual blocks of the network, at each of its levels.",
+        localizers=LOCALIZERS,
+    ),
+    Choice(
+        "--levels",
+        click.IntRange(min=0, max=4),
+        "Levels of the network below symbol pitch; 0 is the flat one.",
+        localizers=LOCALIZERS,
+    ),
+    Choice(
+        "--refinements",
+        click.IntRange(min=0, max=4),
+        "How often the decoder looks again, for what the symbols decoded so far do not explain.",
+        USUAL_REFINEMENTS,
+        localizers=LOCALIZERS,
+    ),
+    Choice(
+        "--field-rounds",
+        click.IntRange(min=0, max=20),
+        "Of descent to the field: fewer are faster, and lose most where the light is bright.",
+        localizers=LOCALIZERS,
+    ),
+    Choice(
+        "--binning",
+        click.IntRange(min=1, max=2),
+        "Camera pixels along each axis whose mean is sampled, instead of filtering frames first: 2 is quicker and less "
+        "exact.",
+        localizers=LOCALIZERS,
+    ),
+    Choice(
+        "--field-step",
+        click.IntRange(min=GRID_STEP_PX),
+        "Camera pixels from one sample of the field to the next: more are quicker and less exact.",
+        localizers=LOCALIZERS,
+    ),
+    Choice(
+        "--samples",
+        click.IntRange(min=0, max=16),
+        "Samples per symbol and axis that the localizer reads; 0 takes as many as the field has.",
+        localizers=_COHERENT,
+    ),
+    Choice(
+        "--interpolation",
+        click.Choice([BICUBIC, BILINEAR]),
+        "How it reads them off its grid: bilinear is quicker and less exact.",
+        localizers=_COHERENT,
+    ),
+    Choice(
+        "--lenses",
+        click.Choice(LENS_CHOICES),
+        "Lenses that the published rays are traced through.",
+        published="those of the profile",
+        localizers=PUBLISHED,
+    ),
+    Choice(
+        "--learning-rate",
+        float,
+        "Peak of the one-cycle schedule, or that of the published network.",
+        published=f"{PublishedChoices.decoder_rate:g}",
+    ),
+    Choice(
+        "--precision",
+        click.Choice(["bf16-mixed", "16-mixed", "32-true"]),
+        "Of the network's arithmetic; bf16-mixed is fastest where the processor has it.",
+    ),
+    Choice("--seed", click.IntRange(min=0), "Of initial weights, batches and rotations."),
+    Choice(
+        "--synthetic-pages",
+        click.IntRange(min=0),
+        "Pages that the fitted device would show after drifts, trained on beside the recorded ones.",
+        f"{default_synthetic_pages(load_profile('bench'))}, of larger pages fewer",
+        localizers=LOCALIZERS,
+    ),
+    Choice(
+        "--start",
+        click.Path(path_type=Path),
+        "Finished run whose weights this one begins with.",
+        "random ones",
+        localizers=LOCALIZERS,
+    ),
+)
+
+C = TypeVar("C", bound=Callable[..., Any])
+
+
+def with_choices(command: C) -> C:
+    """Give a command the options of `CHOICES`; what is not given comes as None."""
+    for choice in reversed(CHOICES):
+        command = click.option(choice.flag, type=choice.type, help=choice.help)(command)
+    return command
+
+
+def given_choices(localizer: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of `CHOICES` that were given, by name.
+
+    Raises:
+        InvalidInputError: an option that the localizer does not have, or one that cannot be.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    for choice in CHOICES:
+        if choice.name in given and localizer not in choice.localizers:
+            raise InvalidInputError(choice.flag, given[choice.name], f"no such option with --localizer {localizer}")
+    rate = given.get("learning_rate", 1.0)
+    if not (math.isfinite(rate) and rate > 0):
+        raise InvalidInputError("--learning-rate", rate, "a positive number")
+    return given
+
+
+def chosen_recipe(
+    localizer: str, profile: Profile, pages: int, given: dict[str, Any]
+) -> SymbolRecipe | PublishedRecipe:
+    """The way of training that was chosen; what was not stays as it is by default, or as its authors had it.
+
+    Args:
+        localizer: name.
+        profile: the nominal device.
+        pages: to train on.
+        given: see `given_choices`.
+
+    Raises:
+        InvalidInputError: a run to start from that is not finished, or of another size; a grid too coarse for the
+            device.
+    """
+    given = dict(given)
+    if localizer in PUBLISHED:
+        return _published(localizer, published_choices(localizer, profile, pages, given.pop("batch", None)), given)
+    synthetic = given.pop("synthetic_pages", default_synthetic_pages(profile))
+    start = given.pop("start", None)
+    choices = replace(Hyperparameters(refinements=USUAL_REFINEMENTS), **given)
+    choices.grid(profile)
+    recipe = SymbolRecipe(localizer, choices, synthetic, start)
+    recipe.check_start(profile)
+    return recipe
+
+
+def _published(localizer: str, defaults: PublishedChoices, given: dict[str, Any]) -> PublishedRecipe:
+    if "channels" in given:
+        given["channels"] = (given["channels"], 2 * given["channels"])
+    if "learning_rate" in given:
+        given["decoder_rate"] = given.pop("learning_rate")
+    return PublishedRecipe(localizer, replace(defaults, **given))

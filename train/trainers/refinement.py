@@ -1,0 +1,250 @@
+"""Looking again: what the decoded page would have shown, against what was seen.
+
+A first look knows neither |E|^2 nor what neighbouring symbols spill into a symbol. Once most is decoded, the wave model
+says both: the expected page is sent through the device, its light is taken off both frames with each measurement
+weighted by what it tells at that light, and what remains is brought back to the page. That is one step of Gauss and
+Newton towards the most likely page; a small network takes it, for the waves are not quite the device's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, repeat
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lightpage.calibration.wave_model import illumination_terms
+from lightpage.device.profile import Profile
+from lightpage.recording.reader import Recording
+from lightpage.waves.grid import FieldGrid
+from train.data.feature_store import FeatureStore, fill
+from train.data.features import FeatureExtractor, PageFeatures
+from train.data.known_light import Explained
+from train.data.patches import training_pages
+from train.fitting.fit import Fitted, Hyperparameters, SymbolTraining, fit_network
+from train.models.field import FieldRecovery, Measured
+from train.models.localizers.wave import by_symbol
+from train.models.network import Refiner
+from train.models.parts import conjugate, multiply, parts, stacked, turned
+from train.models.waves import Real, WaveMatrices, Waves
+
+_FLOORS = (0.05, 20.0)
+"""Least and largest `Measured.pull` floor that is believed."""
+
+
+class Prediction(nn.Module):
+    """What decoded symbols leave unexplained of both frames, on the modulator.
+
+    Args:
+        profile: the nominal device.
+        parameters: [P] fitted.
+        grid: the common grid, where it is not the usual one.
+
+    Attributes:
+        illumination: real and imaginary parts of the factors of `illumination_terms`, [2, 6]; even until fitted.
+        floor: see `Measured.pull`; one until it is fitted (`fit_prediction`).
+    """
+
+    def __init__(self, profile: Profile, parameters: Real, grid: FieldGrid | None = None) -> None:
+        super().__init__()
+        self.waves = Waves(profile, parameters, filled=True, grid=grid)
+        self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
+        self.illumination: Tensor
+        self.floor: Tensor
+        even = torch.zeros(2, len(self._terms()))
+        even[0, 0] = 1
+        self.register_buffer("illumination", even)
+        self.register_buffer("floor", torch.ones(()))
+
+    @property
+    def light_channels(self) -> int:
+        """Features that carry unexplained light: real parts of a symbol's samples, then imaginary parts."""
+        return 2 * self.waves.samples**2
+
+    def field(self, at: WaveMatrices, p: Tensor) -> Tensor:
+        """Expected field on the common grid, [2, Gy, Gx], of a believed page p [2, ny, nx]; its scale is open."""
+        samples = self.waves.samples
+        written = expected_phasors(p).repeat_interleave(samples, dim=1).repeat_interleave(samples, dim=2)
+        illumination = torch.tensordot(self.illumination, torch.stack(self._terms()), 1)
+        return self.waves.to_camera(at, torch.stack(multiply(parts(written), parts(illumination))))
+
+    def _terms(self) -> list[Tensor]:
+        return illumination_terms(self.waves.x_m / self._half_width, self.waves.y_m / self._half_height)
+
+    def forward(
+        self, recovery: FieldRecovery, measured: Measured, field: Tensor, p: Tensor, parameters: Tensor | None = None
+    ) -> Tensor:
+        """Light that a believed page leaves unexplained.
+
+        Args:
+            recovery: of the same device.
+            measured, field: of the page; the field says how strong its light is.
+            p: [2, ny, nx].
+            parameters: [P] of a device that has drifted since.
+
+        Returns:
+            [2, 1, S, ny, nx], as a localizer gives it.
+        """
+        at = self.waves.matrices(parameters)
+        expected = self.field(at, p)
+        real, imaginary = multiply(parts(field), conjugate(parts(expected)))
+        gain = torch.stack([real.sum(), imaginary.sum()]) / (expected.square().sum() + 1e-12)
+        expected = torch.stack(multiply(parts(expected), parts(gain)))
+        left = recovery.innovation(measured, expected, self.floor)
+        return by_symbol(self.waves.to_page(at, left), self.waves.samples)
+
+
+def expected_phasors(p: Tensor) -> Tensor:
+    """Mean of exp(i phase) under von Mises beliefs, [2, ...] to [2, ...].
+
+    Its length, a ratio of Bessel functions, lies within 5% of kappa / (1/2 + sqrt(kappa^2 + 9/4)), one of the bounds of
+    Amos (Math. Comp. 28, 1974).
+    """
+    return p / (0.5 + torch.sqrt(p.square().sum(0, keepdim=True) + 2.25))
+
+
+def fit_prediction(
+    profile: Profile, parameters: Real, known: Sequence[Explained], grid: FieldGrid | None = None
+) -> Prediction:
+    """The prediction of a device, illumination and floor as known pages show them.
+
+    Args:
+        profile, parameters, grid: see `Prediction`.
+        known: pages, on that grid.
+    """
+    prediction = Prediction(profile, parameters, grid)
+    squares, lengths = [], []
+    for light in known:
+        measured, seen = light.measured, light.seen
+        e = stacked(light.expected) / measured.amplitude
+        for left, arm in zip(measured.left(e), (1.0, complex(measured.cos, measured.sin)), strict=True):
+            squares.append(left.numpy()[seen] ** 2)
+            lengths.append(np.abs(arm + e[0].numpy() + 1j * e[1].numpy())[seen] ** 2)
+    # an equation's variance is that of a photon count times (|arm + e|^2 + floor)
+    by_light, constant = np.polyfit(np.concatenate(lengths), np.concatenate(squares), 1)
+    floor = constant / by_light if by_light > 0 else np.inf
+    prediction.illumination.copy_(stacked(np.mean([light.illumination for light in known], axis=0)))
+    prediction.floor.fill_(float(np.clip(floor, *_FLOORS)))
+    return prediction
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Trained refinements.
+
+    Attributes:
+        trained: their trainings, in order.
+        validation: its features of the validation pages.
+        seconds: of all of it, features and training, all stretches together.
+    """
+
+    trained: list[Fitted[SymbolTraining]]
+    validation: FeatureStore
+    seconds: float
+
+    @property
+    def last(self) -> Fitted[SymbolTraining]:
+        """The last one's training."""
+        return self.trained[-1]
+
+
+@dataclass(frozen=True)
+class RefinementPages:
+    """Recorded pages that refinements are trained on.
+
+    Attributes:
+        recording: with their frames.
+        pages: page numbers: those trained on, those validated on, then others.
+        training, validation: how many of them.
+        features: their features for the first look, in the same order.
+    """
+
+    recording: Recording
+    pages: list[int]
+    training: int
+    validation: int
+    features: Path
+
+
+def fit_refinements(
+    folder: Path,
+    choices: Hyperparameters,
+    material: RefinementPages,
+    extractor: FeatureExtractor,
+    prediction: Prediction,
+    first: Fitted[SymbolTraining],
+    key: str,
+    starts: Iterable[nn.Module] = (),
+    devices: int | str = "auto",
+) -> Refined:
+    """Train, or go on with, the refinements of a run, one behind the other.
+
+    Args:
+        folder: of the run.
+        choices: the run's; `choices.refinements` of them, at least one.
+        material: pages.
+        extractor, prediction: of the device.
+        first: the first look's training.
+        key: everything that the first look's features depend on.
+        starts: networks whose weights the first of them begin with.
+        devices: see `fit_network`.
+    """
+    looks, features, seconds = [first], material.features, 0.0
+    count, seen = len(material.pages), material.training + material.validation
+    chosen = choices.of_refinement()
+    for number, start in zip(range(1, choices.refinements + 1), chain(starts, repeat(None)), strict=False):
+        make = partial(refined_pages, extractor, prediction, material, FeatureStore(features), looks[-1].module)
+        at = folder / f"refinement-{number}"
+        features = at / "features"
+        key = f"{key} {number} {looks[-1].validation_air}"
+
+        seconds += fill(features, key, count, make, f"pages of refinement {number}")
+        training, validation = (
+            FeatureStore(features, part) for part in (range(material.training), range(material.training, seen))
+        )
+        mask, levels = first.module.pilot_mask, first.module.levels
+        patches = training_pages([training], mask, chosen)
+        looks.append(
+            fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, start=start, devices=devices)
+        )
+        seconds += looks[-1].seconds
+    return Refined(looks[1:], validation, seconds)
+
+
+def refined_pages(
+    extractor: FeatureExtractor,
+    prediction: Prediction,
+    material: RefinementPages,
+    earlier: FeatureStore,
+    module: SymbolTraining,
+    start: int,
+    shift_px: tuple[float, float],
+) -> Iterator[PageFeatures]:
+    """Features for a refinement.
+
+    Args:
+        extractor, prediction: of the device.
+        material: pages.
+        earlier: their features for the look before.
+        module: which was trained on such features.
+        start: first page.
+        shift_px: not asked for: the look before has found each page's.
+    """
+    for number in range(start, len(material.pages)):
+        *shown, phases = earlier[number]
+        state = earlier.state(number)
+        measured, field = extractor.look(material.recording.frames(material.pages[number]), state.shift_px)
+        belief = module(*(part[None] for part in shown))[0]
+        light = prediction(extractor.recovery, measured, field, turned(belief, state.piston_rad))
+        yield PageFeatures(
+            turned(light, -state.piston_rad).numpy().astype(np.float16),
+            shown[1].numpy(),
+            phases.numpy(),
+            state,
+            belief.numpy(),
+        )

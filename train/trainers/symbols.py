@@ -1,0 +1,200 @@
+"""The way of training decoders at symbol pitch: features of recorded and synthetic pages, then the network."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import click
+import numpy as np
+from torch import Tensor, nn
+
+from lightpage.calibration.known_pages import known_pages
+from lightpage.device.profile import Profile
+from lightpage.errors import InvalidInputError
+from lightpage.waves.grid import symbol_samples
+from train.data.feature_store import FeatureStore, fill
+from train.data.known_light import Explained, explained
+from train.data.material import Material, Trained
+from train.data.patches import training_pages
+from train.data.synthetic import MOST_NOISE, SyntheticPages, likeness
+from train.fitting.fit import Fitted, Hyperparameters, SymbolTraining, best_kappa_scale, fit_network
+from train.models.decoder import WAVE, SymbolDecoder
+from train.runs import load_decoder, load_run
+from train.trainers.refinement import Refined, RefinementPages, fit_prediction, fit_refinements
+
+USUAL_REFINEMENTS = 1
+"""Of a decoder, unless told otherwise: it adds more than anything else does. With ideal lenses it takes twice the time
+a page; with real ones its waves pass each of them in fifty terms, which takes much longer at the full size."""
+_SYNTHETIC_SYMBOLS = 470_000
+"""Of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""
+_SYNTHETIC_PAGES = 12, 96
+"""Fewest and most: few large ones would show few drifted states, and more small ones teach no more."""
+LIKENESS_PAGES = 2
+"""Recorded pages that the wave model is compared with: each has thousands of symbols."""
+
+
+def default_synthetic_pages(profile: Profile) -> int:
+    """Synthetic pages that are made unless told otherwise."""
+    return int(np.clip(round(_SYNTHETIC_SYMBOLS / np.prod(profile.page_shape)), *_SYNTHETIC_PAGES))
+
+
+@dataclass(frozen=True)
+class SymbolRecipe:
+    """Trains the network at symbol pitch.
+
+    Attributes:
+        localizer: of `LOCALIZERS`.
+        choices: the run's.
+        synthetic_pages: pages of the drifted device to train on beside the recorded ones.
+        start: finished run whose weights are begun with.
+    """
+
+    localizer: str
+    choices: Hyperparameters
+    synthetic_pages: int
+    start: Path | None
+
+    def options(self) -> dict[str, object]:
+        """Everything that a run must go on with, by the names of the command line."""
+        return {
+            "--localizer": self.localizer,
+            "--synthetic-pages": self.synthetic_pages,
+            "--start": None if self.start is None else str(self.start.resolve()),
+            **{f"--{name.replace('_', '-')}": value for name, value in asdict(self.choices).items()},
+        }
+
+    def train(self, material: Material) -> Trained:
+        """Train, or go on with, the run; raises KeyboardInterrupt after Ctrl-C, with nothing lost.
+
+        Raises:
+            InvalidInputError: a start that is no finished run, or of another size.
+        """
+        before = None if self.start is None else self._before(material.profile)
+        known = [*material.training, *material.validation]
+        features = material.out / "features"
+        preparing = fill(
+            features,
+            f"{material.key} {self.localizer} {self.choices.first_look}",
+            len(known),
+            lambda first, shift: material.extractor.pages(material.recording, known[first:], shift),
+            "recorded pages",
+        )
+        count = len(material.training)
+        known_light = self._explained(material)
+        stores = [FeatureStore(features, range(count)), *map(FeatureStore, self._synthetic(material, known_light))]
+        training = training_pages(stores, material.pilot_mask, self.choices)
+        validation = FeatureStore(features, range(count, len(known)))
+        fitted = fit_network(
+            material.out,
+            self.choices,
+            material.pilot_mask,
+            material.recording.levels,
+            training,
+            validation,
+            start=None if before is None else before.network,
+            devices=material.devices,
+        )
+        weights = {f"network.{name}": value for name, value in fitted.module.network.state_dict().items()}
+        seconds, last = preparing + fitted.seconds, fitted
+        if self.choices.refinements:
+            refined = self._refined(
+                material,
+                RefinementPages(material.recording, known, count, len(material.validation), features),
+                fitted,
+                known_light,
+                () if before is None else before.refiners,
+                weights,
+            )
+            seconds, last, validation = seconds + refined.seconds, refined.last, refined.validation
+        return Trained(
+            weights=weights,
+            validation_air=last.validation_air,
+            kappa_scale=best_kappa_scale(last.module, validation, material.pilot_mask),
+            seconds=seconds,
+            synthetic_pages=sum(map(len, stores)) - count,
+        )
+
+    def _refined(
+        self,
+        material: Material,
+        pages: RefinementPages,
+        first: Fitted[SymbolTraining],
+        known_light: list[Explained],
+        starts: Iterable[nn.Module],
+        weights: dict[str, Tensor],
+    ) -> Refined:
+        """Trained refinements, which add what they have learnt to the weights."""
+        prediction = fit_prediction(material.profile, material.calibration.vector, known_light, material.extractor.grid)
+        refined = fit_refinements(
+            material.out,
+            self.choices,
+            pages,
+            material.extractor,
+            prediction,
+            first,
+            f"{material.key} {self.localizer} {self.choices.first_look}",
+            starts,
+            material.devices,
+        )
+        for name, module in {
+            "prediction": prediction,
+            "refiners": nn.ModuleList(one.module.network for one in refined.trained),
+        }.items():
+            weights |= {f"{name}.{key}": value for key, value in module.state_dict().items()}
+        return refined
+
+    def check_start(self, profile: Profile) -> None:
+        """Check that the run to start from, if any, has networks of this size.
+
+        Raises:
+            InvalidInputError: see `train`.
+        """
+        if self.start is not None:
+            self._before(profile)
+
+    def _before(self, profile: Profile) -> SymbolDecoder:
+        """The decoder whose weights are begun with: those of its first look, and of as many refinements as it has."""
+        assert self.start is not None
+        run = load_run(self.start)
+        size = (run.localizer, run.profile.page_shape, *_size(run.hyperparameters, run.profile))
+        wanted = (self.localizer, profile.page_shape, *_size(self.choices, profile))
+        if size != wanted:
+            raise InvalidInputError(
+                f"--start {self.start}: localizer, page, channels, blocks, levels, samples", size, f"{wanted}"
+            )
+        return load_decoder(self.start, run)
+
+    def _explained(self, material: Material) -> list[Explained]:
+        """Recorded pages against the wave model; none where nothing is made of it."""
+        if not (self.synthetic_pages or self.choices.refinements):
+            return []
+        pages = known_pages(material.recording, material.profile, material.training[:LIKENESS_PAGES])
+        return explained(material.extractor, material.profile, material.calibration.vector, pages)
+
+    def _synthetic(self, material: Material, known: list[Explained]) -> list[Path]:
+        """Folder with the features of synthetic pages; none where the wave model is not like the device."""
+        if self.synthetic_pages == 0:
+            return []
+        profile, vector, seed = material.profile, material.calibration.vector, self.choices.seed
+        like = likeness(known)
+        if like.noise > MOST_NOISE:
+            click.echo(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
+            return []
+        click.echo(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
+        folder = material.out / "synthetic"
+        reader = self.choices.coherent_localizer(profile)
+        pages = SyntheticPages(
+            profile, vector, like, None if self.localizer == WAVE else reader, seed, material.extractor.grid
+        )
+        key = f"{self.localizer} {self.choices.first_look} {seed} "
+        key += f"{profile.to_toml()} {material.calibration.to_toml()} {like.noise:.6f} "
+        key += f"{np.round(like.illumination, 6).tolist()}"
+        fill(folder, key, self.synthetic_pages, lambda first, shift: pages.pages(first), "synthetic pages")
+        return [folder]
+
+
+def _size(choices: object, profile: Profile) -> tuple[object, ...]:
+    samples = getattr(choices, "samples", 0) or symbol_samples(profile)
+    return (*(getattr(choices, name, None) for name in ("channels", "blocks", "levels")), samples)
