@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from lightpage.errors import BusyError, LightpageError
-
-if TYPE_CHECKING:
-    from runtime.decoding.decoder import DecodedPage
 
 
 class SourceError(LightpageError):
@@ -17,6 +14,10 @@ class SourceError(LightpageError):
 
 class StoppingError(LightpageError):
     """The service is being stopped and drops the work."""
+
+
+class CallerLeft(Exception):
+    """The caller has gone away; the work is dropped."""
 
 
 class SlotsTakenError(BusyError):
@@ -64,16 +65,11 @@ class UnconfirmedPageError(LostPageError):
     """The pilots of a page do not bear out what the decoder claims of it: its symbols would be noise.
 
     Attributes:
-        page: what was decoded, for figures and never for an answer; None on the client's side.
+        page: what was decoded, for figures and never for an answer (`runtime.decoding.tracking.unconfirmed_page`); None
+            on the client's side.
     """
 
-    page: DecodedPage | None = None
-
-    @property
-    def decoded(self) -> DecodedPage:
-        """What was decoded; only on the side that decoded it."""
-        assert self.page is not None
-        return self.page
+    page: object = None
 
     def about(self, page: str) -> Self:
         """See `LostPageError`."""

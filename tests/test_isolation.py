@@ -7,46 +7,141 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("lightpage", "train", "runtime", "export", "analysis")
+ROOMS = (
+    "lightpage.errors",
+    "lightpage.files",
+    "lightpage.progress",
+    "lightpage.device",
+    "lightpage.page",
+    "lightpage.metrics",
+    "lightpage.waves",
+    "lightpage.recording",
+    "lightpage.calibration",
+    "lightpage.simulator",
+    "lightpage.cli",
+    "lightpage",
+    "train.models",
+    "train.data",
+    "train.fitting",
+    "train.published",
+    "train.trainers",
+    "train.runs",
+    "train.commands",
+    "train",
+    "runtime.pb",
+    "runtime.errors",
+    "runtime.bundle",
+    "runtime.execution",
+    "runtime.decoding",
+    "runtime.acquisition",
+    "runtime.bulk",
+    "runtime.recalibration",
+    "runtime.wire",
+    "runtime.client",
+    "runtime.service",
+    "runtime.rpc",
+    "runtime.demo",
+    "runtime.commands",
+    "runtime",
+    "export",
+    "analysis.studies",
+    "analysis.report",
+    "analysis.comparison",
+    "analysis.speed",
+    "analysis.tracking",
+    "analysis",
+)
+"""From the ground up: a room may use itself and those before it."""
 TORCH = {"torch", "lightning", "onnx", "onnxscript"}
 FORBIDDEN = {
-    "optics": {*TORCH, "onnxruntime", "grpc", "train", "export", "runtime", "tests", "benchmarks"},
-    "train": {"onnx", "onnxruntime", "grpc", "export", "runtime", "tests", "benchmarks"},
-    "runtime": {*TORCH, "train", "export", "tests", "benchmarks"},
-    "export": {"tests", "benchmarks"},
+    "lightpage": {*TORCH, "onnxruntime", "grpc", "train", "export", "runtime", "analysis", "tests"},
+    "train": {"onnx", "onnxruntime", "grpc", "export", "runtime", "analysis", "tests"},
+    "runtime": {*TORCH, "train", "export", "analysis", "tests"},
+    "export": {"analysis", "tests"},
+    "analysis": {"tests"},
 }
-"""By package, what none of its files may import: optics <- train <- export and optics <- runtime <- export."""
+"""By package, what none of its files may use: lightpage <- {train, runtime} <- export <- analysis."""
+COMMANDS_ONLY = {"click", "tqdm"}
+"""Terminals are the business of commands and of what they share."""
 
 
 def files(package: str) -> list[Path]:
-    return sorted((ROOT / package).rglob("*.py"))
+    return [path for path in sorted((ROOT / package).rglob("*.py")) if "pb" not in path.parts]
 
 
-def imports(path: Path) -> set[str]:
-    """Top-level names of everything that a file imports, inside functions too."""
+def uses(path: Path) -> set[str]:
+    """Dotted names of everything that a file uses: imports, inside functions too, and modules named in strings.
+
+    A string names a module if it is nothing but its dotted name, with an attribute after a colon or not: as for
+    `importlib`, `python -m`, and entry points.
+    """
     found = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
-            found |= {alias.name.partition(".")[0] for alias in node.names}
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            found.add(node.module.partition(".")[0])
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            named = node.value.removeprefix("-m").strip().partition(":")[0]
+            if named.partition(".")[0] in PACKAGES and "." in named and is_module(named):
+                found.add(named)
     return found
 
 
+def is_module(name: str) -> bool:
+    path = ROOT.joinpath(*name.split("."))
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+def room(name: str) -> str:
+    """The innermost room of `ROOMS` that a dotted name lies in; the name itself where it lies in none."""
+    parts = name.split(".")
+    return next((".".join(parts[:n]) for n in range(len(parts), 0, -1) if ".".join(parts[:n]) in ROOMS), name)
+
+
+def offenders(bad: Callable[[Path, str], bool], paths: Iterable[Path]) -> dict[str, list[str]]:
+    found = {str(path.relative_to(ROOT)): sorted(name for name in uses(path) if bad(path, name)) for path in paths}
+    return {path: names for path, names in found.items() if names}
+
+
 @pytest.mark.parametrize("package", FORBIDDEN)
-def test_no_file_imports_what_lies_above_it(package: str) -> None:
+def test_no_file_uses_a_package_above_it(package: str) -> None:
     found = files(package)
     assert len(found) >= 5
-    offenders = {str(path.relative_to(ROOT)): bad for path in found if (bad := imports(path) & FORBIDDEN[package])}
-    assert offenders == {}
+    assert offenders(lambda _, name: name.partition(".")[0] in FORBIDDEN[package], found) == {}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_room_uses_one_above_it(package: str) -> None:
+    def above(path: Path, name: str) -> bool:
+        here, there = room(".".join(path.relative_to(ROOT).with_suffix("").parts)), room(name)
+        return name.partition(".")[0] == package and ROOMS.index(there) > ROOMS.index(here)
+
+    assert offenders(above, files(package)) == {}
+
+
+def test_every_file_lies_in_a_room() -> None:
+    names = (".".join(path.relative_to(ROOT).with_suffix("").parts) for package in PACKAGES for path in files(package))
+    assert [name for name in names if room(name) not in ROOMS] == []
+
+
+@pytest.mark.parametrize("package", ["lightpage", "train", "runtime"])
+def test_commands_alone_know_of_terminals(package: str) -> None:
+    rooms = ("lightpage.cli", "train.commands", "runtime.commands")
+    others = [p for p in files(package) if room(".".join(p.relative_to(ROOT).with_suffix("").parts)) not in rooms]
+    assert offenders(lambda _, name: name.partition(".")[0] in COMMANDS_ONLY, others) == {}
 
 
 def test_one_module_alone_imports_onnxruntime() -> None:
-    assert [path.name for path in files("runtime") if "onnxruntime" in imports(path)] == ["ort.py"]
+    found = offenders(lambda _, name: name.partition(".")[0] == "onnxruntime", files("runtime"))
+    assert list(found) == ["runtime/execution/session.py"]
 
 
 SERVE = """
@@ -61,8 +156,8 @@ from runtime.service.registry import ModelRegistry
 from runtime.rpc.server import LightpageServer
 from runtime.acquisition.sources import open_source
 import importlib, pkgutil, runtime
-for module in pkgutil.iter_modules(runtime.__path__):
-    importlib.import_module("runtime." + module.name)
+for module in pkgutil.walk_packages(runtime.__path__, "runtime."):
+    importlib.import_module(module.name)
 plane = DataPlane(ModelRegistry(Decoder(Bundle.open(sys.argv[1]))), open_source("recording:" + sys.argv[2]))
 server = LightpageServer(plane, Recalibrator(plane, None))
 with server, LightpageClient(server.target) as client:

@@ -58,7 +58,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
 from runtime.decoding.image_search import BundleSearch
 from runtime.decoding.image_tracker import tracker_for
-from runtime.decoding.tracking import Tracker
+from runtime.decoding.tracking import Tracker, unconfirmed_page
 from runtime.errors import UnconfirmedPageError
 from runtime.execution.twin import TWIN_THREADS, OnnxTwin
 from train.models.field import FieldRecovery, TorchFieldSolver
@@ -244,7 +244,7 @@ def false_acquisitions(point: Point, pages: int) -> Figures:
         except FrameError:
             row["frames_refused"] += 1
         except UnconfirmedPageError as error:
-            shares += [] if error.page is None else [error.page.check.share]
+            shares += [unconfirmed_page(error).check.share]
             row["unconfirmed"] += 1
     return {"kinds": kinds, "shares": shares}
 

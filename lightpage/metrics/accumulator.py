@@ -15,11 +15,11 @@ from lightpage.metrics.information import (
     SymbolMaps,
     calibration_error,
     decide_with_confidence,
-    mean_resultant,
     measure,
     reliability,
     symbol_maps,
 )
+from lightpage.von_mises import mean_resultant
 
 _INDEX_BITS = 33
 _INDEX = np.uint64((1 << _INDEX_BITS) - 1)

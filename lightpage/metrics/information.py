@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import i0e, i1e, logsumexp
+from scipy.special import i0e, logsumexp
 
 from lightpage.errors import PageError
 from lightpage.page.symbols import check_levels
+from lightpage.von_mises import mean_resultant
 
 Floats = NDArray[np.float64]
 
@@ -25,11 +26,6 @@ ECE_BINS = 15
 _WINDOW = 12
 _ALIASING = 60.0
 _CHUNK = 8192
-
-
-def mean_resultant(kappa: Floats) -> Floats:
-    """I1(kappa) / I0(kappa): the mean cosine of the error that a concentration promises."""
-    return np.asarray(i1e(kappa) / i0e(kappa), np.float64)
 
 
 def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int) -> Floats:

@@ -10,8 +10,8 @@ from scipy.special import i0e
 
 from lightpage.device.profile import Profile
 from lightpage.errors import PageError
-from lightpage.metrics.information import mean_resultant
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
+from lightpage.von_mises import mean_resultant
 
 _BELIEF = 20.0
 """Pilots that count for the decoder before any is seen: noise of 54 pilots then costs under 0.01 bit a symbol."""

@@ -15,8 +15,9 @@ from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.recording.reader import FramePair, Recording, page_hashes
 from runtime.bulk.refused import RefusedPage, refusal, unconfirmed
 from runtime.bundle.manifest import GOLDEN
-from runtime.decoding.decoder import Decoder, Timings
+from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
+from runtime.decoding.page import Timings
 from runtime.decoding.tracking import Tracker
 from runtime.errors import LostPageError
 

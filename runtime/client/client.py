@@ -13,20 +13,13 @@ from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, LightpageError
 from lightpage.recording.reader import FramePair
-from runtime.decoding.decoder import ImagePosition
+from runtime.decoding.page import ImagePosition
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.service.limits import CHUNK_BYTES, REPLY_BYTES
 from runtime.wire.address import check_address
-from runtime.wire.convert import (
-    PIXEL_CODES,
-    PIXEL_TYPES,
-    KnownPilots,
-    RemotePage,
-    image_of,
-    pilots_message,
-    remote_page,
-)
+from runtime.wire.messages import PIXEL_CODES, PIXEL_TYPES, KnownPilots, image_of, pilots_message
+from runtime.wire.pages import RemotePage, remote_page
+from runtime.wire.sizes import CHUNK_BYTES, REPLY_BYTES
 from runtime.wire.status import error_of
 
 CALL_S = 60.0

@@ -15,7 +15,7 @@ import numpy as np
 
 from lightpage.errors import InvalidInputError
 from lightpage.files import move_into_place
-from runtime.wire.convert import RemotePage
+from runtime.wire.pages import RemotePage
 
 FORMAT = "lightpage-decoded"
 VERSION = 1

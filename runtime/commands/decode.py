@@ -26,7 +26,8 @@ from runtime.client.decoded_file import DecodedWriter
 from runtime.decoding.frames import narrow
 from runtime.decoding.image_drift import LEAST_COHERENCE
 from runtime.errors import LostPageError, SourceError
-from runtime.wire.convert import KnownPilots, RemotePage
+from runtime.wire.messages import KnownPilots
+from runtime.wire.pages import RemotePage
 
 
 @click.command()

@@ -19,7 +19,8 @@ from lightpage.calibration.sampling_table import shifted, symbol_centres
 from lightpage.device.profile import Profile
 from lightpage.page.pilots import Pilots, read_pilots
 from runtime.bundle.calibrated import calibration_of
-from runtime.decoding.decoder import Decoder, Inference
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.page import Inference
 
 Real = NDArray[np.float64]
 

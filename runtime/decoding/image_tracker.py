@@ -15,10 +15,11 @@ from lightpage.page.pilots import PilotCheck, Pilots, read_pilots
 from lightpage.page.symbols import check_levels
 from lightpage.recording.reader import FramePair
 from runtime.bundle.bundle import Table
-from runtime.decoding.decoder import DecodedPage, Decoder, ImagePosition, Inference, Timings
+from runtime.decoding.decoder import Decoder
 from runtime.decoding.drift_tables import BundleTables, DriftTables
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
 from runtime.decoding.image_search import BundleSearch, PageSearch
+from runtime.decoding.page import DecodedPage, ImagePosition, Inference, Timings
 from runtime.decoding.tracking import NoTracker, Tracker, confirmed
 from runtime.execution.twin import TWIN_THREADS, OnnxTwin
 

@@ -7,7 +7,8 @@ from typing import Protocol
 from lightpage.calibration.image_search import REACH_PX, FoundImage
 from lightpage.page.pilots import LEAST_CONFIRMED_SHARE, Pilots
 from lightpage.recording.reader import FramePair
-from runtime.decoding.decoder import DecodedPage, Decoder
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.page import DecodedPage
 from runtime.errors import Reason, UnconfirmedPageError
 
 
@@ -97,3 +98,9 @@ def confirmed(page: DecodedPage, found: FoundImage | None = None) -> DecodedPage
     error = UnconfirmedPageError("pilots", told, wanted, reason, check.recalibration_due)
     error.page = page
     raise error
+
+
+def unconfirmed_page(error: UnconfirmedPageError) -> DecodedPage:
+    """What was decoded of the page that an error of this process is about."""
+    assert isinstance(error.page, DecodedPage)
+    return error.page

@@ -24,7 +24,7 @@ from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
-from runtime.wire.convert import RemotePage
+from runtime.wire.pages import RemotePage
 
 Floats = NDArray[np.float64]
 

@@ -24,10 +24,11 @@ from lightpage.progress import Progress
 from lightpage.recording.reader import FramePair, hash_frames
 from runtime.bundle.bundle import Bundle, Table, npz, write_bundle
 from runtime.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
-from runtime.decoding.decoder import Decoder, ImagePosition
+from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import named
 from runtime.decoding.image_tracker import tracker_for
-from runtime.decoding.tracking import Tracker
+from runtime.decoding.page import ImagePosition
+from runtime.decoding.tracking import Tracker, unconfirmed_page
 from runtime.errors import LostPageError, UnconfirmedPageError
 
 _RECALIBRATED = re.compile(r"(.*)\+r(\d+)")
@@ -268,7 +269,7 @@ def _judged(tracker: Tracker, bundle: Bundle, pages: KnownPages, progress: Calla
             judged.append(_Judged(0.0, error))
             continue
         except UnconfirmedPageError as error:
-            page, lost = error.decoded, error
+            page, lost = unconfirmed_page(error), error
         figures = measure(page.phase[data], page.concentration[data], symbols[data], pages.levels)
         judged.append(_Judged(figures.air_bits_per_symbol, lost))
     return judged

@@ -17,8 +17,9 @@ from lightpage.progress import Progress
 from lightpage.recording.reader import FramePair, hash_frames
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.calibrated import calibration_of
-from runtime.decoding.decoder import Decoder, ImagePosition
+from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_search import BundleSearch
+from runtime.decoding.page import ImagePosition
 from runtime.execution.twin import TWIN_THREADS, OnnxTwin
 from runtime.recalibration.recalibration import FitReport, FitResult, KnownPages
 

@@ -14,20 +14,11 @@ import grpc
 from lightpage.errors import FrameError, InvalidInputError, LimitError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from runtime.rpc.replies import decode_reply, model_message, read_reply, result_message
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator, Step
-from runtime.wire.convert import (
-    PIXEL_CODES,
-    check_options,
-    decode_reply,
-    levels_of,
-    model_message,
-    pilots_of,
-    pixel_type,
-    read_reply,
-    result_message,
-)
+from runtime.wire.messages import PIXEL_CODES, check_options, levels_of, pilots_of, pixel_type
 from runtime.wire.status import abort, status_of, without_folders
 
 _log = logging.getLogger(__name__)

@@ -6,9 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-
-class CallerLeft(Exception):
-    """The caller has gone away; the work is dropped."""
+from runtime.errors import CallerLeft
 
 
 @dataclass(frozen=True)

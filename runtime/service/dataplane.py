@@ -15,7 +15,8 @@ from lightpage.errors import FrameError, InvalidInputError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.sources import FrameSource, SourcePage, own_fault
-from runtime.decoding.decoder import DecodedPage, Decoder
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.page import DecodedPage
 from runtime.errors import LostPageError, SlotsTakenError, SourceError
 from runtime.service.caller import Caller
 from runtime.service.limits import Limits

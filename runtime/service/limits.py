@@ -4,17 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MESSAGE_BYTES = 4 << 20
-"""One message in: chunks stay far below, so that no single message makes the service hold its breath."""
-
-CHUNK_BYTES = 1 << 20
-"""Chunk that a client sends: larger ones gain nothing, smaller ones cost calls."""
+from runtime.wire.sizes import CHUNK_BYTES, MESSAGE_BYTES, REPLY_BYTES
 
 PAIR_BYTES = 256 << 20
 """Both frames of a pair: three times a full-scale 20-megapixel pair of 16 bits."""
-
-REPLY_BYTES = 64 << 20
-"""One reply: symbols, float32 confidence, concentration and phase of 700 x 450 symbols are 4 MB."""
 
 CONCURRENT_RECEIVES = 8
 """Frame pairs being received, each with its buffer: bounds memory, leaves room for slow senders."""

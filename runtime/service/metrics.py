@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
 
-from runtime.decoding.decoder import DecodedPage
+from runtime.decoding.page import DecodedPage
+from runtime.decoding.tracking import unconfirmed_page
 from runtime.errors import LostPageError, UnconfirmedPageError
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ class ServiceMetrics:
         """Count a page that was not given out, which is a sign of drift too."""
         self.lost_pages.labels(error.reason.value).inc()
         if isinstance(error, UnconfirmedPageError):
-            self._check(error.decoded)
+            self._check(unconfirmed_page(error))
 
     def _check(self, page: DecodedPage) -> None:
         self.share.set(page.check.share)

@@ -27,9 +27,9 @@ from runtime.bundle.archive import check_name
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
-from runtime.errors import SourceError, StoppingError
+from runtime.errors import CallerLeft, SourceError, StoppingError
 from runtime.recalibration.recalibration import Fit, KnownPages, RecalibrationOutcome, next_version, recalibrate
-from runtime.service.caller import Caller, CallerLeft
+from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import GRACE_S
 from runtime.service.store import ModelStore

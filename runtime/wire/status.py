@@ -18,9 +18,8 @@ from lightpage.errors import (
     RecalibrationRefusedError,
 )
 from runtime import errors as service_errors
-from runtime.errors import LostPageError, Reason, SlotsTakenError, SourceError, StoppingError
+from runtime.errors import CallerLeft, LostPageError, Reason, SlotsTakenError, SourceError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.service.caller import CallerLeft
 
 DETAIL_KEY = "lightpage-error-bin"
 

@@ -74,7 +74,7 @@ class _Rays(NamedTuple):
 class RayTracer(nn.Module):
     """Traces the rays of one nominal device. Its pipe is a prism over the parallelogram |x|, |y'| < w/2.
 
-    Without a prescription the lenses are ideal: they obey the sine condition, as in the wave channel and `train.models.twin`.
+    Without a prescription the lenses are ideal: they obey the sine condition, as in the wave channel and the twin.
     A ray parallel to the axis at (x, y) comes to the centre of the entrance with the direction sines -(x, y)/f, and one
     that leaves the pipe with sines s lands at f s, wherever it left. With slopes in place of sines every ray would land
     at the same place, as walls keep the length of s, but the outer ones would meet walls sooner.

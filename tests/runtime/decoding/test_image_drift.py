@@ -7,8 +7,8 @@ import pytest
 
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
-from runtime.decoding.decoder import Inference
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
+from runtime.decoding.page import Inference
 from tests.runtime import toy
 
 NY, NX = toy.PAGE

@@ -12,9 +12,10 @@ from lightpage.calibration.image_search import REACH_PX, FoundImage
 from lightpage.page.pilots import PilotCheck, Pilots
 from lightpage.recording.reader import FramePair
 from runtime.bundle.bundle import Table
-from runtime.decoding.decoder import Decoder, Inference
+from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
 from runtime.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageTracker
+from runtime.decoding.page import Inference
 from runtime.decoding.tracking import NoTracker
 from runtime.errors import Reason, UnconfirmedPageError
 from tests.runtime import toy

@@ -17,7 +17,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.demo.demo import drifted, run_demo, summarise
 from runtime.recalibration.recalibration import KnownPages
 from runtime.recalibration.refit import refit
-from runtime.wire.convert import RemotePage, RemoteTimings
+from runtime.wire.pages import RemotePage, RemoteTimings
 from tests.runtime import toy
 
 TIMINGS = RemoteTimings(0.0, 0.2, 0.1, 0.3)

@@ -16,8 +16,9 @@ from lightpage.simulator.simulator import Simulator
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.calibrated import calibration_of
 from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import DecodedPage, Decoder
+from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
+from runtime.decoding.page import DecodedPage
 from runtime.demo.demo import LEVELS, drifted
 from runtime.recalibration.recalibration import KnownPages, recalibrate
 from runtime.recalibration.recalibration import refit as module

@@ -43,7 +43,7 @@ from runtime.service.limits import Limits
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import KEPT_MODELS, ModelRegistry, TrackerFactory, no_tracker
 from runtime.service.store import ModelStore
-from runtime.wire.convert import KnownPilots
+from runtime.wire.messages import KnownPilots
 from runtime.wire.status import without_folders
 from tests.runtime import toy
 

@@ -1,0 +1,98 @@
+"""What a page becomes on its way through the decoder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.page.pilots import PilotCheck
+
+
+@dataclass(frozen=True)
+class Inference:
+    """What the graph says of a page: p float32 [2, ny, nx], its angle and its length [ny, nx]; piston still in it."""
+
+    p: NDArray[np.float32]
+    phase: NDArray[np.float32]
+    concentration: NDArray[np.float32]
+
+    def turned(self, by: NDArray[np.floating]) -> Inference:
+        """The same with `by` (radians [ny, nx]) added to the phases."""
+        phase = (self.phase + by).astype(np.float32)
+        p = self.concentration * np.stack([np.cos(phase), np.sin(phase)])
+        return Inference(p, phase, self.concentration)
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Wall-clock seconds of one page, every attempt at it counted.
+
+    Attributes:
+        check_s: checks of the frames.
+        inference_s: runs of the graph.
+        decision_s: piston, tracking and decision.
+        search_s: looking for the image.
+    """
+
+    check_s: float
+    inference_s: float
+    decision_s: float
+    search_s: float = 0.0
+
+    @property
+    def total_s(self) -> float:
+        """All of it."""
+        return self.check_s + self.inference_s + self.decision_s + self.search_s
+
+
+@dataclass(frozen=True)
+class ImagePosition:
+    """Where the image of a page lay on the cameras.
+
+    Attributes:
+        shift_x_px, shift_y_px: against where calibration saw it, camera pixels, on both cameras.
+        tilt_x_rad, tilt_y_rad: of the signal against the reference since calibration, radians at the right and lower
+            edge of the page's image.
+        searched: whether it was looked for.
+        found: whether the search found it; False where none was made.
+    """
+
+    shift_x_px: float
+    shift_y_px: float
+    tilt_x_rad: float = 0.0
+    tilt_y_rad: float = 0.0
+    searched: bool = False
+    found: bool = False
+
+
+@dataclass(frozen=True)
+class DecodedPage:
+    """A page of symbols with what is known about each.
+
+    Attributes:
+        symbols: uint8 [ny, nx], 0..levels-1.
+        confidence: float32 [ny, nx], posterior probability of each symbol among the levels.
+        concentration: float32 [ny, nx], von Mises kappa as far as the pilots bear it out.
+        phase: float32 [ny, nx], radians, piston removed.
+        levels: M.
+        piston_rad: what was removed.
+        pilot_coherence: how far the pilots agree on it, 0..1.
+        pilot_trust: share of the network's claimed concentration that they bear out, 0..1; low after a drift.
+        check: information that is claimed of the pilots, and what of it they confirm.
+        timings: seconds.
+        image: where the image lies as this page shows it, None where it is not followed.
+    """
+
+    symbols: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    concentration: NDArray[np.float32]
+    phase: NDArray[np.float32]
+    levels: int
+    piston_rad: float
+    pilot_coherence: float
+    pilot_trust: float
+    check: PilotCheck
+    timings: Timings
+    image: ImagePosition | None = None

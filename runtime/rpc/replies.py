@@ -1,0 +1,86 @@
+"""What the service answers, as messages."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.recalibration.recalibration import RecalibrationOutcome
+from runtime.service.dataplane import Answer, ReadAnswer
+from runtime.service.registry import Model
+from runtime.wire.messages import FLOAT, image_message
+
+
+def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
+    """An answer as its message, for `options` that have been checked."""
+    page = answer.page
+    rows, columns = page.symbols.shape
+    return pb.DecodeReply(
+        rows=rows,
+        columns=columns,
+        levels=page.levels,
+        symbols=page.symbols.tobytes(),
+        confidence=_confidence_bytes(page.confidence, options.confidence_format),
+        confidence_format=options.confidence_format or pb.CONFIDENCE_FORMAT_FLOAT32,
+        concentration=page.concentration.astype(FLOAT).tobytes() if options.want_concentration else b"",
+        phase=page.phase.astype(FLOAT).tobytes() if options.want_phase else b"",
+        piston_rad=page.piston_rad,
+        pilot_coherence=page.pilot_coherence,
+        pilot_trust=page.pilot_trust,
+        claimed_bits=page.check.claimed_bits,
+        confirmed_bits=page.check.confirmed_bits,
+        recalibration_due=page.check.recalibration_due,
+        image=None if page.image is None else image_message(page.image),
+        model_version=answer.model_version,
+        timings=pb.Timings(
+            receive_s=answer.receive_s,
+            decode_s=page.timings.total_s,
+            inference_s=page.timings.inference_s,
+            total_s=answer.total_s,
+        ),
+    )
+
+
+def _confidence_bytes(confidence: NDArray[np.float32], code: int) -> bytes:
+    if code == pb.CONFIDENCE_FORMAT_UINT8:
+        return np.floor(confidence * 255).astype(np.uint8).tobytes()
+    return confidence.astype(FLOAT).tobytes()
+
+
+def read_reply(read: ReadAnswer, request: pb.ReadPageRequest) -> pb.ReadPageReply:
+    """A page read from the source as its message."""
+    written = read.source_page.symbols if request.want_written else None
+    return pb.ReadPageReply(
+        decoded=decode_reply(read.answer, request.options),
+        page=read.source_page.page_index,
+        written=b"" if written is None else written.tobytes(),
+        pilot_mask=b"" if written is None else read.pilot_mask.astype(np.uint8).tobytes(),
+    )
+
+
+def model_message(model: Model, current: bool) -> pb.Model:
+    """A model as its message; metrics that are no numbers stay behind."""
+    manifest = model.decoder.bundle.manifest
+    numbers = {k: float(v) for k, v in manifest.metrics.items() if isinstance(v, int | float)}
+    return pb.Model(
+        name=manifest.name, version=manifest.version, created=manifest.created, current=current, metrics=numbers
+    )
+
+
+def result_message(outcome: RecalibrationOutcome) -> pb.RecalibrationResult:
+    """A recalibration's outcome as its message."""
+    return pb.RecalibrationResult(
+        model_version=outcome.version,
+        previous_version=outcome.previous_version,
+        pages_used=outcome.pages_used,
+        pages_held_back=outcome.pages_held_back,
+        air_before=outcome.air_before,
+        air_after=outcome.air_after,
+        angle_deg=outcome.report.angle_deg,
+        coherence_before=outcome.report.coherence_before,
+        coherence_after=outcome.report.coherence_after,
+        seconds=outcome.seconds,
+        pages_lost_before=outcome.pages_lost_before,
+        image=None if outcome.report.image is None else image_message(outcome.report.image),
+    )

@@ -1,0 +1,99 @@
+"""Parts of messages that both ends write and read."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import InvalidInputError, PageError
+from lightpage.page.pilots import Pilots
+from lightpage.page.symbols import MAX_LEVELS, check_levels, symbol_phases
+from runtime.decoding.page import ImagePosition
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+
+PIXEL_TYPES = {pb.PIXEL_TYPE_UINT8: "uint8", pb.PIXEL_TYPE_UINT16: "uint16"}
+PIXEL_CODES = {name: code for code, name in PIXEL_TYPES.items()}
+
+_CONFIDENCE_FORMATS = (pb.CONFIDENCE_FORMAT_UNSPECIFIED, pb.CONFIDENCE_FORMAT_FLOAT32, pb.CONFIDENCE_FORMAT_UINT8)
+FLOAT = np.dtype("<f4")
+"""Of confidences, concentrations and phases."""
+
+
+def pixel_type(code: pb.PixelType) -> str:
+    """numpy's name of a pixel type.
+
+    Raises:
+        InvalidInputError: unspecified or unknown.
+    """
+    if code not in PIXEL_TYPES:
+        raise InvalidInputError("pixel_type", code, "PIXEL_TYPE_UINT8 or PIXEL_TYPE_UINT16")
+    return PIXEL_TYPES[code]
+
+
+def pilots_of(message: pb.Pilots, page_shape: tuple[int, int], levels: int) -> Pilots:
+    """Pilots that a caller sent.
+
+    Raises:
+        PageError: sizes that do not fit the page, or levels out of range.
+    """
+    flags = np.frombuffer(message.mask, np.uint8)
+    values = np.frombuffer(message.values, np.uint8)
+    if flags.size != page_shape[0] * page_shape[1] or np.count_nonzero(flags) != values.size:
+        got = f"{flags.size} flags, {np.count_nonzero(flags)} of them set, and {values.size} values"
+        raise PageError("pilots", got, f"{page_shape[0] * page_shape[1]} flags and one value a set flag")
+    levels = message.levels or levels
+    if values.size and int(values.max()) >= levels:
+        raise PageError("pilots", f"level {values.max()}", f"0..{levels - 1}")
+    return Pilots(flags.reshape(page_shape) != 0, symbol_phases(values, levels))
+
+
+@dataclass(frozen=True)
+class KnownPilots:
+    """Pilots that a caller knows: bool mask [ny, nx], a page of symbols [ny, nx], and their level count."""
+
+    mask: NDArray[np.bool_]
+    symbols: NDArray[np.uint8]
+    levels: int
+
+
+def pilots_message(pilots: KnownPilots) -> pb.Pilots:
+    """Pilots as their message.
+
+    Raises:
+        PageError: mask and page differ in shape.
+    """
+    if pilots.mask.shape != pilots.symbols.shape:
+        raise PageError("pilots", f"mask {pilots.mask.shape}, page {pilots.symbols.shape}", "two equal shapes")
+    values = pilots.symbols[pilots.mask].tobytes()
+    return pb.Pilots(mask=pilots.mask.astype(np.uint8).tobytes(), values=values, levels=pilots.levels)
+
+
+def check_options(options: pb.DecodeOptions) -> None:
+    """Check what a caller asks for, before a frame is received or a page is read for it.
+
+    Raises:
+        PageError: an impossible level count; 0 stands for the default.
+        InvalidInputError: an unknown format of confidences.
+    """
+    if options.levels:
+        check_levels(options.levels)
+    if options.confidence_format not in _CONFIDENCE_FORMATS:
+        wanted = "CONFIDENCE_FORMAT_FLOAT32 or CONFIDENCE_FORMAT_UINT8"
+        raise InvalidInputError("confidence_format", options.confidence_format, wanted)
+
+
+def levels_of(options: pb.DecodeOptions) -> int:
+    """The level count asked for, 256 by default."""
+    return options.levels or MAX_LEVELS
+
+
+def image_message(image: ImagePosition) -> pb.ImagePosition:
+    """An image's position as its message."""
+    return pb.ImagePosition(**asdict(image))
+
+
+def image_of(message: pb.ImagePosition) -> ImagePosition:
+    """A message as an image's position."""
+    return ImagePosition(**{field.name: getattr(message, field.name) for field in fields(ImagePosition)})
