@@ -22,9 +22,11 @@ from export.graph import (
 from export.onnx_files import decoder_onnx, field_onnx, twin_onnx
 from export.parity import check_parity, torch_answer
 from lightpage.calibration.sampling_table import sampling_table
+from lightpage.cli.paths import NewPath, OutputFile
+from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import BundleError
-from lightpage.files import NewPath, OutputFile, write_json
-from lightpage.progress import Progress, percent_bar
+from lightpage.files import write_json
+from lightpage.progress import Progress
 from lightpage.recording.reader import FramePair
 from runtime.bundle.bundle import Bundle, npz, write_bundle
 from runtime.bundle.manifest import DECODER, FIELD, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version

@@ -1,31 +1,47 @@
-"""What commands say on their way: a progress bar in per cent, and warnings."""
+"""How long work tells of itself; whoever runs it decides how it is shown, and by default nobody sees it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Protocol, TypeVar
 
-import click
-from tqdm import tqdm
+T = TypeVar("T")
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share of the work that is behind, 0 to 1. It may raise to stop the work."""
 
 
+class Reporter(Protocol):
+    """Shows how far a loop has come."""
+
+    def track(self, items: Iterable[T], what: str, unit: str, total: int | None, done: int) -> Iterable[T]:
+        """The same items; `total` of them with the `done` ones that an earlier run has behind it."""
+
+
+_reporter: ContextVar[Reporter | None] = ContextVar("reporter", default=None)
+
+
 @contextmanager
-def percent_bar() -> Iterator[Progress]:
-    """A bar as the callback that tells of progress; it is full when the `with` statement ends well."""
-    with tqdm(total=100, unit="%", bar_format="{desc}{percentage:3.0f}%|{bar}| {elapsed}") as bar:
-
-        def progress(step: str, share: float) -> None:
-            bar.set_description(step, refresh=False)
-            bar.update(max(0.0, 100 * share - bar.n))
-            bar.refresh()
-
-        yield progress
-        progress("done", 1.0)
+def reporting(reporter: Reporter) -> Iterator[None]:
+    """Have loops of this thread that `track` their items shown by `reporter` while the `with` statement runs."""
+    token = _reporter.set(reporter)
+    try:
+        yield
+    finally:
+        _reporter.reset(token)
 
 
-def warn(what: str) -> None:
-    """Say on stderr what the user should know of work that goes on."""
-    click.echo(f"lightpage: warning: {what}", err=True)
+def track(items: Iterable[T], what: str, *, unit: str = "page", total: int | None = None, done: int = 0) -> Iterable[T]:
+    """The items themselves, the way through them shown to whoever watches.
+
+    Args:
+        items: what a loop goes through.
+        what: what is being done.
+        unit: what an item is.
+        total: how many there are, with those that are done already; by default as many as `items` has.
+        done: how many of them an earlier run has done, which are not among `items`.
+    """
+    reporter = _reporter.get()
+    return items if reporter is None else reporter.track(items, what, unit, total, done)

@@ -19,9 +19,10 @@ from torch import nn
 from analysis.comparison.comparison import HEADER, LEVELS, Bench, Outcome, light_name, recorded
 from analysis.comparison.kept import TRAINED, Kept
 from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
-from lightpage.files import OutputFolder, write_json
+from lightpage.files import write_json
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import FeatureExtractor, PageFeatures
 from train.data.patches import training_pages

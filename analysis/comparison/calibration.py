@@ -26,7 +26,6 @@ from pathlib import Path
 import click
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from lightpage.calibration.calibrate import KnownPage, Registered, calibrate
 from lightpage.calibration.coherence import page_coherence
@@ -35,11 +34,13 @@ from lightpage.calibration.parameters import NAMES, as_dict, as_vector
 from lightpage.calibration.samplers import FieldSampler
 from lightpage.calibration.sampling_table import registration_coefficients
 from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device, draw_device
 from lightpage.errors import CalibrationError, InvalidInputError
-from lightpage.files import OutputFile, write_json
+from lightpage.files import write_json
 from lightpage.page.symbols import random_symbols, symbol_phases
+from lightpage.progress import track
 from lightpage.recording.reader import FramePair, Recording
 from lightpage.simulator.simulator import Simulator, true_parameters
 from lightpage.waves.grid import field_grid
@@ -251,14 +252,14 @@ def main(
     settings |= {"profile": profile_name, "profile_sha256": hashlib.sha256(profile.to_toml().encode()).hexdigest()}
     done = {seed: o for seed, o in load(json_path, settings).items() if o.failure is None}
     bench = Bench(profile, pages)
-    tqdm.write(HEADER)
+    click.echo(HEADER)
     seeds = range(first_seed, first_seed + devices)
-    for seed in tqdm(seeds, unit="device"):
+    for seed in track(seeds, "calibrate", unit="device"):
         if seed not in done:
             done[seed] = bench.foreign(seed) if foreign else bench.own(seed)
             document = {"settings": settings, "outcomes": [asdict(done[s]) for s in sorted(done)]}
             write_json(json_path, document)
-        tqdm.write(done[seed].line())
+        click.echo(done[seed].line())
     figures = summary([done[seed] for seed in seeds])
     document = {"settings": settings, "summary": figures, "outcomes": [asdict(done[s]) for s in sorted(done)]}
     write_json(json_path, document)

@@ -22,11 +22,11 @@ from analysis.report.data import exit_centroids
 from lightpage.calibration.calibrate import calibrate
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
+from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device, Sensor
 from lightpage.metrics.information import achievable_rate, measure, own_information, page_kilobytes
 from lightpage.page.symbols import pilot_mask
-from lightpage.progress import percent_bar
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.simulator.simulator import true_parameters

@@ -30,9 +30,10 @@ from analysis.comparison.decoders_figure import draw, title
 from analysis.comparison.kept import TRAINED, Kept
 from analysis.comparison.levels import LEVEL_HEADER
 from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, Sensor, ideal_device
-from lightpage.files import OutputFolder, write_json
+from lightpage.files import write_json
 from train.fitting.fit import Hyperparameters
 from train.fitting.memory import keep_freed_memory
 from train.published.localizers import NAMES as PUBLISHED

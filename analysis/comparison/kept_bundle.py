@@ -24,10 +24,10 @@ from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.cli.main import run as run_command
+from lightpage.cli.paths import NewPath, OutputFolder
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
-from lightpage.files import NewPath, OutputFolder
 from lightpage.page.symbols import pilot_mask, symbol_phases
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob

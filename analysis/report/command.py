@@ -9,8 +9,9 @@ import click
 from analysis.report.from_evaluation import report_of_evaluation
 from analysis.report.from_run import report_of_run
 from analysis.report.page import render
+from lightpage.cli.paths import OutputFile
 from lightpage.errors import InvalidInputError
-from lightpage.files import OutputFile, replace_text
+from lightpage.files import replace_text
 
 
 @click.command()

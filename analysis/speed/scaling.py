@@ -17,8 +17,9 @@ import numpy as np
 from analysis.speed.speed import at_symbol_pitch, frames_of, seconds_of, session_of
 from analysis.studies.scaling import enlarged
 from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
-from lightpage.files import OutputFile, write_json
+from lightpage.files import write_json
 from runtime.execution.cpus import available_cpus
 
 

@@ -30,8 +30,9 @@ from export.onnx_files import decoder_onnx
 from lightpage.calibration.parameters import nominal
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
-from lightpage.files import OutputFile, write_json
+from lightpage.files import write_json
 from lightpage.recording.reader import FramePair
 from runtime.decoding.decoder import inputs_left
 from runtime.execution.constant_table import GraphFile

@@ -10,10 +10,11 @@ import torch
 from analysis.studies import STUDIES
 from analysis.studies.study import RESULTS, Settings, aligned, measured
 from lightpage.cli.options import FiniteRange
+from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import load_profile
 from lightpage.errors import InvalidInputError
-from lightpage.files import OutputFile, OutputFolder, replace_file, replace_text, write_json
-from lightpage.progress import percent_bar
+from lightpage.files import replace_file, replace_text, write_json
 from train.fitting.memory import keep_freed_memory
 from train.runs import BEGUN, begin, sole_writer
 

@@ -25,7 +25,6 @@ import click
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from analysis.comparison.kept import TRAINED
 from analysis.comparison.kept_bundle import export_kept, light_of
@@ -43,13 +42,15 @@ from analysis.tracking.tables import (
 from lightpage.calibration.image_search import ImageSearch
 from lightpage.calibration.sampling_table import registration_coefficients
 from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, draw_device
 from lightpage.errors import FrameError, InvalidInputError
-from lightpage.files import OutputFolder, write_json
+from lightpage.files import write_json
 from lightpage.metrics.information import measure
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
+from lightpage.progress import track
 from lightpage.recording.reader import FramePair, Recording
 from lightpage.simulator.simulator import Simulator, true_parameters
 from runtime.bulk.evaluation import evaluate, was_seen
@@ -151,7 +152,7 @@ def share_of(air: float, reference: float) -> float:
 def offsets(point: Point, seeds: int) -> Figures:
     """The first page of a decoder that was just started, its image off by so much in any direction."""
     rows = []
-    for seed in tqdm(range(seeds), desc=f"{point.name}: offsets", unit="seed"):
+    for seed in track(range(seeds), f"{point.name}: offsets", unit="seed"):
         rng = np.random.default_rng([_OFFSETS, seed])
         written = [point.symbols(_OFFSETS, seed, page) for page in range(2)]
         settled, simulators = (
@@ -187,7 +188,7 @@ def knocked(simulator: Simulator, by_px: tuple[float, float], symbols: NDArray[n
 def apart(point: Point, seeds: int) -> Figures:
     """The same where the quadrature camera alone has moved."""
     rows, pose = [], point.device.quadrature_camera
-    for seed in tqdm(range(seeds), desc=f"{point.name}: cameras apart", unit="seed"):
+    for seed in track(range(seeds), f"{point.name}: cameras apart", unit="seed"):
         rng = np.random.default_rng([_OFFSETS, 1, seed])
         written = point.symbols(_OFFSETS, seed, 1)
         tracked, _ = point.air(point.tracker.fork(), point.simulator(seed).page(written), written)
@@ -234,7 +235,7 @@ def false_acquisitions(point: Point, pages: int) -> Figures:
     """Pages of other devices, swapped frames and noise, each read by a decoder that was just started."""
     kinds: dict[str, dict[str, int]] = {}
     shares = []
-    for kind, pair in tqdm(wrong_pages(point, pages), total=3 * pages, desc=f"{point.name}: wrong", unit="page"):
+    for kind, pair in track(wrong_pages(point, pages), f"{point.name}: wrong", unit="page", total=3 * pages):
         row = kinds.setdefault(kind, dict.fromkeys(("pages", "found", "given_out", "frames_refused", "unconfirmed"), 0))
         row["pages"] += 1
         row["found"] += point.search.find(pair, point.pilots).found
@@ -253,7 +254,7 @@ def walk(point: Point, pages: int, way: str) -> Figures:
     """A walk without a gap, read page by page."""
     tracker, simulator = point.tracker.fork(), point.simulator(_WALKS, reference_stays=way.endswith("reference stays"))
     rng, rows, place = np.random.default_rng(_WALKS), [], np.zeros(2)
-    for page in tqdm(range(pages), desc=f"{point.name}: {way}", unit="page"):
+    for page in track(range(pages), f"{point.name}: {way}", unit="page"):
         step = np.array([0.0, WALK_PX]) if way.startswith("straight") else rng.normal(0, WALK_PX, 2)
         simulator.knock((float(step[0]), float(step[1])))
         place = place + step
@@ -269,7 +270,7 @@ def sound_pages(point: Point, pages: int) -> Figures:
     """Pages of the device as it is, read one after the other: how often one is not given out, or a re-fit is asked."""
     simulator = Simulator(point.decoder.bundle.profile, point.device, LEVELS, _WALKS + 1)
     tracker, shares, lost, due = point.tracker.fork(), [], 0, 0
-    for page in tqdm(range(pages), desc=f"{point.name}: sound pages", unit="page"):
+    for page in track(range(pages), f"{point.name}: sound pages", unit="page"):
         try:
             found = tracker.decode(simulator.page(point.symbols(_WALKS, 1, page)), LEVELS)
         except UnconfirmedPageError:
@@ -312,7 +313,7 @@ def full_size(seeds: int) -> Figures:
     turn = device.homodyne.turn_rad
     homodyne = np.array([np.cos(turn), np.sin(turn)], np.float32)
     pilots, rows = Pilots.of_profile(profile, LEVELS), []
-    for seed in tqdm(range(seeds), desc="full size", unit="page"):
+    for seed in track(range(seeds), "full size", unit="page"):
         simulator = Simulator(profile, device, LEVELS, seed)
         by = np.random.default_rng([_OFFSETS, 2, seed]).uniform(-12, 12, 2)
         simulator.knock((float(by[0]), float(by[1])))
@@ -343,7 +344,7 @@ def gaps(bundle: Path, recording: Path) -> Figures:
     with Recording.open(recording) as pages:
         in_order = evaluate(decoder, pages, tracker.fork()).air_per_page
         mask = decoder.bundle.pilot_mask if (own := pages.pilots()) is None else own
-        for page in tqdm(range(pages.pages), desc=str(recording), unit="page"):
+        for page in track(range(pages.pages), str(recording), unit="page"):
             frames, symbols = pages.frames(page), pages.symbols(page)
             if symbols is None or was_seen(decoder, frames):
                 continue

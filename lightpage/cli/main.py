@@ -14,8 +14,10 @@ from typing import Any, NoReturn, Self
 
 import click
 
+from lightpage.cli.paths import check_outputs
+from lightpage.cli.progress_bar import Bars
 from lightpage.errors import LightpageError
-from lightpage.files import check_outputs
+from lightpage.progress import reporting
 
 GROUP = "lightpage.commands"
 
@@ -134,7 +136,7 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
     termination = _Termination()
     try:
         arguments = list(sys.argv[1:] if arguments is None else arguments)
-        with termination, command.make_context(name, arguments) as ctx:
+        with termination, reporting(Bars()), command.make_context(name, arguments) as ctx:
             meta = ctx.meta
             command.invoke(ctx)
     except click.exceptions.Exit as end:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from lightpage.device.profile import Profile, to_toml
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import random_symbols
+from lightpage.progress import track
 from lightpage.recording.reader import RecordingWriter
 from lightpage.recording.writer import discard_partial, partial_path
 from lightpage.simulator.simulator import LIGHT, Simulator
@@ -76,9 +76,7 @@ class RecordingJob:
             if self.truth:
                 writer.set_truth(to_toml(self.device))
             simulator.skip(writer.pages)
-            for page in tqdm(
-                range(writer.pages, pages), initial=writer.pages, total=pages, unit="page", desc="simulate"
-            ):
+            for page in track(range(writer.pages, pages), "simulate", total=pages, done=writer.pages):
                 self._append(writer, simulator, page)
         self.settings.unlink(missing_ok=True)
 

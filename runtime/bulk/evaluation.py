@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.metrics.accumulator import Tally
 from lightpage.metrics.information import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps, page_kilobytes
 from lightpage.page.pilots import Pilots, estimate_piston
+from lightpage.progress import track
 from lightpage.recording.reader import FramePair, Recording, page_hashes
 from runtime.bulk.refused import RefusedPage, refusal, unconfirmed
 from runtime.bundle.manifest import GOLDEN
@@ -20,8 +21,6 @@ from runtime.decoding.frames import narrow
 from runtime.decoding.page import Timings
 from runtime.decoding.tracking import Tracker
 from runtime.errors import LostPageError
-
-PageDone = Callable[[], object]
 
 _MAP_DECIMALS = 4
 """Of maps in JSON: finer than the noise of any number of pages, and short enough to write."""
@@ -131,16 +130,13 @@ def check_recording(decoder: Decoder, recording: Recording) -> None:
         )
 
 
-def evaluate(
-    decoder: Decoder, recording: Recording, tracker: Tracker, page_done: PageDone = lambda: None
-) -> Evaluation:
+def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evaluation:
     """Decode all unseen pages in their order and measure them against their symbols; a bad page is left out and told.
 
     Args:
         decoder: what to measure.
         recording: pages with known symbols.
         tracker: follows the device from page to page.
-        page_done: told after every page, seen and refused ones too.
 
     Raises:
         RecordingError: another device's recording, or one without symbols.
@@ -157,7 +153,7 @@ def evaluate(
     tally = Tally(levels, data, recording.pages)
     timings: list[Timings] = []
     refused: list[RefusedPage] = []
-    for index in range(recording.pages):
+    for index in track(range(recording.pages), "evaluate"):
         page = None
         try:
             frames, symbols = recording.frames(index), recording.symbols(index)
@@ -169,7 +165,6 @@ def evaluate(
         if page is not None and symbols is not None:
             tally.add(page.phase[data], page.concentration[data], symbols[data])
             timings.append(page.timings)
-        page_done()
     if not timings and refused:
         told = refusal(f"recording {recording.path}", refused, recording.pages)
         figures = {

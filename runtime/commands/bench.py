@@ -8,9 +8,10 @@ from pathlib import Path
 
 import click
 import numpy as np
-from tqdm import tqdm
 
-from lightpage.files import OutputFile, write_json
+from lightpage.cli.paths import OutputFile
+from lightpage.files import write_json
+from lightpage.progress import track
 from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
@@ -43,7 +44,7 @@ def bench(bundle: str, rounds: int, threads: int | None, json_path: Path | None)
             "grpc": lambda: client.decode(pair, LEVELS),
         }
         seconds: dict[str, list[float]] = {name: [] for name in ways}
-        for turn in tqdm(range(rounds + WARM_UP), desc="bench", unit="round"):
+        for turn in track(range(rounds + WARM_UP), "bench", unit="round"):
             for name, way in ways.items():
                 start = time.perf_counter()
                 way()

@@ -11,14 +11,15 @@ from typing import Any
 
 import click
 import numpy as np
-from tqdm import tqdm
 
+from lightpage.cli.paths import OutputFile
+from lightpage.cli.progress_bar import warn
 from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError, RecordingError
-from lightpage.files import OutputFile, write_json
+from lightpage.files import write_json
 from lightpage.metrics.information import PageMeasures, measure
 from lightpage.page.symbols import pilot_symbols
-from lightpage.progress import warn
+from lightpage.progress import track
 from lightpage.recording.reader import Recording
 from runtime.bulk.refused import WORTH_NOTHING, RefusedPage, refusal, unconfirmed
 from runtime.client.client import LightpageClient
@@ -71,7 +72,7 @@ def decode(
                 raise InvalidInputError(f"service at {target}", "no source", "a service started with --source")
             thing, decoded = f"source of {target}", _read(client, count, levels)
         writer = stack.enter_context(DecodedWriter(out, levels)) if out is not None else None
-        for page in tqdm(decoded, total=count, unit="page", desc="decode"):
+        for page in track(decoded, "decode", total=count):
             if isinstance(page, RefusedPage):
                 refused.append(page)
                 continue

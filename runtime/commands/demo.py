@@ -7,9 +7,10 @@ from pathlib import Path
 
 import click
 
+from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import InvalidInputError
-from lightpage.files import OutputFile, OutputFolder, write_json
-from lightpage.progress import percent_bar
+from lightpage.files import write_json
 from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.demo.demo import AIR_LEVELS, LEVELS, DemoResult, run_demo
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-from tqdm import tqdm
 
-from lightpage.files import OutputFile, write_json
-from lightpage.progress import warn
+from lightpage.cli.paths import OutputFile
+from lightpage.cli.progress_bar import warn
+from lightpage.files import write_json
 from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import Evaluation, NothingReadError
 from runtime.bulk.evaluation import evaluate as evaluate_recording
@@ -32,10 +32,10 @@ def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int |
     make the exit status 2.
     """
     decoder = Decoder.load(bundle_path(bundle), threads)
-    with Recording.open(recording) as pages, tqdm(total=pages.pages, unit="page", desc="evaluate") as bar:
+    with Recording.open(recording) as pages:
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
         try:
-            count, result = pages.pages, evaluate_recording(decoder, pages, tracker, bar.update)
+            count, result = pages.pages, evaluate_recording(decoder, pages, tracker)
         except NothingReadError as error:
             if json_path is not None:
                 write_json(json_path, error.figures)

@@ -8,8 +8,9 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from lightpage.cli.paths import OutputFile
 from lightpage.errors import InvalidInputError
-from lightpage.files import OutputFile, replace_file, replace_text
+from lightpage.files import replace_file, replace_text
 
 
 @click.command()

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages, lit_pages
 from lightpage.cli.options import FiniteRange
+from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.cli.progress_bar import percent_bar, warn
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError, RecordingError
-from lightpage.files import OutputFile, OutputFolder, write_json
+from lightpage.files import write_json
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
-from lightpage.progress import percent_bar, warn
 from lightpage.recording.reader import Recording, hash_frames
 from train.commands.calibrate import DEFAULT_PAGES, calibrate_recording
 from train.data.features import FeatureExtractor

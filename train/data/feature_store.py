@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from numpy.lib.format import open_memmap
 from torch.utils.data import Dataset
-from tqdm import tqdm
 
 from lightpage.files import replace_text
+from lightpage.progress import track
 from train.data.features import PageFeatures, PageState
 from train.fitting.fit import Page
 from train.fitting.processes import is_first_process
@@ -99,7 +99,7 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
             old.unlink()
     arrays: dict[str, np.memmap[Any, Any]] = {}
     with torch.inference_mode():
-        pages = tqdm(make(done, shift), desc=what, unit="page", initial=done, total=count)
+        pages = track(make(done, shift), what, total=count, done=done)
         for number, page in zip(range(done, count), pages, strict=False):
             values = {name: getattr(page, name) for name in _SHOWN}
             values[_PAGE_STATE] = np.array([*page.state.shift_px, page.state.piston_rad])

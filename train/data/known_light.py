@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.wave_model import FittedWaves, illumination_terms, on_modulator
 from lightpage.device.profile import Profile
+from lightpage.progress import track
 from lightpage.waves.grid import symbol_samples
 from train.data.features import FeatureExtractor
 from train.models.field import Measured
@@ -67,7 +67,7 @@ def explained(
     stride = max(1, int(np.sqrt(np.prod(grid.shape) / _EQUATIONS)))
     at_few = FittedWaves(profile, parameters, samples, filled=True, stride=stride, accuracy=ACCURACY, grid=grid)
     found = []
-    for page in tqdm(pages, desc="light of known pages", unit="page"):
+    for page in track(pages, "light of known pages"):
         phases = np.angle(page.symbols)
         state = extractor.state(extractor.field(page.pair), phases, np.zeros(2))
         with torch.no_grad():

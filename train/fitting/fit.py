@@ -25,12 +25,12 @@ from scipy import optimize
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, RandomSampler
 
+from lightpage.cli.progress_bar import warn
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file, replace_text
 from lightpage.metrics.information import achievable_rate, decide
 from lightpage.page.pilots import Pilots, estimate_piston
-from lightpage.progress import warn
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
 from train.fitting.curves import TENSORBOARD, Curve, curves_of, thinned
 from train.fitting.loss import training_rate, von_mises_nll

@@ -8,10 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from lightpage.files import replace_text
 from lightpage.page.symbols import symbol_phases
+from lightpage.progress import track
 from lightpage.recording.reader import Recording
 from train.data.features import FeatureExtractor, PageState
 
@@ -36,7 +36,7 @@ def page_states(
         return states, seconds
     start = time.monotonic() - seconds
     done = len(states)
-    for page in tqdm(pages[done:], desc="piston and shift", unit="page", initial=done, total=len(pages)):
+    for page in track(pages[done:], "piston and shift", total=len(pages), done=done):
         symbols = recording.symbols(page)
         assert symbols is not None
         shift = np.array(states[-1].shift_px) if states else np.zeros(2)

@@ -1,0 +1,95 @@
+"""Options that name files and folders to write, known before the work begins to be ones that can be written."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lightpage.errors import InvalidInputError
+
+
+class NewPath(click.ParamType[Path]):
+    """An option that names a new file or folder: known before the work begins to be one that can be made."""
+
+    name = "path"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path.
+
+        Raises:
+            InvalidInputError: its folder cannot be written.
+        """
+        path = Path(value)
+        folder = path.absolute().parent
+        while not folder.exists():
+            folder = folder.parent
+        _check_writable(folder, path, param)
+        return path
+
+
+class OutputFile(click.ParamType[Path]):
+    """An option that names a file to write: known before the work begins to be one that `replace_text` can write."""
+
+    name = "file"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path.
+
+        Raises:
+            InvalidInputError: it is a folder, or its folder is missing or cannot be written.
+        """
+        path = Path(value)
+        if path.is_dir():
+            raise InvalidInputError(_option(path, param), "a folder", "a file")
+        _check_writable(path.absolute().parent, path, param)
+        return path
+
+
+class OutputFolder(click.ParamType[Path]):
+    """An option that names the folder that a command works in, there or yet to be made."""
+
+    name = "folder"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path.
+
+        Raises:
+            InvalidInputError: it is empty, or something else than a folder.
+        """
+        path = Path(value)
+        if not str(value):
+            raise InvalidInputError(param.opts[0] if param is not None else "path", "an empty name", "a folder")
+        if path.exists() and not path.is_dir():
+            raise InvalidInputError(_option(path, param), "a file", "a folder")
+        return path
+
+
+def check_outputs(context: click.Context) -> None:
+    """Check that no option of a command names for writing what another one names.
+
+    Raises:
+        InvalidInputError: the same file is to be read and written, or written twice.
+    """
+    given = [(param, context.params.get(param.name or "")) for param in context.command.params]
+    paths = [(param, Path(value)) for param, value in given if isinstance(value, str | Path) and str(value)]
+    for param, path in paths:
+        for other, there in paths:
+            if param is other or not isinstance(param.type, NewPath | OutputFile):
+                continue
+            if path.resolve() == there.resolve():
+                named = other.opts[0] if isinstance(other, click.Option) else other.make_metavar(context)
+                raise InvalidInputError(_option(path, param), f"what {named} names", "a file of its own")
+
+
+def _option(path: Path, param: click.Parameter | None) -> str:
+    return f"{param.opts[0]} {path}" if param is not None else str(path)
+
+
+def _check_writable(folder: Path, path: Path, param: click.Parameter | None) -> None:
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise InvalidInputError(_option(path, param), error, "a path that can be written") from None

@@ -1,0 +1,67 @@
+"""What commands say on stderr on their way: bars on a terminal, elsewhere a line now and then; and warnings."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import click
+from tqdm import tqdm
+
+from lightpage.progress import Progress
+
+T = TypeVar("T")
+
+LINE_S = 30.0
+"""Seconds from one line to the next where stderr is no terminal."""
+
+
+class _Lines(tqdm):  # type: ignore[type-arg]
+    """A line now and then in place of a bar, so that a log can be read."""
+
+    def __init__(self, items: Iterable[Any] | None = None, **settings: Any) -> None:
+        settings["bar_format"] = "lightpage: {desc}: {percentage:.0f}% after {elapsed}, about {remaining} left"
+        super().__init__(items, mininterval=LINE_S, miniters=1, **settings)
+
+    @staticmethod
+    def status_printer(file: Any) -> Callable[[str], None]:
+        """Lines that stay, where a bar would be drawn over itself."""
+        return lambda text: print(text, file=file, flush=True) if text.strip() else None
+
+
+def bar(items: Iterable[T] | None = None, **settings: Any) -> tqdm[T]:
+    """A bar over the items, or one that is moved by its `update`; settings as for `tqdm`."""
+    kind = tqdm if sys.stderr.isatty() else _Lines
+    shown: tqdm[T] = kind(items, **settings)
+    return shown
+
+
+class Bars:
+    """Shows loops that track their items; see `lightpage.progress.Reporter`."""
+
+    def track(self, items: Iterable[T], what: str, unit: str, total: int | None, done: int) -> Iterable[T]:
+        """See `Reporter`."""
+        return bar(items, desc=what, unit=unit, total=total, initial=done)
+
+
+@contextmanager
+def percent_bar() -> Iterator[Progress]:
+    """A bar as the callback that tells of progress; it is full when the `with` statement ends well."""
+    shown: tqdm[object] = bar(total=100, unit="%", bar_format="{desc}{percentage:3.0f}%|{bar}| {elapsed}")
+    with shown:
+
+        def progress(step: str, share: float) -> None:
+            shown.set_description(step, refresh=False)
+            shown.update(max(0.0, 100 * share - shown.n))
+            if not isinstance(shown, _Lines):
+                shown.refresh()
+
+        yield progress
+        progress("done", 1.0)
+
+
+def warn(what: str) -> None:
+    """Say on stderr what the user should know of work that goes on."""
+    click.echo(f"lightpage: warning: {what}", err=True)
