@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Protocol, TypeVar
+
+_log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -19,6 +22,9 @@ class Reporter(Protocol):
     def track(self, items: Iterable[T], what: str, unit: str, total: int | None, done: int) -> Iterable[T]:
         """The same items; `total` of them with the `done` ones that an earlier run has behind it."""
 
+    def note(self, what: str) -> None:
+        """Tell whoever watches."""
+
 
 _reporter: ContextVar[Reporter | None] = ContextVar("reporter", default=None)
 
@@ -31,6 +37,23 @@ def reporting(reporter: Reporter) -> Iterator[None]:
         yield
     finally:
         _reporter.reset(token)
+
+
+def note(what: str) -> None:
+    """Tell whoever watches what they should know of work that goes on."""
+    reporter = _reporter.get()
+    if reporter is None:
+        _log.info(what)
+    else:
+        reporter.note(what)
+
+
+def warn(what: str) -> None:
+    """The same of what may be wrong."""
+    if _reporter.get() is None:
+        _log.warning(what)
+    else:
+        note(f"warning: {what}")
 
 
 def track(items: Iterable[T], what: str, *, unit: str = "page", total: int | None = None, done: int = 0) -> Iterable[T]:

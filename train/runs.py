@@ -24,9 +24,10 @@ from lightpage.calibration.document import Calibration, parse_calibration
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file, replace_text
-from train.fitting.fit import CHECKPOINTS, FITTED, Hyperparameters
-from train.fitting.processes import is_first_process
+from train.fitting.fitted import CHECKPOINTS, FITTED
 from train.models.decoder import SymbolDecoder
+from train.models.hyperparameters import Hyperparameters
+from train.processes import is_first_process
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.training import PublishedChoices
 

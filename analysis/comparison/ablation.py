@@ -26,9 +26,10 @@ from lightpage.files import write_json
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import FeatureExtractor, PageFeatures
 from train.data.patches import training_pages
-from train.fitting.fit import Hyperparameters, fit_network
+from train.fitting.fit import fit_network
 from train.fitting.memory import keep_freed_memory
 from train.models.field import ROUNDS
+from train.models.hyperparameters import Hyperparameters
 from train.models.network import SymbolUNet
 from train.runs import sole_writer
 

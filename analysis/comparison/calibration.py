@@ -27,6 +27,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.foreign_device import ForeignDevice
 from lightpage.calibration.calibrate import KnownPage, Registered, calibrate
 from lightpage.calibration.coherence import page_coherence
 from lightpage.calibration.known_pages import known_pages
@@ -44,7 +45,6 @@ from lightpage.progress import track
 from lightpage.recording.reader import FramePair, Recording
 from lightpage.simulator.simulator import Simulator, true_parameters
 from lightpage.waves.grid import field_grid
-from tests.system.foreign_device import ForeignDevice
 from train.models.field import FieldRecovery, TorchFieldSolver
 from train.models.twin import RayTwin, TorchTwin
 from train.runs import FORMAT

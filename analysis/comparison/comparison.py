@@ -33,29 +33,25 @@ from lightpage.simulator.simulator import true_parameters
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import FeatureExtractor, PageFeatures
 from train.data.known_light import explained
+from train.data.pages import Page
 from train.data.patches import training_pages
+from train.fitting.concentration_scale import best_kappa_scale, decode_pages, without_piston
 from train.fitting.curves import Curve
-from train.fitting.fit import (
-    DecoderTraining,
-    Fitted,
-    Hyperparameters,
-    Page,
-    SymbolTraining,
-    best_kappa_scale,
-    decode_pages,
-    fit_network,
-    without_piston,
-)
+from train.fitting.fit import fit_network
+from train.fitting.fitted import Fitted
+from train.fitting.modules import DecoderTraining, SymbolTraining
 from train.models.decoder import LOCALIZERS
 from train.models.field import FieldRecovery, TorchFieldSolver
+from train.models.hyperparameters import Hyperparameters
 from train.models.localizers.coherent import BILINEAR
+from train.models.prediction import Prediction
 from train.models.twin import RayTwin, TorchTwin
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import train_published
 from train.published.states import page_states
 from train.published.training import FramePages, PublishedChoices
 from train.runs import begin
-from train.trainers.refinement import Prediction, RefinementPages, fit_prediction, fit_refinements, refined_pages
+from train.trainers.refinement import RefinementPages, fit_prediction, fit_refinements, refined_pages
 from train.trainers.symbols import LIKENESS_PAGES
 
 Real = NDArray[np.float64]

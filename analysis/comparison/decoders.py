@@ -34,8 +34,8 @@ from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, Sensor, ideal_device
 from lightpage.files import write_json
-from train.fitting.fit import Hyperparameters
 from train.fitting.memory import keep_freed_memory
+from train.models.hyperparameters import Hyperparameters
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import published_choices
 from train.runs import sole_writer

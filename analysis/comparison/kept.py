@@ -16,7 +16,7 @@ import torch
 
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file
-from train.fitting.fit import CHECKPOINTS, FITTED, FITTED_WEIGHTS
+from train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS
 from train.runs import BEGUN, FORMAT
 
 TRAINED = Path(__file__).parents[1] / "weights"

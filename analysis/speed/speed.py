@@ -38,8 +38,8 @@ from runtime.decoding.decoder import inputs_left
 from runtime.execution.constant_table import GraphFile
 from runtime.execution.cpus import available_cpus
 from runtime.execution.session import Session, open_session
-from train.fitting.fit import Hyperparameters
 from train.models.decoder import SymbolDecoder
+from train.models.hyperparameters import Hyperparameters
 from train.models.twin import RayTwin, TorchTwin
 from train.published.recipe import published_decoder
 from train.published.training import PublishedChoices

@@ -17,8 +17,8 @@ from lightpage.calibration.parameters import nominal
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.profile import Profile
 from lightpage.progress import Progress
-from train.fitting.fit import Hyperparameters
 from train.models.field import FieldRecovery
+from train.models.hyperparameters import Hyperparameters
 from train.models.localizers.coherent import CoherentLocalizer
 from train.models.network import SymbolUNet
 from train.models.twin import RayTwin, TorchTwin

@@ -45,6 +45,10 @@ class Bars:
         """See `Reporter`."""
         return bar(items, desc=what, unit=unit, total=total, initial=done)
 
+    def note(self, what: str) -> None:
+        """See `Reporter`."""
+        click.echo(f"lightpage: {what}", err=True)
+
 
 @contextmanager
 def percent_bar() -> Iterator[Progress]:
@@ -60,8 +64,3 @@ def percent_bar() -> Iterator[Progress]:
 
         yield progress
         progress("done", 1.0)
-
-
-def warn(what: str) -> None:
-    """Say on stderr what the user should know of work that goes on."""
-    click.echo(f"lightpage: warning: {what}", err=True)

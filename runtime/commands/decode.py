@@ -13,13 +13,12 @@ import click
 import numpy as np
 
 from lightpage.cli.paths import OutputFile
-from lightpage.cli.progress_bar import warn
 from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.files import write_json
 from lightpage.metrics.information import PageMeasures, measure
 from lightpage.page.symbols import pilot_symbols
-from lightpage.progress import track
+from lightpage.progress import track, warn
 from lightpage.recording.reader import Recording
 from runtime.bulk.refused import WORTH_NOTHING, RefusedPage, refusal, unconfirmed
 from runtime.client.client import LightpageClient

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from lightpage.cli.paths import OutputFile
-from lightpage.cli.progress_bar import warn
 from lightpage.files import write_json
+from lightpage.progress import warn
 from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import Evaluation, NothingReadError
 from runtime.bulk.evaluation import evaluate as evaluate_recording

@@ -10,9 +10,10 @@ import click
 from lightpage.calibration.known_pages import first_lit_pages
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import NewPath, OutputFile
-from lightpage.cli.progress_bar import percent_bar, warn
+from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
+from lightpage.progress import warn
 from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.manifest import check_version

@@ -32,7 +32,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.execution.session import open_session
 from tests.export.untrained import untrained_decoder
 from tests.lightpage.small import small_profile
-from train.fitting.fit import Hyperparameters
+from train.models.hyperparameters import Hyperparameters
 from train.models.twin import RayTwin, TorchTwin
 from train.runs import GOLDEN, REFERENCES, WEIGHTS, Run, load_run
 

@@ -19,7 +19,7 @@ from lightpage.waves.grid import field_grid
 from runtime.execution.session import open_session
 from tests.export.untrained import untrained_decoder
 from tests.lightpage.small import small_profile
-from train.fitting.fit import Hyperparameters
+from train.models.hyperparameters import Hyperparameters
 from train.models.localizers.coherent import BILINEAR
 from train.models.twin import RayTwin, TorchTwin
 

@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
-from train.fitting.fit import Hyperparameters
 from train.models.decoder import SymbolDecoder
+from train.models.hyperparameters import Hyperparameters
 
 
 def untrained_decoder(profile: Profile, parameters: NDArray[np.float64], choices: Hyperparameters) -> SymbolDecoder:

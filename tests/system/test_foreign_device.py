@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from tests.system import foreign_device as fd
-from tests.system.foreign_device import Camera, ForeignDevice, PageDrift, Parameters
+from analysis import foreign_device as fd
+from analysis.foreign_device import Camera, ForeignDevice, PageDrift, Parameters
 
 GLASS = fd.GLASS_INDEX * fd.WAVENUMBER
 PERFECT = ForeignDevice()
@@ -40,7 +40,7 @@ def modes(numbers: list[tuple[int, int]], amplitudes: np.ndarray, length: float)
 
 def test_nothing_of_the_project_is_imported() -> None:
     code = (
-        "import sys, tests.system.foreign_device;"
+        "import sys, analysis.foreign_device;"
         "print([m for m in sys.modules if m.split('.')[0] in ('optics', 'train', 'export', 'runtime', 'torch')])"
     )
     root = Path(__file__).parents[2]

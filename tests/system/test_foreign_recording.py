@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.system.foreign_device import ForeignDevice
+from analysis.foreign_device import ForeignDevice
 
 PAGES = 16
 STEPS = 300

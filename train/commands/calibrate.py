@@ -14,10 +14,10 @@ from lightpage.calibration.coherence import seen_share
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.known_pages import first_lit_pages, known_pages
 from lightpage.cli.paths import OutputFile
-from lightpage.cli.progress_bar import percent_bar, warn
+from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile, load_profile
 from lightpage.files import write_json
-from lightpage.progress import Progress
+from lightpage.progress import Progress, warn
 from lightpage.recording.reader import Recording
 from train.models.field import FieldRecovery, TorchFieldSolver
 from train.models.twin import RayTwin, TorchTwin

@@ -14,20 +14,22 @@ from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages, lit_pages
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import OutputFile, OutputFolder
-from lightpage.cli.progress_bar import percent_bar, warn
+from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.files import write_json
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
+from lightpage.progress import warn
 from lightpage.recording.reader import Recording, hash_frames
 from train.commands.calibrate import DEFAULT_PAGES, calibrate_recording
+from train.commands.options import chosen_recipe, given_choices, with_choices
 from train.data.features import FeatureExtractor
 from train.data.material import Material
-from train.fitting.fit import Hyperparameters
 from train.fitting.memory import keep_freed_memory
-from train.fitting.processes import is_first_process
 from train.fitting.provenance import provenance
 from train.models.decoder import LOCALIZERS
+from train.models.hyperparameters import Hyperparameters
+from train.processes import is_first_process
 from train.published.localizers import NAMES as PUBLISHED
 from train.runs import (
     DESCRIPTION,
@@ -41,7 +43,6 @@ from train.runs import (
     save_weights,
     sole_writer,
 )
-from train.trainers.choices import chosen_recipe, given_choices, with_choices
 from train.trainers.symbols import LIKENESS_PAGES, SymbolRecipe
 
 _FEWEST_PAGES = 6

@@ -16,8 +16,8 @@ from torch.utils.data import Dataset
 from lightpage.files import replace_text
 from lightpage.progress import track
 from train.data.features import PageFeatures, PageState
-from train.fitting.fit import Page
-from train.fitting.processes import is_first_process
+from train.data.pages import Page
+from train.processes import is_first_process
 
 _STATE = "state.json"
 _SHOWN = ("light", "positions", "belief", "phases")

@@ -12,7 +12,8 @@ from torch.utils.data import Dataset
 
 from lightpage.errors import InvalidInputError
 from train.data.feature_store import FeatureStore
-from train.fitting.fit import Hyperparameters, Page
+from train.data.pages import Page
+from train.models.hyperparameters import Hyperparameters
 from train.models.network import reach, with_page_coordinates
 
 

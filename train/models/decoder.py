@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from torch import Tensor, nn
 
 from lightpage.device.profile import Profile
-from train.fitting.fit import Hyperparameters
 from train.models.field import FieldRecovery, Measured
+from train.models.hyperparameters import Hyperparameters
 from train.models.localizers.coherent import CoherentLocalizer
 from train.models.localizers.wave import WaveLocalizer
 from train.models.network import Refiner, SymbolUNet
+from train.models.prediction import Prediction
 from train.models.waves import Real
-from train.trainers.refinement import Prediction
 
 COHERENT, WAVE = "coherent", "wave"
 LOCALIZERS = (COHERENT, WAVE)

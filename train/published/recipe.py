@@ -15,7 +15,9 @@ from lightpage.device.lenses import lens_of
 from lightpage.device.profile import Profile
 from lightpage.recording.reader import FramePair
 from train.data.material import Material, Trained
-from train.fitting.fit import Fitted, best_kappa_scale, fit, seed_stretch
+from train.fitting.concentration_scale import best_kappa_scale
+from train.fitting.fit import fit, seed_stretch
+from train.fitting.fitted import Fitted
 from train.published.decoder import PARAXIAL, PublishedDecoder, make_localizer
 from train.published.states import page_states
 from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining

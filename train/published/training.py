@@ -17,7 +17,8 @@ from torch.utils.data import Dataset
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.reader import Recording
 from train.data.features import PageState
-from train.fitting.fit import DecoderTraining, Page
+from train.data.pages import Page
+from train.fitting.modules import DecoderTraining
 from train.published.decoder import PARAXIAL, PublishedDecoder
 from train.published.localizers import RayLocalizer
 

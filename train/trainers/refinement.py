@@ -15,10 +15,8 @@ from itertools import chain, repeat
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor, nn
+from torch import nn
 
-from lightpage.calibration.wave_model import illumination_terms
 from lightpage.device.profile import Profile
 from lightpage.recording.reader import Recording
 from lightpage.waves.grid import FieldGrid
@@ -26,86 +24,17 @@ from train.data.feature_store import FeatureStore, fill
 from train.data.features import FeatureExtractor, PageFeatures
 from train.data.known_light import Explained
 from train.data.patches import training_pages
-from train.fitting.fit import Fitted, Hyperparameters, SymbolTraining, fit_network
-from train.models.field import FieldRecovery, Measured
-from train.models.localizers.wave import by_symbol
+from train.fitting.fit import fit_network
+from train.fitting.fitted import Fitted
+from train.fitting.modules import SymbolTraining
+from train.models.hyperparameters import Hyperparameters
 from train.models.network import Refiner
-from train.models.parts import conjugate, multiply, parts, stacked, turned
-from train.models.waves import Real, WaveMatrices, Waves
+from train.models.parts import stacked, turned
+from train.models.prediction import Prediction
+from train.models.waves import Real
 
 _FLOORS = (0.05, 20.0)
 """Least and largest `Measured.pull` floor that is believed."""
-
-
-class Prediction(nn.Module):
-    """What decoded symbols leave unexplained of both frames, on the modulator.
-
-    Args:
-        profile: the nominal device.
-        parameters: [P] fitted.
-        grid: the common grid, where it is not the usual one.
-
-    Attributes:
-        illumination: real and imaginary parts of the factors of `illumination_terms`, [2, 6]; even until fitted.
-        floor: see `Measured.pull`; one until it is fitted (`fit_prediction`).
-    """
-
-    def __init__(self, profile: Profile, parameters: Real, grid: FieldGrid | None = None) -> None:
-        super().__init__()
-        self.waves = Waves(profile, parameters, filled=True, grid=grid)
-        self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
-        self.illumination: Tensor
-        self.floor: Tensor
-        even = torch.zeros(2, len(self._terms()))
-        even[0, 0] = 1
-        self.register_buffer("illumination", even)
-        self.register_buffer("floor", torch.ones(()))
-
-    @property
-    def light_channels(self) -> int:
-        """Features that carry unexplained light: real parts of a symbol's samples, then imaginary parts."""
-        return 2 * self.waves.samples**2
-
-    def field(self, at: WaveMatrices, p: Tensor) -> Tensor:
-        """Expected field on the common grid, [2, Gy, Gx], of a believed page p [2, ny, nx]; its scale is open."""
-        samples = self.waves.samples
-        written = expected_phasors(p).repeat_interleave(samples, dim=1).repeat_interleave(samples, dim=2)
-        illumination = torch.tensordot(self.illumination, torch.stack(self._terms()), 1)
-        return self.waves.to_camera(at, torch.stack(multiply(parts(written), parts(illumination))))
-
-    def _terms(self) -> list[Tensor]:
-        return illumination_terms(self.waves.x_m / self._half_width, self.waves.y_m / self._half_height)
-
-    def forward(
-        self, recovery: FieldRecovery, measured: Measured, field: Tensor, p: Tensor, parameters: Tensor | None = None
-    ) -> Tensor:
-        """Light that a believed page leaves unexplained.
-
-        Args:
-            recovery: of the same device.
-            measured, field: of the page; the field says how strong its light is.
-            p: [2, ny, nx].
-            parameters: [P] of a device that has drifted since.
-
-        Returns:
-            [2, 1, S, ny, nx], as a localizer gives it.
-        """
-        at = self.waves.matrices(parameters)
-        expected = self.field(at, p)
-        real, imaginary = multiply(parts(field), conjugate(parts(expected)))
-        gain = torch.stack([real.sum(), imaginary.sum()]) / (expected.square().sum() + 1e-12)
-        expected = torch.stack(multiply(parts(expected), parts(gain)))
-        left = recovery.innovation(measured, expected, self.floor)
-        return by_symbol(self.waves.to_page(at, left), self.waves.samples)
-
-
-def expected_phasors(p: Tensor) -> Tensor:
-    """Mean of exp(i phase) under von Mises beliefs, [2, ...] to [2, ...].
-
-    Its length, a ratio of Bessel functions, lies within 5% of kappa / (1/2 + sqrt(kappa^2 + 9/4)), one of the bounds of
-    Amos (Math. Comp. 28, 1974).
-    """
-    return p / (0.5 + torch.sqrt(p.square().sum(0, keepdim=True) + 2.25))
 
 
 def fit_prediction(

@@ -6,21 +6,25 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import click
 import numpy as np
 from torch import Tensor, nn
 
 from lightpage.calibration.known_pages import known_pages
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
+from lightpage.progress import note
 from lightpage.waves.grid import symbol_samples
 from train.data.feature_store import FeatureStore, fill
 from train.data.known_light import Explained, explained
 from train.data.material import Material, Trained
 from train.data.patches import training_pages
 from train.data.synthetic import MOST_NOISE, SyntheticPages, likeness
-from train.fitting.fit import Fitted, Hyperparameters, SymbolTraining, best_kappa_scale, fit_network
+from train.fitting.concentration_scale import best_kappa_scale
+from train.fitting.fit import fit_network
+from train.fitting.fitted import Fitted
+from train.fitting.modules import SymbolTraining
 from train.models.decoder import WAVE, SymbolDecoder
+from train.models.hyperparameters import Hyperparameters
 from train.runs import load_decoder, load_run
 from train.trainers.refinement import Refined, RefinementPages, fit_prediction, fit_refinements
 
@@ -180,9 +184,9 @@ class SymbolRecipe:
         profile, vector, seed = material.profile, material.calibration.vector, self.choices.seed
         like = likeness(known)
         if like.noise > MOST_NOISE:
-            click.echo(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
+            note(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
             return []
-        click.echo(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
+        note(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
         folder = material.out / "synthetic"
         reader = self.choices.coherent_localizer(profile)
         pages = SyntheticPages(

@@ -32,7 +32,7 @@ from lightpage.simulator.simulator import true_parameters
 from tests.lightpage.small import small_profile
 from train.data.features import FeatureExtractor, PageFeatures
 from train.fitting.curves import curves_of
-from train.fitting.fit import FITTED
+from train.fitting.fitted import FITTED
 
 PROFILE = small_profile()
 

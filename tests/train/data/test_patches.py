@@ -13,7 +13,8 @@ from lightpage.errors import InvalidInputError
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import PageFeatures, PageState
 from train.data.patches import Patches, training_pages
-from train.fitting.fit import Hyperparameters, SymbolTraining
+from train.fitting.modules import SymbolTraining
+from train.models.hyperparameters import Hyperparameters
 from train.models.network import SymbolUNet, reach, with_page_coordinates
 
 SHAPE = (30, 41)

@@ -18,7 +18,7 @@ from tests.conftest import SMALL_PAGES
 from tests.lightpage.small import THICK, small_profile
 from train.commands.train import train
 from train.data.features import PageState
-from train.fitting.fit import Page
+from train.data.pages import Page
 from train.published.recipe import published_choices, published_decoder, train_published
 from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
 from train.runs import load_run

@@ -21,10 +21,11 @@ from tests.lightpage.small import small_profile
 from train.commands.train import train
 from train.data.features import FeatureExtractor
 from train.data.known_light import explained
-from train.fitting.fit import Hyperparameters
+from train.models.hyperparameters import Hyperparameters
 from train.models.parts import turned
+from train.models.prediction import Prediction, expected_phasors
 from train.runs import load_decoder, load_run
-from train.trainers.refinement import Prediction, expected_phasors, fit_prediction
+from train.trainers.refinement import fit_prediction
 
 PROFILE = small_profile()
 SURE = 1e4

@@ -13,8 +13,8 @@ import click
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
 from lightpage.waves.grid import GRID_STEP_PX
-from train.fitting.fit import Hyperparameters
 from train.models.decoder import LOCALIZERS, WAVE
+from train.models.hyperparameters import Hyperparameters
 from train.models.localizers.coherent import BICUBIC, BILINEAR
 from train.published.decoder import LENS_CHOICES
 from train.published.localizers import NAMES as PUBLISHED

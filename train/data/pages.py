@@ -1,0 +1,8 @@
+"""What a network is shown of a page."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+Page = tuple[Tensor, ...]
+"""One page, or a batch of them: what the decoder is told, and last its true phases [ny, nx]."""

@@ -1,0 +1,97 @@
+"""The factor on a decoder's concentrations under which held-out pages are most likely."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import optimize
+from torch.utils.data import DataLoader, Dataset
+
+from lightpage.metrics.information import achievable_rate, decide
+from lightpage.page.pilots import Pilots, estimate_piston
+from lightpage.progress import warn
+from train.data.pages import Page
+from train.fitting.loss import von_mises_nll
+from train.fitting.modules import DecoderTraining
+from train.models.parts import turned
+
+_SCALE_BOUNDS = (-3.0, 3.0)
+"""Bounds of the logarithm of a factor that makes a decoder's claims honest: hardly trained ones were off by five."""
+
+_AT_A_BOUND = 1e-3
+
+
+def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> float:
+    """AIR in bits per data symbol of decoded pages.
+
+    Args:
+        p: [pages, 2, ny, nx].
+        phases: true phases [pages, ny, nx].
+        mask: pilots, bool [ny, nx].
+        levels: M of the pages.
+    """
+    rates = []
+    for page, truth in zip(p, phases, strict=True):
+        px, py = without_piston(page, truth, mask)[:, ~mask]
+        air = achievable_rate(np.arctan2(py, px), np.hypot(px, py), decide(truth[~mask], levels), levels)
+        rates.append(float(np.mean(air)))
+    return float(np.mean(rates))
+
+
+def without_piston(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """p [2, ny, nx] of a page, turned by what its pilots show of the piston, as the runtime does it.
+
+    Args:
+        p: decoded.
+        phases: true phases [ny, nx].
+        mask: pilots, bool [ny, nx].
+    """
+    turn = estimate_piston(p, Pilots(mask, phases[mask].astype(np.float64))).angle_rad
+    return np.asarray(turned(torch.tensor(p), -turn).numpy(), dtype=np.float32)
+
+
+def decode_pages(module: DecoderTraining[Any], pages: Dataset[Page]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What a trained module says of pages, p [pages, 2, ny, nx], and their true phases [pages, ny, nx]."""
+    outputs, truths = [], []
+    with torch.no_grad():
+        for *page, phases in DataLoader(pages, batch_size=None):
+            outputs.append(module(*(part[None] for part in page))[0].float().numpy())
+            truths.append(phases.numpy())
+    return np.stack(outputs), np.stack(truths)
+
+
+def best_kappa_scale(module: DecoderTraining[Any], pages: Dataset[Page], mask: NDArray[np.bool_]) -> float:
+    """Factor on p under which held-out pages are most likely: the network's claim, made honest.
+
+    Piston is taken off by the pilots first, as the runtime does it.
+    """
+    outputs, truths = [], []
+    for p, truth in zip(*decode_pages(module, pages), strict=True):
+        outputs.append(without_piston(p, truth, mask)[:, ~mask])
+        truths.append(truth[~mask])
+    return honest_factor(np.concatenate(outputs, axis=1), np.concatenate(truths))
+
+
+def honest_factor(p: NDArray[np.float32], phases: NDArray[np.float32]) -> float:
+    """Factor on p [2, N] under which the true phases [N] are most likely."""
+    shown, asked = torch.from_numpy(p)[None], torch.from_numpy(phases)[None]
+    return most_likely_factor(lambda factor: float(von_mises_nll(shown * factor, asked).mean()))
+
+
+def most_likely_factor(nll: Callable[[float], float]) -> float:
+    """Factor under which the truth is most likely; says so where the search ends at a bound.
+
+    Args:
+        nll: negative log-likelihood of the truth, by factor.
+    """
+    found = optimize.minimize_scalar(lambda log: nll(math.exp(log)), bounds=_SCALE_BOUNDS, method="bounded")
+    log_factor = float(found.x)
+    if min(log_factor - _SCALE_BOUNDS[0], _SCALE_BOUNDS[1] - log_factor) < _AT_A_BOUND:
+        what = f"claims would be more honest still beyond the factor {math.exp(log_factor):.3g}, where the search ends"
+        warn(f"{what}: is the decoder trained?")
+    return math.exp(log_factor)

@@ -1,0 +1,77 @@
+"""What a training run chooses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from lightpage.device.profile import Profile
+from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
+from train.models.field import ROUNDS
+from train.models.localizers.coherent import BICUBIC, CoherentLocalizer
+
+_REFINEMENT_STEPS = 0.25
+"""Steps of a refinement's network over those of the first."""
+
+_FEWEST_STEPS = 2
+"""That a learning rate can rise and fall in."""
+
+
+@dataclass(frozen=True)
+class Hyperparameters:
+    """Everything that a training run chooses.
+
+    Attributes:
+        channels, blocks, levels: size of the network, see `SymbolUNet`.
+        refinements: how often the decoder looks again, see `train.trainers.refinement`.
+        field_rounds, binning: of the field's recovery, see `train.models.field.FieldRecovery`.
+        field_step: pitch of the common grid, camera pixels.
+        samples, interpolation: see `CoherentLocalizer`.
+        steps: optimiser steps.
+        batch: pages a step, or patches of large ones.
+        patch: symbols along a patch's edge; smaller pages are trained on whole.
+        learning_rate: peak of the one-cycle schedule.
+        weight_decay: of AdamW.
+        seed: of initial weights, batches and rotations.
+        precision: Lightning's; bf16-mixed is fastest on CPUs with bf16 and on GPUs.
+    """
+
+    channels: int = 96
+    blocks: int = 2
+    levels: int = 0
+    refinements: int = 0
+    field_rounds: int = ROUNDS
+    binning: int = 1
+    field_step: int = GRID_STEP_PX
+    samples: int = 0
+    interpolation: str = BICUBIC
+    steps: int = 6000
+    batch: int = 4
+    patch: int = 96
+    learning_rate: float = 4e-3
+    weight_decay: float = 1e-3
+    seed: int = 0
+    precision: str = "bf16-mixed"
+
+    @property
+    def first_look(self) -> str:
+        """What the features of the first look depend on."""
+        return f"{self.field_rounds} {self.binning} {self.field_step} {self.samples} {self.interpolation}"
+
+    def grid(self, profile: Profile) -> FieldGrid:
+        """The common grid of these choices."""
+        return field_grid(profile, self.field_step)
+
+    def coherent_localizer(self, profile: Profile) -> CoherentLocalizer:
+        """The localizer of these choices."""
+        return CoherentLocalizer(profile, self.samples, self.interpolation, self.grid(profile))
+
+    def drawn(self, page_shape: tuple[int, int]) -> float:
+        """Pages that all steps together are shown, a patch counting for its share of one."""
+        share = math.prod(min(count, self.patch) / count for count in page_shape)
+        return self.steps * self.batch * share
+
+    def of_refinement(self) -> Hyperparameters:
+        """The choices for a refinement's network, which starts from a good belief and sees little light."""
+        steps = max(_FEWEST_STEPS, round(_REFINEMENT_STEPS * self.steps))
+        return replace(self, channels=max(1, self.channels * 2 // 3), blocks=1, levels=0, refinements=0, steps=steps)
