@@ -218,7 +218,7 @@ class ForeignDevice:
         phase += p.defocus_rad * rho**2
         phase += p.astigmatism_rad * rho**2 * np.cos(2 * (phi - np.deg2rad(p.astigmatism_axis_deg)))
         phase += p.coma_rad * rho**3 * np.cos(phi - np.deg2rad(p.coma_axis_deg))
-        return (1 - p.falloff * rho**2) * np.exp(1j * phase)
+        return np.asarray((1 - p.falloff * rho**2) * np.exp(1j * phase))
 
     def launch(self, page: ComplexArray) -> ComplexArray:
         """From SLM pixels to the entrance facet [y', x], as the pipe sees it."""
@@ -227,8 +227,9 @@ class ForeignDevice:
         top, left = ((a - b) // 2 for a, b in zip(PADDED_PX, PAGE_PX, strict=True))
         padded[top : top + PAGE_PX[0], left : left + PAGE_PX[1]] = page
         turned = turn(padded, -roll)
-        centre_x, centre_y = rotate(*(c * SLM_PITCH for c in self.parameters.page_centre_px), -roll)
-        y0, x0 = (c - (n - 1) / 2 * SLM_PITCH for c, n in zip((centre_y, centre_x), PADDED_PX, strict=True))
+        right, down = self.parameters.page_centre_px
+        centre_x, centre_y = rotate(right * SLM_PITCH, down * SLM_PITCH, -roll)
+        y0, x0 = (float(c) - (n - 1) / 2 * SLM_PITCH for c, n in zip((centre_y, centre_x), PADDED_PX, strict=True))
         facet_y, facet_x = self.facet_coordinates
         dy, dx = self.pitches
         tangent, cosine = np.tan(self.angle), np.cos(self.angle)
@@ -287,7 +288,7 @@ class ForeignDevice:
         x, y = self.plane_coordinates(camera, drift)
         stretch = 1 + self.parameters.distortion * (x**2 + y**2) / CORNER**2
         x, y = rotate(x * stretch, y * stretch, -np.deg2rad(self.parameters.pipe_roll_deg))
-        return image.at(x, y) * np.exp(1j * drift.piston_rad)
+        return np.asarray(image.at(x, y) * np.exp(1j * drift.piston_rad))
 
     def reference(self, camera: Camera) -> ComplexArray:
         """The reference on a camera's pixels."""
@@ -300,9 +301,9 @@ class ForeignDevice:
             along = x * np.cos(direction) + y * np.sin(direction)
             fringes += amplitude * np.cos(2 * np.pi * along / period + phase)
         half_height, half_width = (n * SLM_PITCH / 2 for n in PAGE_PX)
-        phase = p.tilt_rad[0] * x / half_width + p.tilt_rad[1] * y / half_height
-        phase = phase + p.curvature_rad * (x**2 + y**2) / CORNER**2
-        return self.signal_rms * p.reference_ratio * (1 + p.ripple * fringes) * np.exp(1j * phase)
+        front = p.tilt_rad[0] * x / half_width + p.tilt_rad[1] * y / half_height
+        front = front + p.curvature_rad * (x**2 + y**2) / CORNER**2
+        return np.asarray(self.signal_rms * p.reference_ratio * (1 + p.ripple * fringes) * np.exp(1j * front))
 
     @property
     def electrons_per_intensity(self) -> float:
@@ -322,7 +323,8 @@ class ForeignDevice:
         )
         full_scale = 2**p.bit_depth - 1
         counts = np.rint(electrons * (full_scale / (p.full_well_e * exposures)))
-        return np.clip(counts, 0, full_scale).astype(np.uint8 if p.bit_depth == 8 else np.uint16)
+        frame_type = np.uint8 if p.bit_depth == 8 else np.uint16
+        return np.asarray(np.clip(counts, 0, full_scale).astype(frame_type), frame_type)
 
     def intensities(self, image: Image | None, drift: PageDrift = PageDrift()) -> tuple[FloatArray, FloatArray]:
         """Light on the in-phase and the quadrature camera; of the reference alone where there is no image."""

@@ -1,1 +1,60 @@
-"""No torch: bundle, decoder, frame sources, recalibration, gRPC service, client, command line."""
+"""No torch: bundles, decoding, frame sources, recalibration, the gRPC service and its client.
+
+What most users need is here by name: `runtime.load("bench")`. Each name is imported when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from runtime.bulk.evaluation import Evaluation, evaluate
+    from runtime.bundle.bundle import Bundle
+    from runtime.client.client import LightpageClient
+    from runtime.decoding.decoder import Decoder
+    from runtime.decoding.image_tracker import tracker_for
+    from runtime.decoding.page import DecodedPage
+
+_HOMES = {
+    "Bundle": "runtime.bundle.bundle",
+    "DecodedPage": "runtime.decoding.page",
+    "Decoder": "runtime.decoding.decoder",
+    "Evaluation": "runtime.bulk.evaluation",
+    "LightpageClient": "runtime.client.client",
+    "evaluate": "runtime.bulk.evaluation",
+    "tracker_for": "runtime.decoding.image_tracker",
+}
+
+__all__ = [
+    "Bundle",
+    "DecodedPage",
+    "Decoder",
+    "Evaluation",
+    "LightpageClient",
+    "evaluate",
+    "load",
+    "tracker_for",
+]
+
+
+def load(name_or_path: str, threads: int | None = None) -> Decoder:
+    """The decoder of a bundle.
+
+    Args:
+        name_or_path: of a bundle, or the name of a shipped one.
+        threads: of an inference; by default all cores.
+
+    Raises:
+        BundleError: there is none, or it is damaged.
+    """
+    from runtime.bundle.shipped import bundle_path
+    from runtime.decoding.decoder import Decoder
+
+    return Decoder.load(bundle_path(name_or_path), threads)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

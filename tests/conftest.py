@@ -18,7 +18,10 @@ from lightpage.cli.simulate import simulate
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
 from lightpage.simulator.simulator import true_parameters
+from runtime.bundle.bundle import Bundle
+from runtime.decoding.decoder import Decoder
 from tests.lightpage.small import small_profile
+from tests.runtime import toy
 
 BENCH_PAGES = 3
 SMALL_PAGES = 8
@@ -78,3 +81,18 @@ def small_device(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     Calibration.from_registered(right, profile, ["0" * 64]).save(folder / "C.toml")
     named = {"--profile": "small.toml", "--recording": "R.h5", "--calibration": "C.toml"}
     return [word for option, name in named.items() for word in (option, str(folder / name))]
+
+
+@pytest.fixture(scope="session")
+def toy_zip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return toy.write_toy_bundle(tmp_path_factory.mktemp("bundle") / "toy.zip")
+
+
+@pytest.fixture(scope="session")
+def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return toy.write_toy_bundle(tmp_path_factory.mktemp("bundle") / "toy")
+
+
+@pytest.fixture(scope="session")
+def decoder(toy_zip: Path) -> Decoder:
+    return Decoder(Bundle.open(toy_zip), threads=1)
