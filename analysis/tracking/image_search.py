@@ -165,24 +165,24 @@ def offsets(point: Point, seeds: int) -> Figures:
             for stays in (False, True):
                 way = rng.uniform(0, 2 * np.pi)
                 by = offset * np.cos(way), offset * np.sin(way)
-                air, found = point.air(point.tracker.fork(), knocked(simulators[stays], by, written[1]), written[1])
-                rows.append(
-                    {"seed": seed, "offset_px": offset, "by_px": by, "reference_stays": stays, "air": air}
-                    | {
-                        "share_of_tracked": share_of(air, tracked),
-                        "extra_seconds": found["seconds"] - told["seconds"],
-                        **found,
-                    }
-                )
+                started = point.tracker.fork()
+                first, second = knocked(simulators[stays], by, written[1])
+                air, found = point.air(started, first, written[1])
+                then, _ = point.air(started, second, written[1])
+                row = {"seed": seed, "offset_px": offset, "by_px": by, "reference_stays": stays, "air": air}
+                row |= {"share_of_tracked": share_of(air, tracked), "next_share": share_of(then, tracked)}
+                rows.append(row | {"extra_seconds": found["seconds"] - told["seconds"], **found})
     return {"rows": rows}
 
 
-def knocked(simulator: Simulator, by_px: tuple[float, float], symbols: NDArray[np.uint8]) -> FramePair:
-    """A page whose image lies off; the next one lies where it was."""
+def knocked(
+    simulator: Simulator, by_px: tuple[float, float], symbols: NDArray[np.uint8]
+) -> tuple[FramePair, FramePair]:
+    """A page twice, whose image lies off; the next one lies where it was."""
     simulator.knock(by_px)
-    pair = simulator.page(symbols)
+    pairs = simulator.page(symbols), simulator.page(symbols)
     simulator.knock((-by_px[0], -by_px[1]))
-    return pair
+    return pairs
 
 
 def apart(point: Point, seeds: int) -> Figures:
