@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from lightpage.device.profile import Profile, load_profile
     from lightpage.device.state import Device, load_device
     from lightpage.errors import LightpageError
-    from lightpage.metrics.information import PageMeasures, measure
+    from lightpage.metrics.measures import PageMeasures, measure
     from lightpage.page.pilots import Pilots
     from lightpage.recording.reader import FramePair, Recording, RecordingWriter
     from lightpage.simulator.simulator import Simulator

@@ -25,7 +25,8 @@ from lightpage.calibration.known_pages import known_pages
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device, Sensor
-from lightpage.metrics.information import achievable_rate, measure, own_information, page_kilobytes
+from lightpage.metrics.information import achievable_rate, own_information, page_kilobytes
+from lightpage.metrics.measures import measure
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob

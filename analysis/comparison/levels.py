@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.metrics.information import measure
+from lightpage.metrics.measures import measure
 from lightpage.recording.reader import Recording
 
 JUDGED = 0.01, 0.3

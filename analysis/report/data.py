@@ -12,7 +12,9 @@ from lightpage.calibration.document import Calibration
 from lightpage.calibration.sampling_table import symbol_centres
 from lightpage.device.lenses import LensPrescription
 from lightpage.device.profile import Profile
-from lightpage.metrics.information import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps, page_kilobytes
+from lightpage.metrics.information import page_kilobytes
+from lightpage.metrics.measures import PageMeasures, SymbolMaps
+from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.recording.reader import FramePair
 from train.fitting.curves import Curve
 from train.models.twin import RayTwin, TorchTwin

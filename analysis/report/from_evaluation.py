@@ -17,7 +17,8 @@ from analysis.report.data import Golden, Rays, ReportData, how_long
 from lightpage.calibration.document import parse_calibration
 from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError
-from lightpage.metrics.information import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps
+from lightpage.metrics.measures import PageMeasures, SymbolMaps
+from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.page.pilots import remove_piston
 from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.reader import FramePair

@@ -20,7 +20,9 @@ from torch.nn import functional
 from analysis.studies.study import Result, Settings
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
-from lightpage.metrics.information import decide, expected_calibration_error, measure, page_kilobytes, symbol_maps
+from lightpage.metrics.information import decide, page_kilobytes
+from lightpage.metrics.measures import measure, symbol_maps
+from lightpage.metrics.reliability import expected_calibration_error
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording

@@ -47,7 +47,7 @@ from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, draw_device
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.files import write_json
-from lightpage.metrics.information import measure
+from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track

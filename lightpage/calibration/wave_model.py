@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from lightpage.calibration.parameters import as_dict
 from lightpage.calibration.phases import camera_phase, launch_phase
 from lightpage.device.profile import Profile
-from lightpage.waves.channel import WaveChannel, WaveGeometry, cells_for
+from lightpage.waves.channel import WaveChannel
+from lightpage.waves.geometry import WaveGeometry, cells_for
 from lightpage.waves.grid import FieldGrid, field_grid, splitting_steps
 
 Real = NDArray[np.float64]

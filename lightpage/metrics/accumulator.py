@@ -6,19 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import PageError
-from lightpage.metrics.information import (
-    CONCENTRATION_CAP,
-    ECE_BINS,
-    ConcentrationBin,
-    ConfidenceBin,
-    PageMeasures,
-    SymbolMaps,
-    calibration_error,
-    decide_with_confidence,
-    measure,
-    reliability,
-    symbol_maps,
-)
+from lightpage.metrics.information import CONCENTRATION_CAP, decide_with_confidence
+from lightpage.metrics.measures import PageMeasures, SymbolMaps, measure, symbol_maps
+from lightpage.metrics.reliability import ECE_BINS, ConcentrationBin, ConfidenceBin, calibration_error, reliability
 from lightpage.von_mises import mean_resultant
 
 _INDEX_BITS = 33

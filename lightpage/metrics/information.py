@@ -6,8 +6,7 @@ concentration `kappa`. All figures are computed in float64. `levels` is M: symbo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +21,10 @@ Floats = NDArray[np.float64]
 CONCENTRATION_CAP = 1e9
 """Beyond this the float64 difference kappa I1/I0 - log I0 loses digits; one symbol of 256 levels needs about 1e5."""
 
-ECE_BINS = 15
 _WINDOW = 12
+
 _ALIASING = 60.0
+
 _CHUNK = 8192
 
 
@@ -64,7 +64,7 @@ def log_posterior(
     Raises:
         PageError: shapes differ, a symbol outside 0..M-1, a phase or concentration that is not finite.
     """
-    m, phase, k, s = _checked(mu, kappa, symbols, levels)
+    m, phase, k, s = checked(mu, kappa, symbols, levels)
     error = s * (2 * np.pi / m) - phase
     return np.asarray(k * (np.cos(error) - 1) - _partition(phase, k, m)[0])
 
@@ -98,7 +98,7 @@ def gray_rate(
     Raises:
         PageError: as `log_posterior`, or M is no power of two and has no Gray labels.
     """
-    m, phase, k, s = _checked(mu, kappa, symbols, levels)
+    m, phase, k, s = checked(mu, kappa, symbols, levels)
     if m & (m - 1):
         raise PageError("levels of a Gray-labelled page", m, "a power of two")
     bits = m.bit_length() - 1
@@ -112,162 +112,6 @@ def gray_rate(
             alike = (labels[None, :] >> bit & 1) == (sent[:, None] >> bit & 1)
             total[rows] += (logsumexp(np.where(alike, logits, -np.inf), axis=1) - everything) / np.log(2)
     return total
-
-
-@dataclass(frozen=True)
-class ConfidenceBin:
-    """Symbols of similar confidence: what was claimed of them against how often it was right."""
-
-    low: float
-    high: float
-    count: int
-    confidence: float
-    """Mean over the bin."""
-    accuracy: float
-    """Share of right decisions."""
-
-
-def reliability(
-    confidence: NDArray[np.floating], correct: NDArray[np.bool_], bins: int = ECE_BINS
-) -> list[ConfidenceBin]:
-    """Claim and accuracy in `bins` bins of equal width on 0..1, in order; empty bins are left out.
-
-    Args:
-        confidence: posterior of each decided symbol, any shape.
-        correct: whether the decision was right, same shape.
-        bins: number of bins.
-
-    Raises:
-        PageError: no symbols.
-    """
-    c = np.asarray(confidence, np.float64).ravel()
-    if c.size == 0:
-        raise PageError("confidences", "none", "at least one")
-    index = np.clip((c * bins).astype(int), 0, bins - 1)
-    counts = np.bincount(index, minlength=bins)
-    claimed = np.bincount(index, c, bins) / np.maximum(counts, 1)
-    right = np.bincount(index, np.asarray(correct, np.float64).ravel(), bins) / np.maximum(counts, 1)
-    return [
-        ConfidenceBin(n / bins, (n + 1) / bins, int(counts[n]), float(claimed[n]), float(right[n]))
-        for n in np.flatnonzero(counts).tolist()
-    ]
-
-
-def expected_calibration_error(
-    confidence: NDArray[np.floating], correct: NDArray[np.bool_], bins: int = ECE_BINS
-) -> float:
-    """ECE: mean over symbols of |accuracy - mean confidence| of their bin; arguments and errors of `reliability`."""
-    return calibration_error(reliability(confidence, correct, bins))
-
-
-def calibration_error(bins: Sequence[ConfidenceBin]) -> float:
-    """ECE of symbols in `bins`, at least one."""
-    return sum(b.count * abs(b.accuracy - b.confidence) for b in bins) / sum(b.count for b in bins)
-
-
-@dataclass(frozen=True)
-class ConcentrationBin:
-    """Symbols of similar concentration: what they promised against what happened."""
-
-    low: float
-    high: float
-    count: int
-    promised: float
-    """Mean of I1/I0 over the bin."""
-    observed: float
-    """Mean cosine of the phase error."""
-
-
-@dataclass(frozen=True)
-class PageMeasures:
-    """The figures of one set of symbols whose truth is known."""
-
-    count: int
-    levels: int
-    air_bits_per_symbol: float
-    own_mi_bits_per_symbol: float
-    gmi_bits_per_symbol: float | None
-    """None where M is no power of two."""
-    symbol_error_rate: float
-    ece: float
-
-    @property
-    def over_claim_bits_per_symbol(self) -> float:
-        """Own-MI minus AIR: what the decoder claims beyond what a code could carry."""
-        return self.own_mi_bits_per_symbol - self.air_bits_per_symbol
-
-
-def measure(
-    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
-) -> PageMeasures:
-    """All figures of the symbols given, which should be data symbols only (pilots carry nothing).
-
-    Args:
-        mu: decoded phase, radians, piston already removed; any shape.
-        kappa: concentration, same shape.
-        symbols: the true symbols, same shape.
-        levels: M.
-    """
-    truth = np.asarray(symbols)
-    if truth.size == 0:
-        raise PageError("symbols to measure", "none", "at least one")
-    decided, confidence = decide_with_confidence(mu, kappa, levels)
-    correct = decided == truth
-    return PageMeasures(
-        count=int(truth.size),
-        levels=levels,
-        air_bits_per_symbol=float(achievable_rate(mu, kappa, truth, levels).mean()),
-        own_mi_bits_per_symbol=float(own_information(mu, kappa, levels).mean()),
-        gmi_bits_per_symbol=None if levels & (levels - 1) else float(gray_rate(mu, kappa, truth, levels).mean()),
-        symbol_error_rate=float(1 - correct.mean()),
-        ece=expected_calibration_error(confidence, correct),
-    )
-
-
-@dataclass(frozen=True)
-class SymbolMaps:
-    """Means over pages at every place of the page, float64 [ny, nx], NaN at pilots.
-
-    Attributes:
-        air: bits.
-        own_mi: bits, as the decoder claims.
-        error_rad: of the phase error's magnitude, radians.
-    """
-
-    air: Floats
-    own_mi: Floats
-    error_rad: Floats
-
-
-def symbol_maps(
-    mu: NDArray[np.floating],
-    kappa: NDArray[np.floating],
-    symbols: NDArray[np.integer],
-    levels: int,
-    data: NDArray[np.bool_],
-) -> SymbolMaps:
-    """What `measure` averages over the page, place by place.
-
-    Args:
-        mu, kappa, symbols: of the data symbols, [pages, number of Trues in data] in row order.
-        levels: M.
-        data: where the data symbols are, bool [ny, nx].
-
-    Raises:
-        PageError: as `log_posterior`, or the number of symbols is not that of `data`.
-    """
-    m, phase, k, s = _checked(mu, kappa, symbols, levels)
-    if phase.ndim != 2 or phase.shape[1] != np.count_nonzero(data):
-        raise PageError("data symbols", f"shape {phase.shape}", f"(pages, {np.count_nonzero(data)})")
-
-    def spread(values: Floats) -> Floats:
-        page = np.full(data.shape, np.nan)
-        page[data] = values.mean(axis=0)
-        return page
-
-    turned = s * (2 * np.pi / m) - phase
-    error = np.abs(turned - 2 * np.pi * np.rint(turned / (2 * np.pi)))
-    return SymbolMaps(spread(achievable_rate(phase, k, s, m)), spread(own_information(phase, k, m)), spread(error))
 
 
 def _partition(phase: Floats, kappa: Floats, levels: int) -> tuple[Floats, Floats]:
@@ -315,9 +159,14 @@ def _concentration(kappa: NDArray[np.floating]) -> Floats:
     return np.minimum(k, CONCENTRATION_CAP)
 
 
-def _checked(
+def checked(
     mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
 ) -> tuple[int, Floats, Floats, NDArray[np.int64]]:
+    """M, and the other arguments as flat arrays of one type each.
+
+    Raises:
+        PageError: see `log_posterior`.
+    """
     levels, phase, k = _checked_belief(mu, kappa, levels)
     s = np.atleast_1d(np.asarray(symbols))
     if phase.shape != s.shape:

@@ -22,7 +22,8 @@ from lightpage.simulator.cameras import (
     resample,
     to_counts,
 )
-from lightpage.waves.channel import WaveChannel, WaveGeometry, cells_for
+from lightpage.waves.channel import WaveChannel
+from lightpage.waves.geometry import WaveGeometry, cells_for
 from lightpage.waves.grid import check_camera, splitting_steps
 
 Real = NDArray[np.floating]

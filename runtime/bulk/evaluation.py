@@ -10,7 +10,9 @@ import numpy as np
 
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.metrics.accumulator import Tally
-from lightpage.metrics.information import ConcentrationBin, ConfidenceBin, PageMeasures, SymbolMaps, page_kilobytes
+from lightpage.metrics.information import page_kilobytes
+from lightpage.metrics.measures import PageMeasures, SymbolMaps
+from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.progress import track
 from lightpage.recording.reader import FramePair, Recording, page_hashes

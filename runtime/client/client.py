@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
@@ -13,11 +12,11 @@ from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, LightpageError
 from lightpage.recording.reader import FramePair
-from runtime.decoding.page import ImagePosition
+from runtime.client.answers import Description, ModelInfo, Recalibrated, model_info, recalibrated
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.wire.address import check_address
-from runtime.wire.messages import PIXEL_CODES, PIXEL_TYPES, KnownPilots, image_of, pilots_message
+from runtime.wire.messages import PIXEL_CODES, PIXEL_TYPES, KnownPilots, pilots_message
 from runtime.wire.pages import RemotePage, remote_page
 from runtime.wire.sizes import CHUNK_BYTES, REPLY_BYTES
 from runtime.wire.status import error_of
@@ -27,54 +26,6 @@ CALL_S = 60.0
 
 RECALIBRATION_S = 600.0
 """Deadline of a recalibration where none is given."""
-
-
-@dataclass(frozen=True)
-class ModelInfo:
-    """A model that the service holds."""
-
-    name: str
-    version: str
-    created: str
-    current: bool
-    metrics: dict[str, float]
-
-
-@dataclass(frozen=True)
-class Description:
-    """What a service is."""
-
-    service_version: str
-    model: ModelInfo
-    frame_shape: tuple[int, int]
-    frame_dtype: str
-    bit_depth: int
-    page_shape: tuple[int, int]
-    source: str
-    source_levels: int
-    profile_toml: str
-    calibration_toml: str
-    pilot_mask: NDArray[np.bool_]
-    pilot_phases: NDArray[np.float32] | None
-    """Radians, one a True of `pilot_mask` in row order; None for the profile's pattern."""
-
-
-@dataclass(frozen=True)
-class Recalibrated:
-    """The result of a recalibration: AIR in bits per symbol on held-back pages; None where the fit does not say."""
-
-    model_version: str
-    previous_version: str
-    pages_used: int
-    pages_held_back: int
-    air_before: float
-    air_after: float
-    angle_deg: float | None
-    coherence_before: float | None
-    coherence_after: float | None
-    seconds: float
-    pages_lost_before: int = 0
-    image: ImagePosition | None = None
 
 
 class LightpageClient:
@@ -121,7 +72,7 @@ class LightpageClient:
         reply: pb.DescribeReply = self._unary(self._stub.Describe, pb.DescribeRequest())
         self._description = Description(
             service_version=reply.service_version,
-            model=_model(reply.model),
+            model=model_info(reply.model),
             frame_shape=(reply.camera.rows_px, reply.camera.columns_px),
             frame_dtype=PIXEL_TYPES.get(reply.camera.pixel_type, "unknown"),
             bit_depth=reply.camera.bit_depth,
@@ -240,7 +191,7 @@ class LightpageClient:
             result = None
             for reply in call:  # to its end: a call that is left early counts as cancelled
                 if reply.WhichOneof("step") == "result":
-                    result = _recalibrated(reply.result)
+                    result = recalibrated(reply.result)
                 else:
                     progress(reply.progress.step, reply.progress.fraction)
         except grpc.RpcError as error:
@@ -267,7 +218,7 @@ class LightpageClient:
             LightpageError: no answer.
         """
         reply: pb.ListModelsReply = self._unary(self._stub.ListModels, pb.ListModelsRequest())
-        return [_model(model) for model in reply.models]
+        return [model_info(model) for model in reply.models]
 
     def _unary(self, method: Callable[..., Any], request: object) -> Any:
         try:
@@ -287,27 +238,3 @@ def _parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> It
 def _options(levels: int, concentration: bool, phase: bool, quantised: bool) -> pb.DecodeOptions:
     code = pb.CONFIDENCE_FORMAT_UINT8 if quantised else pb.CONFIDENCE_FORMAT_FLOAT32
     return pb.DecodeOptions(levels=levels, confidence_format=code, want_concentration=concentration, want_phase=phase)
-
-
-def _model(model: pb.Model) -> ModelInfo:
-    return ModelInfo(model.name, model.version, model.created, model.current, dict(model.metrics))
-
-
-def _recalibrated(result: pb.RecalibrationResult) -> Recalibrated:
-    def optional(name: str) -> float | None:
-        return float(getattr(result, name)) if result.HasField(name) else None
-
-    return Recalibrated(
-        model_version=result.model_version,
-        previous_version=result.previous_version,
-        pages_used=result.pages_used,
-        pages_held_back=result.pages_held_back,
-        air_before=result.air_before,
-        air_after=result.air_after,
-        angle_deg=optional("angle_deg"),
-        coherence_before=optional("coherence_before"),
-        coherence_after=optional("coherence_after"),
-        seconds=result.seconds,
-        pages_lost_before=result.pages_lost_before,
-        image=image_of(result.image) if result.HasField("image") else None,
-    )

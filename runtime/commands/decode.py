@@ -16,7 +16,7 @@ from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.files import write_json
-from lightpage.metrics.information import PageMeasures, measure
+from lightpage.metrics.measures import PageMeasures, measure
 from lightpage.page.symbols import pilot_symbols
 from lightpage.progress import track, warn
 from lightpage.recording.reader import Recording

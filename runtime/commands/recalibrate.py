@@ -18,9 +18,12 @@ from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.manifest import check_version
 from runtime.bundle.shipped import bundle_path
-from runtime.client.client import RECALIBRATION_S, LightpageClient, Recalibrated
+from runtime.client.answers import Recalibrated
+from runtime.client.client import RECALIBRATION_S, LightpageClient
 from runtime.decoding.decoder import Decoder
-from runtime.recalibration.recalibration import KnownPages, RecalibrationOutcome, next_version
+from runtime.recalibration.known_pages import KnownPages
+from runtime.recalibration.outcome import RecalibrationOutcome
+from runtime.recalibration.recalibration import next_version
 from runtime.recalibration.recalibration import recalibrate as recalibrate_bundle
 from runtime.recalibration.refit import refit
 from runtime.service.recalibrator import read_recorded

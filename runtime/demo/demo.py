@@ -15,8 +15,9 @@ from lightpage.errors import InvalidInputError
 from lightpage.metrics.information import achievable_rate
 from lightpage.progress import Progress
 from lightpage.recording.reader import FramePair
-from runtime.acquisition.sources import SimulatorSource
-from runtime.client.client import LightpageClient, Recalibrated
+from runtime.acquisition.simulator import SimulatorSource
+from runtime.client.answers import Recalibrated
+from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.recalibration.refit import refit

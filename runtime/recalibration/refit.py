@@ -21,7 +21,8 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_search import BundleSearch
 from runtime.decoding.page import ImagePosition
 from runtime.execution.twin import TWIN_THREADS, OnnxTwin
-from runtime.recalibration.recalibration import FitReport, FitResult, KnownPages
+from runtime.recalibration.known_pages import KnownPages
+from runtime.recalibration.outcome import FitReport, FitResult
 
 Real = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.recalibration.recalibration import RecalibrationOutcome
+from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.service.dataplane import Answer, ReadAnswer
 from runtime.service.registry import Model
 from runtime.wire.messages import FLOAT, image_message

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.reader import FramePair
-from runtime.acquisition.sources import FrameSource, SourcePage, own_fault
+from runtime.acquisition.source import FrameSource, SourcePage, own_fault
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
 from runtime.errors import LostPageError, SlotsTakenError, SourceError

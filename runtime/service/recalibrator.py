@@ -21,14 +21,16 @@ from lightpage.errors import (
 )
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
-from runtime.acquisition.sources import FrameSource, own_fault
+from runtime.acquisition.source import FrameSource, own_fault
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.archive import check_name
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
 from runtime.errors import CallerLeft, SourceError, StoppingError
-from runtime.recalibration.recalibration import Fit, KnownPages, RecalibrationOutcome, next_version, recalibrate
+from runtime.recalibration.known_pages import KnownPages
+from runtime.recalibration.outcome import Fit, RecalibrationOutcome
+from runtime.recalibration.recalibration import next_version, recalibrate
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import GRACE_S

@@ -13,7 +13,7 @@ from scipy import ndimage
 from export.command import export_run
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
-from lightpage.metrics.information import measure
+from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.reader import FramePair, Recording

@@ -16,7 +16,8 @@ from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import NothingReadError
 from runtime.commands.evaluate import evaluate
 from runtime.decoding.decoder import Decoder
-from runtime.recalibration.recalibration import KnownPages, recalibrate
+from runtime.recalibration.known_pages import KnownPages
+from runtime.recalibration.recalibration import recalibrate
 from runtime.recalibration.refit import refit
 from train.commands.train import train
 from train.published.recipe import published_decoder

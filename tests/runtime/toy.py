@@ -18,11 +18,12 @@ from lightpage.errors import CalibrationError
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.reader import FramePair, RecordingWriter
-from runtime.acquisition.sources import SourcePage
+from runtime.acquisition.source import SourcePage
 from runtime.bundle.bundle import Bundle, npz, write_bundle
 from runtime.bundle.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
 from runtime.decoding.decoder import Decoder
-from runtime.recalibration.recalibration import FitReport, FitResult, KnownPages
+from runtime.recalibration.known_pages import KnownPages
+from runtime.recalibration.outcome import FitReport, FitResult
 
 PROFILE_TOML = """
 schema_version = 1

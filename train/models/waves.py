@@ -25,9 +25,11 @@ from lightpage.calibration.wave_model import (
 )
 from lightpage.device.lens_path import SeidelTerms
 from lightpage.device.profile import Profile
-from lightpage.waves.channel import PipePropagator, WaveGeometry, couplings, detuning, entrance_window, on_facet
+from lightpage.waves.geometry import WaveGeometry, couplings, detuning, on_facet
 from lightpage.waves.grid import FieldGrid, field_grid, symbol_samples
+from lightpage.waves.lens import entrance_window
 from lightpage.waves.low_rank import Interpolation
+from lightpage.waves.pipe import PipePropagator
 from lightpage.waves.sinc_interpolation import interpolation
 from train.models.parts import Parts, adjoint, conjugate, matmul, multiply, parts, stacked
 

@@ -27,8 +27,8 @@ from lightpage.errors import PageError, ProfileError
 from lightpage.simulator.cameras import resample
 from lightpage.simulator.simulator import Simulator, TrueOptics, true_parameters
 from lightpage.waves import channel as waves
-from lightpage.waves.channel import FourierLens
 from lightpage.waves.grid import splitting_steps
+from lightpage.waves.lens import FourierLens
 from tests.lightpage.small import THICK, on_slm, perfect_device, random_phases, small_profile
 from train.models.twin import RayTwin, TorchTwin
 

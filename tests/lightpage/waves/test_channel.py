@@ -10,15 +10,10 @@ from scipy import fft, integrate, linalg, ndimage
 
 from lightpage.device.lens_path import SeidelTerms
 from lightpage.waves import channel as waves
-from lightpage.waves.channel import (
-    FourierLens,
-    PipePropagator,
-    WaveChannel,
-    WaveGeometry,
-    cells_for,
-    modes_for,
-    sine_matrix,
-)
+from lightpage.waves.channel import WaveChannel
+from lightpage.waves.geometry import WaveGeometry, cells_for, modes_for, sine_matrix
+from lightpage.waves.lens import FourierLens
+from lightpage.waves.pipe import PipePropagator
 
 DEVICE = WaveGeometry(
     wavelength_m=532e-9,

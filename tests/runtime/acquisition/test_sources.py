@@ -12,7 +12,9 @@ from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError, LightpageError, PageError, RecordingError
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import FramePair
-from runtime.acquisition.sources import RecordingSource, SimulatorSource, open_source
+from runtime.acquisition.recording import RecordingSource
+from runtime.acquisition.simulator import SimulatorSource
+from runtime.acquisition.sources import open_source
 from tests.runtime import toy
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lightpage.device.state import Device
-from lightpage.metrics.information import measure
+from lightpage.metrics.measures import measure
 from lightpage.page.symbols import random_symbols
 from lightpage.simulator.simulator import Simulator
 from runtime.bundle.shipped import DEFAULT, bundle_path

@@ -10,7 +10,7 @@ import pytest
 from onnx import TensorProto
 
 from lightpage.errors import BundleError, FrameError, InvalidInputError, PageError
-from lightpage.metrics.information import measure
+from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.recording.reader import FramePair
 from runtime.bundle.bundle import npz, write_bundle

@@ -15,7 +15,7 @@ from lightpage.page.symbols import pilot_mask, symbol_phases
 from runtime.commands.demo import demo
 from runtime.decoding.decoder import Decoder
 from runtime.demo.demo import drifted, run_demo, summarise
-from runtime.recalibration.recalibration import KnownPages
+from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.refit import refit
 from runtime.wire.pages import RemotePage, RemoteTimings
 from tests.runtime import toy

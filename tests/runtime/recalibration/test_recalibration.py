@@ -20,7 +20,9 @@ from lightpage.errors import (
 from lightpage.recording.reader import FramePair, hash_frames
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
-from runtime.recalibration.recalibration import FitReport, FitResult, KnownPages, next_version, recalibrate
+from runtime.recalibration.known_pages import KnownPages
+from runtime.recalibration.outcome import FitReport, FitResult
+from runtime.recalibration.recalibration import next_version, recalibrate
 from runtime.service.registry import ModelRegistry
 from runtime.service.store import CURRENT, KEPT_BUNDLES, ModelStore
 from tests.runtime import toy

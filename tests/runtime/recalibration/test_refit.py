@@ -10,7 +10,7 @@ import pytest
 
 from lightpage.device.state import Device
 from lightpage.errors import RecalibrationRefusedError
-from lightpage.metrics.information import measure
+from lightpage.metrics.measures import measure
 from lightpage.page.symbols import random_symbols
 from lightpage.simulator.simulator import Simulator
 from runtime.bundle.bundle import Bundle
@@ -20,7 +20,8 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.decoding.page import DecodedPage
 from runtime.demo.demo import LEVELS, drifted
-from runtime.recalibration.recalibration import KnownPages, recalibrate
+from runtime.recalibration.known_pages import KnownPages
+from runtime.recalibration.recalibration import recalibrate
 from runtime.recalibration.recalibration import refit as module
 from runtime.recalibration.refit import refit
 

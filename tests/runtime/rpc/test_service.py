@@ -25,7 +25,7 @@ from lightpage.errors import (
     RecalibrationRefusedError,
     RecordingError,
 )
-from lightpage.metrics.information import measure
+from lightpage.metrics.measures import measure
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.sources import open_source
@@ -36,7 +36,7 @@ from runtime.decoding.tracking import NoTracker
 from runtime.errors import Reason, SourceError, StoppingError, UnconfirmedPageError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.recalibration.recalibration import Fit, FitResult
+from runtime.recalibration.outcome import Fit, FitResult
 from runtime.rpc.server import SERVICE, LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits

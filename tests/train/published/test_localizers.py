@@ -8,7 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
-from lightpage.waves.channel import WaveChannel, WaveGeometry, cells_for
+from lightpage.waves.channel import WaveChannel
+from lightpage.waves.geometry import WaveGeometry, cells_for
 from tests.lightpage.small import small_profile
 from train.published.decoder import over_reference, sample_pair
 from train.published.localizers import Localizer, ModeLocalizer, NoLocalizer, RayLocalizer, page_places

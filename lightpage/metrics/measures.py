@@ -1,0 +1,111 @@
+"""All figures of held-out symbols together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import PageError
+from lightpage.metrics.information import (
+    Floats,
+    achievable_rate,
+    checked,
+    decide_with_confidence,
+    gray_rate,
+    own_information,
+)
+from lightpage.metrics.reliability import expected_calibration_error
+
+
+@dataclass(frozen=True)
+class PageMeasures:
+    """The figures of one set of symbols whose truth is known."""
+
+    count: int
+    levels: int
+    air_bits_per_symbol: float
+    own_mi_bits_per_symbol: float
+    gmi_bits_per_symbol: float | None
+    """None where M is no power of two."""
+    symbol_error_rate: float
+    ece: float
+
+    @property
+    def over_claim_bits_per_symbol(self) -> float:
+        """Own-MI minus AIR: what the decoder claims beyond what a code could carry."""
+        return self.own_mi_bits_per_symbol - self.air_bits_per_symbol
+
+
+def measure(
+    mu: NDArray[np.floating], kappa: NDArray[np.floating], symbols: NDArray[np.integer], levels: int
+) -> PageMeasures:
+    """All figures of the symbols given, which should be data symbols only (pilots carry nothing).
+
+    Args:
+        mu: decoded phase, radians, piston already removed; any shape.
+        kappa: concentration, same shape.
+        symbols: the true symbols, same shape.
+        levels: M.
+    """
+    truth = np.asarray(symbols)
+    if truth.size == 0:
+        raise PageError("symbols to measure", "none", "at least one")
+    decided, confidence = decide_with_confidence(mu, kappa, levels)
+    correct = decided == truth
+    return PageMeasures(
+        count=int(truth.size),
+        levels=levels,
+        air_bits_per_symbol=float(achievable_rate(mu, kappa, truth, levels).mean()),
+        own_mi_bits_per_symbol=float(own_information(mu, kappa, levels).mean()),
+        gmi_bits_per_symbol=None if levels & (levels - 1) else float(gray_rate(mu, kappa, truth, levels).mean()),
+        symbol_error_rate=float(1 - correct.mean()),
+        ece=expected_calibration_error(confidence, correct),
+    )
+
+
+@dataclass(frozen=True)
+class SymbolMaps:
+    """Means over pages at every place of the page, float64 [ny, nx], NaN at pilots.
+
+    Attributes:
+        air: bits.
+        own_mi: bits, as the decoder claims.
+        error_rad: of the phase error's magnitude, radians.
+    """
+
+    air: Floats
+    own_mi: Floats
+    error_rad: Floats
+
+
+def symbol_maps(
+    mu: NDArray[np.floating],
+    kappa: NDArray[np.floating],
+    symbols: NDArray[np.integer],
+    levels: int,
+    data: NDArray[np.bool_],
+) -> SymbolMaps:
+    """What `measure` averages over the page, place by place.
+
+    Args:
+        mu, kappa, symbols: of the data symbols, [pages, number of Trues in data] in row order.
+        levels: M.
+        data: where the data symbols are, bool [ny, nx].
+
+    Raises:
+        PageError: as `log_posterior`, or the number of symbols is not that of `data`.
+    """
+    m, phase, k, s = checked(mu, kappa, symbols, levels)
+    if phase.ndim != 2 or phase.shape[1] != np.count_nonzero(data):
+        raise PageError("data symbols", f"shape {phase.shape}", f"(pages, {np.count_nonzero(data)})")
+
+    def spread(values: Floats) -> Floats:
+        page = np.full(data.shape, np.nan)
+        page[data] = values.mean(axis=0)
+        return page
+
+    turned = s * (2 * np.pi / m) - phase
+    error = np.abs(turned - 2 * np.pi * np.rint(turned / (2 * np.pi)))
+    return SymbolMaps(spread(achievable_rate(phase, k, s, m)), spread(own_information(phase, k, m)), spread(error))

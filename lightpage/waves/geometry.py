@@ -1,0 +1,163 @@
+"""Planes, modes and cells of the device's waves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.device.lens_path import IDEAL, SeidelTerms
+from lightpage.waves.lens import lens_kernel
+
+Complex = NDArray[np.complexfloating]
+
+Real = NDArray[np.floating]
+
+UNCOUPLED = 1.2 * np.pi, 0.8 * np.pi
+"""Radians in a step by which modes fall apart that are not coupled, and that are fully coupled."""
+
+_MODE_MARGIN = 1.04
+"""Modes beyond the one that the page's edge excites: an edge of the facet spreads it."""
+
+
+@dataclass(frozen=True)
+class WaveGeometry:
+    """Everything that the field depends on between SLM and cameras. Metres and radians."""
+
+    wavelength_m: float
+    focal_length_m: float
+    pipe_length_m: float
+    pipe_width_m: float
+    refractive_index: float
+    pipe_angle: float = 0.0
+    """Shear t of the cross-section."""
+    pipe_roll: float = 0.0
+    """Rotation of the pipe about the optical axis, from x towards y, against page and cameras."""
+    lens_path: SeidelTerms = IDEAL
+    """Of the first lens; the second one is its mirror image."""
+
+    @property
+    def wave_number(self) -> float:
+        """Free-space k, rad/m."""
+        return 2 * np.pi / self.wavelength_m
+
+
+def modes_for(half_extent_m: float, geometry: WaveGeometry, margin: float) -> int:
+    """Cells per pipe axis such that the sine modes reach the plane wave of an SLM point at `half_extent_m`."""
+    cells = 2 * half_extent_m * geometry.pipe_width_m / (geometry.wavelength_m * geometry.focal_length_m)
+    return int(np.ceil(cells * margin))
+
+
+def cells_for(
+    geometry: WaveGeometry, page_x_m: Real, page_y_m: Real, seen_x_m: float, seen_y_m: float
+) -> tuple[int, int]:
+    """Cells of the pipe along (y', x) such that its modes carry all of the page's light.
+
+    Reflections between walls that are sheared by t turn the light by 2 t, a roll of the pipe turns it once more: the
+    page's long edge then reaches further along the short one. And since the facet is sampled, the camera plane shows
+    the page's image again, one period (2 modes' reach) further; the period must keep that out of what is looked at.
+
+    Args:
+        geometry: the device, with its true or fitted angle and roll.
+        page_x_m, page_y_m: SLM sample positions against the optical axis, shift of the page included, [nx] and [ny].
+        seen_x_m, seen_y_m: half extents of what is looked at on the camera plane.
+    """
+    reach_x, reach_y = float(np.abs(page_x_m).max()), float(np.abs(page_y_m).max())
+    shear = abs(geometry.pipe_roll) + 2 * abs(geometry.pipe_angle)
+
+    def cells(reach: float, seen: float) -> int:
+        return max(modes_for(reach, geometry, _MODE_MARGIN), modes_for((reach + seen) / 2, geometry, margin=1))
+
+    return cells(reach_y + shear * reach_x, seen_y_m), cells(reach_x + shear * reach_y, seen_x_m)
+
+
+def sine_matrix(cells: int) -> Real:
+    """Orthonormal DST-I matrix [cells-1, cells-1]: mode m = row + 1 sampled at j/cells, j = column + 1."""
+    index = np.arange(1, cells)
+    return np.asarray(np.sqrt(2 / cells) * np.sin(np.pi * np.outer(index, index) / cells))
+
+
+def facet_axis(cells: int, width: float) -> Real:
+    """Sample positions on one axis of a facet, metres, [cells - 1]."""
+    return np.asarray((np.arange(1, cells) / cells - 0.5) * width)
+
+
+def mode_detuning(geometry: WaveGeometry, rows: Real, columns: Real) -> Real:
+    """kz - nk of the square pipe's sine modes, rad/m.
+
+    Args:
+        geometry: the device; its shear does not count.
+        rows, columns: mode numbers along y' and x, arrays that broadcast.
+
+    Raises:
+        ValueError: a mode that does not propagate.
+    """
+    nk = geometry.refractive_index * geometry.wave_number
+    transverse = (np.pi / geometry.pipe_width_m) ** 2 * (rows**2 + columns**2)
+    if transverse.max() >= nk**2:
+        raise ValueError(f"modes: got transverse wave number {np.sqrt(transverse.max()):.3g}, wanted below {nk:.3g}")
+    return np.asarray(detuning(nk, transverse, np.sqrt))
+
+
+def detuning(nk: Any, transverse: Any, sqrt: Callable[[Any], Any]) -> Any:
+    """kz - nk of a wave with a squared transverse wave number, without cancellation; in numpy or torch, by its sqrt."""
+    return -transverse / (sqrt(nk * nk - transverse) + nk)
+
+
+class Couplings(NamedTuple):
+    """Factors on k/f in a lens's phase between a point (x, y) of its plane and one (X, Y') of the oblique facet."""
+
+    x_to_x: Any
+    y_to_x: Any
+    y_to_y: Any
+    x_to_y: Any
+
+
+def couplings(geometry: WaveGeometry, xp: Any = np) -> Couplings:
+    """The couplings for a pipe's shear and roll; `xp` is numpy, or torch for a geometry of tensors."""
+    t, roll = geometry.pipe_angle, geometry.pipe_roll
+    sin, cos, tan = xp.sin(roll), xp.cos(roll), xp.tan(t)
+    return Couplings(cos + tan * sin, sin - tan * cos, cos / xp.cos(t), -sin / xp.cos(t))
+
+
+def on_facet(factors: Couplings, across: Any, up: Any) -> tuple[Any, Any]:
+    """A point (X, Y') of the oblique facet as Cartesian coordinates of the lens's plane."""
+    return factors.x_to_x * across + factors.x_to_y * up, factors.y_to_x * across + factors.y_to_y * up
+
+
+def highest_frequencies(geometry: WaveGeometry, path: SeidelTerms, x_m: Real, y_m: Real) -> tuple[float, float]:
+    """Bounds on the frequencies along x and y that a facet's light has on a lens's plane, cycles a metre.
+
+    Args:
+        geometry: the device.
+        path: of that lens.
+        x_m, y_m: what is looked at of the plane.
+    """
+    edge, factors = geometry.pipe_width_m / 2, np.abs(couplings(geometry))
+    furthest = on_facet(Couplings(*factors), edge, edge)
+    corner = np.abs(x_m).max(), np.abs(y_m).max()
+    # each term as if it added to the others at the corner of both planes
+    slopes = SeidelTerms(*np.abs(path)).slope_on_field(*corner, *furthest)
+    per_metre = geometry.wave_number / geometry.focal_length_m
+    along_x, along_y = (
+        float(per_metre * place + slope) / (2 * np.pi) for place, slope in zip(furthest, slopes, strict=True)
+    )
+    return along_x, along_y
+
+
+def modes_of_plane(geometry: WaveGeometry, plane_m: Real, cells: int) -> Complex:
+    """One axis of a field on a lens's outer plane to the square pipe's sine modes, by a matrix [cells - 1, samples].
+
+    Mode m = row + 1. The pipe neither sheared nor rolled; the matrix's adjoint takes modes back to the plane.
+
+    Args:
+        geometry: the device.
+        plane_m: sample positions, uniform, metres, [samples].
+        cells: sample intervals of the pipe on this axis.
+    """
+    width = geometry.pipe_width_m
+    unitary = np.sqrt((plane_m[1] - plane_m[0]) * width / cells / (geometry.wavelength_m * geometry.focal_length_m))
+    return np.asarray(unitary * sine_matrix(cells) @ lens_kernel(geometry, facet_axis(cells, width), plane_m))

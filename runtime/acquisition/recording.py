@@ -1,0 +1,61 @@
+"""Pages of a recording as a source."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+from lightpage.device.profile import Profile
+from lightpage.errors import PageError, RecordingError
+from lightpage.recording.reader import FramePair, Recording
+from runtime.acquisition.source import SourcePage
+from runtime.decoding.frames import narrow
+
+
+class RecordingSource:
+    """Pages of a recording, over and over again: after the last page the next one is the first.
+
+    Raises:
+        RecordingError: not a sound recording.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._recording = Recording.open(path)
+        self._lock = threading.Lock()
+        """Guards the file and the position; held while one page is read."""
+        self._next = 0
+        self.name = f"recording:{path}"
+        self.levels, self.bit_depth = self._recording.levels, self._recording.bit_depth
+
+    def check_against(self, profile: Profile) -> None:
+        """Raise `RecordingError` unless the recording's shapes are those of `profile`."""
+        self._recording.check_against(profile)
+
+    def read(self, page: int | None = None) -> SourcePage:
+        """Read page `page` of the file, or the next one.
+
+        Raises:
+            PageError: no such page.
+            RecordingError: it cannot be read.
+        """
+        recording = self._recording
+        with self._lock:
+            if page is None:
+                page, self._next = self._next, (self._next + 1) % max(1, recording.pages)
+            if not 0 <= page < recording.pages:
+                raise PageError(f"page of {self.name}", page, f"0..{recording.pages - 1}")
+            try:
+                pair, symbols = narrow(recording.frames(page), self.bit_depth), recording.symbols(page)
+                return SourcePage(pair, page, symbols, recording.pilots())
+            except RecordingError as error:
+                raise RecordingError(f"page {page}, {error.thing}", error.got, error.wanted) from None
+
+    def references(self) -> FramePair:
+        """The recording's reference frames."""
+        with self._lock:
+            return narrow(self._recording.references(), self.bit_depth)
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            self._recording.close()

@@ -1,0 +1,87 @@
+"""What a service says of itself and of a recalibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.decoding.page import ImagePosition
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.wire.messages import image_of
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """A model that the service holds."""
+
+    name: str
+    version: str
+    created: str
+    current: bool
+    metrics: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a service is."""
+
+    service_version: str
+    model: ModelInfo
+    frame_shape: tuple[int, int]
+    frame_dtype: str
+    bit_depth: int
+    page_shape: tuple[int, int]
+    source: str
+    source_levels: int
+    profile_toml: str
+    calibration_toml: str
+    pilot_mask: NDArray[np.bool_]
+    pilot_phases: NDArray[np.float32] | None
+    """Radians, one a True of `pilot_mask` in row order; None for the profile's pattern."""
+
+
+@dataclass(frozen=True)
+class Recalibrated:
+    """The result of a recalibration: AIR in bits per symbol on held-back pages; None where the fit does not say."""
+
+    model_version: str
+    previous_version: str
+    pages_used: int
+    pages_held_back: int
+    air_before: float
+    air_after: float
+    angle_deg: float | None
+    coherence_before: float | None
+    coherence_after: float | None
+    seconds: float
+    pages_lost_before: int = 0
+    image: ImagePosition | None = None
+
+
+def model_info(model: pb.Model) -> ModelInfo:
+    """A model from its message."""
+    return ModelInfo(model.name, model.version, model.created, model.current, dict(model.metrics))
+
+
+def recalibrated(result: pb.RecalibrationResult) -> Recalibrated:
+    """A recalibration from its message."""
+
+    def optional(name: str) -> float | None:
+        return float(getattr(result, name)) if result.HasField(name) else None
+
+    return Recalibrated(
+        model_version=result.model_version,
+        previous_version=result.previous_version,
+        pages_used=result.pages_used,
+        pages_held_back=result.pages_held_back,
+        air_before=result.air_before,
+        air_after=result.air_after,
+        angle_deg=optional("angle_deg"),
+        coherence_before=optional("coherence_before"),
+        coherence_after=optional("coherence_after"),
+        seconds=result.seconds,
+        pages_lost_before=result.pages_lost_before,
+        image=image_of(result.image) if result.HasField("image") else None,
+    )

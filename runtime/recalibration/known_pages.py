@@ -1,0 +1,72 @@
+"""Pages with known symbols, as a recalibration takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import InvalidInputError
+from lightpage.page.symbols import check_symbols
+from lightpage.recording.reader import FramePair, hash_frames
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.frames import named
+
+MIN_PAGES = 2
+"""One to fit on, one to judge by."""
+
+
+@dataclass(frozen=True)
+class KnownPages:
+    """Pages whose symbols are known.
+
+    Attributes:
+        pairs: frame pairs, one a page.
+        symbols: what was written, uint8 [ny, nx], one a page.
+        levels: M of those symbols.
+        references: reference-only frames taken with them, or None: then those of the last recalibration hold.
+        pilot_mask: where the pilots are, bool [ny, nx], or None for the device's usual positions.
+        image_px: where the image was last seen against the model's calibration, (x, y), camera pixels.
+    """
+
+    pairs: tuple[FramePair, ...]
+    symbols: tuple[NDArray[np.uint8], ...]
+    levels: int
+    references: FramePair | None = None
+    pilot_mask: NDArray[np.bool_] | None = None
+    image_px: tuple[float, float] = (0.0, 0.0)
+
+    def check(self, decoder: Decoder) -> None:
+        """Check everything against the device of `decoder`.
+
+        Raises:
+            InvalidInputError: too few pages, not as many symbols as frames, or the same page twice.
+            FrameError: a bad frame.
+            PageError: symbols of the wrong shape or range.
+        """
+        if len(self.pairs) < MIN_PAGES or len(self.pairs) != len(self.symbols):
+            got = f"{len(self.pairs)} frame pairs and {len(self.symbols)} pages of symbols"
+            raise InvalidInputError("pages to recalibrate with", got, f"at least {MIN_PAGES} of both")
+        for number, (pair, symbols) in enumerate(zip(self.pairs, self.symbols, strict=True)):
+            with named(f"known page {number}: "):
+                decoder.check(pair)
+            check_symbols(symbols, decoder.bundle.profile.page_shape, self.levels, f"known page {number}: symbols")
+        if self.references is not None:
+            with named("reference: "):
+                decoder.check(self.references)
+        self._check_different()
+
+    def _check_different(self) -> None:
+        """A re-fit judged by a page that it was fitted on would praise itself."""
+        first: dict[str, int] = {}
+        for number, pair in enumerate(self.pairs):
+            earlier = first.setdefault(hash_frames(pair), number)
+            if earlier != number:
+                raise InvalidInputError(
+                    f"known page {number}", f"the frames of known page {earlier}", "pages that differ: one is judged by"
+                )
+
+    def part(self, pages: slice) -> KnownPages:
+        """Some of the pages, the rest as it is."""
+        return replace(self, pairs=self.pairs[pages], symbols=self.symbols[pages])
