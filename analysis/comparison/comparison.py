@@ -36,11 +36,12 @@ from train.data.features import FeatureExtractor, PageFeatures
 from train.data.known_light import explained
 from train.data.pages import Page
 from train.data.patches import training_pages
-from train.fitting.concentration_scale import best_kappa_scale, decode_pages, without_piston
+from train.fitting.concentration_scale import best_kappa_scale, decode_pages
 from train.fitting.curves import Curve
 from train.fitting.fit import fit_network
 from train.fitting.fitted import Fitted
 from train.fitting.modules import DecoderTraining, SymbolTraining
+from train.fitting.validation import without_piston
 from train.models.decoder import LOCALIZERS
 from train.models.field import FieldRecovery, TorchFieldSolver
 from train.models.hyperparameters import Hyperparameters

@@ -33,8 +33,9 @@ from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob
 from train.data.features import FeatureExtractor
 from train.data.known_light import explained
-from train.fitting.concentration_scale import honest_factor, without_piston
+from train.fitting.concentration_scale import honest_factor
 from train.fitting.fitted import FITTED, FITTED_WEIGHTS
+from train.fitting.validation import without_piston
 from train.models.decoder import COHERENT, SymbolDecoder
 from train.models.hyperparameters import Hyperparameters
 from train.models.twin import RayTwin, TorchTwin

@@ -23,10 +23,11 @@ from lightpage.recording.reader import FramePair, Recording, page_hashes
 from train.data.feature_store import FeatureStore
 from train.data.features import PageState
 from train.data.pages import Page
-from train.fitting.concentration_scale import decode_pages, without_piston
+from train.fitting.concentration_scale import decode_pages
 from train.fitting.curves import Curve, curves_of
 from train.fitting.fitted import fitted_curves
 from train.fitting.modules import DecoderTraining, SymbolTraining
+from train.fitting.validation import without_piston
 from train.models.network import Refiner, SymbolUNet
 from train.published.localizers import RayLocalizer
 from train.published.recipe import published_decoder

@@ -28,8 +28,9 @@ from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
 from lightpage.simulator.recording_job import RecordingJob
 from train.data.features import PageState
-from train.fitting.concentration_scale import decode_pages, honest_factor, most_likely_factor, without_piston
+from train.fitting.concentration_scale import decode_pages, honest_factor, most_likely_factor
 from train.fitting.curves import curves_of
+from train.fitting.validation import without_piston
 from train.models.parts import turned
 from train.published.recipe import published_choices, train_published
 from train.published.training import (

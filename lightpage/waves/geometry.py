@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.device.lens_path import IDEAL, SeidelTerms
-from lightpage.waves.lens import lens_kernel
 
 Complex = NDArray[np.complexfloating]
 
@@ -146,18 +145,3 @@ def highest_frequencies(geometry: WaveGeometry, path: SeidelTerms, x_m: Real, y_
         float(per_metre * place + slope) / (2 * np.pi) for place, slope in zip(furthest, slopes, strict=True)
     )
     return along_x, along_y
-
-
-def modes_of_plane(geometry: WaveGeometry, plane_m: Real, cells: int) -> Complex:
-    """One axis of a field on a lens's outer plane to the square pipe's sine modes, by a matrix [cells - 1, samples].
-
-    Mode m = row + 1. The pipe neither sheared nor rolled; the matrix's adjoint takes modes back to the plane.
-
-    Args:
-        geometry: the device.
-        plane_m: sample positions, uniform, metres, [samples].
-        cells: sample intervals of the pipe on this axis.
-    """
-    width = geometry.pipe_width_m
-    unitary = np.sqrt((plane_m[1] - plane_m[0]) * width / cells / (geometry.wavelength_m * geometry.focal_length_m))
-    return np.asarray(unitary * sine_matrix(cells) @ lens_kernel(geometry, facet_axis(cells, width), plane_m))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lightpage.device.lens_path import IDEAL
-from lightpage.waves.geometry import Complex, Real, WaveGeometry, couplings, facet_axis, on_facet
+from lightpage.waves.geometry import Complex, Real, WaveGeometry, couplings, facet_axis, on_facet, sine_matrix
 from lightpage.waves.low_rank import Expansion, Interpolation, Phase
 
 _TOLERANCE = 1e-7
@@ -122,3 +122,18 @@ class FourierLens:
             total = term if total is None else total + term
         assert total is not None
         return np.asarray(total * self.on_plane.conj())
+
+
+def modes_of_plane(geometry: WaveGeometry, plane_m: Real, cells: int) -> Complex:
+    """One axis of a field on a lens's outer plane to the square pipe's sine modes, by a matrix [cells - 1, samples].
+
+    Mode m = row + 1. The pipe neither sheared nor rolled; the matrix's adjoint takes modes back to the plane.
+
+    Args:
+        geometry: the device.
+        plane_m: sample positions, uniform, metres, [samples].
+        cells: sample intervals of the pipe on this axis.
+    """
+    width = geometry.pipe_width_m
+    unitary = np.sqrt((plane_m[1] - plane_m[0]) * width / cells / (geometry.wavelength_m * geometry.focal_length_m))
+    return np.asarray(unitary * sine_matrix(cells) @ lens_kernel(geometry, facet_axis(cells, width), plane_m))

@@ -12,47 +12,16 @@ from numpy.typing import NDArray
 from scipy import optimize
 from torch.utils.data import DataLoader, Dataset
 
-from lightpage.metrics.information import achievable_rate, decide
-from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.progress import warn
 from train.data.pages import Page
 from train.fitting.loss import von_mises_nll
 from train.fitting.modules import DecoderTraining
-from train.models.parts import turned
+from train.fitting.validation import without_piston
 
 _SCALE_BOUNDS = (-3.0, 3.0)
 """Bounds of the logarithm of a factor that makes a decoder's claims honest: hardly trained ones were off by five."""
 
 _AT_A_BOUND = 1e-3
-
-
-def held_out_air(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> float:
-    """AIR in bits per data symbol of decoded pages.
-
-    Args:
-        p: [pages, 2, ny, nx].
-        phases: true phases [pages, ny, nx].
-        mask: pilots, bool [ny, nx].
-        levels: M of the pages.
-    """
-    rates = []
-    for page, truth in zip(p, phases, strict=True):
-        px, py = without_piston(page, truth, mask)[:, ~mask]
-        air = achievable_rate(np.arctan2(py, px), np.hypot(px, py), decide(truth[~mask], levels), levels)
-        rates.append(float(np.mean(air)))
-    return float(np.mean(rates))
-
-
-def without_piston(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """p [2, ny, nx] of a page, turned by what its pilots show of the piston, as the runtime does it.
-
-    Args:
-        p: decoded.
-        phases: true phases [ny, nx].
-        mask: pilots, bool [ny, nx].
-    """
-    turn = estimate_piston(p, Pilots(mask, phases[mask].astype(np.float64))).angle_rad
-    return np.asarray(turned(torch.tensor(p), -turn).numpy(), dtype=np.float32)
 
 
 def decode_pages(module: DecoderTraining[Any], pages: Dataset[Page]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from train.data.pages import Page
-from train.fitting.concentration_scale import held_out_air
 from train.fitting.loss import training_rate, von_mises_nll
+from train.fitting.validation import held_out_air
 from train.models.hyperparameters import Hyperparameters
 from train.models.network import Refiner, SymbolUNet
 from train.models.parts import turned

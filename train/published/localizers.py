@@ -8,7 +8,8 @@ from torch import Tensor, nn
 
 from lightpage.device.lenses import LensPrescription
 from lightpage.device.profile import Profile
-from lightpage.waves.geometry import WaveGeometry, cells_for, mode_detuning, modes_of_plane
+from lightpage.waves.geometry import WaveGeometry, cells_for, mode_detuning
+from lightpage.waves.lens import modes_of_plane
 from train.models.parts import adjoint, matmul, multiply, parts, stacked
 from train.published.rays import RayTracer
 

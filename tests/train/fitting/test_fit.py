@@ -14,9 +14,10 @@ from torch.utils.data import TensorDataset
 
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.information import achievable_rate
-from train.fitting.concentration_scale import best_kappa_scale, decode_pages, held_out_air, most_likely_factor
+from train.fitting.concentration_scale import best_kappa_scale, decode_pages, most_likely_factor
 from train.fitting.fit import fit_network
 from train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS
+from train.fitting.validation import held_out_air
 from train.models.hyperparameters import Hyperparameters
 
 PAGE = (8, 12)
