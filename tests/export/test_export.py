@@ -12,7 +12,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from export import cli_export
+from export import command as cli_export
 from export.command import export, export_run
 from export.graph import TABLE_INPUTS
 from export.parity import check_parity

@@ -242,6 +242,6 @@ def test_what_is_wrong_is_told_in_a_line(tmp_path: Path) -> None:
         "--out",
         str(tmp_path / "out"),
     ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=Path(__file__).parents[2])
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=Path(__file__).parents[3])
     assert done.returncode == 2
     assert re.fullmatch(r"lightpage: error: profile nosuch: .*bench, paper\n", done.stderr)

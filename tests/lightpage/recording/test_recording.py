@@ -663,7 +663,7 @@ class TestInterruption:
     def test_pages_that_another_process_is_writing_outlive_a_second_writer(self, tmp_path: Path) -> None:
         path, profile = tmp_path / "own.h5", small_profile()
         again = (
-            "import sys; from tests.optics.test_recording import *\n"
+            "import sys; from tests.lightpage.recording.test_recording import *\n"
             "RecordingWriter.resume(Path(sys.argv[1]), small_profile(), LEVELS, 12, random_frames(100))"
         )
         with RecordingWriter(path, profile, LEVELS, 12, random_frames(100)) as writer:

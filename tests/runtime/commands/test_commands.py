@@ -20,14 +20,15 @@ import h5py
 import numpy as np
 import pytest
 
+from lightpage.cli import main as cli_main
 from lightpage.cli.main import RESUME_KEY, LazyGroup, lightpage
 from lightpage.errors import CalibrationError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.reader import FramePair, Recording, RecordingWriter
-from runtime import cli, cli_recalibrate
 from runtime.acquisition.sources import open_source
 from runtime.bundle.bundle import Bundle
 from runtime.client.client import LightpageClient
+from runtime.commands import recalibrate as cli_recalibrate
 from runtime.commands.serve import _resume
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
@@ -38,11 +39,11 @@ from runtime.service.registry import ModelRegistry
 from runtime.service.store import ModelStore
 from tests.runtime import toy
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def run(arguments: Sequence[str | Path], group: click.Group = lightpage) -> int:
-    return cli.run(group, [str(argument) for argument in arguments])
+    return cli_main.run(group, [str(argument) for argument in arguments])
 
 
 @click.command()
@@ -78,7 +79,7 @@ def broken() -> None:
 
 
 def group_of(**points: str) -> LazyGroup:
-    return LazyGroup([EntryPoint(name, value, cli.GROUP) for name, value in points.items()], name="lightpage")
+    return LazyGroup([EntryPoint(name, value, cli_main.GROUP) for name, value in points.items()], name="lightpage")
 
 
 HERE = "tests.runtime.commands.test_commands"

@@ -20,9 +20,9 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.decoding.page import DecodedPage
 from runtime.demo.demo import LEVELS, drifted
+from runtime.recalibration import refit as module
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.recalibration import recalibrate
-from runtime.recalibration.recalibration import refit as module
 from runtime.recalibration.refit import refit
 
 

@@ -29,8 +29,8 @@ from tests.lightpage.small import small_profile
 from train.commands import train as cli_train
 from train.commands.train import _own_pilots, train
 from train.data.feature_store import FeatureStore
+from train.fitting import provenance as origin
 from train.fitting.curves import curves_of
-from train.fitting.fit import provenance as origin
 from train.fitting.provenance import provenance, provenance_of
 from train.runs import FORMAT, begin, sole_writer
 
