@@ -25,7 +25,7 @@ _HOMES = {
     "Device": "lightpage.device.state",
     "FramePair": "lightpage.recording.reader",
     "LightpageError": "lightpage.errors",
-    "PageMeasures": "lightpage.metrics.information",
+    "PageMeasures": "lightpage.metrics.measures",
     "Pilots": "lightpage.page.pilots",
     "Profile": "lightpage.device.profile",
     "Recording": "lightpage.recording.reader",
@@ -33,7 +33,7 @@ _HOMES = {
     "Simulator": "lightpage.simulator.simulator",
     "load_device": "lightpage.device.state",
     "load_profile": "lightpage.device.profile",
-    "measure": "lightpage.metrics.information",
+    "measure": "lightpage.metrics.measures",
 }
 
 __all__ = [

@@ -21,7 +21,8 @@ PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["
 COMMANDS: dict[str, str] = {**PROJECT["scripts"], **PROJECT["entry-points"]["lightpage.commands"]}
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 # What a wheel is made of, and so what the image build is given.
-SOURCES = ("pyproject.toml", "constraints.txt", "LICENSE", "README.md", "optics", "train", "export", "runtime")
+PACKAGES = ("lightpage", "train", "export", "runtime", "analysis")
+SOURCES = ("pyproject.toml", "constraints.txt", "LICENSE", "README.md", *PACKAGES)
 
 
 def run(command: Sequence[str | Path], *, cwd: Path = ROOT, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
@@ -231,7 +232,7 @@ def test_the_runtime_needs_no_torch(torchless: Path) -> None:
     assert ask(torchless, "from importlib.util import find_spec; print(find_spec('torch'))") == "None"
     imports_everything = """
 import importlib, pkgutil, sys
-for package in ("optics", "runtime"):
+for package in ("lightpage", "runtime"):
     for module in pkgutil.walk_packages(importlib.import_module(package).__path__, package + "."):
         importlib.import_module(module.name)
 print("lightpage.cli.main" in sys.modules, "runtime.commands.healthcheck" in sys.modules)
@@ -249,8 +250,8 @@ def test_the_command_runs_without_torch(torchless: Path) -> None:
 def test_profiles_and_type_markers_travel_with_the_wheel(torchless: Path) -> None:
     lists_files = """
 from importlib.resources import files
-print(sorted(file.name for file in files("optics").joinpath("profiles").iterdir()))
-print(all(files(package).joinpath("py.typed").is_file() for package in ("optics", "train", "export", "runtime")))
+print(sorted(file.name for file in files("lightpage.device").joinpath("profiles").iterdir()))
+print(all(files(package).joinpath("py.typed").is_file() for package in ("lightpage", "train", "export", "runtime")))
 """
     assert ask(torchless, lists_files) == "['bench.toml', 'paper.toml']\nTrue"
 

@@ -44,7 +44,7 @@ def _program() -> str:
 @cache
 def _commit() -> str:
     """Asked for once: what is committed while a process works is not what it runs."""
-    tree = Path(__file__).parent.parent
+    tree = Path(__file__).parents[2]
     toplevel, _, commit = _git(tree, "rev-parse", "--show-toplevel", "HEAD").partition("\n")
     if not commit or Path(toplevel) != tree.resolve():
         return ""

@@ -347,7 +347,7 @@ def test_without_git_there_is_no_commit_and_no_error(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.usefixtures("asked_anew")
 def test_what_a_training_is_of_is_what_was_there_when_it_began(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    said = {"rev-parse": f"{Path(origin.__file__).parents[1]}\nabc", "status": ""}
+    said = {"rev-parse": f"{Path(origin.__file__).parents[2]}\nabc", "status": ""}
     monkeypatch.setattr(origin, "_git", lambda tree, command, *options: said[command])
     first = provenance_of(tmp_path)
     assert first["commit"] == "abc"
