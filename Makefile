@@ -77,7 +77,7 @@ train-decoders: $(STAMP)  ## every decoder in every light at quarter scale, trai
 bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 	$(BIN)/lightpage bench
 
-bench-image-search: $(STAMP)  ## how the image is found, followed and confirmed: tables and a picture, in most of an hour
+bench-image-search: $(STAMP)  ## how the image is found, followed and confirmed: tables and a picture, in more than an hour
 	$(BIN)/python -m analysis.tracking.image_search --out runs/bench-image-search
 
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/

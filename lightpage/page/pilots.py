@@ -29,8 +29,8 @@ LEAST_CONFIRMED_SHARE = 0.25
 a third on the bench device, four pixels off a thirtieth, a page of another device nothing."""
 
 LEAST_CONFIRMED_NATS = 9.0
-"""Information that all pilots together must confirm, beyond what fitting to them gains. Chance confirms as much about
-once in e^9 = 8,000 pages."""
+"""Information that all pilots together must confirm, beyond what fitting to them gains. Chance confirms as much at
+most about once in e^9 = 8,000 pages."""
 
 SOUND_SHARE = 0.85
 """Share below which a device is no longer as it was calibrated, where the pilots' own noise does not explain it."""

@@ -22,6 +22,7 @@ from runtime.commands.evaluate import evaluate
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_drift import SHIFT, DriftModel
 from runtime.decoding.image_tracker import WIDEST, ImageTracker, tracker_for
+from runtime.execution.twin import OnnxTwin
 from tests.lightpage.small import small_profile
 from train.commands.train import train
 from train.models.twin import RayTwin, TorchTwin
@@ -84,7 +85,7 @@ def test_the_image_is_followed(made: tuple[Path, Path, float], small_device: lis
     by = (0.0, 0.3)  # rows, columns
     moved = [np.rint(ndimage.shift(f.astype(float), by, mode="nearest")) for f in (pair.in_phase, pair.quadrature)]
     seen = decoder.infer(FramePair(*(frame.astype(np.uint8) for frame in moved)))
-    model, prior = DriftModel.of_decoder(decoder), np.diag(WIDEST**2)
+    model, prior = DriftModel.of_decoder(decoder, OnnxTwin(decoder.bundle, 1)), np.diag(WIDEST**2)
     found, before = (model.estimate(page, 256, known, prior) for page in (seen, decoder.infer(pair)))
     assert found is not None
     assert before is not None
