@@ -48,7 +48,7 @@ format: $(STAMP)  ## let ruff put the code in order
 	$(BIN)/ruff format .
 
 # What was trained is kept and only measured, which takes hours on two cores, most of them for the full-size page.
-COMPARE := $(BIN)/python -m benchmarks.decoders
+COMPARE := $(BIN)/python -m analysis.comparison.decoders
 LOOKS := --arm wave --arm wave-refined --arm coherent --arm refined --arm oracle --arm oracle-refined
 bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: the table of what is kept, resumed when run again
 	$(COMPARE) --angle -0.6 --arm ray --arm mode --arm fast $(LOOKS) --out runs/bench-decoders/sheared
@@ -66,7 +66,7 @@ bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: th
 	$(COMPARE) --ideal --angle 0 --angle -0.6 --arm mode --published-steps 1125 --out runs/bench-decoders/ideal
 	$(BIN)/python -m analysis.speed.speed --decoder fast --decoder coherent --decoder wave --decoder refined \
 	    --decoder "ray 32/64" --decoder "ray 64/128"
-	$(BIN)/python -m benchmarks.scaling
+	$(BIN)/python -m analysis.speed.scaling
 
 # Exposures of 1 and 0.13: bright light, and about the dimmest in which two known pages still calibrate the device.
 train-decoders: $(STAMP)  ## every decoder in every light at quarter scale, trained anew: days on two cores, resumed when run again

@@ -142,4 +142,4 @@ def main(
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m benchmarks.ablation"))
+    sys.exit(run(main, name="python -m analysis.comparison.ablation"))

@@ -268,4 +268,4 @@ def main(
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m benchmarks.calibration"))
+    sys.exit(run(main, name="python -m analysis.comparison.calibration"))

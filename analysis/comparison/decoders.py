@@ -213,4 +213,4 @@ def compared(outcomes: list[Outcome]) -> list[Outcome]:
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m benchmarks.decoders"))
+    sys.exit(run(main, name="python -m analysis.comparison.decoders"))

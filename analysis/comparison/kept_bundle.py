@@ -174,4 +174,4 @@ def main(kept: Path, localizer: str, refinements: int, work: Path, out: Path) ->
 
 
 if __name__ == "__main__":
-    sys.exit(run_command(main, name="python -m benchmarks.kept_bundle"))
+    sys.exit(run_command(main, name="python -m analysis.comparison.kept_bundle"))

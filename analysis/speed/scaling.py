@@ -1,6 +1,6 @@
 """Time per symbol of the coherent decoder in the runtime, page and frames growing together, the symbol's size fixed.
 
-    python -m benchmarks.scaling
+    python -m analysis.speed.scaling
 
 `lightpage study scaling` compares it with other decoders, all in torch.
 """
@@ -63,4 +63,4 @@ def main(
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m benchmarks.scaling"))
+    sys.exit(run(main, name="python -m analysis.speed.scaling"))

@@ -159,4 +159,4 @@ def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int |
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m benchmarks.speed"))
+    sys.exit(run(main, name="python -m analysis.speed.speed"))

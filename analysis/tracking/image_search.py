@@ -426,4 +426,4 @@ def main(
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m benchmarks.image_search"))
+    sys.exit(run(main, name="python -m analysis.tracking.image_search"))
