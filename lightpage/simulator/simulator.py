@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.parameters import NAMES, as_vector
+from lightpage.calibration.parameters import NAMES, as_dict, as_vector
+from lightpage.calibration.wave_model import fitted_geometry
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
 from lightpage.page.symbols import check_levels, check_symbols, symbol_phases
@@ -68,17 +69,7 @@ class TrueOptics:
     @cached_property
     def geometry(self) -> WaveGeometry:
         """The true geometry."""
-        truth, nominal = self.device.geometry, self.profile
-        return WaveGeometry(
-            wavelength_m=nominal.light.wavelength_m,
-            focal_length_m=nominal.lens.focal_length_m * (1 + truth.focal_length_relative_error),
-            pipe_length_m=nominal.pipe.length_m * (1 + truth.pipe_length_relative_error),
-            pipe_width_m=nominal.pipe.width_m * (1 + truth.pipe_width_relative_error),
-            refractive_index=nominal.pipe.refractive_index,
-            pipe_angle=np.deg2rad(truth.pipe_angle_deg),
-            pipe_roll=np.deg2rad(truth.pipe_roll_deg),
-            lens_path=nominal.seidel_terms(1 + self.device.aberration.lens_path_relative_error),
-        )
+        return fitted_geometry(self.profile, as_dict(true_parameters(self.profile, self.device)))
 
     @cached_property
     def page_axes_m(self) -> tuple[Real, Real]:
@@ -152,6 +143,11 @@ class TrueOptics:
     def camera_field(self, exit_field: Complex) -> Complex:
         """Field on the exit facet to the computed camera plane."""
         return self.channel.camera_field(exit_field)
+
+    @cached_property
+    def reference_in_place(self) -> Complex:
+        """Reference beam on the computed camera plane."""
+        return self.reference()
 
     def reference(self, offset_m: tuple[float, float] = (0.0, 0.0)) -> Complex:
         """Reference beam on the computed camera plane, or `offset_m` (x, y) from there."""
@@ -241,11 +237,6 @@ class Simulator:
     def set_device(self, device: Device) -> None:
         """Move the device to another true state (slow drift); piston and shift go on from where they are."""
         self.optics = TrueOptics(self.profile, device, self.optics.channel.steps)
-        self.__dict__.pop("_reference", None)
-
-    @cached_property
-    def _reference(self) -> Complex:
-        return self.optics.reference()
 
     def knock(self, shift_px: tuple[float, float]) -> None:
         """Move the image at once by (x, y) camera pixels, on both cameras; it walks on from there."""
@@ -280,7 +271,7 @@ class Simulator:
 
     def references(self) -> FramePair:
         """Reference-only frames, the mean of so many exposures that only quantisation is left."""
-        return self._frames(np.zeros_like(self._reference), (0.0, 0.0), None)
+        return self._frames(np.zeros_like(self.optics.reference_in_place), (0.0, 0.0), None)
 
     def _drift(self) -> None:
         """Walk on by one page; its noise has a stream of its own, so that pages can pass without being computed."""
@@ -311,7 +302,7 @@ class Simulator:
     def _reference_behind(self, pose: CameraPose, shift: tuple[float, float]) -> Complex:
         """The reference where a camera sees it behind an image that has moved by `shift`, on the image's plane."""
         if not self.reference_stays or shift == (0.0, 0.0):
-            return self._reference
+            return self.optics.reference_in_place
         middle = tuple(count // 2 for count in self.profile.frame_shape)
         still, moved = ([float(axis[middle]) for axis in self.optics.view(pose, by)] for by in ((0.0, 0.0), shift))
         return self.optics.reference((still[0] - moved[0], still[1] - moved[1]))

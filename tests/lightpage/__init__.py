@@ -1,1 +1,1 @@
-"""Tests of the package `optics`."""
+"""Tests of the package `lightpage`."""

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from lightpage.calibration.interfaces import BRANCHES, Rays
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.phases import camera_phase, launch_phase
+from lightpage.calibration.wave_model import fitted_geometry
 from lightpage.device.lens_path import SeidelTerms
 from lightpage.device.profile import Profile
 
@@ -44,21 +45,18 @@ class RayTwin(nn.Module):
 
     def __init__(self, profile: Profile) -> None:
         super().__init__()
+        self.profile = profile
         self.wave_number = 2 * math.pi / profile.light.wavelength_m
         self.index = profile.pipe.refractive_index
-        self.focal_length = profile.lens.focal_length_m
-        self.pipe_length = profile.pipe.length_m
-        self.pipe_width = profile.pipe.width_m
-        self.pipe_angle = math.radians(profile.pipe.angle_deg)
         self.half_width = profile.page_width_m / 2
         self.half_height = profile.page_height_m / 2
         self.corner = profile.corner_m
-        self.seidel_terms = profile.seidel_terms
         self.ideal_lenses = profile.ideal_lenses
         self.symbol_pitch = profile.symbol_pitch_m
         self.camera_pitch = profile.camera.pitch_m
         self.camera_centre = ((profile.camera.columns_px - 1) / 2, (profile.camera.rows_px - 1) / 2)
-        spread = self.pipe_length / self.focal_length / self.index / self.pipe_width * _WIDEST_SPREAD
+        pipe, focal_length_m = profile.pipe, profile.lens.focal_length_m
+        spread = pipe.length_m / focal_length_m / pipe.refractive_index / pipe.width_m * _WIDEST_SPREAD
         self.walls_met = math.ceil(max(self.half_width, self.half_height) * spread) + 1
 
     def forward(
@@ -79,11 +77,9 @@ class RayTwin(nn.Module):
         return (*self._trace(value, points, anchors), self._pixels(value, places))
 
     def _trace(self, value: dict[str, Tensor], points: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        focal = self.focal_length * (1 + value["focal_length_relative"])
-        length = self.pipe_length * (1 + value["pipe_length_relative"])
-        width = self.pipe_width * (1 + value["pipe_width_relative"])
-        angle = self.pipe_angle + value["pipe_angle_rad"]
-        roll = value["pipe_roll_rad"]
+        geometry = fitted_geometry(self.profile, value)
+        focal, length, width = geometry.focal_length_m, geometry.pipe_length_m, geometry.pipe_width_m
+        angle, roll = geometry.pipe_angle, geometry.pipe_roll
         centre = torch.stack([value["page_centre_x_m"], value["page_centre_y_m"]])
         wall_offset = torch.stack([value["pipe_centre_x_m"], value["pipe_centre_y_m"]])
         nk = self.index * self.wave_number
@@ -111,7 +107,7 @@ class RayTwin(nn.Module):
             return torch.stack([slope_x, slope_y], dim=-1), mean - slope_x * x - slope_y * y
 
         per_metre = self.wave_number / focal
-        path = self.seidel_terms(1 + value["lens_path_relative"])
+        path = geometry.lens_path
         starts = in_pipe(points)
         straight = -per_metre * starts
         positions = exit_centroid(straight)
