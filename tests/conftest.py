@@ -17,7 +17,7 @@ from lightpage.calibration.parameters import NAMES
 from lightpage.cli.simulate import simulate
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
-from lightpage.simulator.simulator import true_parameters
+from lightpage.simulator.true_optics import true_parameters
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from tests.lightpage.small import small_profile

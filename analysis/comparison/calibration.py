@@ -43,7 +43,8 @@ from lightpage.files import write_json
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.progress import track
 from lightpage.recording.reader import FramePair, Recording
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid
 from train.models.field import FieldRecovery, TorchFieldSolver
 from train.models.twin import RayTwin, TorchTwin

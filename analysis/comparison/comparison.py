@@ -30,7 +30,7 @@ from lightpage.metrics.measures import measure
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob
-from lightpage.simulator.simulator import true_parameters
+from lightpage.simulator.true_optics import true_parameters
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import FeatureExtractor, PageFeatures
 from train.data.known_light import explained

@@ -13,7 +13,7 @@ from lightpage.device.state import Device
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.reader import FramePair, Recording
 from lightpage.simulator.cameras import resample
-from lightpage.simulator.simulator import TrueOptics, true_parameters
+from lightpage.simulator.true_optics import TrueOptics, true_parameters
 from train.data.features import FeatureExtractor, PageFeatures
 
 

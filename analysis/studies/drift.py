@@ -20,7 +20,7 @@ from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.progress import Progress
 from lightpage.simulator.cameras import expose, resample
-from lightpage.simulator.simulator import TrueOptics
+from lightpage.simulator.true_optics import TrueOptics
 
 Real = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from analysis.studies.study import Case, Result, Row, Settings, Study
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.progress import Progress
-from lightpage.simulator.simulator import TrueOptics
+from lightpage.simulator.true_optics import TrueOptics
 
 Real = NDArray[np.float64]
 

@@ -52,7 +52,8 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.reader import FramePair, Recording
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from runtime.bulk.evaluation import evaluate, was_seen
 from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.decoding.decoder import Decoder

@@ -3,41 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.parameters import NAMES, as_dict, as_vector
-from lightpage.calibration.wave_model import fitted_geometry
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
 from lightpage.page.symbols import check_levels, check_symbols, symbol_phases
 from lightpage.recording.layout import frame_type
 from lightpage.recording.reader import FramePair
 from lightpage.simulator.cameras import (
-    CameraView,
     expose,
     in_phase_intensity,
     quadrature_intensity,
     resample,
     to_counts,
 )
-from lightpage.waves.channel import WaveChannel
-from lightpage.waves.geometry import WaveGeometry, cells_for
-from lightpage.waves.grid import check_camera, splitting_steps
+from lightpage.simulator.true_optics import TrueOptics
+from lightpage.waves.grid import check_camera
 
-Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
 
 LIGHT = 1
 """Raised when the same device and pages give other frames: what an earlier version began is then not gone on with."""
-_CLIPPING_AMPLITUDE = 2.4
-"""Signal amplitude over its root mean square that, in phase with the reference, just fills the well: about one sample
-in twenty thousand clips."""
-_GRID_MARGIN = 1.04
-"""Computed camera plane over the sensor, so that rotated and shifted pixels still look inside."""
-_WALK, _RIPPLE, _NOISE = 0, 1, 2
+_WALK, _NOISE = 0, 2
 """Independent random streams drawn from one seed; the last has one for each page."""
 
 
@@ -56,133 +45,6 @@ class SimulatedPage:
     exit_field: Complex
     piston: float
     shift_px: tuple[float, float]
-
-
-class TrueOptics:
-    """The noise-free optics of one device: what a simulator, or an oracle that may know the truth, computes with."""
-
-    def __init__(self, profile: Profile, device: Device, steps: int | None = None) -> None:
-        self.profile = profile
-        self.device = device
-        self._steps = splitting_steps(profile) if steps is None else steps
-
-    @cached_property
-    def geometry(self) -> WaveGeometry:
-        """The true geometry."""
-        return fitted_geometry(self.profile, as_dict(true_parameters(self.profile, self.device)))
-
-    @cached_property
-    def page_axes_m(self) -> tuple[Real, Real]:
-        """Centres of the SLM pixels (x, y) against the optical axis."""
-        page, pitch = self.profile.page, self.profile.slm.pitch_m
-        columns, rows = page.columns * page.symbol_size_px, page.rows * page.symbol_size_px
-        x = (np.arange(columns) - (columns - 1) / 2 + self.device.geometry.page_shift_x_px) * pitch
-        y = (np.arange(rows) - (rows - 1) / 2 + self.device.geometry.page_shift_y_px) * pitch
-        return x, y
-
-    @cached_property
-    def camera_axes_m(self) -> tuple[Real, Real]:
-        """Uniform axes (x, y) of the computed camera plane, at the cameras' pitch."""
-        camera = self.profile.camera
-
-        def axis(pixels: int) -> Real:
-            count = int(pixels * _GRID_MARGIN) + 48
-            return np.asarray((np.arange(count) - (count - 1) / 2) * camera.pitch_m)
-
-        return axis(camera.columns_px), axis(camera.rows_px)
-
-    @cached_property
-    def channel(self) -> WaveChannel:
-        """SLM to camera plane."""
-        page_x, page_y = self.page_axes_m
-        camera_x, camera_y = self.camera_axes_m
-        camera, pitch = self.profile.camera, self.profile.slm.pitch_m
-        sensor = camera.columns_px * camera.pitch_m / 2, camera.rows_px * camera.pitch_m / 2
-        return WaveChannel(
-            self.geometry,
-            page_x,
-            page_y,
-            camera_x,
-            camera_y,
-            cells=cells_for(self.geometry, page_x, page_y, *sensor),
-            steps=self._steps,
-            envelope_m=pitch,
-            blur_m=self.device.slm.blur_px * pitch,
-        )
-
-    @cached_property
-    def slm_factor(self) -> Complex:
-        """Illumination and the launch side's aberrations on the SLM's pixels [ny, nx], complex."""
-        page_x, page_y = self.page_axes_m
-        x = (page_x - page_x.mean())[None, :] / self.profile.corner_m
-        y = (page_y - page_y.mean())[:, None] / self.profile.corner_m
-        radius2 = x**2 + y**2
-        aberration = self.device.aberration
-        phase = (
-            aberration.defocus_rad * radius2
-            + aberration.astigmatism_rad * (x**2 - y**2)
-            + aberration.coma_rad * radius2 * x
-        )
-        amplitude = 1 - self.device.slm.falloff_relative * radius2
-        return np.asarray(amplitude * np.exp(1j * phase))
-
-    @cached_property
-    def signal_scale(self) -> float:
-        """Factor that makes the signal's mean power over the page's image one."""
-        size = self.profile.page.symbol_size_px
-        symbols = np.exp(2j * np.pi * np.random.default_rng(0).random(self.profile.page_shape))
-        field = self.channel.exit_field(self.slm_factor * np.kron(symbols, np.ones((size, size))))
-        # the de-launch is unitary on samples of the camera's pitch, and the page is imaged at its own size
-        samples = self.profile.page_width_m * self.profile.page_height_m / self.profile.camera.pitch_m**2
-        return float(np.sqrt(samples) / np.linalg.norm(field))
-
-    def exit_field(self, page_phase: Real) -> Complex:
-        """Phase written on the SLM [ny, nx], radians, to the field on the exit facet."""
-        return self.signal_scale * self.channel.exit_field(self.slm_factor * np.exp(1j * page_phase))
-
-    def camera_field(self, exit_field: Complex) -> Complex:
-        """Field on the exit facet to the computed camera plane."""
-        return self.channel.camera_field(exit_field)
-
-    @cached_property
-    def reference_in_place(self) -> Complex:
-        """Reference beam on the computed camera plane."""
-        return self.reference()
-
-    def reference(self, offset_m: tuple[float, float] = (0.0, 0.0)) -> Complex:
-        """Reference beam on the computed camera plane, or `offset_m` (x, y) from there."""
-        knobs = self.device.reference
-        axis_x, axis_y = self.camera_axes_m
-        half_width, half_height = self.profile.page_width_m / 2, self.profile.page_height_m / 2
-        x, y = axis_x[None, :] + offset_m[0], axis_y[:, None] + offset_m[1]
-        phase = (
-            knobs.tilt_x_rad * x / half_width
-            + knobs.tilt_y_rad * y / half_height
-            + knobs.curvature_rad * (x**2 + y**2) / self.profile.corner_m**2
-        )
-        rng = np.random.default_rng([knobs.ripple_seed, _RIPPLE])
-        ripple = np.zeros((len(axis_y), len(axis_x)))
-        for _ in range(6):
-            turns_x, turns_y = rng.uniform(-3, 3, 2)
-            ripple += np.cos(2 * np.pi * (turns_x * x / half_width + turns_y * y / half_height + rng.random()))
-        ripple *= knobs.ripple_relative / np.sqrt(3)
-        return np.asarray(knobs.amplitude_ratio * (1 + ripple) * np.exp(1j * phase), dtype=np.complex64)
-
-    def view(self, pose: CameraPose, shift_px: tuple[float, float] = (0.0, 0.0)) -> tuple[Real, Real]:
-        """Camera-plane points (x, y) of one camera's pixels, with the drift's shift added to its pose."""
-        moved = pose.model_copy(
-            update={"shift_x_px": pose.shift_x_px + shift_px[0], "shift_y_px": pose.shift_y_px + shift_px[1]}
-        )
-        distortion = self.device.aberration.distortion_relative
-        return CameraView(self.profile.camera, moved, distortion, self.profile.corner_m).positions_m()
-
-    @property
-    def electrons_per_unit(self) -> float:
-        """Electrons per unit intensity (mean signal power is one)."""
-        brightest = (self.device.reference.amplitude_ratio + _CLIPPING_AMPLITUDE) ** 2
-        sensor = self.device.sensor
-        full = sensor.full_well_e * sensor.exposure_relative
-        return full / brightest / max(1.0, self.device.homodyne.quadrature_gain)
 
 
 class Simulator:
@@ -306,38 +168,3 @@ class Simulator:
         middle = tuple(count // 2 for count in self.profile.frame_shape)
         still, moved = ([float(axis[middle]) for axis in self.optics.view(pose, by)] for by in ((0.0, 0.0), shift))
         return self.optics.reference((still[0] - moved[0], still[1] - moved[1]))
-
-
-def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
-    """The truth as a ray twin's parameter vector [P] (see `lightpage.calibration.parameters`)."""
-    g, pitch = device.geometry, profile.slm.pitch_m
-    values = dict.fromkeys(NAMES, 0.0)
-    values |= {
-        "pipe_angle_rad": np.deg2rad(g.pipe_angle_deg - profile.pipe.angle_deg),
-        "focal_length_relative": g.focal_length_relative_error,
-        "pipe_length_relative": g.pipe_length_relative_error,
-        "pipe_width_relative": g.pipe_width_relative_error,
-        "page_centre_x_m": g.page_shift_x_px * pitch,
-        "page_centre_y_m": g.page_shift_y_px * pitch,
-        "pipe_roll_rad": np.deg2rad(g.pipe_roll_deg),
-        "launch_defocus_rad": device.aberration.defocus_rad,
-        "launch_astigmatism_0_rad": device.aberration.astigmatism_rad,
-        "launch_coma_x_rad": device.aberration.coma_rad,
-        "lens_path_relative": device.aberration.lens_path_relative_error,
-        # the field is measured against the reference, so the reference's phase comes off
-        "camera_tilt_x_rad": -device.reference.tilt_x_rad,
-        "camera_tilt_y_rad": -device.reference.tilt_y_rad,
-        "camera_curvature_rad": -device.reference.curvature_rad,
-        "distortion_relative": device.aberration.distortion_relative,
-    }
-    for camera, pose in (("in_phase", device.in_phase_camera), ("quadrature", device.quadrature_camera)):
-        scale, turn = 1 + pose.scale_relative_error, np.deg2rad(pose.rotation_deg)
-        values |= {
-            f"{camera}_shift_x_px": pose.shift_x_px,
-            f"{camera}_shift_y_px": pose.shift_y_px,
-            f"{camera}_scale_x_relative": scale * np.cos(turn) - 1,
-            f"{camera}_scale_y_relative": scale * np.cos(turn) - 1,
-            f"{camera}_turn_xy_slope": -scale * np.sin(turn),
-            f"{camera}_turn_yx_slope": scale * np.sin(turn),
-        }
-    return as_vector(values)

@@ -19,9 +19,7 @@ class SimulatorSource:
     """A simulated device that writes a random page whenever one is read; the seed and the number fix its symbols."""
 
     def __init__(self, profile: Profile, device: Device, levels: int = 16, seed: int = 0, name: str = "") -> None:
-        from lightpage.simulator.simulator import (
-            Simulator,  # its parts take long to import, and most services read no simulator
-        )
+        from lightpage.simulator.simulator import Simulator
 
         self._simulator = Simulator(profile, device, levels, seed)
         self._lock = threading.Lock()

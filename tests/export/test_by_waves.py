@@ -17,7 +17,8 @@ from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.reader import FramePair, Recording
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from runtime.commands.evaluate import evaluate
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_drift import SHIFT, DriftModel

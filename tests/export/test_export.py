@@ -24,7 +24,8 @@ from lightpage.device.state import Device
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.reader import FramePair
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid
 from runtime.bundle.bundle import Bundle, write_bundle
 from runtime.bundle.manifest import FIELD

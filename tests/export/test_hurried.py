@@ -14,7 +14,8 @@ from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.profile import Camera
 from lightpage.device.state import Device
 from lightpage.page.symbols import random_symbols
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid
 from runtime.execution.session import open_session
 from tests.export.untrained import untrained_decoder

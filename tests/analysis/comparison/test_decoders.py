@@ -28,7 +28,7 @@ from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording
 from lightpage.simulator.recording_job import RecordingJob
-from lightpage.simulator.simulator import true_parameters
+from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.small import small_profile
 from train.data.features import FeatureExtractor, PageFeatures
 from train.fitting.curves import curves_of

@@ -41,7 +41,7 @@ from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, ideal_device
 from lightpage.errors import InvalidInputError, LightpageError, ProfileError
 from lightpage.simulator.recording_job import RecordingJob
-from lightpage.simulator.simulator import TrueOptics
+from lightpage.simulator.true_optics import TrueOptics
 from tests.lightpage.small import small_profile
 from train.data.features import PageState
 from train.published.decoder import PARAXIAL

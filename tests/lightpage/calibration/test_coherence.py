@@ -10,7 +10,8 @@ from lightpage.calibration.interfaces import BRANCHES
 from lightpage.calibration.parameters import NAMES, nominal
 from lightpage.calibration.samplers import FieldSampler
 from lightpage.device.state import Geometry
-from lightpage.simulator.simulator import TrueOptics, resample, true_parameters
+from lightpage.simulator.simulator import resample
+from lightpage.simulator.true_optics import TrueOptics, true_parameters
 from lightpage.waves.grid import field_grid
 from tests.lightpage.calibration.flat_twin import FlatTwin, Picture
 from tests.lightpage.small import on_slm, perfect_device, random_phases, small_profile

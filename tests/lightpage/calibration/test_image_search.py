@@ -12,7 +12,8 @@ from lightpage.device.state import Device
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.reader import FramePair
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.small import small_profile
 from train.models.field import FieldRecovery, TorchFieldSolver
 from train.models.twin import RayTwin, TorchTwin

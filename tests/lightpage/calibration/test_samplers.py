@@ -7,7 +7,8 @@ import pytest
 
 from lightpage.calibration.samplers import FieldSampler, FrameSampler
 from lightpage.device.state import CameraPose, Homodyne, Reference, Sensor
-from lightpage.simulator.simulator import Simulator, resample, true_parameters
+from lightpage.simulator.simulator import Simulator, resample
+from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import perfect_device, small_profile
 from train.models.twin import RayTwin, TorchTwin

@@ -13,7 +13,8 @@ from lightpage.calibration.wave_fit import WaveFit
 from lightpage.device.profile import Profile
 from lightpage.device.state import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor, draw_device
 from lightpage.page.symbols import symbol_phases
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid
 from tests.lightpage.small import THICK, small_profile
 from train.models.twin import RayTwin, TorchTwin

@@ -14,7 +14,7 @@ from lightpage.simulator.cameras import (
     resample,
     to_counts,
 )
-from lightpage.simulator.simulator import true_parameters
+from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.small import perfect_device, small_profile
 from train.models.twin import RayTwin, TorchTwin
 

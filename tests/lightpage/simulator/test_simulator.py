@@ -25,7 +25,8 @@ from lightpage.device.state import (
 )
 from lightpage.errors import PageError, ProfileError
 from lightpage.simulator.cameras import resample
-from lightpage.simulator.simulator import Simulator, TrueOptics, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import TrueOptics, true_parameters
 from lightpage.waves import channel as waves
 from lightpage.waves.grid import splitting_steps
 from lightpage.waves.lens import FourierLens

@@ -22,7 +22,8 @@ from lightpage.device.state import Device
 from lightpage.errors import CalibrationError, FrameError, InvalidInputError, LightpageError, RecordingError
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.reader import FramePair, Recording, RecordingWriter
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from train.commands.calibrate import calibrate
 
 

@@ -13,7 +13,8 @@ from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.parameters import NAMES
 from lightpage.device.state import Device, SlmDefects
 from lightpage.page.symbols import random_symbols, symbol_phases
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.small import small_profile
 from train.data.features import FeatureExtractor, PageFeatures
 from train.data.known_light import explained

@@ -8,7 +8,8 @@ import pytest
 from lightpage.calibration.coherence import COHERENT_BRANCHES, branch_shares
 from lightpage.device.state import Device, Drift, SlmDefects
 from lightpage.page.symbols import random_symbols, symbol_phases
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import GRID_STEP_PX, field_grid
 from tests.lightpage.small import small_profile
 from train.data.features import FeatureExtractor

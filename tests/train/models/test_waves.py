@@ -10,7 +10,7 @@ from lightpage.calibration.parameters import NAMES, PRIORS, nominal
 from lightpage.calibration.wave_model import FittedWaves
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
-from lightpage.simulator.simulator import true_parameters
+from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.small import THICK, small_profile
 from train.models.parts import stacked
 from train.models.waves import ACCURACY, Waves

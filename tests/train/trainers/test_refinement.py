@@ -16,7 +16,8 @@ from lightpage.calibration.wave_model import illumination_terms
 from lightpage.device.state import Device, Drift, Sensor
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.recording.reader import FramePair
-from lightpage.simulator.simulator import Simulator, true_parameters
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.small import small_profile
 from train.commands.train import train
 from train.data.features import FeatureExtractor
