@@ -8,6 +8,7 @@ A real lens adds a phase to each ray: a phase and a tilt, about the middle of th
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -77,7 +78,7 @@ class RayTwin(nn.Module):
         return (*self._trace(value, points, anchors), self._pixels(value, places))
 
     def _trace(self, value: dict[str, Tensor], points: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        geometry = fitted_geometry(self.profile, value)
+        geometry: Any = fitted_geometry(self.profile, value)  # its numbers are tensors here
         focal, length, width = geometry.focal_length_m, geometry.pipe_length_m, geometry.pipe_width_m
         angle, roll = geometry.pipe_angle, geometry.pipe_roll
         centre = torch.stack([value["page_centre_x_m"], value["page_centre_y_m"]])
