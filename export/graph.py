@@ -42,10 +42,7 @@ class DecoderGraph(nn.Module):
 
     def __init__(self, profile: Profile, decoder: SymbolDecoder, kappa_scale: float) -> None:
         super().__init__()
-        choices = decoder.choices
-        self.recovery = FieldRecovery(
-            profile, rounds=choices.field_rounds, binning=choices.binning, grid=choices.grid(profile)
-        )
+        self.recovery = decoder.choices.field_recovery(profile)
         self.decoder = decoder
         self.kappa_scale = kappa_scale
         with torch.no_grad():

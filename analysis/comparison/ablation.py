@@ -56,14 +56,8 @@ class Unconditioned(SymbolUNet):
 
 def extractor_without(part: str, bench: Bench) -> FeatureExtractor:
     """Features of the calibrated device, without a part of the field's recovery."""
-    found = FeatureExtractor(
-        bench.profile,
-        bench.fitted.vector,
-        bench.fitted.turn_rad,
-        bench.recording.references(),
-        with_signal_power=part != SIGNAL_POWER,
-        rounds=0 if part == DESCENT else ROUNDS,
-    )
+    choices = Hyperparameters(field_rounds=0 if part == DESCENT else ROUNDS)
+    found = FeatureExtractor(bench.calibrated_device(), choices=choices, with_signal_power=part != SIGNAL_POWER)
     if part == LOW_PASS:
         found.recovery.add_module("prefilter", nn.Identity())
     return found

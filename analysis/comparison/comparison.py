@@ -20,6 +20,7 @@ from analysis.comparison.levels import LevelFigures, level_figures
 from analysis.comparison.oracle import Oracle
 from analysis.report.data import exit_centroids
 from lightpage.calibration.calibrate import calibrate
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.cli.progress_bar import percent_bar
@@ -30,7 +31,7 @@ from lightpage.metrics.measures import measure
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob
-from lightpage.simulator.true_optics import true_parameters
+from lightpage.simulator.true_optics import perfectly_calibrated
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import FeatureExtractor, PageFeatures
 from train.data.known_light import explained
@@ -157,27 +158,17 @@ class Bench:
         """All that is not calibrated on, in order."""
         return [*self.training, *self.validation, *self.unseen]
 
-    def parameters(self, arm: str) -> Real:
-        """The device as an arm knows it, [P]: fitted, or true."""
-        return true_parameters(self.profile, self.device) if arm == ORACLE else self.fitted.vector
+    def calibrated_device(self, arm: str = "") -> CalibratedDevice:
+        """The device as an arm knows it: fitted, or true."""
+        references = self.recording.references()
+        if arm == ORACLE:
+            return perfectly_calibrated(self.profile, self.device, references)
+        return CalibratedDevice.of(self.profile, self.fitted, references)
 
     def extractor(self, arm: str) -> FeatureExtractor:
         """Of the calibrated device; of the true one for what an oracle looks at again, the signal's power left in."""
-        if arm == ORACLE:
-            turn, references = self.device.homodyne.turn_rad, self.recording.references()
-            return FeatureExtractor(self.profile, self.parameters(arm), turn, references, "coherent")
-        choices = HURRIED if arm == FAST else Hyperparameters()
-        return FeatureExtractor(
-            self.profile,
-            self.fitted.vector,
-            self.fitted.turn_rad,
-            self.recording.references(),
-            "coherent" if arm == FAST else arm,
-            rounds=choices.field_rounds,
-            binning=choices.binning,
-            grid=choices.grid(self.profile),
-            coherent=choices.coherent_localizer(self.profile),
-        )
+        localizer = "coherent" if arm in (ORACLE, FAST) else arm
+        return FeatureExtractor(self.calibrated_device(arm), localizer, HURRIED if arm == FAST else None)
 
     def symbol_arm(self, name: str, size: str, choices: Hyperparameters) -> Outcome:
         """Features, then the network at symbol pitch."""
@@ -194,10 +185,9 @@ class Bench:
             drawn = choices.drawn(self.profile.page_shape)
             outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing, drawn)
             return replace(outcome, by_levels=self.at_levels(name, folder, [first], outcome.kappa_scale))
-        extractor, parameters = self.extractor(look), self.parameters(look)
+        extractor = self.extractor(look)
         pages = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
-        known = explained(extractor, self.profile, parameters, pages)
-        prediction = fit_prediction(self.profile, parameters, known, extractor.grid)
+        prediction = fit_prediction(extractor, explained(extractor, pages))
         counts = len(self.training), len(self.validation)
         material = RefinementPages(self.recording, self.pages, *counts, features)
         key = self.key(look)

@@ -20,6 +20,7 @@ from analysis.comparison.kept import CALIBRATION
 from export.command import export_run
 from export.graph import DecoderGraph, table_tensors
 from export.parity import torch_answer
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.sampling_table import sampling_table
@@ -123,12 +124,9 @@ def _decoder(
     decoder = SymbolDecoder(profile, calibration.vector, localizer, choices)
     decoder.network.load_state_dict(_weights(arm))
     if refinements:
-        extractor = FeatureExtractor(
-            profile, calibration.vector, calibration.turn_rad, recording.references(), localizer
-        )
+        extractor = FeatureExtractor(CalibratedDevice.of(profile, calibration, recording.references()), localizer)
         pages = known_pages(recording, profile, range(CALIBRATED, CALIBRATED + LIKENESS_PAGES))
-        known = explained(extractor, profile, calibration.vector, pages)
-        decoder.prediction = fit_prediction(profile, calibration.vector, known, extractor.grid)
+        decoder.prediction = fit_prediction(extractor, explained(extractor, pages))
         decoder.refiners[0].load_state_dict(_weights(arm / "refinement-1"))
     return decoder.float().eval()
 

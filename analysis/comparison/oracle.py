@@ -13,7 +13,7 @@ from lightpage.device.state import Device
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.reader import FramePair, Recording
 from lightpage.simulator.cameras import resample
-from lightpage.simulator.true_optics import TrueOptics, true_parameters
+from lightpage.simulator.true_optics import TrueOptics, perfectly_calibrated
 from train.data.features import FeatureExtractor, PageFeatures
 
 
@@ -45,10 +45,8 @@ class Oracle:
 
     def __init__(self, recording: Recording, profile: Profile, device: Device) -> None:
         self._recording, self._optics = recording, TrueOptics(profile, device)
-        truth, turn = true_parameters(profile, device), device.homodyne.turn_rad
-        self._extractor = FeatureExtractor(
-            profile, truth, turn, recording.references(), "wave", with_signal_power=False
-        )
+        perfect = perfectly_calibrated(profile, device, recording.references())
+        self._extractor = FeatureExtractor(perfect, "wave", with_signal_power=False)
 
     def pages(self, indices: Sequence[int], shift_px: tuple[float, float] = (0.0, 0.0)) -> Iterator[PageFeatures]:
         """Features of the given pages, in order; the shift is followed from page to page, from `shift_px` on."""

@@ -7,10 +7,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.parameters import NAMES, as_dict, as_vector
 from lightpage.calibration.wave_model import fitted_geometry
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
+from lightpage.recording.reader import FramePair
 from lightpage.simulator.cameras import (
     CameraView,
 )
@@ -157,6 +159,11 @@ class TrueOptics:
         sensor = self.device.sensor
         full = sensor.full_well_e * sensor.exposure_relative
         return full / brightest / max(1.0, self.device.homodyne.quadrature_gain)
+
+
+def perfectly_calibrated(profile: Profile, device: Device, references: FramePair) -> CalibratedDevice:
+    """A device as a calibration without any error would find it."""
+    return CalibratedDevice(profile, true_parameters(profile, device), device.homodyne.turn_rad, references)
 
 
 def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:

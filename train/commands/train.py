@@ -10,6 +10,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages, lit_pages
 from lightpage.cli.options import FiniteRange
@@ -116,17 +117,7 @@ def train(
         options["calibration"] = calibration.to_toml()
         features = localizer if localizer in LOCALIZERS else LOCALIZERS[0]
         choices = recipe.choices if isinstance(recipe, SymbolRecipe) else Hyperparameters()
-        extractor = FeatureExtractor(
-            profile,
-            calibration.vector,
-            calibration.turn_rad,
-            references,
-            features,
-            rounds=choices.field_rounds,
-            binning=choices.binning,
-            grid=choices.grid(profile),
-            coherent=choices.coherent_localizer(profile),
-        )
+        extractor = FeatureExtractor(CalibratedDevice.of(profile, calibration, references), features, choices)
         extractor.check(known_pages(recording, profile, groups[0][:1])[0], calibration.coherence_after)
         begin(out, options)
         if (out / DESCRIPTION).exists():

@@ -12,16 +12,17 @@ from scipy import ndimage
 from torch import Tensor
 
 from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, least_coherence
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.coherence import COHERENT_BRANCHES, branch_shares, page_coherence
 from lightpage.calibration.interfaces import BRANCHES
 from lightpage.calibration.samplers import FieldSampler
 from lightpage.calibration.sampling_table import Table, sampling_table, shifted
-from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.reader import FramePair, Recording
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid
-from train.models.field import ROUNDS, FieldRecovery, Measured, TorchFieldSolver
+from train.models.field import Measured, TorchFieldSolver
+from train.models.hyperparameters import Hyperparameters
 from train.models.localizers.coherent import CoherentLocalizer
 from train.models.localizers.wave import WaveLocalizer
 from train.models.parts import stacked
@@ -69,39 +70,29 @@ class FeatureExtractor:
     """Turns frame pairs of one calibrated device into features.
 
     Args:
-        profile: the nominal device.
-        parameters: [P] fitted parameters.
-        turn: angle between the homodyne arms, radians.
-        references: reference-only frames.
+        device: as calibrated.
         localizer: `coherent` or `wave`.
-        with_signal_power, rounds, binning: see `FieldRecovery`.
-        coherent: the coherent localizer, where it is not the usual one.
-        grid: the common grid, where it is not the usual one.
+        choices: of the decoder that the features are for.
+        with_signal_power: see `FieldRecovery`.
     """
 
     def __init__(
         self,
-        profile: Profile,
-        parameters: Real,
-        turn: float,
-        references: FramePair,
+        device: CalibratedDevice,
         localizer: str = "coherent",
+        choices: Hyperparameters | None = None,
         *,
         with_signal_power: bool = True,
-        rounds: int = ROUNDS,
-        binning: int = 1,
-        coherent: CoherentLocalizer | None = None,
-        grid: FieldGrid | None = None,
     ) -> None:
-        self._profile, self._parameters, self._twin = profile, parameters, TorchTwin(RayTwin(profile))
-        self.table: Table = sampling_table(self._twin, parameters, turn, profile)
-        self.recovery = FieldRecovery(
-            profile, with_signal_power=with_signal_power, rounds=rounds, binning=binning, grid=grid
-        )
+        choices = choices or Hyperparameters()
+        profile, parameters = device.profile, device.parameters
+        self.device = device
+        self._twin = TorchTwin(RayTwin(profile))
+        self.table: Table = sampling_table(self._twin, parameters, device.quadrature_phase_rad, profile)
+        self.recovery = choices.field_recovery(profile, with_signal_power=with_signal_power)
         self._solve = TorchFieldSolver(self.recovery)
-        self._coherent = coherent or CoherentLocalizer(profile, grid=grid)
-        self._wave = WaveLocalizer(profile, parameters, grid) if localizer == "wave" else None
-        self._references = references
+        self._coherent = choices.coherent_localizer(profile)
+        self._wave = WaveLocalizer(profile, parameters, self.grid) if localizer == "wave" else None
         shares = branch_shares(self.table["positions"].reshape(2, -1).T.astype(float))
         self._shares = shares.reshape(len(COHERENT_BRANCHES), *profile.page_shape)
         self._chosen = [BRANCHES.index(name) for name in COHERENT_BRANCHES]
@@ -113,12 +104,12 @@ class FeatureExtractor:
 
     def field(self, pair: FramePair) -> NDArray[np.complex64]:
         """Recovered field on the common grid."""
-        return self._solve(pair, self._references, self.table["registration"], self.table["homodyne"])[0]
+        return self._solve(pair, self.device.references, self.table["registration"], self.table["homodyne"])[0]
 
     def look(self, pair: FramePair, shift_px: tuple[float, float]) -> tuple[Measured, Tensor]:
         """What was measured on the calibrated grid of a page whose image has moved by (x, y), and its field there."""
         registration = shifted(self.table["registration"], np.array(shift_px))
-        seen = (pair.in_phase, pair.quadrature, self._references.in_phase, self._references.quadrature)
+        seen = (pair.in_phase, pair.quadrature, self.device.references.in_phase, self.device.references.quadrature)
         tensors = [*(frame.astype(np.float32) for frame in seen), registration, self.table["homodyne"]]
         measured = self.recovery.measure(*map(torch.from_numpy, tensors))
         return measured, self.recovery.solve(measured)[0]
@@ -135,7 +126,7 @@ class FeatureExtractor:
         """
         field = self.known_field(page.pair, np.angle(page.symbols))
         sampler = FieldSampler(field, self.grid)
-        found = page_coherence(sampler, self._twin, self._parameters, self._profile, page.symbols)
+        found = page_coherence(sampler, self._twin, self.device.parameters, self.device.profile, page.symbols)
         least = max(least_coherence(page.symbols.size), LEAST_KEPT * calibrated)
         if not found >= least:
             raise CalibrationError(
@@ -188,7 +179,7 @@ class FeatureExtractor:
         return PageState((float(shift[0]), float(shift[1])), piston)
 
     def _moved(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.complex64]:
-        return moved(field, shift * self._profile.camera.pitch_m / self.grid.pitch_m)
+        return moved(field, shift * self.device.profile.camera.pitch_m / self.grid.pitch_m)
 
     def _light(self, field: NDArray[np.complex64], shift: Real) -> NDArray[np.float32]:
         return demodulate(self._coherent, field, self.table, shift)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.wave_model import FittedWaves, illumination_terms, on_modulator
-from lightpage.device.profile import Profile
 from lightpage.progress import track
 from lightpage.waves.grid import symbol_samples
 from train.data.features import FeatureExtractor
@@ -47,19 +46,16 @@ class Explained:
         return self.measured.lit.numpy().astype(bool)
 
 
-def explained(
-    extractor: FeatureExtractor, profile: Profile, parameters: Real, pages: Sequence[KnownPage]
-) -> list[Explained]:
+def explained(extractor: FeatureExtractor, pages: Sequence[KnownPage]) -> list[Explained]:
     """Known pages as the calibrated device measured them and its fitted waves explain them, by least squares.
 
     The waves are as exact as those of a decoder that looks again.
 
     Args:
         extractor: of the device.
-        profile: the nominal device.
-        parameters: [P] fitted.
         pages: of the device.
     """
+    profile, parameters = extractor.device.profile, extractor.device.parameters
     samples = symbol_samples(profile)
     grid = extractor.grid
     waves = FittedWaves(profile, parameters, samples, filled=True, accuracy=ACCURACY, grid=grid)

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.calibration.wave_model import FittedWaves, illumination_terms, on_modulator
-from lightpage.device.profile import Profile
 from lightpage.page.symbols import MAX_LEVELS, random_symbols, symbol_phases
 from lightpage.waves.grid import FieldGrid, field_grid, symbol_samples
 from train.data.features import PageFeatures, PageState, demodulate, localized
@@ -88,8 +88,7 @@ class SyntheticPages:
     """Features of pages that the fitted device would show after drifts of its own.
 
     Args:
-        profile: the nominal device.
-        parameters: [P] fitted.
+        device: as calibrated.
         like: what recorded pages show over that geometry.
         localizer: the coherent one; None for that by waves.
         seed: of drifts, symbols and noise.
@@ -98,14 +97,14 @@ class SyntheticPages:
 
     def __init__(
         self,
-        profile: Profile,
-        parameters: Real,
+        device: CalibratedDevice,
         like: Likeness,
         localizer: CoherentLocalizer | None,
         seed: int,
         grid: FieldGrid | None = None,
     ) -> None:
-        self._profile, self._parameters, self._like, self._seed = profile, parameters, like, seed
+        profile = device.profile
+        self._device, self._like, self._seed = device, like, seed
         self._twin, self._grid = TorchTwin(RayTwin(profile)), grid or field_grid(profile)
         self._per_state = PAGES_PER_STATE if np.prod(profile.page_shape) < _LARGE else 1
         self._coherent = localizer
@@ -120,10 +119,10 @@ class SyntheticPages:
 
     def _state(self, number: int) -> Iterator[PageFeatures]:
         """All pages of one drifted state."""
-        profile = self._profile
+        profile = self._device.profile
         rng = np.random.default_rng([self._seed, number])
         drift = np.array([_DRIFT.get(name, 0.0) for name in NAMES]) * rng.uniform(-1, 1, len(NAMES))
-        parameters = self._parameters + drift
+        parameters = self._device.parameters + drift
         waves = FittedWaves(profile, parameters, symbol_samples(profile), filled=True, grid=self._grid)
         waves_back = WaveLocalizer(profile, parameters, self._grid) if self._coherent is None else None
         table = sampling_table(self._twin, parameters, np.pi / 2, profile)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from lightpage.device.profile import Profile
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
-from train.models.field import ROUNDS
+from train.models.field import ROUNDS, FieldRecovery
 from train.models.localizers.coherent import BICUBIC, CoherentLocalizer
 
 _REFINEMENT_STEPS = 0.25
@@ -61,6 +61,16 @@ class Hyperparameters:
     def grid(self, profile: Profile) -> FieldGrid:
         """The common grid of these choices."""
         return field_grid(profile, self.field_step)
+
+    def field_recovery(self, profile: Profile, *, with_signal_power: bool = True) -> FieldRecovery:
+        """The field's recovery of these choices."""
+        return FieldRecovery(
+            profile,
+            with_signal_power=with_signal_power,
+            rounds=self.field_rounds,
+            binning=self.binning,
+            grid=self.grid(profile),
+        )
 
     def coherent_localizer(self, profile: Profile) -> CoherentLocalizer:
         """The localizer of these choices."""

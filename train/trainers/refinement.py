@@ -17,9 +17,7 @@ from pathlib import Path
 import numpy as np
 from torch import nn
 
-from lightpage.device.profile import Profile
 from lightpage.recording.reader import Recording
-from lightpage.waves.grid import FieldGrid
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import FeatureExtractor, PageFeatures
 from train.data.known_light import Explained
@@ -31,22 +29,19 @@ from train.models.hyperparameters import Hyperparameters
 from train.models.network import Refiner
 from train.models.parts import stacked, turned
 from train.models.prediction import Prediction
-from train.models.waves import Real
 
 _FLOORS = (0.05, 20.0)
 """Least and largest `Measured.pull` floor that is believed."""
 
 
-def fit_prediction(
-    profile: Profile, parameters: Real, known: Sequence[Explained], grid: FieldGrid | None = None
-) -> Prediction:
+def fit_prediction(extractor: FeatureExtractor, known: Sequence[Explained]) -> Prediction:
     """The prediction of a device, illumination and floor as known pages show them.
 
     Args:
-        profile, parameters, grid: see `Prediction`.
-        known: pages, on that grid.
+        extractor: of the device.
+        known: pages, as `explained` gives them for that extractor.
     """
-    prediction = Prediction(profile, parameters, grid)
+    prediction = Prediction(extractor.device.profile, extractor.device.parameters, extractor.grid)
     squares, lengths = [], []
     for light in known:
         measured, seen = light.measured, light.seen

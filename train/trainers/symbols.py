@@ -130,7 +130,7 @@ class SymbolRecipe:
         weights: dict[str, Tensor],
     ) -> Refined:
         """Trained refinements, which add what they have learnt to the weights."""
-        prediction = fit_prediction(material.profile, material.calibration.vector, known_light, material.extractor.grid)
+        prediction = fit_prediction(material.extractor, known_light)
         refined = fit_refinements(
             material.out,
             self.choices,
@@ -175,23 +175,21 @@ class SymbolRecipe:
         if not (self.synthetic_pages or self.choices.refinements):
             return []
         pages = known_pages(material.recording, material.profile, material.training[:LIKENESS_PAGES])
-        return explained(material.extractor, material.profile, material.calibration.vector, pages)
+        return explained(material.extractor, pages)
 
     def _synthetic(self, material: Material, known: list[Explained]) -> list[Path]:
         """Folder with the features of synthetic pages; none where the wave model is not like the device."""
         if self.synthetic_pages == 0:
             return []
-        profile, vector, seed = material.profile, material.calibration.vector, self.choices.seed
+        profile, seed = material.profile, self.choices.seed
         like = likeness(known)
         if like.noise > MOST_NOISE:
             note(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
             return []
         note(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
         folder = material.out / "synthetic"
-        reader = self.choices.coherent_localizer(profile)
-        pages = SyntheticPages(
-            profile, vector, like, None if self.localizer == WAVE else reader, seed, material.extractor.grid
-        )
+        reader = None if self.localizer == WAVE else self.choices.coherent_localizer(profile)
+        pages = SyntheticPages(material.extractor.device, like, reader, seed, material.extractor.grid)
         key = f"{self.localizer} {self.choices.first_look} {seed} "
         key += f"{profile.to_toml()} {material.calibration.to_toml()} {like.noise:.6f} "
         key += f"{np.round(like.illumination, 6).tolist()}"

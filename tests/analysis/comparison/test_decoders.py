@@ -28,7 +28,7 @@ from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording
 from lightpage.simulator.recording_job import RecordingJob
-from lightpage.simulator.true_optics import true_parameters
+from lightpage.simulator.true_optics import perfectly_calibrated, true_parameters
 from tests.lightpage.small import small_profile
 from train.data.features import FeatureExtractor, PageFeatures
 from train.fitting.curves import curves_of
@@ -67,7 +67,6 @@ def test_the_oracle_is_spared_the_signals_own_power(tmp_path: Path) -> None:
     job = RecordingJob(PROFILE, device, 256, 2, truth=True, out=tmp_path / "R.h5")
     job.claim(force=False)
     job.run(1)
-    truth, turn = true_parameters(PROFILE, device), device.homodyne.turn_rad
 
     def error(page: PageFeatures) -> float:
         light = page.light.astype(np.float64)[:, 0].mean(1)
@@ -75,7 +74,7 @@ def test_the_oracle_is_spared_the_signals_own_power(tmp_path: Path) -> None:
         return float(1 - abs(z.mean()) ** 2 / np.mean(np.abs(z) ** 2))
 
     with Recording.open(tmp_path / "R.h5") as recording:
-        wave = FeatureExtractor(PROFILE, truth, turn, recording.references(), "wave")
+        wave = FeatureExtractor(perfectly_calibrated(PROFILE, device, recording.references()), "wave")
         oracle = Oracle(recording, PROFILE, device)
         assert error(next(oracle.pages([0]))) < error(next(wave.pages(recording, [0])))
 

@@ -14,7 +14,7 @@ from lightpage.calibration.parameters import NAMES
 from lightpage.device.state import Device, SlmDefects
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.simulator.simulator import Simulator
-from lightpage.simulator.true_optics import true_parameters
+from lightpage.simulator.true_optics import perfectly_calibrated
 from tests.lightpage.small import small_profile
 from train.data.features import FeatureExtractor, PageFeatures
 from train.data.known_light import explained
@@ -25,7 +25,6 @@ SEED = 5
 FALLOFF = 0.25
 PROFILE = small_profile()
 DEVICE = Device(slm=SlmDefects(falloff_relative=FALLOFF))
-TRUTH = true_parameters(PROFILE, DEVICE)
 
 
 class Recorded(NamedTuple):
@@ -40,15 +39,14 @@ def recorded() -> Recorded:
     simulator = Simulator(PROFILE, DEVICE, seed=SEED)
     phases = symbol_phases(random_symbols(PROFILE, 256, 1, np.random.default_rng(SEED))[0], 256)
     pair = simulator.page(np.rint(phases / (2 * np.pi) * 256).astype(np.uint8))
-    turn = DEVICE.homodyne.turn_rad
-    extractor = FeatureExtractor(PROFILE, TRUTH, turn, simulator.references())
+    extractor = FeatureExtractor(perfectly_calibrated(PROFILE, DEVICE, simulator.references()))
     features, _ = extractor.page(extractor.field(pair), phases, np.zeros(2))
     return Recorded(features, extractor, KnownPage(pair, np.exp(1j * phases)))
 
 
 @pytest.fixture(scope="module")
 def like(recorded: Recorded) -> Likeness:
-    return likeness(explained(recorded.extractor, PROFILE, TRUTH, [recorded.page]))
+    return likeness(explained(recorded.extractor, [recorded.page]))
 
 
 def agreement(page: PageFeatures) -> float:
@@ -68,22 +66,24 @@ def test_the_fitted_waves_explain_the_recorded_light_and_its_fall_off(like: Like
 
 def test_other_symbols_explain_nothing_and_another_angle_less(like: Likeness, recorded: Recorded) -> None:
     others = replace(recorded.page, symbols=recorded.page.symbols[::-1])
-    assert likeness(explained(recorded.extractor, PROFILE, TRUTH, [others])).noise > MOST_NOISE
-    other = TRUTH.copy()
+    assert likeness(explained(recorded.extractor, [others])).noise > MOST_NOISE
+    device = recorded.extractor.device
+    other = device.parameters.copy()
     other[NAMES.index("pipe_angle_rad")] += np.deg2rad(0.5)
-    assert likeness(explained(recorded.extractor, PROFILE, other, [recorded.page])).noise > 3 * like.noise
+    turned = FeatureExtractor(replace(device, parameters=other))
+    assert likeness(explained(turned, [recorded.page])).noise > 3 * like.noise
 
 
 def test_synthetic_light_shows_its_symbols_as_the_recorded_light_does(like: Likeness, recorded: Recorded) -> None:
-    pages = list(islice(SyntheticPages(PROFILE, TRUTH, like, CoherentLocalizer(PROFILE), SEED).pages(), 4))
+    pages = list(islice(SyntheticPages(recorded.extractor.device, like, CoherentLocalizer(PROFILE), SEED).pages(), 4))
     found = np.array([agreement(page) for page in pages])
     # pages of this size differ by their symbols' chance neighbours
     assert found.mean() == pytest.approx(agreement(recorded.features), rel=0.06)
     assert pages[0].light.shape == recorded.features.light.shape
 
 
-def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: Likeness) -> None:
-    made = SyntheticPages(PROFILE, TRUTH, like, CoherentLocalizer(PROFILE), SEED)
+def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: Likeness, recorded: Recorded) -> None:
+    made = SyntheticPages(recorded.extractor.device, like, CoherentLocalizer(PROFILE), SEED)
     count = PAGES_PER_STATE + 2
     all_pages = list(islice(made.pages(), count))
     again = next(islice(made.pages(PAGES_PER_STATE + 1), 1))
@@ -93,6 +93,6 @@ def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: Lik
     assert np.abs(all_pages[0].positions - all_pages[-1].positions).max() > 1e-5
 
 
-def test_the_wave_localizer_has_synthetic_pages_too(like: Likeness) -> None:
-    page = next(SyntheticPages(PROFILE, TRUTH, like, None, SEED).pages())
+def test_the_wave_localizer_has_synthetic_pages_too(like: Likeness, recorded: Recorded) -> None:
+    page = next(SyntheticPages(recorded.extractor.device, like, None, SEED).pages())
     assert agreement(page) > 0.85

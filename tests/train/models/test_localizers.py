@@ -9,10 +9,11 @@ from lightpage.calibration.coherence import COHERENT_BRANCHES, branch_shares
 from lightpage.device.state import Device, Drift, SlmDefects
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.simulator.simulator import Simulator
-from lightpage.simulator.true_optics import true_parameters
-from lightpage.waves.grid import GRID_STEP_PX, field_grid
+from lightpage.simulator.true_optics import perfectly_calibrated
+from lightpage.waves.grid import GRID_STEP_PX
 from tests.lightpage.small import small_profile
 from train.data.features import FeatureExtractor
+from train.models.hyperparameters import Hyperparameters
 
 SEED = 3
 
@@ -25,12 +26,9 @@ def page(request: pytest.FixtureRequest) -> tuple[np.ndarray, dict[str, np.ndarr
     symbols = random_symbols(profile, 256, 1, np.random.default_rng(SEED))[0]
     recorded = simulator.simulate(symbols)
     phases = symbol_phases(symbols, 256)
-    turn = device.homodyne.turn_rad
-    features, grid = {}, field_grid(profile, request.param)
+    perfect, features = perfectly_calibrated(profile, device, simulator.references()), {}
     for localizer in ("coherent", "wave"):
-        extractor = FeatureExtractor(
-            profile, true_parameters(profile, device), turn, simulator.references(), localizer, grid=grid
-        )
+        extractor = FeatureExtractor(perfect, localizer, Hyperparameters(field_step=request.param))
         found, shift = extractor.page(extractor.field(recorded.pair), phases, np.zeros(2))
         features[localizer] = found.light.astype(np.float32)
         np.testing.assert_allclose(shift, recorded.shift_px, atol=0.1)

@@ -17,7 +17,7 @@ from lightpage.device.state import Device, Drift, Sensor
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.recording.reader import FramePair
 from lightpage.simulator.simulator import Simulator
-from lightpage.simulator.true_optics import true_parameters
+from lightpage.simulator.true_optics import perfectly_calibrated
 from tests.lightpage.small import small_profile
 from train.commands.train import train
 from train.data.features import FeatureExtractor
@@ -44,12 +44,9 @@ def known_page(**device: object) -> Known:
     simulator = Simulator(PROFILE, state, seed=5)
     symbols = random_symbols(PROFILE, 256, 1, np.random.default_rng(5))[0]
     recorded, phases = simulator.simulate(symbols), symbol_phases(symbols, 256)
-    truth, turn = true_parameters(PROFILE, state), state.homodyne.turn_rad
-    extractor = FeatureExtractor(PROFILE, truth, turn, simulator.references())
+    extractor = FeatureExtractor(perfectly_calibrated(PROFILE, state, simulator.references()))
     known = KnownPage(recorded.pair, np.exp(1j * phases))
-    return Known(
-        recorded.pair, phases, extractor, fit_prediction(PROFILE, truth, explained(extractor, PROFILE, truth, [known]))
-    )
+    return Known(recorded.pair, phases, extractor, fit_prediction(extractor, explained(extractor, [known])))
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,35 @@
+"""One device as calibration found it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.document import Calibration
+from lightpage.device.profile import Profile
+from lightpage.recording.reader import FramePair
+
+
+@dataclass(frozen=True)
+class CalibratedDevice:
+    """All that a field and its rays are computed with, beside the frames themselves.
+
+    Attributes:
+        profile: the nominal device.
+        parameters: [P] fitted, see `lightpage.calibration.parameters`.
+        quadrature_phase_rad: phase between the two cameras, about 90 degrees, negative where Q is inverted.
+        references: reference-only frames.
+    """
+
+    profile: Profile
+    parameters: NDArray[np.float64]
+    quadrature_phase_rad: float
+    references: FramePair
+
+    @classmethod
+    def of(cls, profile: Profile, calibration: Calibration, references: FramePair) -> Self:
+        """The device of a calibration document."""
+        return cls(profile, calibration.vector, calibration.turn_rad, references)
