@@ -70,6 +70,8 @@ class RecordingWriter:
         bit_depth: int,
         references: FramePair,
         pilots: ArrayLike | None = None,
+        *,
+        resume: bool = False,
     ) -> None:
         """Start a new recording; a partial file of the same name that nobody is writing is overwritten.
 
@@ -80,13 +82,15 @@ class RecordingWriter:
             bit_depth: bits of a camera count, 8 to 16.
             references: reference-only frames.
             pilots: boolean [ny, nx]; None leaves the profile's default positions in force.
+            resume: as `RecordingWriter.resume` does.
 
         Raises:
             RecordingError: wrong bit depth, frames or pilots, or the file cannot be written or is being written.
             PageError: a level count outside 2..256.
         """
         self._prepare(path, profile, levels, bit_depth)
-        self._create(references, pilots)
+        if not (resume and self._continue(references, pilots)):
+            self._create(references, pilots)
 
     @classmethod
     def resume(
@@ -102,11 +106,7 @@ class RecordingWriter:
 
         `pages` tells how many pages are there already. Arguments and errors as for the constructor.
         """
-        writer = cls.__new__(cls)
-        writer._prepare(path, profile, levels, bit_depth)
-        if not writer._continue(references, pilots):
-            writer._create(references, pilots)
-        return writer
+        return cls(path, profile, levels, bit_depth, references, pilots, resume=True)
 
     @property
     def pages(self) -> int:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from copy import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,18 +18,16 @@ from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
 from lightpage.page.symbols import MAX_LEVELS, check_levels
 from lightpage.recording.reader import FramePair
-from lightpage.waves.grid import field_grid
 from runtime.bundle.bundle import Bundle, Table
 from runtime.bundle.manifest import DECODER, FIELD, GOLDEN
+from runtime.decoding.field_solver import BundleFieldSolver
 from runtime.decoding.frames import check_pair
 from runtime.decoding.page import DecodedPage, Inference, Timings
 from runtime.execution.constant_table import GraphFile
-from runtime.execution.session import Port, Session, open_session
+from runtime.execution.session import Port
+from runtime.execution.table_graph import TableGraph
 
 OUTPUTS = ("p", "phase", "concentration")
-FIELD_OUTPUTS = ("field", "unexplained")
-"""Outputs of the field graph, or of a decoder that shows them, [2, Gy, Gx] each: the recovered field, and what is left
-of the homodyne equations."""
 PAGE_INPUTS = frozenset(["registration"])
 """Table inputs that may differ from page to page, as the image shifts."""
 _LARGE_WITH_REAL_LENSES = frozenset(["parameters"])
@@ -43,33 +41,52 @@ def inputs_left(profile: Profile) -> frozenset[str]:
     return PAGE_INPUTS if profile.ideal_lenses else PAGE_INPUTS | _LARGE_WITH_REAL_LENSES
 
 
+@contextmanager
+def _table_of(bundle: Bundle) -> Iterator[None]:
+    """What does not fit in a bundle's table is the bundle's fault."""
+    try:
+        yield
+    except InvalidInputError as error:
+        raise BundleError(f"{bundle.thing}: {error.thing}", error.got, error.wanted) from None
+
+
+def open_graph(bundle: Bundle, threads: int | None = None) -> TableGraph:
+    """The graph of a bundle's decoder with the bundle's table.
+
+    Raises:
+        BundleError: no ONNX model, or its table is not the one of the manifest, or does not fit.
+    """
+    thing = f"{bundle.thing}: {DECODER}"
+    file = GraphFile(bundle.files[DECODER], thing)
+    if set(file.table_inputs) != set(bundle.manifest.table_inputs):
+        raise BundleError(f"{thing}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
+    with _table_of(bundle):
+        return TableGraph(file, thing, inputs_left(bundle.profile), threads, bundle.table)
+
+
 class Decoder:
     """The decoder of one bundle. Its methods may be called from many threads at once.
 
     Args:
         bundle: an opened bundle.
         threads: threads of one inference; by default the cores that this process may use.
+        graph: of the bundle, where it is open already; then neither it nor the golden page is looked at.
 
     Raises:
         BundleError: the graph is not a decoder of this profile, table or pilots do not fit it, or the golden page
             comes out differently.
     """
 
-    def __init__(self, bundle: Bundle, threads: int | None = None) -> None:
+    def __init__(self, bundle: Bundle, threads: int | None = None, graph: TableGraph | None = None) -> None:
         self.bundle, self.threads = bundle, threads
-        self._thing = f"{bundle.thing}: {DECODER}"
-        graph = GraphFile(bundle.files[DECODER], self._thing)
-        self._graph, self._ports = graph, graph.table_inputs
-        if set(self._ports) != set(bundle.manifest.table_inputs):
-            wanted = sorted(bundle.manifest.table_inputs)
-            raise BundleError(f"{self._thing}: table inputs", sorted(self._ports), wanted)
-        self._build_in(graph, self._checked_defaults(bundle.table))
-        self._check_graph(self._session)
+        self.graph = graph or open_graph(bundle, threads)
         residual = bundle.manifest.residual_output
         self._outputs = [*OUTPUTS, *([residual] if residual else [])]
         self._pilots: dict[int, Pilots] = {}
-        self.pilots(MAX_LEVELS)  # damaged pilots are noticed now, not with the first page
-        self._check_golden()
+        if graph is None:
+            self._check_graph()
+            self.pilots(MAX_LEVELS)  # damaged pilots are noticed now, not with the first page
+            self._check_golden()
 
     @classmethod
     def load(cls, path: str | Path, threads: int | None = None) -> Decoder:
@@ -82,10 +99,7 @@ class Decoder:
         Raises:
             InvalidInputError: a table that does not fit.
         """
-        self.check_table(table)
-        other = copy(self)
-        other._build_in(self._graph, {**self._table, **table})
-        return other
+        return Decoder(self.bundle, self.threads, self.graph.with_table(table))
 
     def of_bundle(self, bundle: Bundle) -> Decoder:
         """This decoder with the table of a bundle of the same graphs, whose golden page is not looked at.
@@ -93,20 +107,8 @@ class Decoder:
         Raises:
             BundleError: its table does not fit.
         """
-        other = copy(self)
-        other.bundle = bundle
-        other._build_in(self._graph, {**self._table, **other._checked_defaults(bundle.table)})
-        return other
-
-    def table_value(self, name: str) -> NDArray[Any]:
-        """A tensor of the table as this decoder decodes with it.
-
-        Raises:
-            InvalidInputError: no such tensor.
-        """
-        if name not in self._ports:
-            raise InvalidInputError("table", repr(name), f"one of {sorted(self._ports)}")
-        return self._table[name] if name in self._table else self._graph.default(name)
+        with _table_of(bundle):
+            return Decoder(bundle, self.threads, self.graph.with_table(bundle.table))
 
     @property
     def references(self) -> FramePair:
@@ -115,18 +117,13 @@ class Decoder:
         Raises:
             InvalidInputError: its table holds none.
         """
-        in_phase, quadrature = (self.table_value(f"reference_{name}") for name in ("in_phase", "quadrature"))
+        in_phase, quadrature = (self.graph.value(f"reference_{name}") for name in ("in_phase", "quadrature"))
         return FramePair(in_phase, quadrature)
 
     @property
     def version(self) -> str:
         """The bundle's version."""
         return self.bundle.version
-
-    @property
-    def table_shapes(self) -> dict[str, tuple[int | None, ...]]:
-        """Shape of every tensor of the table."""
-        return {name: port.shape for name, port in self._ports.items()}
 
     def pilots(self, levels: int, mask: NDArray[np.bool_] | None = None) -> Pilots:
         """The pilots that this device's pages carry at `levels` levels.
@@ -158,21 +155,6 @@ class Decoder:
         manifest = self.bundle.manifest
         check_pair(pair, self.bundle.profile.frame_shape, manifest.frame_dtype, manifest.camera_bit_depth)
 
-    def check_table(self, table: Table) -> None:
-        """Check tensors that are to stand in the table instead of the graph's defaults.
-
-        Raises:
-            InvalidInputError: an unknown name, a wrong type or shape, or values that are not finite.
-        """
-        for name, value in table.items():
-            port = self._ports.get(name)
-            if port is None:
-                raise InvalidInputError("table", repr(name), f"one of {sorted(self._ports)}")
-            if not port.admits(str(value.dtype), value.shape):
-                raise InvalidInputError(f"table {name}", f"{value.dtype} {value.shape}", f"{port.dtype} {port.shape}")
-            if not np.isfinite(value).all():
-                raise InvalidInputError(f"table {name}", "NaN or infinity", "finite numbers")
-
     def infer(self, pair: FramePair, table: Table | None = None) -> Inference:
         """Run the graph on a checked pair.
 
@@ -185,11 +167,11 @@ class Decoder:
             FrameError: the frames contradict the homodyne equations beyond the bundle's limit.
         """
         table = table or {}
-        self.check_table(table)
+        self.graph.check(table)
         if others := set(table) - PAGE_INPUTS:
             raise InvalidInputError("table of a page", ", ".join(sorted(others)), f"only {', '.join(PAGE_INPUTS)}")
-        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **self._fed, **table}
-        p, phase, concentration, *rest = self._session.run(self._outputs, feeds)
+        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
+        p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
         limit = self.bundle.manifest.residual_limit
         if rest and limit is not None and not (residual := float(np.max(rest[0]))) <= limit:
             raise FrameError(
@@ -200,49 +182,19 @@ class Decoder:
             )
         return Inference(p, phase, concentration)
 
-    def recover_field(
-        self,
-        pair: FramePair,
-        references: FramePair,
-        registration: NDArray[np.float32],
-        homodyne: NDArray[np.float32],
-    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
-        """The field behind a frame pair (`lightpage.calibration.interfaces.FieldSolver`), whatever its residual is.
+    @cached_property
+    def field_solver(self) -> BundleFieldSolver:
+        """Recovers fields as this bundle does.
 
         Raises:
-            BundleError: no graph shows the field.
-            InvalidInputError: a tensor that does not fit.
+            BundleError: no graph of the bundle shows the field.
         """
-        session = self._field_session
-        if missing := set(FIELD_OUTPUTS) - {node.name for node in session.get_outputs()}:
-            raise BundleError(f"{self._thing}: outputs", f"no {', '.join(sorted(missing))}", "a graph with its field")
-        table: Table = {
-            "reference_in_phase": references.in_phase,
-            "reference_quadrature": references.quadrature,
-            "registration": registration,
-            "homodyne": homodyne,
-        }
-        self.check_table(table)
-        feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
-        if FIELD not in self.bundle.files:
-            feeds = {**self._table, **feeds}
-        (real, imaginary), left = session.run(FIELD_OUTPUTS, feeds)
-        if real.shape != (wanted := field_grid(self.bundle.profile).shape):
-            raise BundleError(
-                f"{self._thing}: output field", f"shape {real.shape}", f"{wanted}, or a {FIELD} beside it"
-            )
-        return np.asarray(real + 1j * imaginary, np.complex64), left
+        return BundleFieldSolver(self.bundle, self.graph, self.threads)
 
     @property
     def has_field_graph(self) -> bool:
-        """Whether `recover_field` runs the field alone, and not all of the decoder."""
+        """Whether `field_solver` runs the field alone, and not all of the decoder."""
         return FIELD in self.bundle.files
-
-    @cached_property
-    def _field_session(self) -> Session:
-        """The field's own graph, which does no more than is asked for; without one, the decoder's, all of it fed."""
-        name = FIELD if FIELD in self.bundle.files else DECODER
-        return open_session(self.bundle.files[name], f"{self.bundle.thing}: {name}", self.threads)
 
     def decode(
         self, pair: FramePair, levels: int = 256, table: Table | None = None, pilots: Pilots | None = None
@@ -286,37 +238,24 @@ class Decoder:
             timings=Timings(0.0, 0.0, 0.0),
         )
 
-    def _build_in(self, graph: GraphFile, table: Table) -> None:
-        """Open the graph with this table, which was checked."""
-        fed = inputs_left(self.bundle.profile)
-        self._table, self._fed = table, {name: value for name, value in table.items() if name in fed}
-        self._session = open_session(graph.built_in(table, fed), self._thing, self.threads)
-
-    def _check_graph(self, session: Session) -> None:
+    def _check_graph(self) -> None:
         """Check names, types and shapes of the frames and of what the graph says of them."""
-        manifest, profile = self.bundle.manifest, self.bundle.profile
-        inputs = {node.name: Port.of(node) for node in session.get_inputs()}
+        manifest, profile, thing = self.bundle.manifest, self.bundle.profile, f"{self.bundle.thing}: {DECODER}"
+        inputs = {node.name: Port.of(node) for node in self.graph.session.get_inputs()}
         if set(inputs) != {"in_phase", "quadrature"}:
-            raise BundleError(f"{self._thing}: inputs", sorted(inputs), "in_phase and quadrature")
+            raise BundleError(f"{thing}: inputs", sorted(inputs), "in_phase and quadrature")
         for name, port in inputs.items():
             if not port.admits(manifest.frame_dtype, profile.frame_shape):
                 wanted = f"{manifest.frame_dtype} {profile.frame_shape}"
-                raise BundleError(f"{self._thing}: input {name}", f"{port.dtype} {port.shape}", wanted)
-        outputs = {node.name: Port.of(node) for node in session.get_outputs()}
+                raise BundleError(f"{thing}: input {name}", f"{port.dtype} {port.shape}", wanted)
+        outputs = {node.name: Port.of(node) for node in self.graph.session.get_outputs()}
         shapes = {"p": (2, *profile.page_shape), "phase": profile.page_shape, "concentration": profile.page_shape}
         for name, shape in shapes.items():
             if name not in outputs or not outputs[name].admits("float32", shape):
                 got = f"{outputs[name].dtype} {outputs[name].shape}" if name in outputs else "nothing"
-                raise BundleError(f"{self._thing}: output {name}", got, f"float32 {shape}")
+                raise BundleError(f"{thing}: output {name}", got, f"float32 {shape}")
         if manifest.residual_output is not None and manifest.residual_output not in outputs:
-            raise BundleError(f"{self._thing}: output {manifest.residual_output}", "nothing", "a scalar residual")
-
-    def _checked_defaults(self, table: Table) -> Table:
-        try:
-            self.check_table(table)
-        except InvalidInputError as error:
-            raise BundleError(f"{self.bundle.thing}: {error.thing}", error.got, error.wanted) from None
-        return table
+            raise BundleError(f"{thing}: output {manifest.residual_output}", "nothing", "a scalar residual")
 
     def _check_golden(self) -> None:
         golden, thing = self.bundle.golden, f"{self.bundle.thing}: {GOLDEN}"

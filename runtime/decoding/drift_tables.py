@@ -44,7 +44,7 @@ class BundleTables:
 
     def __init__(self, decoder: Decoder, twin: Twin) -> None:
         self._decoder, self._twin, self._calibration = decoder, twin, calibration_of(decoder.bundle)
-        self._registration = decoder.table_value("registration")
+        self._registration = decoder.graph.value("registration")
 
     def shifted(self, shift_px: Real) -> Table:
         """See `DriftTables`."""
@@ -63,4 +63,4 @@ class BundleTables:
         for name, tilt in zip(("camera_tilt_x_rad", "camera_tilt_y_rad"), tilt_rad, strict=True):
             parameters[NAMES.index(name)] += tilt
         table = sampling_table(self._twin, parameters, self._calibration.turn_rad, bundle.profile)
-        return self._decoder.with_table({n: v for n, v in table.items() if n in self._decoder.table_shapes})
+        return self._decoder.with_table({n: v for n, v in table.items() if n in self._decoder.graph.ports})

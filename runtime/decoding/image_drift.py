@@ -100,7 +100,7 @@ class DriftModel:
         Raises:
             CalibrationError: the bundle holds no calibration.
         """
-        registration = decoder.table_value("registration")
+        registration = decoder.graph.value("registration")
         pair, profile = decoder.bundle.golden.pair, decoder.bundle.profile
         moved = [
             [

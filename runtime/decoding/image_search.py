@@ -37,7 +37,7 @@ class BundleSearch:
 
     def __init__(self, decoder: Decoder, twin: Twin) -> None:
         self._decoder, self._references = decoder, decoder.references
-        self._registration, self._homodyne = (decoder.table_value(name) for name in ("registration", "homodyne"))
+        self._registration, self._homodyne = (decoder.graph.value(name) for name in ("registration", "homodyne"))
         self._search = ImageSearch(twin, calibration_of(decoder.bundle).vector, decoder.bundle.profile)
 
     def find(
@@ -54,5 +54,5 @@ class BundleSearch:
             BundleError: no graph of the bundle shows the field.
         """
         references = references or self._references
-        field, _ = self._decoder.recover_field(pair, references, self._registration, self._homodyne)
+        field, _ = self._decoder.field_solver(pair, references, self._registration, self._homodyne)
         return self._search.find(field, pilots, around_px)

@@ -342,7 +342,7 @@ def tracker_for(decoder: Decoder) -> Tracker:
     Raises:
         BundleError, CalibrationError: see `DriftModel.of_decoder`.
     """
-    if "registration" not in decoder.table_shapes:
+    if "registration" not in decoder.graph.ports:
         return NoTracker(decoder)
     twin, search = OnnxTwin(decoder.bundle, TWIN_THREADS), None
     if decoder.has_field_graph:

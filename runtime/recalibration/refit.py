@@ -49,10 +49,10 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         BundleError: the bundle's graphs do not show the field, or hold a geometry that cannot be fed instead.
     """
     profile, earlier = bundle.profile, calibration_of(bundle)
-    if not _REFITTED & decoder.table_shapes.keys():
+    if not _REFITTED & decoder.graph.ports.keys():
         among = f"{' or '.join(sorted(_REFITTED))} among them"
         wanted = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
-        raise BundleError(f"{bundle.thing}: table inputs", sorted(decoder.table_shapes), wanted)
+        raise BundleError(f"{bundle.thing}: table inputs", sorted(decoder.graph.ports), wanted)
     references = pages.references or _kept_references(bundle)
     if references is None:
         raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
@@ -66,7 +66,7 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
     ]
     registered = refine(
         twin,
-        decoder.recover_field,
+        decoder.field_solver,
         profile,
         references,
         known,
@@ -89,7 +89,7 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         **sampling_table(twin, registered.parameters, registered.turn, profile),
     }
     return FitResult(
-        table={name: value for name, value in table.items() if name in decoder.table_shapes},
+        table={name: value for name, value in table.items() if name in decoder.graph.ports},
         calibration_toml=fitted.to_toml(),
         report=FitReport(
             angle_deg=fitted.angle_deg(profile),

@@ -64,7 +64,7 @@ def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(made: tupl
     pair = Simulator(profile, drifted, seed=9).page(symbols)
     twin, parameters = TorchTwin(RayTwin(profile)), true_parameters(profile, drifted)
     table = sampling_table(twin, parameters, drifted.homodyne.turn_rad, profile)
-    own = {name: value for name, value in table.items() if name in decoder.table_shapes}
+    own = {name: value for name, value in table.items() if name in decoder.graph.ports}
     mask = decoder.pilots(256).mask
 
     def air(decoder: Decoder) -> float:

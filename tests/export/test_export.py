@@ -115,8 +115,8 @@ def test_the_fields_own_graph_shows_the_decoders_field(
     with np.load(run_folder / REFERENCES) as kept:
         references = FramePair(kept["in_phase"], kept["quadrature"])
     asked = bundle.golden.pair, references, table["registration"], table["homodyne"]
-    field, left = Decoder.load(exported[2]).recover_field(*asked)
-    expected, expected_left = without.recover_field(*asked)
+    field, left = Decoder.load(exported[2]).field_solver(*asked)
+    expected, expected_left = without.field_solver(*asked)
     assert np.sqrt(np.mean(np.abs(expected) ** 2)) > 0.1  # of the light that a symbol of full modulation brings
     assert np.max(expected_left) > 1e-3
     np.testing.assert_allclose(field, expected, atol=1e-4)
@@ -124,17 +124,17 @@ def test_the_fields_own_graph_shows_the_decoders_field(
     # as a decoder that looks at the field more coarsely would have it
     monkeypatch.setattr("runtime.decoding.decoder.field_grid", partial(field_grid, step_px=3))
     with pytest.raises(BundleError, match=r"output field.*wanted .*field\.onnx beside it"):
-        without.recover_field(*asked)
+        without.field_solver(*asked)
 
 
 def test_the_table_is_a_default_that_another_replaces(exported: tuple[Bundle, float, Path]) -> None:
     decoder = Decoder.load(exported[2])
     golden = decoder.bundle.golden
     plain = decoder.infer(golden.pair).p
-    phases = decoder.table_shapes["phases"]
+    phases = decoder.graph.ports["phases"].shape
     other = decoder.with_table({"phases": np.zeros([n or 1 for n in phases], dtype=np.float32)})
     fed = other.infer(golden.pair).p
-    assert set(decoder.table_shapes) == {*TABLE_INPUTS, "positions", "places", "place_gradients", "phases"}
+    assert set(decoder.graph.ports) == {*TABLE_INPUTS, "positions", "places", "place_gradients", "phases"}
     assert np.linalg.norm(fed - plain) > 0.01 * np.linalg.norm(plain)
 
 

@@ -67,7 +67,7 @@ def test_a_bundle_without_field_or_calibration_cannot_be_refitted(decoder: Decod
     with pytest.raises(CalibrationError, match="calibration"):
         refit(decoder.bundle, KnownPages((pair,), (symbols,), 16, device.references()), lambda *_: None, decoder)
     with pytest.raises(BundleError, match="no field, unexplained"):
-        decoder.recover_field(pair, pair, np.zeros((2, 2, 10), np.float32), np.ones(2, np.float32))
+        decoder.field_solver(pair, pair, np.zeros((2, 2, 10), np.float32), np.ones(2, np.float32))
 
 
 def test_no_pages_are_no_demo(tmp_path: Path) -> None:

@@ -21,21 +21,25 @@ SHAPE = (30, 41)
 SIDE = 24
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> FeatureStore:
+def store_of(folder: Path, shape: tuple[int, int]) -> FeatureStore:
     rng = np.random.default_rng(0)
 
     def make(start: int, shift: tuple[float, float]) -> Iterator[PageFeatures]:
         for page in range(start, 3):
             yield PageFeatures(
-                light=rng.standard_normal((2, 1, 4, *SHAPE)).astype(np.float16),
-                positions=rng.uniform(-2, 2, (2, *SHAPE)).astype(np.float32),
-                phases=(10 * page + rng.random(SHAPE)).astype(np.float32),
+                light=rng.standard_normal((2, 1, 4, *shape)).astype(np.float16),
+                positions=rng.uniform(-2, 2, (2, *shape)).astype(np.float32),
+                phases=(10 * page + rng.random(shape)).astype(np.float32),
                 state=PageState((0.0, 0.0), 0.0),
             )
 
-    fill(tmp_path / "features", "key", 3, make, "pages")
-    return FeatureStore(tmp_path / "features")
+    fill(folder, "key", 3, make, "pages")
+    return FeatureStore(folder)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> FeatureStore:
+    return store_of(tmp_path / "features", SHAPE)
 
 
 @pytest.fixture
@@ -57,10 +61,9 @@ def test_small_pages_are_trained_on_whole(store: FeatureStore, mask: np.ndarray)
     assert wide[0][-1].shape == (30, 40)  # the shorter side is taken whole
 
 
-def test_a_page_of_few_rows_is_cut_along_its_columns_alone(store: FeatureStore, mask: np.ndarray) -> None:
+def test_a_page_of_few_rows_is_cut_along_its_columns_alone(tmp_path: Path, mask: np.ndarray) -> None:
     rows = 9
-    low = FeatureStore.__new__(FeatureStore)
-    low.__dict__ |= store.__dict__ | {"_arrays": [array[..., :rows, :] for array in store._arrays]}
+    low = store_of(tmp_path / "low", (rows, SHAPE[1]))
     for index in range(6):
         phases = Patches([low], mask[:rows], SIDE, rim=5)[index][-1]
         assert phases.shape == (rows, SIDE)

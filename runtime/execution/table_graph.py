@@ -1,0 +1,77 @@
+"""A decoder's graph opened with one table: most of the table is built in, a few tensors are fed with each page."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import InvalidInputError
+from runtime.bundle.bundle import Table
+from runtime.execution.constant_table import GraphFile
+from runtime.execution.session import Port, Session, open_session
+
+
+class TableGraph:
+    """A graph and its table. It never changes; its methods may be called from many threads at once.
+
+    Args:
+        file: the graph as stored.
+        thing: what it is, for errors.
+        fed: names of table inputs that stay inputs, and are fed.
+        threads: threads of one run; by default the cores that this process may use.
+        table: values instead of the graph's defaults.
+
+    Raises:
+        InvalidInputError: a table that does not fit.
+        BundleError: the graph cannot be run.
+    """
+
+    def __init__(
+        self, file: GraphFile, thing: str, fed: Collection[str], threads: int | None, table: Table | None = None
+    ) -> None:
+        self._file, self._thing, self._fed_names, self._threads = file, thing, fed, threads
+        self.table: Table = table or {}
+        self.check(self.table)
+        self._fed = {name: value for name, value in self.table.items() if name in fed}
+        self.session: Session = open_session(file.built_in(self.table, fed), thing, threads)
+
+    def with_table(self, table: Table) -> TableGraph:
+        """The graph with other tensors in its table, by name; those left out stay. Errors as for the constructor."""
+        return TableGraph(self._file, self._thing, self._fed_names, self._threads, {**self.table, **table})
+
+    @property
+    def ports(self) -> Mapping[str, Port]:
+        """Type and shape of every tensor of the table, by name."""
+        return self._file.table_inputs
+
+    def value(self, name: str) -> NDArray[Any]:
+        """A tensor of the table, as the graph is run with it.
+
+        Raises:
+            InvalidInputError: no such tensor.
+        """
+        if name not in self.ports:
+            raise InvalidInputError("table", repr(name), f"one of {sorted(self.ports)}")
+        return self.table[name] if name in self.table else self._file.default(name)
+
+    def check(self, table: Table) -> None:
+        """Check tensors that are to stand in the table instead of the graph's defaults.
+
+        Raises:
+            InvalidInputError: an unknown name, a wrong type or shape, or values that are not finite.
+        """
+        for name, value in table.items():
+            port = self.ports.get(name)
+            if port is None:
+                raise InvalidInputError("table", repr(name), f"one of {sorted(self.ports)}")
+            if not port.admits(str(value.dtype), value.shape):
+                raise InvalidInputError(f"table {name}", f"{value.dtype} {value.shape}", f"{port.dtype} {port.shape}")
+            if not np.isfinite(value).all():
+                raise InvalidInputError(f"table {name}", "NaN or infinity", "finite numbers")
+
+    def run(self, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+        """Run the graph; `feeds` holds the frames, and table tensors for this run alone."""
+        return self.session.run(outputs, {**self._fed, **feeds})
