@@ -13,6 +13,7 @@ import click
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
 from lightpage.waves.grid import GRID_STEP_PX
+from train.fitting.precision import PRECISIONS
 from train.models.decoder import LOCALIZERS, WAVE
 from train.models.hyperparameters import Hyperparameters
 from train.models.localizers.coherent import BICUBIC, BILINEAR
@@ -150,8 +151,8 @@ CHOICES = (
     ),
     Choice(
         "--precision",
-        click.Choice(["bf16-mixed", "16-mixed", "32-true"]),
-        "Of the network's arithmetic; bf16-mixed is fastest where the processor has it.",
+        click.Choice(PRECISIONS),
+        "Of the network's arithmetic; auto is bf16-mixed where the processor has it, else 32-true.",
     ),
     Choice("--seed", click.IntRange(min=0), "Of initial weights, batches and rotations."),
     Choice(

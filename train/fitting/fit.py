@@ -24,6 +24,7 @@ from train.data.pages import Page
 from train.fitting.curves import TENSORBOARD, curves_of, thinned
 from train.fitting.fitted import CHECKPOINTS, KEPT_POINTS, Fitted, M, finished
 from train.fitting.modules import AVERAGED_SHARE, SymbolTraining
+from train.fitting.precision import lightning_precision
 from train.fitting.provenance import provenance_of
 from train.models.hyperparameters import Hyperparameters
 from train.models.network import Refiner, SymbolUNet
@@ -117,7 +118,7 @@ def fit(
         training: batches of pages whose phases are NaN where nothing is asked.
         validation: pages.
         steps: optimiser steps.
-        precision: Lightning's.
+        precision: of `PRECISIONS`.
         callbacks: further Lightning callbacks.
         devices: how many GPUs, or processes where there is none; "auto" takes all GPUs, or one process.
         progress: whether to show a bar.
@@ -133,7 +134,7 @@ def fit(
     with _without_hints():
         trainer = L.Trainer(
             max_steps=steps,
-            precision=precision,  # type: ignore[arg-type]
+            precision=lightning_precision(precision),  # type: ignore[arg-type]
             logger=TensorBoardLogger(str(run), name="", version=TENSORBOARD),
             callbacks=[*callbacks, best, timer, newest, *([_Bar()] if progress else [])],
             devices=devices,

@@ -33,7 +33,7 @@ class Hyperparameters:
         learning_rate: peak of the one-cycle schedule.
         weight_decay: of AdamW.
         seed: of initial weights, batches and rotations.
-        precision: Lightning's; bf16-mixed is fastest on CPUs with bf16 and on GPUs.
+        precision: see `train.fitting.precision`.
     """
 
     channels: int = 96
@@ -51,7 +51,7 @@ class Hyperparameters:
     learning_rate: float = 4e-3
     weight_decay: float = 1e-3
     seed: int = 0
-    precision: str = "bf16-mixed"
+    precision: str = "auto"
 
     @property
     def first_look(self) -> str:

@@ -44,7 +44,7 @@ class PublishedChoices:
         decay: factor on the decoder's learning rate at each of `DECAYS`.
         lenses: of `train.published.decoder.LENS_CHOICES`.
         seed: of initial weights and batches.
-        precision: Lightning's.
+        precision: see `train.fitting.precision`.
         classes: levels that the decoder tells apart by cross-entropy; 0 for the von Mises likelihood.
     """
 
@@ -57,7 +57,7 @@ class PublishedChoices:
     decay: float = 0.5
     lenses: str = PARAXIAL
     seed: int = 0
-    precision: str = "bf16-mixed"
+    precision: str = "auto"
     classes: int = 0
 
 
