@@ -14,12 +14,15 @@ T = TypeVar("T")
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share of the work that is behind, 0 to 1. It may raise to stop the work."""
+State = Callable[[], str]
 
 
 class Reporter(Protocol):
     """Shows how far a loop has come."""
 
-    def track(self, items: Iterable[T], what: str, unit: str, total: int | None, done: int) -> Iterable[T]:
+    def track(
+        self, items: Iterable[T], what: str, unit: str, total: int | None, done: int, state: State
+    ) -> Iterable[T]:
         """The same items; `total` of them with the `done` ones that an earlier run has behind it."""
 
     def note(self, what: str) -> None:
@@ -30,8 +33,8 @@ _reporter: ContextVar[Reporter | None] = ContextVar("reporter", default=None)
 
 
 @contextmanager
-def reporting(reporter: Reporter) -> Iterator[None]:
-    """Have loops of this thread that `track` their items shown by `reporter` while the `with` statement runs."""
+def reporting(reporter: Reporter | None) -> Iterator[None]:
+    """Have loops of this thread that `track` their items shown by `reporter`, or by nobody, in the `with` statement."""
     token = _reporter.set(reporter)
     try:
         yield
@@ -56,7 +59,15 @@ def warn(what: str) -> None:
         note(f"warning: {what}")
 
 
-def track(items: Iterable[T], what: str, *, unit: str = "page", total: int | None = None, done: int = 0) -> Iterable[T]:
+def track(
+    items: Iterable[T],
+    what: str,
+    *,
+    unit: str = "page",
+    total: int | None = None,
+    done: int = 0,
+    state: State = lambda: "",
+) -> Iterable[T]:
     """The items themselves, the way through them shown to whoever watches.
 
     Args:
@@ -65,6 +76,7 @@ def track(items: Iterable[T], what: str, *, unit: str = "page", total: int | Non
         unit: what an item is.
         total: how many there are, with those that are done already; by default as many as `items` has.
         done: how many of them an earlier run has done, which are not among `items`.
+        state: says in a word or two, after each item, how the work stands.
     """
     reporter = _reporter.get()
-    return items if reporter is None else reporter.track(items, what, unit, total, done)
+    return items if reporter is None else reporter.track(items, what, unit, total, done, state)

@@ -24,7 +24,7 @@ from lightpage.metrics.information import decide, page_kilobytes
 from lightpage.metrics.measures import measure, symbol_maps
 from lightpage.metrics.reliability import expected_calibration_error
 from lightpage.page.symbols import pilot_mask
-from lightpage.progress import Progress
+from lightpage.progress import Progress, reporting
 from lightpage.recording.reader import Recording
 from lightpage.simulator.recording_job import RecordingJob
 from train.data.features import PageState
@@ -120,9 +120,10 @@ def trained(
             for part in (range(first), range(first, second), range(second, pages))
         )
         turn, tell = device.homodyne.turn_rad, _Tell(progress, choices)
-        fitted = train_published(
-            work, localizer, choices, profile, turn, mask, training, validation, callbacks=[tell], progress=False
-        )
+        with reporting(None):  # the case's own progress is shown
+            fitted = train_published(
+                work, localizer, choices, profile, turn, mask, training, validation, callbacks=[tell]
+            )
         p, phases = _beliefs(fitted.module, validation, mask, knows_piston)
         scale = honest_factor(p.reshape(2, -1), phases.ravel())
         p, phases = _beliefs(fitted.module, unseen, mask, knows_piston)

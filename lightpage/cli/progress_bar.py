@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import click
 from tqdm import tqdm
 
-from lightpage.progress import Progress
+from lightpage.progress import Progress, State
 
 T = TypeVar("T")
 
@@ -22,7 +22,7 @@ class _Lines(tqdm):  # type: ignore[type-arg]
     """A line now and then in place of a bar, so that a log can be read."""
 
     def __init__(self, items: Iterable[Any] | None = None, **settings: Any) -> None:
-        settings["bar_format"] = "lightpage: {desc}: {percentage:.0f}% after {elapsed}, about {remaining} left"
+        settings["bar_format"] = "lightpage: {desc}: {percentage:.0f}% after {elapsed}, about {remaining} left{postfix}"
         super().__init__(items, mininterval=LINE_S, miniters=1, **settings)
 
     @staticmethod
@@ -41,9 +41,14 @@ def bar(items: Iterable[T] | None = None, **settings: Any) -> tqdm[T]:
 class Bars:
     """Shows loops that track their items; see `lightpage.progress.Reporter`."""
 
-    def track(self, items: Iterable[T], what: str, unit: str, total: int | None, done: int) -> Iterable[T]:
+    def track(
+        self, items: Iterable[T], what: str, unit: str, total: int | None, done: int, state: State
+    ) -> Iterator[T]:
         """See `Reporter`."""
-        return bar(items, desc=what, unit=unit, total=total, initial=done)
+        with bar(items, desc=what, unit=unit, total=total, initial=done) as shown:
+            for item in shown:
+                yield item
+                shown.set_postfix_str(state(), refresh=False)
 
     def note(self, what: str) -> None:
         """See `Reporter`."""

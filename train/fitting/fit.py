@@ -14,12 +14,13 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint, Timer, TQDMProgressBar
+from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from torch import nn
 from torch.utils.data import DataLoader, Dataset, RandomSampler
 
+from lightpage.progress import track
 from train.data.pages import Page
 from train.fitting.curves import TENSORBOARD, curves_of, thinned
 from train.fitting.fitted import CHECKPOINTS, KEPT_POINTS, Fitted, M, finished
@@ -50,12 +51,11 @@ def fit_network(
     kind: type[SymbolUNet] | type[Refiner] = SymbolUNet,
     start: nn.Module | None = None,
     devices: int | str = "auto",
-    progress: bool = True,
 ) -> Fitted[SymbolTraining]:
     """Train, or go on with, the network of a run: see `fit`.
 
     Args:
-        run, validation, devices, progress: as for `fit`.
+        run, validation, devices: as for `fit`.
         training: pages whose phases are NaN where nothing is asked (`train.data.patches.training_pages`).
         hyperparameters: the run's choices.
         pilot_mask: bool [ny, nx].
@@ -81,7 +81,6 @@ def fit_network(
         precision=hyperparameters.precision,
         callbacks=[averaged],
         devices=devices,
-        progress=progress,
     )
 
 
@@ -102,7 +101,6 @@ def fit(
     precision: str,
     callbacks: Sequence[Callback] = (),
     devices: int | str = "auto",
-    progress: bool = True,
 ) -> Fitted[M]:
     """Train, or go on with, the module of a run, looking at its validation pages after every pass of `training`.
 
@@ -121,7 +119,6 @@ def fit(
         precision: of `PRECISIONS`.
         callbacks: further Lightning callbacks.
         devices: how many GPUs, or processes where there is none; "auto" takes all GPUs, or one process.
-        progress: whether to show a bar.
     """
     if (before := finished(run, module)) is not None:
         return before
@@ -136,9 +133,9 @@ def fit(
             max_steps=steps,
             precision=lightning_precision(precision),  # type: ignore[arg-type]
             logger=TensorBoardLogger(str(run), name="", version=TENSORBOARD),
-            callbacks=[*callbacks, best, timer, newest, *([_Bar()] if progress else [])],
+            callbacks=[*callbacks, best, timer, newest, _Steps()],
             devices=devices,
-            enable_progress_bar=progress,
+            enable_progress_bar=False,
             enable_model_summary=False,
             gradient_clip_val=1.0,
             use_distributed_sampler=False,  # each process draws its own pages, and validates all
@@ -173,11 +170,24 @@ def fit(
     return fitted
 
 
-class _Bar(TQDMProgressBar):
-    """Lightning's, without the version of the log: there is one."""
+class _Steps(Callback):
+    """Tells of the steps as all long work does (`lightpage.progress`), with the latest validation AIR."""
 
-    def get_metrics(self, trainer: L.Trainer, pl_module: L.LightningModule) -> dict[str, Any]:
-        return {name: value for name, value in super().get_metrics(trainer, pl_module).items() if name != "v_num"}
+    def __init__(self) -> None:
+        self._steps: Iterator[int] = iter(())
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        def state() -> str:
+            air = trainer.callback_metrics.get("val_air")
+            return "" if air is None else f"validation AIR {float(air):.3f} bits/symbol"
+
+        if trainer.is_global_zero:
+            done, total = trainer.global_step, trainer.max_steps
+            self._steps = iter(track(range(done, total), "training", unit="step", total=total, done=done, state=state))
+            next(self._steps, None)
+
+    def on_train_batch_end(self, *_: object) -> None:
+        next(self._steps, None)
 
 
 @contextmanager

@@ -100,7 +100,6 @@ def train_published(
     *,
     callbacks: Sequence[Callback] = (),
     devices: int | str = "auto",
-    progress: bool = True,
 ) -> Fitted[PublishedTraining]:
     """Train a published decoder from its first weights, or go on with it.
 
@@ -109,7 +108,7 @@ def train_published(
         localizer, choices, profile, turn: as for `published_decoder`.
         mask: pilots, bool [ny, nx], which are not learnt from.
         training, validation: pages of one recording.
-        callbacks, devices, progress: as for `train.fitting.fit.fit`.
+        callbacks, devices: as for `train.fitting.fit.fit`.
     """
     seed_stretch(run, choices.seed)
     recording = training.recording
@@ -124,7 +123,6 @@ def train_published(
         precision=choices.precision,
         callbacks=callbacks,
         devices=devices,
-        progress=progress,
     )
 
 

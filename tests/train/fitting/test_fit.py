@@ -52,15 +52,15 @@ def mask() -> np.ndarray:
 def test_it_learns_and_is_not_trained_twice(tmp_path: Path, mask: np.ndarray) -> None:
     training, validation = pages(12, 0), pages(3, 1)
     run = tmp_path / "run"
-    first = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    first = fit_network(run, CHOICES, mask, LEVELS, training, validation)
     assert first.validation_air > 1.0
-    kept = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    kept = fit_network(run, CHOICES, mask, LEVELS, training, validation)
     assert (kept.validation_air, kept.seconds, kept.curves) == (first.validation_air, first.seconds, first.curves)
     assert kept.curves["val_air"][-1][1] == pytest.approx(first.validation_air, abs=0.1)
     torch.testing.assert_close(kept.module.network.state_dict(), first.module.network.state_dict())
     (run / FITTED).unlink()  # interrupted after its last step, and moved
     run = run.rename(tmp_path / "moved")
-    again = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    again = fit_network(run, CHOICES, mask, LEVELS, training, validation)
     assert again.validation_air == pytest.approx(first.validation_air, abs=1e-6)
     for one, other in zip(first.module.parameters(), again.module.parameters(), strict=True):
         torch.testing.assert_close(one, other)
@@ -69,7 +69,7 @@ def test_it_learns_and_is_not_trained_twice(tmp_path: Path, mask: np.ndarray) ->
     checkpoint = torch.load(run / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=False)
     assert checkpoint["global_step"] == CHOICES.steps
     shutil.rmtree(run / CHECKPOINTS)
-    without = fit_network(run, CHOICES, mask, LEVELS, training, validation, progress=False)
+    without = fit_network(run, CHOICES, mask, LEVELS, training, validation)
     assert without.validation_air == again.validation_air
     assert not (run / CHECKPOINTS).exists()
 
@@ -79,18 +79,18 @@ def test_what_a_finished_training_kept_is_named_when_it_is_damaged(
     damaged: str, tmp_path: Path, mask: np.ndarray
 ) -> None:
     choices = replace(CHOICES, steps=10)
-    fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1), progress=False)
+    fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1))
     with pytest.raises(InvalidInputError, match=FITTED_WEIGHTS):  # of another size
-        fit_network(tmp_path, replace(choices, channels=8), mask, LEVELS, pages(2, 0), pages(1, 1), progress=False)
+        fit_network(tmp_path, replace(choices, channels=8), mask, LEVELS, pages(2, 0), pages(1, 1))
     (tmp_path / damaged).write_bytes(b"")
     with pytest.raises(InvalidInputError, match=damaged):
-        fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1), progress=False)
+        fit_network(tmp_path, choices, mask, LEVELS, pages(2, 0), pages(1, 1))
 
 
 def test_few_steps_teach_large_confidences_and_small_ones(tmp_path: Path, mask: np.ndarray) -> None:
     noise = np.where(np.arange(PAGE[1]) < PAGE[1] // 2, 0.03, 0.6)
     training, validation = pages(12, 0, noise), pages(8, 1, noise)
-    module = fit_network(tmp_path, CHOICES, mask, LEVELS, training, validation, progress=False).module
+    module = fit_network(tmp_path, CHOICES, mask, LEVELS, training, validation).module
     p, phases = decode_pages(module, validation)
     mu, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])
     clear, noisy = np.split(kappa, 2, axis=2)
@@ -102,7 +102,7 @@ def test_few_steps_teach_large_confidences_and_small_ones(tmp_path: Path, mask: 
 def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarray) -> None:
     training, validation = pages(12, 0), pages(3, 1)
     choices = replace(CHOICES, steps=60)
-    module = fit_network(tmp_path, choices, mask, LEVELS, training, validation, progress=False).module
+    module = fit_network(tmp_path, choices, mask, LEVELS, training, validation).module
     honest = best_kappa_scale(module, validation, mask)
     with torch.no_grad():
         assert module.network.head.bias is not None
@@ -111,11 +111,11 @@ def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarra
     assert best_kappa_scale(module, validation, mask) == pytest.approx(honest / 3, rel=0.02)
 
 
-def test_a_factor_at_the_end_of_the_search_is_said_to_be_there(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_factor_at_the_end_of_the_search_is_said_to_be_there(caplog: pytest.LogCaptureFixture) -> None:
     assert most_likely_factor(lambda factor: (math.log(factor) - 1) ** 2) == pytest.approx(math.e, rel=1e-4)
-    assert capsys.readouterr().err == ""
+    assert caplog.text == ""
     most_likely_factor(lambda factor: -factor)
-    assert "more honest still beyond the factor 20" in capsys.readouterr().err
+    assert "more honest still beyond the factor 20" in caplog.text
 
 
 def test_air_does_not_see_the_piston_and_leaves_pilots_out(mask: np.ndarray) -> None:
