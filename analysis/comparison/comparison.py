@@ -45,8 +45,7 @@ from train.fitting.modules import DecoderTraining, SymbolTraining
 from train.fitting.validation import without_piston
 from train.models.decoder import LOCALIZERS
 from train.models.field import FieldRecovery, TorchFieldSolver
-from train.models.hyperparameters import Hyperparameters
-from train.models.localizers.coherent import BILINEAR
+from train.models.hyperparameters import FAST, PRESETS, Hyperparameters
 from train.models.prediction import Prediction
 from train.models.twin import RayTwin, TorchTwin
 from train.published.localizers import NAMES as PUBLISHED
@@ -66,9 +65,6 @@ WAVE_REFINED = "wave-refined"
 ORACLE_REFINED = "oracle-refined"
 FIRST_LOOKS = {REFINED: "coherent", WAVE_REFINED: "wave", ORACLE_REFINED: ORACLE}
 """Arms that look again, and the arm whose first look they share."""
-FAST = "fast"
-HURRIED = Hyperparameters(channels=48, field_rounds=0, binning=2, field_step=3, samples=3, interpolation=BILINEAR)
-"""A coherent decoder for when time counts more than the last half bit."""
 ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, WAVE_REFINED, ORACLE, ORACLE_REFINED)
 WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
 """Whether a symbol's light meets walls of a pair, as the columns of the table say it."""
@@ -168,12 +164,12 @@ class Bench:
     def extractor(self, arm: str) -> FeatureExtractor:
         """Of the calibrated device; of the true one for what an oracle looks at again, the signal's power left in."""
         localizer = "coherent" if arm in (ORACLE, FAST) else arm
-        return FeatureExtractor(self.calibrated_device(arm), localizer, HURRIED if arm == FAST else None)
+        return FeatureExtractor(self.calibrated_device(arm), localizer, PRESETS[FAST] if arm == FAST else None)
 
     def symbol_arm(self, name: str, size: str, choices: Hyperparameters) -> Outcome:
         """Features, then the network at symbol pitch."""
         if name == FAST:
-            choices = replace(HURRIED, steps=choices.steps, seed=choices.seed)
+            choices = replace(PRESETS[FAST], steps=choices.steps, seed=choices.seed)
             size = f"{choices.channels}x{choices.blocks}x{choices.levels}"
         else:
             channels, blocks, levels = map(int, size.split("x"))
@@ -244,7 +240,7 @@ class Bench:
         """What the features of an arm depend on, beside the recording."""
         if name == ORACLE:
             return ""
-        return self.fitted.to_toml() + (HURRIED.first_look if name == FAST else "")
+        return self.fitted.to_toml() + (PRESETS[FAST].first_look if name == FAST else "")
 
     def features_of(
         self, name: str, recording: Recording, pages: Sequence[int], start: int, shift: tuple[float, float]

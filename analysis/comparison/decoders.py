@@ -25,7 +25,7 @@ from typing import Any
 
 import click
 
-from analysis.comparison.comparison import ARMS, FAST, FOOTNOTE, HEADER, ORACLE, Bench, Outcome, light_name, recorded
+from analysis.comparison.comparison import ARMS, FOOTNOTE, HEADER, ORACLE, Bench, Outcome, light_name, recorded
 from analysis.comparison.decoders_figure import draw, title
 from analysis.comparison.kept import TRAINED, Kept
 from analysis.comparison.levels import LEVEL_HEADER
@@ -35,7 +35,7 @@ from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, Sensor, ideal_device
 from lightpage.files import write_json
 from train.fitting.memory import keep_freed_memory
-from train.models.hyperparameters import Hyperparameters
+from train.models.hyperparameters import FAST, Hyperparameters
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import published_choices
 from train.runs import sole_writer

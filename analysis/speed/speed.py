@@ -17,7 +17,6 @@ import click
 import numpy as np
 from torch import nn
 
-from analysis.comparison.comparison import FAST, HURRIED
 from export.graph import (
     FRAME_INPUTS,
     DecoderGraph,
@@ -39,7 +38,7 @@ from runtime.execution.constant_table import GraphFile
 from runtime.execution.cpus import available_cpus
 from runtime.execution.session import Session, open_session
 from train.models.decoder import SymbolDecoder
-from train.models.hyperparameters import Hyperparameters
+from train.models.hyperparameters import FAST, PRESETS, Hyperparameters
 from train.models.twin import RayTwin, TorchTwin
 from train.published.recipe import published_decoder
 from train.published.training import PublishedChoices
@@ -81,7 +80,7 @@ def makers(profile: Profile) -> dict[str, Callable[[], tuple[Graph, Tensors]]]:
     return {
         "coherent": lambda: at_symbol_pitch(profile, "coherent"),
         "refined": lambda: at_symbol_pitch(profile, "coherent", Hyperparameters(refinements=1)),
-        FAST: lambda: at_symbol_pitch(profile, "coherent", HURRIED),
+        FAST: lambda: at_symbol_pitch(profile, "coherent", PRESETS[FAST]),
         "wave": lambda: at_symbol_pitch(profile, "wave"),
         **rays,
         "mode 32/64": lambda: published(profile, "mode", (32, 64)),

@@ -15,13 +15,13 @@ from lightpage.errors import InvalidInputError
 from lightpage.waves.grid import GRID_STEP_PX
 from train.fitting.precision import PRECISIONS
 from train.models.decoder import LOCALIZERS, WAVE
-from train.models.hyperparameters import Hyperparameters
+from train.models.hyperparameters import ACCURATE, FAST, PRESETS, Hyperparameters
 from train.models.localizers.coherent import BICUBIC, BILINEAR
 from train.published.decoder import LENS_CHOICES
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import PublishedRecipe, published_choices
 from train.published.training import PublishedChoices
-from train.trainers.symbols import USUAL_REFINEMENTS, SymbolRecipe, default_synthetic_pages
+from train.trainers.symbols import SymbolRecipe, default_synthetic_pages
 
 _ALL = (*PUBLISHED, *LOCALIZERS)
 _COHERENT = tuple(name for name in LOCALIZERS if name != WAVE)
@@ -38,6 +38,7 @@ class Choice:
         default: what holds without it at symbol pitch; the value of `Hyperparameters` if left out.
         published: what holds without it for the published decoders, where they have it.
         localizers: that have it.
+        of_preset: whether it is set by `--preset`; `--help` does not list it then, but it may be given too.
     """
 
     flag: str
@@ -46,6 +47,7 @@ class Choice:
     default: object = None
     published: object = None
     localizers: tuple[str, ...] = _ALL
+    of_preset: bool = False
 
     @property
     def name(self) -> str:
@@ -65,6 +67,13 @@ class Choice:
 
 
 CHOICES = (
+    Choice(
+        "--preset",
+        click.Choice(list(PRESETS)),
+        "How much time the decoder may take for a page: one quick pass, one pass, or two passes.",
+        ACCURATE,
+        localizers=LOCALIZERS,
+    ),
     Choice(
         "--steps",
         click.IntRange(min=10),
@@ -91,25 +100,29 @@ CHOICES = (
         click.IntRange(min=1),
         "Residual blocks of the network, at each of its levels.",
         localizers=LOCALIZERS,
+        of_preset=True,
     ),
     Choice(
         "--levels",
         click.IntRange(min=0, max=4),
         "Levels of the network below symbol pitch; 0 is the flat one.",
         localizers=LOCALIZERS,
+        of_preset=True,
     ),
     Choice(
         "--refinements",
         click.IntRange(min=0, max=4),
         "How often the decoder looks again, for what the symbols decoded so far do not explain.",
-        USUAL_REFINEMENTS,
+        PRESETS[ACCURATE].refinements,
         localizers=LOCALIZERS,
+        of_preset=True,
     ),
     Choice(
         "--field-rounds",
         click.IntRange(min=0, max=20),
         "Of descent to the field: fewer are faster, and lose most where the light is bright.",
         localizers=LOCALIZERS,
+        of_preset=True,
     ),
     Choice(
         "--binning",
@@ -117,24 +130,28 @@ CHOICES = (
         "Camera pixels along each axis whose mean is sampled, instead of filtering frames first: 2 is quicker and less "
         "exact.",
         localizers=LOCALIZERS,
+        of_preset=True,
     ),
     Choice(
         "--field-step",
         click.IntRange(min=GRID_STEP_PX),
         "Camera pixels from one sample of the field to the next: more are quicker and less exact.",
         localizers=LOCALIZERS,
+        of_preset=True,
     ),
     Choice(
         "--samples",
         click.IntRange(min=0, max=16),
         "Samples per symbol and axis that the localizer reads; 0 takes as many as the field has.",
         localizers=_COHERENT,
+        of_preset=True,
     ),
     Choice(
         "--interpolation",
         click.Choice([BICUBIC, BILINEAR]),
         "How it reads them off its grid: bilinear is quicker and less exact.",
         localizers=_COHERENT,
+        of_preset=True,
     ),
     Choice(
         "--lenses",
@@ -177,7 +194,7 @@ C = TypeVar("C", bound=Callable[..., Any])
 def with_choices(command: C) -> C:
     """Give a command the options of `CHOICES`; what is not given comes as None."""
     for choice in reversed(CHOICES):
-        command = click.option(choice.flag, type=choice.type, help=choice.help)(command)
+        command = click.option(choice.flag, type=choice.type, help=choice.help, hidden=choice.of_preset)(command)
     return command
 
 
@@ -217,7 +234,10 @@ def chosen_recipe(
         return _published(localizer, published_choices(localizer, profile, pages, given.pop("batch", None)), given)
     synthetic = given.pop("synthetic_pages", default_synthetic_pages(profile))
     start = given.pop("start", None)
-    choices = replace(Hyperparameters(refinements=USUAL_REFINEMENTS), **given)
+    preset = given.pop("preset", ACCURATE)
+    if preset == FAST and localizer not in _COHERENT:
+        raise InvalidInputError(f"--preset {FAST}", f"--localizer {localizer}", f"--localizer {' or '.join(_COHERENT)}")
+    choices = replace(PRESETS[preset], **given)
     choices.grid(profile)
     recipe = SymbolRecipe(localizer, choices, synthetic, start)
     recipe.check_start(profile)

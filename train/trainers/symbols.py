@@ -28,9 +28,6 @@ from train.models.hyperparameters import Hyperparameters
 from train.runs import load_decoder, load_run
 from train.trainers.refinement import Refined, RefinementPages, fit_prediction, fit_refinements
 
-USUAL_REFINEMENTS = 1
-"""Of a decoder, unless told otherwise: it adds more than anything else does. With ideal lenses it takes twice the time
-a page; with real ones its waves pass each of them in fifty terms, which takes much longer at the full size."""
 _SYNTHETIC_SYMBOLS = 470_000
 """Of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""
 _SYNTHETIC_PAGES = 12, 96

@@ -9,7 +9,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 import h5py
@@ -27,12 +29,15 @@ from lightpage.recording.reader import Recording
 from tests.conftest import SMALL_PAGES
 from tests.lightpage.small import small_profile
 from train.commands import train as cli_train
+from train.commands.options import chosen_recipe
 from train.commands.train import _own_pilots, train
 from train.data.feature_store import FeatureStore
 from train.fitting import provenance as origin
 from train.fitting.curves import curves_of
 from train.fitting.provenance import provenance, provenance_of
+from train.models.hyperparameters import PRESETS, Hyperparameters
 from train.runs import FORMAT, begin, sole_writer
+from train.trainers.symbols import SymbolRecipe
 
 SECONDS = 120
 
@@ -375,3 +380,18 @@ def test_a_run_does_not_go_on_with_other_options(tmp_path: Path) -> None:
         begin(tmp_path, options | {"--channels": 16})
     with pytest.raises(InvalidInputError, match=r"begun without --rate, wanted the version that began the run"):
         begin(tmp_path, options | {"--channels": [8, 16], "--rate": 0.1})
+
+
+def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
+    profile = small_profile()
+
+    def chosen(**given: Any) -> Hyperparameters:
+        recipe = chosen_recipe("coherent", profile, 6, given)
+        assert isinstance(recipe, SymbolRecipe)
+        return recipe.choices
+
+    assert chosen() == PRESETS["accurate"] == Hyperparameters(refinements=1)
+    assert chosen(preset="standard") == Hyperparameters()
+    assert chosen(preset="fast", channels=8) == replace(PRESETS["fast"], channels=8)
+    with pytest.raises(InvalidInputError, match="--preset fast: got --localizer wave, wanted --localizer coherent"):
+        chosen_recipe("wave", profile, 6, {"preset": "fast"})
