@@ -34,7 +34,7 @@ _FINE_PX = (1.0, 0.4, 0.15)
 FALSE_ALARMS = 1e-5
 """How often light that is not this page's may pass for it in one search."""
 
-_FEWEST_PILOTS = 4
+FEWEST_SEARCHED = 4
 """Fewer agree by chance wherever they are looked at."""
 
 _INDEPENDENT_PER_PX2 = 0.5
@@ -154,7 +154,7 @@ def needed_significance(pilots: int, area_px2: float = (2 * REACH_PX) ** 2) -> f
     The sum of n unrelated phasors with normally distributed parts has |sum|^2 / sum | |^2 / n distributed as
     Beta(1, n - 1); independent trials multiply.
     """
-    if pilots < _FEWEST_PILOTS:
+    if pilots < FEWEST_SEARCHED:
         return float("inf")
     trials = area_px2 * _INDEPENDENT_PER_PX2
     return float(pilots * (1 - (FALSE_ALARMS / trials) ** (1 / (pilots - 1))))

@@ -58,7 +58,9 @@ class Pilots:
             PageError: no pilots, or another number of phases.
         """
         count = int(np.count_nonzero(self.mask))
-        if count == 0 or self.phases.shape != (count,):
+        if count == 0:
+            raise PageError("pilots", "none", "at least one position")
+        if self.phases.shape != (count,):
             raise PageError("pilots", f"{count} positions and phases of shape {self.phases.shape}", "one phase each")
 
     @classmethod

@@ -45,6 +45,7 @@ class Evaluation:
         maps: means over the pages at every place of the page.
         confidence_bins: what confidences claim against what was right.
         bundle: what made the bundle and where it lay, as JSON can keep it.
+        recalibration_due: pages whose pilots show that the device is no longer as it was calibrated.
         refused: pages that could not be decoded, or were not confirmed; no figure counts them.
     """
 
@@ -60,6 +61,7 @@ class Evaluation:
     maps: SymbolMaps
     confidence_bins: tuple[ConfidenceBin, ...]
     bundle: dict[str, Any]
+    recalibration_due: int = 0
     refused: tuple[RefusedPage, ...] = ()
 
     @property
@@ -90,6 +92,7 @@ class Evaluation:
             "confidence_bins": [asdict(part) for part in self.confidence_bins],
             "maps": {name: page.round(_MAP_DECIMALS).tolist() for name, page in vars(self.maps).items()},
             "bundle": self.bundle,
+            "pages_recalibration_due": self.recalibration_due,
             **_refused_json(self.refused),
         }
 
@@ -155,6 +158,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     tally = Tally(levels, data, recording.pages)
     timings: list[Timings] = []
     refused: list[RefusedPage] = []
+    due = 0
     for index in track(range(recording.pages), "evaluate"):
         page = None
         try:
@@ -167,6 +171,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         if page is not None and symbols is not None:
             tally.add(page.phase[data], page.concentration[data], symbols[data])
             timings.append(page.timings)
+            due += page.check.recalibration_due
     if not timings and refused:
         told = refusal(f"recording {recording.path}", refused, recording.pages)
         figures = {
@@ -196,6 +201,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         maps=tally.maps(),
         confidence_bins=tuple(tally.confidence_bins()),
         bundle=_describe(decoder, levels),
+        recalibration_due=due,
         refused=tuple(refused),
     )
 

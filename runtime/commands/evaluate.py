@@ -45,6 +45,8 @@ def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int |
     click.echo(describe(result))
     if result.figures.air_bits_per_symbol <= 0:
         warn(WORTH_NOTHING)
+    if result.recalibration_due:
+        warn(f"the pilots of {result.recalibration_due} of {result.pages} pages show that the device has changed")
     if result.refused:
         raise refusal(f"recording {recording}", result.refused, count)
 

@@ -174,11 +174,12 @@ class Decoder:
         p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
         limit = self.bundle.manifest.residual_limit
         if rest and limit is not None and not (residual := float(np.max(rest[0]))) <= limit:
+            got = f"frames that contradict each other (residual {residual:.3g})"
             raise FrameError(
                 "frame pair",
-                f"frames that contradict each other (residual {residual:.3g})",
-                f"an in-phase and a quadrature frame of one shot, not swapped, and cameras where they were calibrated "
-                f"(residual up to {limit:.3g}; where frames are right, recalibrate)",
+                got if np.isfinite(residual) else "no light of a page over the reference beam",
+                f"an in-phase and a quadrature frame of one shot, not swapped, cameras and exposure as they were "
+                f"calibrated (residual up to {limit:.3g}; where frames are right, recalibrate)",
             )
         return Inference(p, phase, concentration)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.image_search import FoundImage
+from lightpage.calibration.image_search import FEWEST_SEARCHED, FoundImage
 from lightpage.page.pilots import PilotCheck, Pilots, read_pilots
 from lightpage.page.symbols import check_levels
 from lightpage.recording.reader import FramePair
@@ -202,7 +202,7 @@ class ImageTracker:
         pilots = pilots or self._decoder.pilots(levels)
         clock.add("check_s")
         state, found = begun, None
-        if not begun.settled and self._search is not None:
+        if not begun.settled and self._search is not None and len(pilots.phases) >= FEWEST_SEARCHED:
             found = self._search.find(pair, pilots, self._around(begun))
             state = self._moved_to(found, begun)
             clock.add("search_s")
@@ -353,8 +353,8 @@ def tracker_for(decoder: Decoder) -> Tracker:
 
 
 def _search_may_pay(check: PilotCheck, begun: ImageState) -> bool:
-    """Whether the pilots confirm too little, or much less than they lately did."""
-    return not check.confirmed or (not check.sound and check.share < DROP * begun.share)
+    """Whether the pilots disagree, or confirm much less than they lately did, and are not only too few."""
+    return not check.agrees or (not check.sound and check.share < DROP * begun.share)
 
 
 def _walked(walk: Real, step: Estimate) -> Real:

@@ -91,10 +91,9 @@ def confirmed(page: DecodedPage, found: FoundImage | None = None) -> DecodedPage
         wanted = "more pilots, or more light: as much may be chance"
     else:
         reason = Reason.IMAGE_NOT_FOUND if lost else Reason.PILOTS_DISAGREE
-        wanted = (
-            f"at least {LEAST_CONFIRMED_SHARE:.0%} of them: frames and pilots of this device, as it was calibrated (if "
-            "it has changed, recalibrate)"
-        )
+        cure = "its image lies further off or it has changed, calibrate anew" if lost else "it has changed, recalibrate"
+        share = f"at least {LEAST_CONFIRMED_SHARE:.0%} of them"
+        wanted = f"{share}: frames and pilots of this device, as it was calibrated (if {cure})"
     error = UnconfirmedPageError("pilots", told, wanted, reason, check.recalibration_due)
     error.page = page
     raise error

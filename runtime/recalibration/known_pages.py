@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import InvalidInputError
+from lightpage.errors import FrameError, InvalidInputError
 from lightpage.page.symbols import check_symbols
+from lightpage.progress import warn
+from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.reader import FramePair, hash_frames
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import named
@@ -56,6 +58,29 @@ class KnownPages:
             with named("reference: "):
                 decoder.check(self.references)
         self._check_different()
+
+    def lit(self, bit_depth: int) -> KnownPages:
+        """The pages whose frames show light; of each other one is warned.
+
+        Args:
+            bit_depth: of the counts.
+
+        Raises:
+            FrameError: too few show light.
+        """
+        kept, dark = [], None
+        for number, pair in enumerate(self.pairs):
+            try:
+                check_pair_light(f"known page {number}: ", pair, bit_depth)
+            except FrameError as error:
+                dark = error
+                warn(f"left out: {error}")
+            else:
+                kept.append(number)
+        if dark is not None and len(kept) < MIN_PAGES:
+            raise dark
+        pairs, symbols = tuple(self.pairs[n] for n in kept), tuple(self.symbols[n] for n in kept)
+        return replace(self, pairs=pairs, symbols=symbols)
 
     def _check_different(self) -> None:
         """A re-fit judged by a page that it was fitted on would praise itself."""

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
 from lightpage.calibration.document import Calibration
+from lightpage.calibration.image_search import REACH_PX
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.sampling_table import sampling_table
@@ -64,16 +65,22 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         KnownPage(pair, np.exp(1j * symbol_phases(symbols, pages.levels)))
         for pair, symbols in zip(pages.pairs, pages.symbols, strict=True)
     ]
-    registered = refine(
-        twin,
-        decoder.field_solver,
-        profile,
-        references,
-        known,
-        start=start,
-        turn=earlier.turn_rad,
-        progress=progress,
-    )
+    try:
+        registered = refine(
+            twin,
+            decoder.field_solver,
+            profile,
+            references,
+            known,
+            start=start,
+            turn=earlier.turn_rad,
+            progress=progress,
+        )
+    except CalibrationError as error:
+        if image is None:
+            wanted = f"{error.wanted}; an image within {REACH_PX:g} px of where it was last seen, else calibrate anew"
+            raise CalibrationError("re-fit", f"no image of the first page; then {error.got}", wanted) from None
+        raise
     if registered.coherence_after < LEAST_KEPT * earlier.reference_coherence:
         raise CalibrationError(
             "re-fit, outcome",

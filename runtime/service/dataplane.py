@@ -148,7 +148,7 @@ class DataPlane:
             caller.check()
             # Taken once: a swap in the meantime changes the next request, not this one.
             model = self.registry.current
-            page = self._decode(model, pair, levels, pilots, "frame pair")
+            page = self._decode(model, pair, levels, pilots, "frame pair", sure=pilots is None)
         return Answer(page, model.version, received - start, time.perf_counter() - start)
 
     def read_page(self, page: int | None, levels: int | None, caller: Caller) -> ReadAnswer:
@@ -207,13 +207,21 @@ class DataPlane:
     def _mask(found: SourcePage, decoder: Decoder) -> NDArray[np.bool_]:
         return decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
 
-    def _decode(self, model: Model, pair: FramePair, levels: int, pilots: Pilots | None, thing: str) -> DecodedPage:
-        """Decode with a model that was taken once, and count the page, which an error calls `thing`."""
+    def _decode(
+        self, model: Model, pair: FramePair, levels: int, pilots: Pilots | None, thing: str, *, sure: bool = True
+    ) -> DecodedPage:
+        """Decode with a model that was taken once, and count the page, which an error calls `thing`.
+
+        Of a page that its pilots do not confirm, only pilots that are `sure` say anything of the device: a caller's may
+        be wrong.
+        """
         try:
             page = model.tracker.decode(pair, levels, pilots)
         except LostPageError as error:
-            self.metrics.lost(error)
-            raise error.about(thing) from None
+            self.metrics.lost(error, tells=sure)
+            lost = error.about(thing)
+            lost.recalibration_due = lost.recalibration_due and sure
+            raise lost from None
         self.metrics.page(page, model.version)
         return page
 

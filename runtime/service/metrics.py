@@ -54,10 +54,10 @@ class ServiceMetrics:
             self.image.labels("x").set(page.image.shift_x_px)
             self.image.labels("y").set(page.image.shift_y_px)
 
-    def lost(self, error: LostPageError) -> None:
-        """Count a page that was not given out, which is a sign of drift too."""
+    def lost(self, error: LostPageError, *, tells: bool = True) -> None:
+        """Count a page that was not given out; where it `tells` of the device, that is a sign of drift too."""
         self.lost_pages.labels(error.reason.value).inc()
-        if isinstance(error, UnconfirmedPageError):
+        if tells and isinstance(error, UnconfirmedPageError):
             self._check(unconfirmed_page(error))
 
     def _check(self, page: DecodedPage) -> None:

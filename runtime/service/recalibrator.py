@@ -166,6 +166,7 @@ class Recalibrator:
         plane = self._plane
         model = plane.registry.current
         with own_fault():  # the pages are the service's own
+            pages = pages.lit(model.decoder.bundle.manifest.camera_bit_depth)
             pages.check(model.decoder)
         store = self._store()
         version = next_version(model.version, [*(m.version for m in plane.registry.models), *store.versions()])

@@ -40,6 +40,8 @@ def pilots_of(message: pb.Pilots, page_shape: tuple[int, int], levels: int) -> P
     """
     flags = np.frombuffer(message.mask, np.uint8)
     values = np.frombuffer(message.values, np.uint8)
+    if flags.size and int(flags.max()) > 1:
+        raise PageError("pilots", f"a flag of {flags.max()}", "flags of 0 or 1")
     if flags.size != page_shape[0] * page_shape[1] or np.count_nonzero(flags) != values.size:
         got = f"{flags.size} flags, {np.count_nonzero(flags)} of them set, and {values.size} values"
         raise PageError("pilots", got, f"{page_shape[0] * page_shape[1]} flags and one value a set flag")
