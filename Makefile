@@ -14,7 +14,7 @@ IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo test bench bench-image-search bench-decoders train-decoders image check-image proto lint format clean
+.PHONY: help setup demo test test-long bench bench-speed bench-service bench-image-search bench-decoders train-decoders image check-image proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -34,8 +34,12 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)  ## run the whole main job on a simulated device, into out/demo
 	$(BIN)/lightpage demo --out out/demo
 
-test: lint  ## lint, then every test
-	$(ONE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+PYTEST := $(ONE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+test: lint  ## lint, then every test but the long ones; prints the slowest
+	$(PYTEST) -m "not long" --durations 20 --durations-min 5 $(PYTEST_ARGS)
+
+test-long: $(STAMP)  ## tests that take minutes and prove little more
+	$(PYTEST) -m long $(PYTEST_ARGS)
 
 lint: $(STAMP)  ## ruff, mypy --strict, hadolint
 	$(BIN)/ruff check .

@@ -211,6 +211,17 @@ def test_a_page_that_is_nowhere_is_lost_with_its_reason_and_moves_nothing(device
     assert tracker.image_px == pytest.approx((1.0, 0.0), abs=1e-3)
 
 
+def test_where_pilots_are_too_few_to_find_an_image_none_is_looked_for(device: FakeDevice) -> None:
+    pilots = device.decoder.pilots(16)
+    mask = pilots.mask.copy()
+    mask[tuple(axis[3:] for axis in np.nonzero(mask))] = False
+    few = Pilots(mask, pilots.phases[:3])
+    with pytest.raises(UnconfirmedPageError) as caught:
+        device.tracker().decode(device.page(), 16, few)
+    assert caught.value.reason is Reason.TOO_FEW_PILOTS
+    assert device.searches == []
+
+
 def test_a_page_whose_image_is_found_but_whose_pilots_disagree_says_that(device: FakeDevice) -> None:
     device.seen_px = 0.0
     with pytest.raises(UnconfirmedPageError, match="px and found") as caught:

@@ -75,7 +75,6 @@ def test_no_pages_are_no_demo(tmp_path: Path) -> None:
         run_demo(tmp_path / "b.zip", 0, 0)
 
 
-@pytest.mark.slow
 def test_drift_is_lost_and_won_back_with_the_shipped_bundle(tmp_path: Path) -> None:
     result = CliRunner().invoke(demo, ["--out", str(tmp_path), "--pages", "3"], standalone_mode=False)
     assert result.exception is None

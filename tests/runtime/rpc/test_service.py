@@ -606,6 +606,13 @@ def test_a_page_whose_pilots_disagree_is_lost_and_not_answered(start: Start) -> 
     assert count("lightpage_pages_lost_total", {"reason": "PILOTS_DISAGREE"}) == 1
     assert count("lightpage_recalibration_due") == 1
     assert count("lightpage_calls_total", {"method": "DecodeFrames", "code": "DATA_LOSS"}) == 1
+    # a caller's own pilots may be wrong, and say nothing of the device
+    service.client.decode(a_page()[1], 16)
+    wrong = np.random.default_rng(8).integers(16, size=toy.PAGE).astype(np.uint8)
+    with pytest.raises(UnconfirmedPageError) as caught:
+        service.client.decode(a_page()[1], 16, pilots=KnownPilots(pilot_mask(toy.PROFILE), wrong, 16))
+    assert not caught.value.recalibration_due
+    assert count("lightpage_recalibration_due") == 0
     # the page after it is answered, and what its pilots confirm is told
     page = service.client.decode(a_page()[1], 16)
     assert not page.recalibration_due
@@ -823,6 +830,14 @@ def test_recalibration_from_a_recording_on_the_server(start: Start, tmp_path: Pa
             service.client.recalibrate(recording=name)
     with pytest.raises(LimitError, match="at most 16"):
         service.client.recalibrate(count=17)
+
+
+def test_pages_without_light_are_left_out_of_a_recalibration(start: Start, tmp_path: Path) -> None:
+    service = start()
+    toy.write_toy_recording(tmp_path / "dark.h5", toy.ToyDevice(DRIFTED), 16, 4)
+    with h5py.File(tmp_path / "dark.h5", "r+") as file:
+        file["in_phase"][1] = 0
+    assert service.client.recalibrate(recording="dark.h5").pages_used == 3
 
 
 def test_of_a_recording_on_the_server_the_first_pages_asked_for_are_used(start: Start, tmp_path: Path) -> None:

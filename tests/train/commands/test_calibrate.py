@@ -165,6 +165,7 @@ def test_a_folder_that_is_not_there_is_named_before_the_work(tmp_path: Path) -> 
         run(tmp_path / "R.h5", tmp_path / "nowhere" / "calibration.toml")
 
 
+@pytest.mark.long
 def test_a_device_outside_the_capture_range_is_not_guessed_at(tmp_path: Path) -> None:
     """Takes its seconds: a whole search. At 4.5 degrees all light but that of the y walls lies where it would at 0."""
     profile, rng = load_profile("bench"), np.random.default_rng(0)
