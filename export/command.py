@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,7 +30,7 @@ from lightpage.files import write_json
 from lightpage.progress import Progress
 from lightpage.recording.reader import FramePair
 from runtime.bundle.bundle import Bundle, npz, write_bundle
-from runtime.bundle.manifest import DECODER, FIELD, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version
+from runtime.bundle.manifest import DECODER, FIELD, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version, sha256
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
 from runtime.execution.session import open_session
@@ -50,24 +51,24 @@ _LEAST_CONTRAST = 2.0
 @click.argument("run", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--out", required=True, type=NewPath(), help="New bundle: a folder, or a .zip.")
 @click.option("--name", default=None, help="Name of the bundle; the profile's if left out.")
-@click.option("--version", "version", default="1", show_default=True)
+@click.option("--version", "version", default=None, help="Of the bundle; its name, the time and a hash if left out.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-def export(run: Path, out: Path, name: str | None, version: str, json_path: Path | None) -> None:
+def export(run: Path, out: Path, name: str | None, version: str | None, json_path: Path | None) -> None:
     """Export a training run, proving the bundle against torch with the runtime's own decoder."""
     with percent_bar() as progress:
         bundle, error = export_run(run, out, name, version, progress)
     size = sum(len(data) for data in bundle.files.values())
     if json_path is not None:
-        figures = {"bundle": str(out), "version": version, "parity_error": error, "unpacked_bytes": size}
+        figures = {"bundle": str(out), "version": bundle.version, "parity_error": error, "unpacked_bytes": size}
         write_json(json_path, figures)
-    click.echo(f"{out}: version {version}, p within {error:.1e} of torch, {size / 1e6:.1f} MB unpacked")
+    click.echo(f"{out}: version {bundle.version}, p within {error:.1e} of torch, {size / 1e6:.1f} MB unpacked")
 
 
 def export_run(
     folder: Path,
     out: Path,
     name: str | None = None,
-    version: str = "1",
+    version: str | None = None,
     progress: Progress = lambda step, share: None,
 ) -> tuple[Bundle, float]:
     """Write the bundle of a run.
@@ -79,7 +80,8 @@ def export_run(
         InvalidInputError: the run is unfinished.
         BundleError: `version` is none, or the exported decoder does not say what torch says; nothing stays at `out`.
     """
-    check_version(version, "--version")
+    if version is not None:
+        check_version(version, "--version")
     if out.exists():
         raise BundleError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     run = load_run(folder)
@@ -99,10 +101,11 @@ def export_run(
     session = open_session(decoder, f"{out}: {DECODER}")
     (answer,) = session.run(["p"], dict(zip(FRAME_INPUTS, (pair.in_phase, pair.quadrature), strict=True)))
     error = check_parity(expected["p"], np.asarray(answer), str(out))
+    name, created = name or profile.name, datetime.now(UTC)
     manifest = Manifest(
-        name=name or profile.name,
-        version=version,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        name=name,
+        version=version or _version(name, created, decoder),
+        created=created.isoformat(timespec="seconds"),
         profile=run.profile_toml,
         calibration=run.calibration_toml,
         camera_bit_depth=run.camera_bit_depth,
@@ -132,6 +135,12 @@ def export_run(
         _remove(partial)
     write_bundle(out, manifest, files)
     return Bundle.open(out), error
+
+
+def _version(name: str, created: datetime, decoder: bytes) -> str:
+    """A version that no other bundle has: name, time (UTC) and the beginning of the decoder's hash."""
+    plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", name).lstrip("_.+-")[:60] or "bundle"
+    return f"{plain}-{created:%Y%m%dT%H%M%SZ}-{sha256(decoder)[:8]}"
 
 
 def _graph(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tuple[Graph, Tensors]:

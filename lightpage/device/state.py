@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -134,13 +136,25 @@ class Device(Table):
             path, separator, value = setting.partition("=")
             table, dot, key = path.strip().partition(".")
             if not separator or not dot or key not in data.get(table, {}):
-                known = ", ".join(f"{t}.{k}" for t, keys in self.model_dump().items() for k in keys)
-                raise ProfileError(f"--set {setting}", path, f"TABLE.KEY=VALUE with one of {known}")
+                raise ProfileError(f"--set {setting}", path, f"TABLE.KEY=VALUE, {_alike(path.strip(), data)}")
             try:
                 data[table][key] = tomllib.loads(f"value = {value}")["value"]
             except tomllib.TOMLDecodeError:
                 raise ProfileError(f"--set {setting}", value, "a number in TOML syntax") from None
         return validate(Device, data, "device settings")
+
+
+def _alike(path: str, tables: Mapping[str, Mapping[str, Any]]) -> str:
+    """Which settings may have been meant by a TABLE.KEY that is none."""
+    known = [f"{table}.{key}" for table, keys in tables.items() for key in keys]
+    table, _, key = path.rpartition(".")
+    by_key = {name.partition(".")[2]: name for name in known}
+    close = [*get_close_matches(path, known, 3), *(by_key[name] for name in get_close_matches(key, by_key, 3))]
+    if not close and table in tables:
+        return f"KEY being one of {', '.join(tables[table])}"
+    if not close:
+        return f"TABLE being one of {', '.join(tables)}"
+    return f"perhaps {' or '.join(dict.fromkeys(close))}"
 
 
 def ideal_device() -> Device:

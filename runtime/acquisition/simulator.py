@@ -63,12 +63,13 @@ class SimulatorSource:
         """Nothing to let go of."""
 
 
-def open_simulator(spec: str, rest: str) -> SimulatorSource:
-    """The source of a spec `simulator:PROFILE?KEY=VALUE&...`, of which `rest` is what follows the colon.
+def open_simulator(rest: str) -> SimulatorSource:
+    """The source `simulator:REST`, REST being `PROFILE?KEY=VALUE&...`.
 
     Raises:
         InvalidInputError: an unknown profile, or settings that no device can have.
     """
+    spec = f"simulator:{rest}"
     profile, _, query = rest.partition("?")
     settings = dict(parse_qsl(query, keep_blank_values=True))
     device = load_device(path) if (path := settings.pop("device", None)) else Device()

@@ -1,45 +1,34 @@
-"""Where frame pairs come from when the service reads a page itself: a recording, a simulated device, later cameras."""
+"""Frame sources by name: entry points of the group `lightpage.sources`, so that another package may bring its own."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from importlib.metadata import EntryPoint, entry_points
+
 from lightpage.errors import InvalidInputError
-from runtime.acquisition.recording import RecordingSource
-from runtime.acquisition.simulator import open_simulator
 from runtime.acquisition.source import FrameSource
 
+GROUP = "lightpage.sources"
 
-class CameraSource:
-    """Real cameras, which this version cannot drive.
-
-    Raises:
-        InvalidInputError: always.
-    """
-
-    def __init__(self, address: str) -> None:
-        raise InvalidInputError(
-            f"source camera:{address}",
-            "a camera, for which this installation has no driver",
-            "the camera extra (pip install 'lightpage[camera]') in a version that drives cameras, "
-            "or recording:FILE or simulator:PROFILE",
-        )
+Opener = Callable[[str], FrameSource]
+"""Opens a source; called with what follows the colon in its name."""
 
 
-def open_source(spec: str) -> FrameSource:
+def open_source(spec: str, points: Iterable[EntryPoint] | None = None) -> FrameSource:
     """Open a source by its name.
 
     Args:
-        spec: ``recording:FILE``, ``simulator:PROFILE`` (a shipped name or a file), optionally followed by
-            ``?levels=16&seed=0&device=FILE``, or ``camera:ADDRESS``.
+        spec: KIND:REST, e.g. ``recording:FILE``, or ``simulator:PROFILE`` (a shipped name or a file), optionally followed
+            by ``?levels=16&seed=0&device=FILE``.
+        points: kinds of sources, by default those that are installed.
 
     Raises:
-        InvalidInputError: another name, or one whose recording, profile or device does not validate.
+        InvalidInputError: another kind, or one whose recording, profile or device does not validate.
     """
+    kinds = {point.name: point for point in (entry_points(group=GROUP) if points is None else points)}
     kind, colon, rest = spec.partition(":")
-    if colon and rest and kind == "recording":
-        return RecordingSource(rest)
-    if colon and rest and kind == "simulator":
-        return open_simulator(spec, rest)
-    if colon and kind == "camera":
-        # A constructor that only raises cannot be typed as the protocol.
-        CameraSource(rest)
-    raise InvalidInputError("source", repr(spec), "recording:FILE, simulator:PROFILE or camera:ADDRESS")
+    if not (colon and rest and kind in kinds):
+        wanted = f"KIND:REST, KIND being one of {', '.join(sorted(kinds))}, e.g. recording:FILE or simulator:PROFILE"
+        raise InvalidInputError("source", repr(spec), wanted)
+    opener: Opener = kinds[kind].load()
+    return opener(rest)

@@ -51,6 +51,10 @@ def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int |
         raise refusal(f"recording {recording}", result.refused, count)
 
 
+_MANY_LEVELS = 64
+MANY = " (with so many levels, most wrong symbols are neighbours; the AIR is what a code carries)"
+
+
 def describe(result: Evaluation) -> str:
     """The figures as a table for people."""
     figures = result.figures
@@ -67,7 +71,7 @@ def describe(result: Evaluation) -> str:
         ("over-claim", f"{figures.over_claim_bits_per_symbol:.3f} bit/symbol"),
         ("GMI", "no Gray labels" if gmi is None else f"{gmi:.3f} bit/symbol"),
         ("page", f"{result.page_kb:.3f} kB"),
-        ("symbol error rate", f"{figures.symbol_error_rate:.4f}"),
+        ("symbol error rate", f"{figures.symbol_error_rate:.4f}{MANY if figures.levels >= _MANY_LEVELS else ''}"),
         ("ECE", f"{figures.ece:.4f}"),
         ("decode", f"{1e3 * result.seconds_per_page:.1f} ms a page (median)"),
     ]

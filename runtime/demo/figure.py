@@ -8,10 +8,12 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from runtime.demo.demo import LEVELS, DemoResult
 
 _LEAST_BITS, _MOST_BITS = 0.0, 8.0
+_PILOTS = "white"
 
 
 def write_figure(result: DemoResult, path: Path) -> None:
@@ -34,8 +36,11 @@ def write_figure(result: DemoResult, path: Path) -> None:
     figure.colorbar(confidence, ax=axes[1, :], shrink=0.8, label="confidence")
     for axis, phase in zip(axes[2], result.phases, strict=True):
         # an unlikely symbol costs many bits; the colour tells losses apart, not their depth
-        rate = axis.imshow(np.clip(phase.air, _LEAST_BITS, _MOST_BITS), vmin=_LEAST_BITS, vmax=_MOST_BITS, cmap="magma")
+        colours = colormaps["magma"].with_extremes(bad=_PILOTS)
+        rate = axis.imshow(np.clip(phase.air, _LEAST_BITS, _MOST_BITS), vmin=_LEAST_BITS, vmax=_MOST_BITS, cmap=colours)
         axis.set_title(f"{phase.name}: AIR {phase.air_bits_per_symbol:.2f} bit/symbol")
+    pilots = Patch(facecolor=_PILOTS, edgecolor="black", label="pilots: known symbols, not counted")
+    figure.legend(handles=[pilots], loc="outside lower center")
     figure.colorbar(rate, ax=axes[2, :], shrink=0.8, label="AIR, bit/symbol")
     for axis in axes.ravel():
         axis.set_xticks([])

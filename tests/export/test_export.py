@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 
@@ -198,6 +199,12 @@ def test_an_interrupted_export_leaves_nothing_and_works_again(
     figures = json.loads((tmp_path / "F").read_text())
     assert 0 < figures["parity_error"] <= 1e-3
     assert sorted(path.name for path in tmp_path.iterdir()) == ["F", "small.zip"]
+
+
+def test_without_one_a_bundle_gets_a_version_of_its_own(exported: tuple[Bundle, float, Path]) -> None:
+    manifest = exported[0].manifest
+    time = datetime.fromisoformat(manifest.created).strftime("%Y%m%dT%H%M%SZ")
+    assert manifest.version == f"{manifest.name}-{time}-{manifest.files[DECODER][:8]}"
 
 
 def test_a_version_that_is_none_is_refused_before_the_work(run_folder: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -76,9 +77,20 @@ def test_a_bad_setting_is_refused_and_says_what_is_wrong(setting: str) -> None:
         Device().with_settings([setting])
 
 
-def test_an_unknown_setting_lists_the_known_ones() -> None:
-    with pytest.raises(ProfileError, match=r"geometry\.pipe_angle_deg.*drift\.shift_px"):
-        Device().with_settings(["geometry.angle=1"])
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("geometry.pipe_angel_deg=1", "perhaps geometry.pipe_angle_deg"),
+        ("pipe_angle_deg=1", "perhaps geometry.pipe_angle_deg"),
+        ("sensor.full_well=1", "perhaps sensor.full_well_e"),
+        ("drift.colour=1", "KEY being one of piston_rad, shift_px"),
+        ("weather=1", "TABLE being one of geometry, "),
+    ],
+)
+def test_an_unknown_setting_names_what_may_have_been_meant(setting: str, told: str) -> None:
+    with pytest.raises(ProfileError, match=re.escape(told)) as caught:
+        Device().with_settings([setting])
+    assert len(str(caught.value)) < 250
 
 
 @pytest.mark.parametrize(
