@@ -18,8 +18,8 @@ def open_source(spec: str, points: Iterable[EntryPoint] | None = None) -> FrameS
     """Open a source by its name.
 
     Args:
-        spec: KIND:REST, e.g. ``recording:FILE``, or ``simulator:PROFILE`` (a shipped name or a file), optionally followed
-            by ``?levels=16&seed=0&device=FILE``.
+        spec: KIND:REST, e.g. ``recording:FILE``, or ``simulator:PROFILE`` (a shipped name or a file), which
+            ``?levels=16&seed=0&device=FILE`` may follow.
         points: kinds of sources, by default those that are installed.
 
     Raises:

@@ -29,7 +29,7 @@ from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid
 from runtime.bundle.bundle import Bundle, write_bundle
-from runtime.bundle.manifest import FIELD
+from runtime.bundle.manifest import DECODER, FIELD
 from runtime.decoding.decoder import Decoder
 from runtime.execution.session import open_session
 from tests.export.untrained import untrained_decoder
