@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +12,19 @@ from numpy.typing import NDArray
 from scipy import ndimage, signal
 
 from analysis.studies.study import Case, Result, Row, Settings, Study
-from lightpage.device.profile import Profile
+from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
-from lightpage.errors import InvalidInputError, LightpageError
-from lightpage.progress import Progress
+from lightpage.errors import InvalidInputError
+from lightpage.page.symbols import MAX_LEVELS
+from lightpage.progress import Progress, reporting
+from lightpage.recording.reader import Recording
 from lightpage.simulator.cameras import expose, resample
+from lightpage.simulator.recording_job import RecordingJob
 from lightpage.simulator.true_optics import TrueOptics
+from runtime.bulk.evaluation import NothingReadError, evaluate
+from runtime.bundle.shipped import bundle_path
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.image_tracker import tracker_for
 
 Real = NDArray[np.float64]
 
@@ -153,33 +157,31 @@ def _crosshairs(settings: Settings, progress: Progress) -> Result:
 
 
 def _air(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    """AIR of the shipped bundle on a drifted device, with piston and shift followed, by the commands themselves."""
-    state, changes = Device(), []
+    """AIR of the shipped bundle on a drifted device, with piston and shift followed."""
+    changes = []
     for table in case["tables"]:
-        value = getattr(getattr(state, table), case["key"]) + case["amount"]
-        changes += ["--set", f"{table}.{case['key']}={value!r}"]
-    recording, figures = work / "R.h5", work / "E.json"
-    pages = "1" if settings.quick else "4"
-    figures.unlink(missing_ok=True)
-    for name, arguments in (
-        ("simulate", ["--profile", _BUNDLED, "--pages", pages, "--out", str(recording), "--force", *changes]),
-        ("evaluate", ["--bundle", _BUNDLED, "--recording", str(recording), "--json", str(figures)]),
-    ):
-        progress(name, 0.0 if name == "simulate" else 0.5)
-        seed = ["--seed", str(_FIRST_SEED + settings.seed)] if name == "simulate" else []
-        command = [sys.executable, "-m", "lightpage.cli.main", name, *arguments, *seed]
-        done = subprocess.run(command, capture_output=True, text=True)
-        # where pages could not be decoded, evaluate fails after it has written the figures that there are
-        if done.returncode != 0 and not figures.exists():
-            said = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
-            raise LightpageError(f"lightpage {name} {' '.join(arguments)}", said, "figures of a drifted device")
-    recording.unlink()
-    found = json.loads(figures.read_text())
+        value = getattr(getattr(Device(), table), case["key"]) + case["amount"]
+        changes.append(f"{table}.{case['key']}={value!r}")
+    path, device = work / "R.h5", Device().with_settings(changes)
+    with reporting(None):  # the case's own progress is shown
+        progress("simulate", 0.0)
+        seed = _FIRST_SEED + settings.seed
+        job = RecordingJob(load_profile(_BUNDLED), device, MAX_LEVELS, seed, truth=False, out=path)
+        job.claim(force=True)
+        job.run(1 if settings.quick else 4)
+        progress("evaluate", 0.5)
+        decoder = Decoder.load(bundle_path(_BUNDLED))
+        with Recording.open(path) as recording:
+            try:
+                found = evaluate(decoder, recording, tracker_for(decoder)).to_json()
+            except NothingReadError as error:
+                found = error.figures
+    path.unlink()
     return {"air": air_of_all_pages(found), "bundle": f"{found['bundle_version']} ({found['bundle']['golden_sha256']})"}
 
 
 def air_of_all_pages(evaluation: Mapping[str, Any]) -> float:
-    """Bits per symbol of what `lightpage evaluate` wrote; pages that could not be decoded carry nothing."""
+    """Bits per symbol of an evaluation as JSON has it; pages that could not be decoded carry nothing."""
     pages = evaluation["pages"]
     if not pages:
         return 0.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -39,7 +38,7 @@ from analysis.studies.trained import Light, _beliefs, _of_classes, chosen
 from lightpage.device.lenses import LENSES
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, ideal_device
-from lightpage.errors import InvalidInputError, LightpageError, ProfileError
+from lightpage.errors import InvalidInputError, ProfileError
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.simulator.true_optics import TrueOptics
 from tests.lightpage.small import small_profile
@@ -242,20 +241,6 @@ def test_pages_that_are_refused_under_a_drift_carry_nothing() -> None:
     evaluation = {"air_bits_per_symbol": 6.0, "pages": 3, "refused_pages": [{"page": 1}]}
     assert drift.air_of_all_pages(evaluation) == 4.5
     assert drift.air_of_all_pages({"pages": 0, "refused_pages": [{"page": 0}]}) == 0
-
-
-def test_a_bundle_that_cannot_be_measured_is_told_and_no_earlier_figure_taken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    settings = Settings(load_profile("bench"), quick=True)
-    (tmp_path / "E.json").write_text(json.dumps({"air_bits_per_symbol": 6.5, "pages": 1, "refused_pages": []}))
-
-    def refused(command: list[str], **options: object) -> subprocess.CompletedProcess[str]:
-        return subprocess.CompletedProcess(command, 0 if "simulate" in command else 2, "", "error: bundle: damaged")
-
-    monkeypatch.setattr(drift.subprocess, "run", refused)
-    with pytest.raises(LightpageError, match="bundle: damaged"):
-        drift.STUDY.measure(settings, drift.STUDY.cases(settings)[1], tmp_path, lambda what, share: None)
 
 
 def test_figures_of_two_bundles_are_not_put_in_one_table() -> None:
