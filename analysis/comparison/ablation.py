@@ -16,8 +16,10 @@ from pathlib import Path
 import click
 from torch import nn
 
-from analysis.comparison.comparison import HEADER, LEVELS, Bench, Outcome, light_name, recorded
+from analysis.comparison.bench import Bench
 from analysis.comparison.kept import TRAINED, Kept
+from analysis.comparison.light import LEVELS, light_name, recorded
+from analysis.comparison.outcome import HEADER, Outcome
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile

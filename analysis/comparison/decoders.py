@@ -25,10 +25,12 @@ from typing import Any
 
 import click
 
-from analysis.comparison.comparison import ARMS, FOOTNOTE, HEADER, ORACLE, Bench, Outcome, light_name, recorded
+from analysis.comparison.bench import ARMS, ORACLE, Bench
 from analysis.comparison.decoders_figure import draw, title
 from analysis.comparison.kept import TRAINED, Kept
 from analysis.comparison.levels import LEVEL_HEADER
+from analysis.comparison.light import light_name, recorded
+from analysis.comparison.outcome import FOOTNOTE, HEADER, Outcome
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile

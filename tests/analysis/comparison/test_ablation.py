@@ -20,8 +20,9 @@ from analysis.comparison.ablation import (
     features_without,
     main,
 )
-from analysis.comparison.comparison import Bench, light_name, recorded
+from analysis.comparison.bench import Bench
 from analysis.comparison.kept import Kept
+from analysis.comparison.light import light_name, recorded
 from lightpage.device.state import Device, Sensor
 from tests.analysis.comparison.test_decoders import PROFILE, calibration_of
 

@@ -16,10 +16,10 @@ import pytest
 from click.testing import CliRunner
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from analysis.comparison.comparison import HEADER, WALLS, Outcome, gained_at_the_end, symbols_by_walls
 from analysis.comparison.decoders import main
 from analysis.comparison.kept import Kept
 from analysis.comparison.oracle import Oracle
+from analysis.comparison.outcome import HEADER, WALLS, Outcome, gained_at_the_end, symbols_by_walls
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,20 +16,18 @@ from torch.utils.data import Dataset
 from analysis.comparison.decoders_figure import MAP
 from analysis.comparison.kept import CALIBRATION, Kept
 from analysis.comparison.levels import LevelFigures, level_figures
+from analysis.comparison.light import CALIBRATED, LEVELS, calibrated, recorded
 from analysis.comparison.oracle import Oracle
-from analysis.report.data import exit_centroids
-from lightpage.calibration.calibrate import calibrate
+from analysis.comparison.outcome import Outcome, gained_at_the_end, symbols_by_walls
 from lightpage.calibration.calibrated_device import CalibratedDevice
-from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.document import Calibration
 from lightpage.calibration.known_pages import known_pages
-from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile
-from lightpage.device.state import Device, Sensor
+from lightpage.device.state import Device
 from lightpage.metrics.information import achievable_rate, own_information, page_kilobytes
 from lightpage.metrics.measures import measure
 from lightpage.page.symbols import pilot_mask
-from lightpage.recording.reader import Recording, hash_frames
-from lightpage.simulator.recording_job import RecordingJob
+from lightpage.recording.reader import Recording
 from lightpage.simulator.true_optics import perfectly_calibrated
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import FeatureExtractor, PageFeatures
@@ -38,16 +35,13 @@ from train.data.known_light import explained
 from train.data.pages import Page
 from train.data.patches import training_pages
 from train.fitting.concentration_scale import best_kappa_scale, decode_pages
-from train.fitting.curves import Curve
 from train.fitting.fit import fit_network
 from train.fitting.fitted import Fitted
 from train.fitting.modules import DecoderTraining, SymbolTraining
 from train.fitting.validation import without_piston
 from train.models.decoder import LOCALIZERS
-from train.models.field import FieldRecovery, TorchFieldSolver
 from train.models.hyperparameters import FAST, PRESETS, Hyperparameters
 from train.models.prediction import Prediction
-from train.models.twin import RayTwin, TorchTwin
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.recipe import train_published
 from train.published.states import page_states
@@ -58,35 +52,23 @@ from train.trainers.symbols import LIKENESS_PAGES
 
 Real = NDArray[np.float64]
 
-LEVELS = 256
 ORACLE = "oracle"
+
 REFINED = "refined"
+
 WAVE_REFINED = "wave-refined"
+
 ORACLE_REFINED = "oracle-refined"
+
 FIRST_LOOKS = {REFINED: "coherent", WAVE_REFINED: "wave", ORACLE_REFINED: ORACLE}
 """Arms that look again, and the arm whose first look they share."""
+
 ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, WAVE_REFINED, ORACLE, ORACLE_REFINED)
-WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
-"""Whether a symbol's light meets walls of a pair, as the columns of the table say it."""
-CALIBRATED = 2
+
 HELD_OUT_SHARE = 0.05
-LAST_SHARE = 0.2
-SETTLED_BITS = 0.02
-"""A decoder whose validation AIR gains as much in that last share of its steps has not learnt what it could."""
+
 LEVEL_PAGES = 4
 """Of each number of levels, and as many as are calibrated on: thirty thousand symbols on the bench device."""
-
-
-def calibrated(profile: Profile, recording: Recording, path: Path) -> Calibration:
-    """The calibration from nominal on the recording's first pages, kept in `path`."""
-    if not path.exists():
-        pages = known_pages(recording, profile, range(CALIBRATED))
-        twin, solver = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
-        with percent_bar() as progress:
-            fitted = calibrate(twin, solver, profile, recording.references(), pages, progress)
-        hashes = [hash_frames(page.pair) for page in pages]
-        Calibration.from_registered(fitted, profile, hashes).save(path)
-    return load_calibration(path)
 
 
 @dataclass(frozen=True)
@@ -351,109 +333,3 @@ class Bench:
             training_seconds=trained.seconds,
             pages_per_second=drawn / trained.seconds,
         )
-
-
-def symbols_by_walls(profile: Profile, fitted: Calibration) -> dict[str, NDArray[np.bool_]]:
-    """Which symbols' light meets the walls of `WALLS`, bool [ny, nx] each."""
-    met = np.rint(exit_centroids(profile, fitted)).astype(bool)
-    return {name: (met[0] == x) & (met[1] == y) for name, (x, y) in WALLS.items()}
-
-
-def gained_at_the_end(curve: Curve, steps: int) -> float:
-    """What the best of the last fifth of a run's steps has over the best before, of a curve of (step, value)."""
-    late = [value for step, value in curve if step > (1 - LAST_SHARE) * steps]
-    early = [value for step, value in curve if step <= (1 - LAST_SHARE) * steps]
-    return max(late) - max(early) if late and early else float("nan")
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What one arm reached with a network of one size.
-
-    Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor on its
-    concentrations that the validation pages ask for, `own_mi_unscaled` what it claims without, `looks` how often it
-    looks, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light meets the
-    walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by step. The size is that of the
-    first look's network, steps, times and curves are those of the last look, which goes on from the ones before.
-    `analysis.comparison.decoders.compared` tells `over_oracle` and `over_published`.
-    """
-
-    run: str
-    arm: str
-    size: str
-    steps: int
-    air: float
-    own_mi: float
-    own_mi_unscaled: float
-    page_kB: float
-    own_mi_kB: float
-    by_walls: dict[str, float]
-    validation_air: float
-    gained_in_last_fifth: float
-    preparing_seconds: float
-    training_seconds: float
-    pages_per_second: float
-    kappa_scale: float
-    training_curve: Curve
-    validation_curve: Curve
-    looks: int = 1
-    over_oracle: float | None = None
-    over_published: float | None = None
-    by_levels: list[LevelFigures] = field(default_factory=list)
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether more steps would hardly have helped; False if that was not seen."""
-        return self.gained_in_last_fifth < SETTLED_BITS
-
-    def line(self) -> str:
-        over = ["" if ratio is None else f"{ratio:.3f}" for ratio in (self.over_oracle, self.over_published)]
-        walls = "".join(f"{self.by_walls[name]:>7.3f} " for name in WALLS)
-        return (
-            f"{self.arm:<16} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} "
-            f"{self.own_mi - self.air:>7.3f} {self.page_kB:>6.2f} {self.own_mi_kB:>6.2f} "
-            f"{walls}{over[0]:>10} {over[1]:>10} "
-            f"{self.gained_in_last_fifth:>8.3f}{' ' if self.is_settled else UNSETTLED} "
-            f"{self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f} {self.pages_per_second:>7.2f}"
-        )
-
-
-HEADER = (
-    f"{'arm':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} {'own-kB':>6} "
-    + "".join(f"{name:>7} " for name in WALLS)
-    + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8}  {'features':>9} {'training':>8} {'pages/s':>7}"
-)
-"""Held-out pages, bits a symbol and kB a page; own-MI and what it claims beyond the AIR, concentrations multiplied by
-one factor that the validation pages ask for; AIR where a symbol's light meets no wall of the pipe, a wall of pair x,
-of pair y, or of both; AIR over the oracle's, and over that of the best published decoder; of the last look alone, as
-its steps: what validation AIR gained in the last fifth of them (`FOOTNOTE`), minutes of features and of training, and
-pages it trained on a second, validation counted as time: of a kept arm, on the machine that trained it. The network's
-size is the first look's."""
-UNSETTLED = "*"
-FOOTNOTE = (
-    f"{UNSETTLED} still learning: validation AIR gained {SETTLED_BITS} bit or more in the last {LAST_SHARE:.0%} of the"
-    " steps; no comparison with it counts yet"
-)
-
-
-def light_name(device: Device, symbol_size_px: int, apart: str = "") -> str:
-    """Name of the folder of a light; `apart` says what else sets it apart."""
-    geometry, sensor = device.geometry, device.sensor
-    dimmed = "" if sensor.exposure_relative == Sensor().exposure_relative else f"-{sensor.exposure_relative:g}x"
-    return f"{geometry.pipe_angle_deg:g}deg-{sensor.full_well_e:g}e-{symbol_size_px}px{dimmed}{apart}"
-
-
-@contextmanager
-def recorded(
-    profile: Profile, device: Device, pages: int, seed: int, folder: Path, levels: int = LEVELS
-) -> Iterator[Recording]:
-    """The recording of a light, of so many pages and some to calibrate on before them; made if it is not there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    begin(folder, {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed})
-    path = folder / "recording.h5"
-    if not path.exists():
-        job = RecordingJob(profile, device, levels, seed, truth=True, out=path)
-        job.claim(force=False)
-        job.run(CALIBRATED + pages)
-    with Recording.open(path) as recording:
-        yield recording

@@ -1,0 +1,58 @@
+"""The data sets of a comparison: a device, its recording and its calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from lightpage.calibration.calibrate import calibrate
+from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.known_pages import known_pages
+from lightpage.cli.progress_bar import percent_bar
+from lightpage.device.profile import Profile
+from lightpage.device.state import Device, Sensor
+from lightpage.recording.reader import Recording, hash_frames
+from lightpage.simulator.recording_job import RecordingJob
+from train.models.field import FieldRecovery, TorchFieldSolver
+from train.models.twin import RayTwin, TorchTwin
+from train.runs import begin
+
+LEVELS = 256
+
+CALIBRATED = 2
+
+
+def calibrated(profile: Profile, recording: Recording, path: Path) -> Calibration:
+    """The calibration from nominal on the recording's first pages, kept in `path`."""
+    if not path.exists():
+        pages = known_pages(recording, profile, range(CALIBRATED))
+        twin, solver = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
+        with percent_bar() as progress:
+            fitted = calibrate(twin, solver, profile, recording.references(), pages, progress)
+        hashes = [hash_frames(page.pair) for page in pages]
+        Calibration.from_registered(fitted, profile, hashes).save(path)
+    return load_calibration(path)
+
+
+def light_name(device: Device, symbol_size_px: int, apart: str = "") -> str:
+    """Name of the folder of a light; `apart` says what else sets it apart."""
+    geometry, sensor = device.geometry, device.sensor
+    dimmed = "" if sensor.exposure_relative == Sensor().exposure_relative else f"-{sensor.exposure_relative:g}x"
+    return f"{geometry.pipe_angle_deg:g}deg-{sensor.full_well_e:g}e-{symbol_size_px}px{dimmed}{apart}"
+
+
+@contextmanager
+def recorded(
+    profile: Profile, device: Device, pages: int, seed: int, folder: Path, levels: int = LEVELS
+) -> Iterator[Recording]:
+    """The recording of a light, of so many pages and some to calibrate on before them; made if it is not there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    begin(folder, {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed})
+    path = folder / "recording.h5"
+    if not path.exists():
+        job = RecordingJob(profile, device, levels, seed, truth=True, out=path)
+        job.claim(force=False)
+        job.run(CALIBRATED + pages)
+    with Recording.open(path) as recording:
+        yield recording

@@ -1,0 +1,107 @@
+"""What a method reached, as figures and as a line of the table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.comparison.levels import LevelFigures
+from analysis.report.data import exit_centroids
+from lightpage.calibration.document import Calibration
+from lightpage.device.profile import Profile
+from train.fitting.curves import Curve
+
+WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
+"""Whether a symbol's light meets walls of a pair, as the columns of the table say it."""
+
+LAST_SHARE = 0.2
+
+SETTLED_BITS = 0.02
+"""A decoder whose validation AIR gains as much in that last share of its steps has not learnt what it could."""
+
+
+def symbols_by_walls(profile: Profile, fitted: Calibration) -> dict[str, NDArray[np.bool_]]:
+    """Which symbols' light meets the walls of `WALLS`, bool [ny, nx] each."""
+    met = np.rint(exit_centroids(profile, fitted)).astype(bool)
+    return {name: (met[0] == x) & (met[1] == y) for name, (x, y) in WALLS.items()}
+
+
+def gained_at_the_end(curve: Curve, steps: int) -> float:
+    """What the best of the last fifth of a run's steps has over the best before, of a curve of (step, value)."""
+    late = [value for step, value in curve if step > (1 - LAST_SHARE) * steps]
+    early = [value for step, value in curve if step <= (1 - LAST_SHARE) * steps]
+    return max(late) - max(early) if late and early else float("nan")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one arm reached with a network of one size.
+
+    Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor on its
+    concentrations that the validation pages ask for, `own_mi_unscaled` what it claims without, `looks` how often it
+    looks, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light meets the
+    walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by step. The size is that of the
+    first look's network, steps, times and curves are those of the last look, which goes on from the ones before.
+    `analysis.comparison.decoders.compared` tells `over_oracle` and `over_published`.
+    """
+
+    run: str
+    arm: str
+    size: str
+    steps: int
+    air: float
+    own_mi: float
+    own_mi_unscaled: float
+    page_kB: float
+    own_mi_kB: float
+    by_walls: dict[str, float]
+    validation_air: float
+    gained_in_last_fifth: float
+    preparing_seconds: float
+    training_seconds: float
+    pages_per_second: float
+    kappa_scale: float
+    training_curve: Curve
+    validation_curve: Curve
+    looks: int = 1
+    over_oracle: float | None = None
+    over_published: float | None = None
+    by_levels: list[LevelFigures] = field(default_factory=list)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether more steps would hardly have helped; False if that was not seen."""
+        return self.gained_in_last_fifth < SETTLED_BITS
+
+    def line(self) -> str:
+        over = ["" if ratio is None else f"{ratio:.3f}" for ratio in (self.over_oracle, self.over_published)]
+        walls = "".join(f"{self.by_walls[name]:>7.3f} " for name in WALLS)
+        return (
+            f"{self.arm:<16} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} "
+            f"{self.own_mi - self.air:>7.3f} {self.page_kB:>6.2f} {self.own_mi_kB:>6.2f} "
+            f"{walls}{over[0]:>10} {over[1]:>10} "
+            f"{self.gained_in_last_fifth:>8.3f}{' ' if self.is_settled else UNSETTLED} "
+            f"{self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f} {self.pages_per_second:>7.2f}"
+        )
+
+
+HEADER = (
+    f"{'arm':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} {'own-kB':>6} "
+    + "".join(f"{name:>7} " for name in WALLS)
+    + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8}  {'features':>9} {'training':>8} {'pages/s':>7}"
+)
+"""Held-out pages, bits a symbol and kB a page; own-MI and what it claims beyond the AIR, concentrations multiplied by
+one factor that the validation pages ask for; AIR where a symbol's light meets no wall of the pipe, a wall of pair x,
+of pair y, or of both; AIR over the oracle's, and over that of the best published decoder; of the last look alone, as
+its steps: what validation AIR gained in the last fifth of them (`FOOTNOTE`), minutes of features and of training, and
+pages it trained on a second, validation counted as time: of a kept arm, on the machine that trained it. The network's
+size is the first look's."""
+
+UNSETTLED = "*"
+
+FOOTNOTE = (
+    f"{UNSETTLED} still learning: validation AIR gained {SETTLED_BITS} bit or more in the last {LAST_SHARE:.0%} of the"
+    " steps; no comparison with it counts yet"
+)
