@@ -1,4 +1,4 @@
-"""One light, and every decoder on it: the same recording, the same held-out pages."""
+"""What all methods of a comparison share: their pages, features and trainings, and what each came to."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,12 +16,13 @@ from lightpage.recording.reader import FramePair
 from runtime.acquisition.source import FrameSource, SourcePage, own_fault
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
-from runtime.errors import LostPageError, SlotsTakenError, SourceError
+from runtime.errors import LostPageError, SourceError
 from runtime.service.caller import Caller
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.receiver import PairReceiver
 from runtime.service.registry import Model, ModelRegistry
+from runtime.service.slots import Slots
 from runtime.service.store import ModelStore
 
 
@@ -73,8 +73,8 @@ class DataPlane:
         self._source = source
         if source is not None:
             _check_source(source, registry.current.decoder)
-        self._receives = threading.BoundedSemaphore(self.limits.concurrent_receives)
-        self._decodes = threading.BoundedSemaphore(self.limits.concurrent_decodes)
+        self.receives = Slots(self.limits.concurrent_receives, "receives", self.limits.deadline_s)
+        self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s)
         self.metrics.in_service(registry.current.version)
 
     @property
@@ -113,7 +113,7 @@ class DataPlane:
                 f"{shape[0]}x{shape[1]} pixels, {dtype}, {bit_depth} bits",
                 f"{wanted[0][0]}x{wanted[0][1]} pixels, {wanted[1]}, {wanted[2]} bits",
             )
-        with self._slot(self._receives, "receives", caller):
+        with self.receives.held(caller):
             yield PairReceiver(shape, dtype, self.limits.pair_bytes)
 
     def decode(
@@ -144,7 +144,7 @@ class DataPlane:
         now = time.perf_counter()
         start = now if start is None else start
         received = now if received is None else received
-        with self._slot(self._decodes, "decodes", caller):
+        with self.decodes.held(caller):
             caller.check()
             # Taken once: a swap in the meantime changes the next request, not this one.
             model = self.registry.current
@@ -162,7 +162,7 @@ class DataPlane:
         source = self.source
         levels = source.levels if levels is None else levels
         # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
-        with self._slot(self._decodes, "decodes", caller):
+        with self.decodes.held(caller):
             caller.check()
             model, begun = self.registry.current, time.perf_counter()
             with own_fault():
@@ -224,21 +224,6 @@ class DataPlane:
             raise lost from None
         self.metrics.page(page, model.version)
         return page
-
-    @contextmanager
-    def _slot(self, slots: threading.BoundedSemaphore, what: str, caller: Caller) -> Iterator[None]:
-        """Hold one of `slots`, waiting as long as the caller does, but not for one who has gone."""
-        until = time.monotonic() + min(caller.seconds_left(), self.limits.deadline_s)
-        while not slots.acquire(timeout=min(0.5, max(0.0, until - time.monotonic()))):
-            caller.check()
-            if time.monotonic() >= until:
-                raise SlotsTakenError(
-                    f"concurrent {what}", "all taken", "a free one within the deadline; try again later"
-                )
-        try:
-            yield
-        finally:
-            slots.release()
 
 
 def _check_source(source: FrameSource, decoder: Decoder) -> None:

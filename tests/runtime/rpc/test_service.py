@@ -38,6 +38,7 @@ from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.recalibration.outcome import Fit, FitResult
 from runtime.rpc.server import SERVICE, LightpageServer
+from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits
 from runtime.service.recalibrator import Recalibrator
@@ -63,6 +64,10 @@ class Running:
     @property
     def device(self) -> toy.ToyDevice:
         return self.source.device
+
+    def count(self, name: str, **labels: str) -> float:
+        """What the service's metrics say."""
+        return self.plane.metrics.registry.get_sample_value(name, labels) or 0.0
 
     def stub(self, channel: grpc.Channel) -> pb_grpc.LightpageStub:
         return pb_grpc.LightpageStub(channel)
@@ -305,16 +310,15 @@ def test_a_client_that_leaves_mid_call_leaves_nothing_behind(start: Start) -> No
         yield pb.DecodeFramesRequest(chunk=bytes(100))
         gone.wait(20)
 
-    in_flight = service.plane.metrics.in_flight._value.get
     for _ in range(6):  # three times as many as there are slots
         with grpc.insecure_channel(service.server.target) as channel:
             call = service.stub(channel).DecodeFrames.future(endless(), timeout=20)
-            assert wait_until(lambda: in_flight() == 1)
+            assert wait_until(lambda: service.count("lightpage_calls_in_flight") == 1)
             call.cancel()
-        assert wait_until(lambda: in_flight() == 0)
+        assert wait_until(lambda: service.count("lightpage_calls_in_flight") == 0)
     gone.set()
     assert (service.client.decode(a_page()[1], 16).symbols == a_page()[0]).all()
-    assert service.plane.metrics.pages.labels("toy-1")._value.get() == 1
+    assert service.count("lightpage_pages_total", model_version="toy-1") == 1
 
 
 def test_a_client_that_stalls_is_cut_off_and_gives_its_slot_back(start: Start) -> None:
@@ -337,8 +341,8 @@ def test_a_client_that_stalls_is_cut_off_and_gives_its_slot_back(start: Start) -
 
 def test_waiting_for_a_slot_is_not_stalling(start: Start) -> None:
     service = start(Limits(concurrent_receives=1, receive_s=0.3))
-    assert service.plane._receives.acquire(timeout=1)
-    free = threading.Timer(0.8, service.plane._receives.release)
+    service.plane.receives.take(Caller())
+    free = threading.Timer(0.8, service.plane.receives.give_back)
     free.start()
     assert (service.client.decode(a_page()[1], 16).symbols == a_page()[0]).all()
     free.join(5)
@@ -346,20 +350,20 @@ def test_waiting_for_a_slot_is_not_stalling(start: Start) -> None:
 
 def test_too_many_at_once_are_told_to_come_back(start: Start) -> None:
     service = start(Limits(concurrent_decodes=1, deadline_s=0.2))
-    assert service.plane._decodes.acquire(timeout=1)
+    service.plane.decodes.take(Caller())
     with pytest.raises(BusyError, match="try again"):
         service.client.decode(a_page()[1], 16)
-    service.plane._decodes.release()
+    service.plane.decodes.give_back()
     assert service.client.decode(a_page()[1], 16).levels == 16
 
 
 def test_a_page_is_not_read_from_the_source_before_there_is_room_to_decode_it(start: Start) -> None:
     service = start(Limits(concurrent_decodes=1, deadline_s=0.2))
-    assert service.plane._decodes.acquire(timeout=1)
+    service.plane.decodes.take(Caller())
     for _ in range(3):
         with pytest.raises(BusyError, match="try again"):
             service.client.read_page()
-    service.plane._decodes.release()
+    service.plane.decodes.give_back()
     page = service.client.read_page()
     assert page.page == 0  # none was taken from the source in vain
     assert 0 < page.timings.receive_s + page.timings.decode_s < page.timings.total_s
@@ -373,10 +377,10 @@ def status(call: Callable[[], object]) -> tuple[grpc.StatusCode, str]:
 
 def test_a_call_without_a_slot_is_resource_exhausted(start: Start) -> None:
     service = start(Limits(concurrent_decodes=1, deadline_s=0.2))
-    assert service.plane._decodes.acquire(timeout=1)
+    service.plane.decodes.take(Caller())
     with grpc.insecure_channel(service.server.target) as channel:
         code, text = status(lambda: service.stub(channel).ReadPage(pb.ReadPageRequest(), timeout=20))
-    service.plane._decodes.release()
+    service.plane.decodes.give_back()
     assert code == grpc.StatusCode.RESOURCE_EXHAUSTED
     assert "try again later" in text
 
@@ -494,17 +498,18 @@ def test_health_is_served_beside_the_service_and_ends_first(start: Start) -> Non
 
 def test_an_answer_in_flight_survives_the_stop(start: Start) -> None:
     service = start()
-    assert service.plane._decodes.acquire(timeout=1)
-    assert service.plane._decodes.acquire(timeout=1)
+    service.plane.decodes.take(Caller())
+    service.plane.decodes.take(Caller())
     pages: list[object] = []
     caller = threading.Thread(target=lambda: pages.append(service.client.decode(a_page()[1], 16)))
     caller.start()
-    assert wait_until(lambda: service.plane.metrics.in_flight._value.get() == 1)
+    assert wait_until(lambda: service.count("lightpage_calls_in_flight") == 1)
     ending = threading.Thread(target=service.server.stop, args=(10.0,))
     ending.start()
     ending.join(0.3)
     assert ending.is_alive()  # it waits for the answer
-    service.plane._decodes.release(2)
+    service.plane.decodes.give_back()
+    service.plane.decodes.give_back()
     caller.join(10)
     ending.join(10)
     assert len(pages) == 1
@@ -569,7 +574,7 @@ def test_recalibration_with_wrong_pilots_is_refused_and_the_old_model_stays(star
     service.source.read = honest  # type: ignore[method-assign]
     assert service.client.describe().model.version == "toy-1"
     assert [m.version for m in service.client.models()] == ["toy-1"]
-    assert service.plane.metrics.recalibrations.labels("refused")._value.get() == 1
+    assert service.count("lightpage_recalibrations_total", result="refused") == 1
 
 
 def test_recalibration_that_would_decode_worse_is_refused(start: Start) -> None:
@@ -699,7 +704,7 @@ def test_a_recalibration_that_the_end_of_the_service_cuts_off_says_so(start: Sta
     service.server.stop(5.0)
     caller.join(10)
     assert [type(error) for error in errors] == [StoppingError]
-    assert service.plane.metrics.recalibrations.labels("dropped")._value.get() == 1
+    assert service.count("lightpage_recalibrations_total", result="dropped") == 1
 
 
 def test_a_recalibration_that_is_stopped_reads_and_decodes_no_more_pages(start: Start) -> None:
@@ -735,7 +740,7 @@ def test_the_service_ends_in_time_beside_a_recalibration_that_does_not_stop(star
         service.server.stop(0.5)
         assert time.monotonic() - begun < 5
     go.set()
-    assert wait_until(lambda: service.plane.metrics.recalibrations.labels("dropped")._value.get() == 1)
+    assert wait_until(lambda: service.count("lightpage_recalibrations_total", result="dropped") == 1)
     assert [model.version for model in service.plane.registry.models] == ["toy-1"]
 
 
@@ -764,7 +769,7 @@ def test_a_recalibration_whose_caller_leaves_is_dropped(start: Start) -> None:
         assert fit.entered.wait(10)
         call.cancel()
     assert fit.ended.wait(10)
-    assert wait_until(lambda: service.plane.metrics.recalibrations.labels("dropped")._value.get() == 1)
+    assert wait_until(lambda: service.count("lightpage_recalibrations_total", result="dropped") == 1)
     assert service.client.describe().model.version == "toy-1"
     fit.go.set()
     assert service.client.recalibrate(count=2).model_version == "toy-1+r1"
@@ -814,7 +819,7 @@ def test_a_change_of_model_that_cannot_be_noted_is_not_made(
         with pytest.raises(BundleError, match="disk full"):
             service.client.recalibrate(count=2)
     assert service.client.describe().model.version == "toy-1+r1"
-    assert service.plane.metrics.model.labels("toy-1+r1")._value.get() == 1
+    assert service.count("lightpage_model_info", version="toy-1+r1") == 1
     assert sorted(path.name for path in store.folder.iterdir()) == ["current.json", "toy-1+r1.zip"]
     assert store.last() == store.path_of("toy-1+r1")
     assert service.client.rollback()[0] == "toy-1"
