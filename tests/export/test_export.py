@@ -123,7 +123,7 @@ def test_the_fields_own_graph_shows_the_decoders_field(
     np.testing.assert_allclose(field, expected, atol=1e-4)
     np.testing.assert_allclose(left, expected_left, atol=1e-4)
     # as a decoder that looks at the field more coarsely would have it
-    monkeypatch.setattr("runtime.decoding.decoder.field_grid", partial(field_grid, step_px=3))
+    monkeypatch.setattr("runtime.decoding.field_solver.field_grid", partial(field_grid, step_px=3))
     with pytest.raises(BundleError, match=r"output field.*wanted .*field\.onnx beside it"):
         without.field_solver(*asked)
 

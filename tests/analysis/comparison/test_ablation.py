@@ -24,7 +24,9 @@ from analysis.comparison.bench import Bench
 from analysis.comparison.kept import Kept
 from analysis.comparison.light import light_name, recorded
 from lightpage.device.state import Device, Sensor
+from lightpage.progress import reporting
 from tests.analysis.comparison.test_decoders import PROFILE, calibration_of
+from tests.told import Told
 
 DEVICE = Device().with_settings(["geometry.pipe_angle_deg=-0.6", "sensor.full_well_e=32"])
 
@@ -81,12 +83,16 @@ def test_the_command_prints_the_parts_and_takes_up_what_is_there(out: Path, tmp_
     profile = tmp_path / "small.toml"
     profile.write_text(PROFILE.to_toml())
     arguments = f"--profile {profile} --pages 12 --steps 10 --part {NOTHING} --part {POSITIONS} --out {out}".split()
-    first = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    told = Told()
+    with reporting(told):
+        first = CliRunner().invoke(main, arguments, catch_exceptions=False)
     assert first.exit_code == 0, first.output
     assert "filters that depend on where a symbol lies" in first.output
     outcomes = json.loads((out / "ablation.json").read_text())["outcomes"]
     assert [outcome["arm"] for outcome in outcomes] == [NOTHING, POSITIONS]
-    again = CliRunner().invoke(main, arguments, catch_exceptions=False)
-    assert "features without nothing" in first.output
-    assert "features without" not in again.output
+    assert ("features without nothing", "page") in told.loops
+    told = Told()
+    with reporting(told):
+        CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert not any(what.startswith("features without") for what, _ in told.loops)
     assert json.loads((out / "ablation.json").read_text())["outcomes"] == outcomes

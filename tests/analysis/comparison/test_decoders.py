@@ -26,10 +26,12 @@ from lightpage.calibration.parameters import NAMES
 from lightpage.device.state import Device, Reference, Sensor, ideal_device
 from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask
+from lightpage.progress import reporting
 from lightpage.recording.reader import Recording
 from lightpage.simulator.recording_job import RecordingJob
 from lightpage.simulator.true_optics import perfectly_calibrated, true_parameters
 from tests.lightpage.small import small_profile
+from tests.told import Told
 from train.data.features import FeatureExtractor, PageFeatures
 from train.fitting.curves import curves_of
 from train.fitting.fitted import FITTED
@@ -172,8 +174,10 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     )
     assert first.output.count("of theirs") == len(figures["outcomes"]) + 1  # as soon as an arm is there, and in the end
     assert figures["angle_error_deg"] == pytest.approx(0, abs=1e-9)
-    again = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
-    assert set(re.findall(r"\r([^\r:]+):[^\r]*page/s", again.output)) == {"light of known pages"}
+    told = Told()
+    with reporting(told):
+        again = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
+    assert {what for what, unit in told.loops if unit == "page"} == {"light of known pages"}
     outcomes = json.loads((out / "figures.json").read_text())["lights"][0]["outcomes"]
     for one, other in zip(outcomes, figures["outcomes"], strict=True):
         assert one == other

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import i0e, i1e
 
 from lightpage.errors import PageError
-from lightpage.metrics import information as measures
+from lightpage.metrics import information, measures, reliability
 from lightpage.metrics.accumulator import Tally
 
 
@@ -33,9 +33,9 @@ def test_pages_one_by_one_give_the_figures_of_all_at_once(levels: int) -> None:
         vars(tally.maps()).values(), vars(measures.symbol_maps(mu, kappa, symbols, levels, data)).values(), strict=True
     ):
         np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-14)
-    decided, confidence = measures.decide_with_confidence(mu, kappa, levels)
+    decided, confidence = information.decide_with_confidence(mu, kappa, levels)
     for claims, wanted_claims in zip(
-        tally.confidence_bins(), measures.reliability(confidence, decided == symbols), strict=True
+        tally.confidence_bins(), reliability.reliability(confidence, decided == symbols), strict=True
     ):
         assert asdict(claims) == pytest.approx(asdict(wanted_claims), rel=1e-12)
 

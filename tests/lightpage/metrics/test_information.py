@@ -9,7 +9,7 @@ from scipy.special import i0e, logsumexp, softmax
 from scipy.stats import entropy
 
 from lightpage.errors import PageError
-from lightpage.metrics import information as measures
+from lightpage.metrics import information, measures, reliability
 
 
 def drawn_page(levels: int, kappa: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -26,7 +26,7 @@ def test_own_information_of_many_levels_is_the_integral_of_the_density(kappa: fl
         return float(density * np.log2(2 * np.pi * max(density, 1e-300)))
 
     expected = quad(integrand, -np.pi, np.pi, points=[-0.1, 0.1], limit=400)[0]
-    assert measures.own_information(np.array([0.3]), np.array([kappa]), 256)[0] == pytest.approx(expected, rel=1e-7)
+    assert information.own_information(np.array([0.3]), np.array([kappa]), 256)[0] == pytest.approx(expected, rel=1e-7)
 
 
 @pytest.mark.parametrize("levels", [2, 3, 16, 25, 26, 100, 256])
@@ -35,11 +35,11 @@ def test_own_information_is_what_the_posterior_leaves_unknown(levels: int) -> No
     kappa, mu = 10 ** rng.uniform(-3, 6, 400), rng.uniform(-20, 20, 400)
     logits = kappa[:, None] * (np.cos(np.arange(levels) * 2 * np.pi / levels - mu[:, None]) - 1)
     expected = np.log2(levels) - entropy(softmax(logits, axis=1), base=2, axis=1)
-    np.testing.assert_allclose(measures.own_information(mu, kappa, levels), expected, atol=1e-8)
+    np.testing.assert_allclose(information.own_information(mu, kappa, levels), expected, atol=1e-8)
 
 
 def test_own_information_is_nothing_without_concentration_and_never_more_than_the_levels_hold() -> None:
-    bits = measures.own_information(np.zeros(3), np.array([0.0, 1e4, 1e30]), levels=16)
+    bits = information.own_information(np.zeros(3), np.array([0.0, 1e4, 1e30]), levels=16)
     np.testing.assert_allclose(bits, [0, 4, 4], atol=1e-12)
 
 
@@ -48,11 +48,11 @@ def test_posterior_equals_the_plain_softmax(levels: int) -> None:
     rng = np.random.default_rng(levels)
     kappa = 10 ** rng.uniform(-3, 6, 400)
     mu = rng.uniform(-20, 20, 400)
-    symbols = np.where(rng.random(400) < 0.5, measures.decide(mu, levels), rng.integers(levels, size=400))
+    symbols = np.where(rng.random(400) < 0.5, information.decide(mu, levels), rng.integers(levels, size=400))
     logits = kappa[:, None] * (np.cos(np.arange(levels) * 2 * np.pi / levels - mu[:, None]) - 1)
     expected = logits[np.arange(400), symbols] - logsumexp(logits, axis=1)
     # float64 knows a phase of 20 rad to 4e-15 and kappa multiplies that, so part of the allowance grows with kappa.
-    difference = np.abs(measures.log_posterior(mu, kappa, symbols, levels) - expected)
+    difference = np.abs(information.log_posterior(mu, kappa, symbols, levels) - expected)
     assert (difference <= 1e-9 + 1e-13 * kappa).all()
 
 
@@ -61,15 +61,15 @@ def test_decision_is_the_nearest_level_whatever_the_winding(levels: int) -> None
     symbols = np.arange(levels)
     mu = symbols * 2 * np.pi / levels + 0.49 * 2 * np.pi / levels
     for turns in (-3, 0, 2):
-        assert np.array_equal(measures.decide(mu + 2 * np.pi * turns, levels), symbols)
+        assert np.array_equal(information.decide(mu + 2 * np.pi * turns, levels), symbols)
 
 
 @pytest.mark.parametrize("levels", [3, 4, 8, 16, 256])
 def test_air_of_honest_beliefs_equals_own_information(levels: int) -> None:
     kappa = np.random.default_rng(0).lognormal(np.log(10), 1, 200_000)
     symbols, mu = drawn_page(levels, kappa, 1)
-    air = measures.achievable_rate(mu, kappa, symbols, levels).mean()
-    assert air == pytest.approx(measures.own_information(mu, kappa, levels).mean(), abs=0.01)
+    air = information.achievable_rate(mu, kappa, symbols, levels).mean()
+    assert air == pytest.approx(information.own_information(mu, kappa, levels).mean(), abs=0.01)
 
 
 def test_air_at_256_levels_agrees_with_the_continuous_form() -> None:
@@ -77,7 +77,7 @@ def test_air_at_256_levels_agrees_with_the_continuous_form() -> None:
     symbols, mu = drawn_page(256, kappa, 2)
     error = symbols * 2 * np.pi / 256 - mu
     continuous = np.log2(2 * np.pi) + (kappa * (np.cos(error) - 1) - np.log(2 * np.pi * i0e(kappa))) / np.log(2)
-    np.testing.assert_allclose(measures.achievable_rate(mu, kappa, symbols, 256), continuous, atol=1e-9)
+    np.testing.assert_allclose(information.achievable_rate(mu, kappa, symbols, 256), continuous, atol=1e-9)
 
 
 def test_overconfident_beliefs_claim_more_than_they_achieve() -> None:
@@ -101,36 +101,36 @@ def test_gray_rate_is_a_brute_force_bit_posterior_and_never_above_air() -> None:
     for bit in range(3):
         alike = (labels >> bit & 1)[None, :] == (labels[symbols] >> bit & 1)[:, None]
         expected += 1 + np.log2((weight * alike).sum(1))
-    got = measures.gray_rate(mu, kappa, symbols, 8)
+    got = information.gray_rate(mu, kappa, symbols, 8)
     np.testing.assert_allclose(got, expected, atol=1e-9)
-    assert got.mean() <= measures.achievable_rate(mu, kappa, symbols, 8).mean()
+    assert got.mean() <= information.achievable_rate(mu, kappa, symbols, 8).mean()
 
 
 def test_gray_labels_need_a_power_of_two_and_the_page_measure_says_none_without() -> None:
     kappa = np.full(100, 12.0)
     symbols, mu = drawn_page(6, kappa, 5)
     with pytest.raises(PageError, match="power of two"):
-        measures.gray_rate(mu, kappa, symbols, 6)
+        information.gray_rate(mu, kappa, symbols, 6)
     assert measures.measure(mu, kappa, symbols, 6).gmi_bits_per_symbol is None
 
 
 def test_ece_is_the_gap_between_claim_and_accuracy() -> None:
     confidence = np.full(1000, 0.9)
-    assert measures.expected_calibration_error(confidence, np.arange(1000) < 600) == pytest.approx(0.3)
+    assert reliability.expected_calibration_error(confidence, np.arange(1000) < 600) == pytest.approx(0.3)
     two_bins = np.repeat([0.95, 0.55], 500)
     correct = np.concatenate([np.arange(500) < 450, np.arange(500) < 300])
-    assert measures.expected_calibration_error(two_bins, correct) == pytest.approx(0.05)
+    assert reliability.expected_calibration_error(two_bins, correct) == pytest.approx(0.05)
 
 
 def test_bins_of_confidence_hold_every_symbol_once_with_its_claim_and_outcome() -> None:
     confidence = np.repeat([0.95, 0.55, 1.0, 0.25], [500, 400, 100, 1])
-    bins = measures.reliability(confidence, np.arange(1001) % 4 > 0, bins=10)
+    bins = reliability.reliability(confidence, np.arange(1001) % 4 > 0, bins=10)
     counted = [(round(b.low, 9), round(b.high, 9), b.count) for b in bins]
     assert counted == [(0.2, 0.3, 1), (0.5, 0.6, 400), (0.9, 1.0, 600)]
     assert [b.confidence for b in bins] == pytest.approx([0.25, 0.55, (500 * 0.95 + 100) / 600])
     assert [b.accuracy for b in bins] == [0, 0.75, 0.75]
     with pytest.raises(PageError, match="confidences"):
-        measures.reliability(np.empty(0), np.empty(0, bool))
+        reliability.reliability(np.empty(0), np.empty(0, bool))
 
 
 def test_maps_average_to_the_figures_of_the_page() -> None:
@@ -152,7 +152,7 @@ def test_maps_average_to_the_figures_of_the_page() -> None:
 
 
 def test_confidence_lies_between_a_guess_and_certainty() -> None:
-    _, confidence = measures.decide_with_confidence(np.zeros(3), np.array([0.0, 3.0, 1e12]), 4)
+    _, confidence = information.decide_with_confidence(np.zeros(3), np.array([0.0, 3.0, 1e12]), 4)
     assert confidence.dtype == np.float32
     assert confidence[0] == pytest.approx(0.25)
     assert confidence[0] < confidence[1] < confidence[2] == 1
@@ -172,4 +172,4 @@ def test_confidence_lies_between_a_guess_and_certainty() -> None:
 )
 def test_nonsense_is_named(mu: np.ndarray, kappa: np.ndarray, symbols: np.ndarray, levels: int, named: str) -> None:
     with pytest.raises(PageError, match=named):
-        measures.log_posterior(mu, kappa, symbols, levels)
+        information.log_posterior(mu, kappa, symbols, levels)

@@ -27,7 +27,7 @@ from lightpage.errors import PageError, ProfileError
 from lightpage.simulator.cameras import resample
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import TrueOptics, true_parameters
-from lightpage.waves import channel as waves
+from lightpage.waves import lens
 from lightpage.waves.grid import splitting_steps
 from lightpage.waves.lens import FourierLens
 from tests.lightpage.small import THICK, on_slm, perfect_device, random_phases, small_profile
@@ -340,7 +340,7 @@ class TestLight:
     def test_light_between_the_computed_samples_is_what_the_lens_makes_there(
         self, lenses: str, geometry: dict[str, float], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(waves, "_TOLERANCE_WITH_PATH", 1e-6)  # both have other terms, which must not show
+        monkeypatch.setattr(lens, "_TOLERANCE_WITH_PATH", 1e-6)  # both have other terms, which must not show
         profile = TALL if lenses == "ideal" else TALL.model_copy(update={"lens_path": THICK})
         device = mishandled()
         device = device.model_copy(update={"geometry": device.geometry.model_copy(update=geometry)})

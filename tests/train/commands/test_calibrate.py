@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-import train.commands.calibrate
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.parameters import NAMES, PRIORS
@@ -21,18 +20,22 @@ from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
 from lightpage.errors import CalibrationError, FrameError, InvalidInputError, LightpageError, RecordingError
 from lightpage.page.symbols import random_symbols
+from lightpage.progress import reporting
 from lightpage.recording.reader import FramePair, Recording, RecordingWriter
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
+from tests.told import Told
 from train.commands.calibrate import calibrate
 
 
 def run(recording: Path, out: Path, *more: str, profile: str = "bench") -> str:
     arguments = ["--profile", profile, "--recording", str(recording), "--out", str(out), *more]
-    result = CliRunner().invoke(calibrate, arguments, standalone_mode=False)
+    told = Told()
+    with reporting(told):
+        result = CliRunner().invoke(calibrate, arguments, standalone_mode=False)
     if result.exception is not None:
         raise result.exception
-    return result.output
+    return "\n".join([*told.notes, result.output])
 
 
 def flat_recording(
@@ -58,7 +61,7 @@ def fake_registration(monkeypatch: pytest.MonkeyPatch, outcome: Registered | Bas
             raise outcome
         return outcome
 
-    monkeypatch.setattr(train.cli_calibrate, "register", register)
+    monkeypatch.setattr("train.commands.calibrate.register", register)
 
 
 REGISTERED = Registered(

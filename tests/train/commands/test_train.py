@@ -24,10 +24,11 @@ from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError, InvalidInputError
 from lightpage.page.symbols import pilot_mask
-from lightpage.progress import Progress
+from lightpage.progress import Progress, reporting
 from lightpage.recording.reader import Recording
 from tests.conftest import SMALL_PAGES
 from tests.lightpage.small import small_profile
+from tests.told import Told
 from train.commands import train as cli_train
 from train.commands.options import chosen_recipe
 from train.commands.train import _own_pilots, train
@@ -175,12 +176,13 @@ def test_dark_pages_are_named_and_left_out(device: list[str], tmp_path: Path) ->
     with h5py.File(path, "r+") as file:
         file["quadrature"][0] = 0
         file["in_phase"][6] = 255
-    output = run(
-        [*device[:3], str(path), *device[4:], "--steps", "10", "--synthetic-pages", "2", "--out", str(tmp_path / "run")]
-    )
+    told, options = Told(), [*device[:3], str(path), *device[4:], "--steps", "10", "--synthetic-pages", "2"]
+    with reporting(told):
+        output = run([*options, "--out", str(tmp_path / "run")])
     assert "4 recorded and 2 synthetic pages trained on, 1 validation pages, 1 left" in output
-    assert "page 0, quadrature frame: got black" in output
-    assert "page 6, in-phase frame: got saturated" in output
+    dark, bright = told.notes[:2]
+    assert "page 0, quadrature frame: got black" in dark
+    assert "page 6, in-phase frame: got saturated" in bright
     with Recording.open(path) as recording:
         wanted = [recording.page_hash(page) for page in (1, 2, 3, 4, 5)]
     assert json.loads((tmp_path / "run" / "run.json").read_text())["trained_pages"] == wanted

@@ -1,0 +1,33 @@
+"""A reporter that remembers what it was told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from lightpage.progress import State
+
+T = TypeVar("T")
+
+
+@dataclass
+class Told:
+    """See `lightpage.progress.Reporter`.
+
+    Attributes:
+        loops: what was tracked, with its unit.
+        notes: what was told.
+    """
+
+    loops: list[tuple[str, str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def track(
+        self, items: Iterable[T], what: str, unit: str, total: int | None, done: int, state: State
+    ) -> Iterable[T]:
+        self.loops.append((what, unit))
+        return items
+
+    def note(self, what: str) -> None:
+        self.notes.append(what)
