@@ -78,6 +78,13 @@ train-decoders: $(STAMP)  ## every decoder in every light at quarter scale, trai
 	    --symbol-size 4 --symbol-size 2 --pages 500 --levels 4 --levels 8 --levels 16 --trained runs/train-decoders/kept --keep \
 	    --out runs/train-decoders
 
+SPEED_ARGS ?= --decoder fast --decoder coherent --decoder wave --decoder refined --decoder "ray 32/64"
+bench-speed: $(STAMP)  ## time decoders side by side in one run: SPEED_ARGS chooses them
+	$(BIN)/python -m analysis.speed.speed $(SPEED_ARGS)
+
+bench-service: $(STAMP)  ## time a page through the running service
+	$(BIN)/lightpage bench
+
 bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 	$(BIN)/lightpage bench
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,7 @@ from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid
 from runtime.bundle.bundle import Bundle, write_bundle
-from runtime.bundle.manifest import DECODER, FIELD
+from runtime.bundle.manifest import DECODER, FIELD, TWIN
 from runtime.decoding.decoder import Decoder
 from runtime.execution.session import open_session
 from tests.export.untrained import untrained_decoder
@@ -81,7 +82,26 @@ def exported(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     return (*export_run(run_folder, path), path)
 
 
-def test_eight_bit_counts_that_came_in_sixteen_bits_make_an_eight_bit_bundle(run_folder: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def frame_types(exported: tuple[Bundle, float, Path], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Has an export take the graphs of an earlier one, which take most of its time; frame types that it asks for."""
+    files, asked = exported[0].files, []
+
+    def ready(name: str) -> Callable[..., bytes]:
+        def graph(_: object, *more: object) -> bytes:
+            asked.extend(str(value) for value in more[:1])
+            return files[name]
+
+        return graph
+
+    for function, name in (("decoder_onnx", DECODER), ("field_onnx", FIELD), ("twin_onnx", TWIN)):
+        monkeypatch.setattr(cli_export, function, ready(name))
+    return asked
+
+
+def test_eight_bit_counts_that_came_in_sixteen_bits_make_an_eight_bit_bundle(
+    run_folder: Path, tmp_path: Path, frame_types: list[str]
+) -> None:
     wide = tmp_path / "run"
     shutil.copytree(run_folder, wide)
     for name in (GOLDEN, REFERENCES):
@@ -92,6 +112,7 @@ def test_eight_bit_counts_that_came_in_sixteen_bits_make_an_eight_bit_bundle(run
         np.savez(wide / name, **arrays)
     bundle, error = export_run(wide, tmp_path / "wide.zip")
     assert bundle.manifest.frame_dtype == "uint8"
+    assert frame_types == ["uint8", "uint8"]
     assert error <= 1e-3
 
 
@@ -164,7 +185,7 @@ def test_swapped_frames_are_refused(exported: tuple[Bundle, float, Path]) -> Non
 
 
 def test_a_graph_that_differs_from_torch_leaves_no_bundle(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_folder: Path, tmp_path: Path, frame_types: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answer = cli_export.torch_answer
 
@@ -179,7 +200,7 @@ def test_a_graph_that_differs_from_torch_leaves_no_bundle(
 
 
 def test_an_interrupted_export_leaves_nothing_and_works_again(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_folder: Path, tmp_path: Path, frame_types: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(path: Path) -> None:
         assert path.exists()

@@ -17,7 +17,7 @@ from analysis.foreign_device import ForeignDevice
 MINUTES = 20
 """Machines differ by a factor of three, and other tests run beside these."""
 TRAININGS = {
-    "short": (12, ["--preset", "standard", "--channels", "32", "--blocks", "1", "--steps", "300"], 0),
+    "short": (10, ["--preset", "standard", "--channels", "32", "--blocks", "1", "--steps", "250"], 0),
     "long": (16, ["--preset", "accurate", "--steps", "300"], 48),
 }
 """Pages, choices and synthetic pages: enough to read a page, and all that a decoder is made of."""
@@ -74,7 +74,7 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
     calibration, run, bundle = tmp_path / "calibration.toml", tmp_path / "run", tmp_path / "bundle.zip"
     found, figures = tmp_path / "calibration.json", tmp_path / "evaluation.json"
     lightpage("calibrate", "--profile", "bench", "--recording", str(recording), "--out", str(calibration),
-              "--pages", "3", "--json", str(found))  # fmt: skip
+              "--pages", "2", "--json", str(found))  # fmt: skip
     angle = json.loads(found.read_text())["angle_deg"]
     assert abs(angle - device.parameters.pipe_angle_deg) <= 0.03, f"seed {seed}"
 
@@ -88,7 +88,7 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
         f"angle {angle:.4f}, true {device.parameters.pipe_angle_deg:.4f}; AIR {evaluation['air_bits_per_symbol']:.2f}"
     )
     assert evaluation["pages"] >= 1
-    # 300 steps on ten pages are a start, not a decoder: 3.6 to 4.5 on devices seen so far; unrelated light gives none
+    # so few steps on eight pages are a start, not a decoder; unrelated light gives none
     assert evaluation["air_bits_per_symbol"] > 2.5, f"seed {seed}: {evaluation}"
 
     read_after_jumps(device, bundle, evaluation["air_bits_per_symbol"], seed, tmp_path)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lightpage.calibration.calibrate import Registered
 from lightpage.device.state import Device
 from lightpage.errors import RecalibrationRefusedError
 from lightpage.metrics.measures import measure
@@ -92,5 +93,9 @@ def test_small_losses_do_not_add_up_unseen(tmp_path: Path, monkeypatch: pytest.M
     def late(bundle: Bundle) -> object:
         return calibration_of(bundle).model_copy(update={"coherence_at_first": 1.0})
 
+    def fitted(*_: object, start: np.ndarray, turn: float, **__: object) -> Registered:
+        return Registered(start, np.ones(len(start)), turn, 0.0, 0.5, 1.0, 0.5)
+
     monkeypatch.setattr(module, "calibration_of", late)
+    monkeypatch.setattr(module, "refine", fitted)
     refused(Device(), lambda written: [written[0], written[1]], "90% of the 1.000 when it was calibrated", tmp_path)
