@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 
 from analysis.report.data import Golden, Rays, ReportData, how_long
 from lightpage.errors import InvalidInputError, RecordingError
-from lightpage.metrics.accumulator import Tally
+from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.information import decide
 from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.reader import FramePair, Recording, page_hashes
@@ -65,9 +65,9 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
     p = np.stack([without_piston(run.kappa_scale * o, t, mask) for o, t in zip(outputs, phases, strict=True)])
     symbols = decide(phases[:, ~mask], levels)
     phase, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])[:, ~mask]
-    tally = Tally(levels, ~mask, len(p))
+    accumulator = Accumulator(levels, ~mask, len(p))
     for page in zip(phase[:, ~mask], kappa, symbols, strict=True):
-        tally.add(*page)
+        accumulator.add(*page)
     golden = load_arrays(folder / GOLDEN)
     return ReportData(
         title=f"Training run on {run.profile.name}",
@@ -78,10 +78,10 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
         profile=run.profile,
         calibration=run.calibration,
         rays=_rays(run, module),
-        measures=tally.figures(),
-        maps=tally.maps(),
-        confidence_bins=tally.confidence_bins(),
-        concentration_bins=tally.concentration_bins(),
+        measures=accumulator.figures(),
+        maps=accumulator.maps(),
+        confidence_bins=accumulator.confidence_bins(),
+        concentration_bins=accumulator.concentration_bins(),
         curves=_curves(folder, run) or "There are no curves: the run did not keep them for every look.",
         golden=Golden(FramePair(golden["in_phase"], golden["quadrature"]), phase[0]),
     )

@@ -16,7 +16,7 @@ _INDEX = np.uint64((1 << _INDEX_BITS) - 1)
 _AT_ONCE = 1 << 16
 
 
-class Tally:
+class Accumulator:
     """What `lightpage.metrics.information` says of all pages together, in twelve bytes a symbol.
 
     Args:

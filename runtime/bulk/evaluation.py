@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lightpage.errors import InvalidInputError, RecordingError
-from lightpage.metrics.accumulator import Tally
+from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.information import page_kilobytes
 from lightpage.metrics.measures import PageMeasures, SymbolMaps
 from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
@@ -155,7 +155,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     own = recording.pilots()
     mask = decoder.bundle.pilot_mask if own is None else own
     data = ~mask
-    tally = Tally(levels, data, recording.pages)
+    accumulator = Accumulator(levels, data, recording.pages)
     timings: list[Timings] = []
     refused: list[RefusedPage] = []
     due = 0
@@ -169,7 +169,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         except (InvalidInputError, LostPageError) as error:
             refused.append(RefusedPage.of(index, error))
         if page is not None and symbols is not None:
-            tally.add(page.phase[data], page.concentration[data], symbols[data])
+            accumulator.add(page.phase[data], page.concentration[data], symbols[data])
             timings.append(page.timings)
             due += page.check.recalibration_due
     if not timings and refused:
@@ -190,16 +190,16 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         )
     return Evaluation(
         bundle_version=decoder.version,
-        figures=tally.figures(),
+        figures=accumulator.figures(),
         pages=len(timings),
         pages_left_out=recording.pages - len(timings) - len(refused),
         symbols_per_page=int(np.count_nonzero(data)),
         seconds_per_page=float(np.median([t.total_s for t in timings])),
         inference_seconds_per_page=float(np.median([t.inference_s for t in timings])),
-        air_per_page=tuple(page.air_bits_per_symbol for page in tally.pages),
-        concentration_bins=tuple(tally.concentration_bins()),
-        maps=tally.maps(),
-        confidence_bins=tuple(tally.confidence_bins()),
+        air_per_page=tuple(page.air_bits_per_symbol for page in accumulator.pages),
+        concentration_bins=tuple(accumulator.concentration_bins()),
+        maps=accumulator.maps(),
+        confidence_bins=tuple(accumulator.confidence_bins()),
         bundle=_describe(decoder, levels),
         recalibration_due=due,
         refused=tuple(refused),

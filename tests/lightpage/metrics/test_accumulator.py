@@ -10,7 +10,7 @@ from scipy.special import i0e, i1e
 
 from lightpage.errors import PageError
 from lightpage.metrics import information, measures, reliability
-from lightpage.metrics.accumulator import Tally
+from lightpage.metrics.accumulator import Accumulator
 
 
 @pytest.mark.parametrize("levels", [6, 16])
@@ -20,45 +20,47 @@ def test_pages_one_by_one_give_the_figures_of_all_at_once(levels: int) -> None:
     kappa = rng.choice([0, 0.5, 4, 4.25, 60, 1e12], (5, np.count_nonzero(data))).astype(np.float32)
     symbols = rng.integers(levels, size=kappa.shape).astype(np.uint8)
     mu = (symbols * 2 * np.pi / levels + 0.3 * rng.standard_normal(kappa.shape)).astype(np.float32)
-    tally = Tally(levels, data, pages=7)
+    accumulator = Accumulator(levels, data, pages=7)
     for page in zip(mu, kappa, symbols, strict=True):
-        tally.add(*page)
+        accumulator.add(*page)
     got_figures, wanted_figures = (
         {name: np.nan if value is None else value for name, value in asdict(figures).items()}
-        for figures in (tally.figures(), measures.measure(mu, kappa, symbols, levels))
+        for figures in (accumulator.figures(), measures.measure(mu, kappa, symbols, levels))
     )
     assert got_figures == pytest.approx(wanted_figures, rel=1e-12, nan_ok=True)
-    assert tally.pages == tuple(measures.measure(*page, levels) for page in zip(mu, kappa, symbols, strict=True))
+    assert accumulator.pages == tuple(measures.measure(*page, levels) for page in zip(mu, kappa, symbols, strict=True))
     for got, wanted in zip(
-        vars(tally.maps()).values(), vars(measures.symbol_maps(mu, kappa, symbols, levels, data)).values(), strict=True
+        vars(accumulator.maps()).values(),
+        vars(measures.symbol_maps(mu, kappa, symbols, levels, data)).values(),
+        strict=True,
     ):
         np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-14)
     decided, confidence = information.decide_with_confidence(mu, kappa, levels)
     for claims, wanted_claims in zip(
-        tally.confidence_bins(), reliability.reliability(confidence, decided == symbols), strict=True
+        accumulator.confidence_bins(), reliability.reliability(confidence, decided == symbols), strict=True
     ):
         assert asdict(claims) == pytest.approx(asdict(wanted_claims), rel=1e-12)
 
 
 def test_bins_of_equal_count_hold_the_symbols_in_order_of_concentration() -> None:
-    tally = Tally(16, np.ones((2, 5), bool), pages=3)
+    accumulator = Accumulator(16, np.ones((2, 5), bool), pages=3)
     kappa, symbols = np.random.default_rng(1).permutation(np.arange(1, 31.0)).reshape(3, 10), np.zeros(10, int)
     for page in kappa:
-        tally.add(1 / page, page, symbols)
-    bins = tally.concentration_bins(bins=4)
+        accumulator.add(1 / page, page, symbols)
+    bins = accumulator.concentration_bins(bins=4)
     assert [(b.low, b.high, b.count) for b in bins] == [(1, 8, 8), (9, 16, 8), (17, 23, 7), (24, 30, 7)]
     for part in bins:
         ranked = np.arange(part.low, part.high + 1)
         assert part.promised == pytest.approx(np.mean(i1e(ranked) / i0e(ranked)))
         assert part.observed == pytest.approx(np.mean(np.cos(1 / ranked)))
-    assert [b.count for b in tally.concentration_bins(bins=31)] == [1] * 30
+    assert [b.count for b in accumulator.concentration_bins(bins=31)] == [1] * 30
 
 
 def test_honest_concentrations_keep_their_promise_in_every_bin_and_doubled_ones_do_not() -> None:
     rng = np.random.default_rng(6)
     kappa = rng.gamma(2.0, 5.0, 100_000)
     symbols, errors = rng.integers(64, size=kappa.size), rng.vonmises(0, kappa)
-    honest, doubled = Tally(64, np.ones((250, 400), bool), 1), Tally(64, np.ones((250, 400), bool), 1)
+    honest, doubled = Accumulator(64, np.ones((250, 400), bool), 1), Accumulator(64, np.ones((250, 400), bool), 1)
     honest.add(symbols * 2 * np.pi / 64 + errors, kappa, symbols)
     doubled.add(symbols * 2 * np.pi / 64 + errors, 2 * kappa, symbols)
     assert len(honest.concentration_bins()) == 10
@@ -68,4 +70,4 @@ def test_honest_concentrations_keep_their_promise_in_every_bin_and_doubled_ones_
 
 def test_no_page_has_no_figures() -> None:
     with pytest.raises(PageError, match="pages to measure: got none"):
-        Tally(16, np.ones((2, 3), bool), pages=4).figures()
+        Accumulator(16, np.ones((2, 3), bool), pages=4).figures()
