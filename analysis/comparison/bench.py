@@ -48,7 +48,7 @@ from train.published.states import page_states
 from train.published.training import FramePages, PublishedChoices
 from train.runs import begin
 from train.trainers.refinement import RefinementPages, fit_prediction, fit_refinements, refined_pages
-from train.trainers.symbols import LIKENESS_PAGES
+from train.trainers.symbols import MATCHED_PAGES
 
 Real = NDArray[np.float64]
 
@@ -164,7 +164,7 @@ class Bench:
             outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing, drawn)
             return replace(outcome, by_levels=self.at_levels(name, folder, [first], outcome.kappa_scale))
         extractor = self.extractor(look)
-        pages = known_pages(self.recording, self.profile, self.training[:LIKENESS_PAGES])
+        pages = known_pages(self.recording, self.profile, self.training[:MATCHED_PAGES])
         prediction = fit_prediction(extractor, explained(extractor, pages))
         counts = len(self.training), len(self.validation)
         material = RefinementPages(self.recording, self.pages, *counts, features)

@@ -42,7 +42,7 @@ from train.models.hyperparameters import Hyperparameters
 from train.models.twin import RayTwin, TorchTwin
 from train.runs import BEGUN, GOLDEN, REFERENCES, Run, save_arrays, save_weights
 from train.trainers.refinement import fit_prediction
-from train.trainers.symbols import LIKENESS_PAGES
+from train.trainers.symbols import MATCHED_PAGES
 
 LEVELS = 256
 JUDGED = 3
@@ -86,11 +86,11 @@ def export_kept(kept: Path, work: Path, out: Path, localizer: str = COHERENT, re
     if not path.exists():
         job = RecordingJob(profile, device, LEVELS, seed, truth=False, out=path)
         job.claim(force=False)
-        job.run(CALIBRATED + LIKENESS_PAGES + JUDGED)
+        job.run(CALIBRATED + MATCHED_PAGES + JUDGED)
     with Recording.open(path) as recording:
         decoder = _decoder(arm, profile, calibration, recording, localizer, refinements)
         references, mask = recording.references(), pilot_mask(profile)
-        judged = range(CALIBRATED + LIKENESS_PAGES, recording.pages)
+        judged = range(CALIBRATED + MATCHED_PAGES, recording.pages)
         run = Run(
             localizer=localizer,
             profile_toml=profile.to_toml(),
@@ -125,7 +125,7 @@ def _decoder(
     decoder.network.load_state_dict(_weights(arm))
     if refinements:
         extractor = FeatureExtractor(CalibratedDevice.of(profile, calibration, recording.references()), localizer)
-        pages = known_pages(recording, profile, range(CALIBRATED, CALIBRATED + LIKENESS_PAGES))
+        pages = known_pages(recording, profile, range(CALIBRATED, CALIBRATED + MATCHED_PAGES))
         decoder.prediction = fit_prediction(extractor, explained(extractor, pages))
         decoder.refiners[0].load_state_dict(_weights(arm / "refinement-1"))
     return decoder.float().eval()

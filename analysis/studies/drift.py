@@ -109,14 +109,14 @@ def locate(frame: NDArray[np.integer], scale: float) -> Real:
     kernel[arm - line : arm + line + 1] = kernel[:, arm - line : arm + line + 1] = 1
     kernel -= kernel.mean()
     matched = signal.oaconvolve(np.pad(flat, arm, mode="edge"), kernel, mode="valid")
-    likeness = ndimage.gaussian_filter(matched, 1.0) ** 2
-    peaks = np.argwhere((likeness == ndimage.maximum_filter(likeness, 2 * arm + 1)) & (likeness > 0))
-    best = peaks[np.argsort(likeness[tuple(peaks.T)])[::-1][: _CROSSHAIRS**2]]
+    model_match = ndimage.gaussian_filter(matched, 1.0) ** 2
+    peaks = np.argwhere((model_match == ndimage.maximum_filter(model_match, 2 * arm + 1)) & (model_match > 0))
+    best = peaks[np.argsort(model_match[tuple(peaks.T)])[::-1][: _CROSSHAIRS**2]]
     around = round(scale)
     centres = []
     for row, column in best:
         part = (slice(max(row - around, 0), row + around + 1), slice(max(column - around, 0), column + around + 1))
-        inner = ndimage.center_of_mass(likeness[part])
+        inner = ndimage.center_of_mass(model_match[part])
         centres.append((part[1].start + inner[1], part[0].start + inner[0]))
     found = np.array(centres)
     by_row = found[np.argsort(found[:, 1])].reshape(_CROSSHAIRS, _CROSSHAIRS, 2)

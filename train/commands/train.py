@@ -44,7 +44,7 @@ from train.runs import (
     save_weights,
     sole_writer,
 )
-from train.trainers.symbols import LIKENESS_PAGES, SymbolRecipe
+from train.trainers.symbols import MATCHED_PAGES, SymbolRecipe
 
 _FEWEST_PAGES = 6
 _RECORDED = "--recording (SHA-256 of its frames and symbols)"
@@ -230,9 +230,9 @@ def _split(
     test = round(pages * test_share) if test_share == 0 else max(1, round(pages * test_share))
     validation = max(1, round(pages * validation_share))
     first = pages - test - validation
-    if first < LIKENESS_PAGES:
+    if first < MATCHED_PAGES:
         got = f"{validation} validation and {test} test pages of {pages}"
-        raise InvalidInputError("--validation-share and --test-share", got, f"{LIKENESS_PAGES} pages left to train on")
+        raise InvalidInputError("--validation-share and --test-share", got, f"{MATCHED_PAGES} pages left to train on")
     return usable[:first], usable[first : first + validation], usable[first + validation :]
 
 

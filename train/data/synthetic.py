@@ -60,7 +60,7 @@ anything."""
 
 
 @dataclass(frozen=True)
-class Likeness:
+class ModelMatch:
     """What recorded pages show over the fitted geometry.
 
     Attributes:
@@ -74,14 +74,14 @@ class Likeness:
     seen: NDArray[np.bool_]
 
 
-def likeness(known: Sequence[Explained]) -> Likeness:
+def model_match(known: Sequence[Explained]) -> ModelMatch:
     """What known pages show over the fitted wave model, as means over them."""
     left = [
         np.mean(np.abs(light.field - light.expected)[light.seen] ** 2) / np.mean(np.abs(light.field[light.seen]) ** 2)
         for light in known
     ]
     seen = np.all([light.seen for light in known], axis=0)
-    return Likeness(np.mean([light.illumination for light in known], axis=0), float(np.mean(left)), seen)
+    return ModelMatch(np.mean([light.illumination for light in known], axis=0), float(np.mean(left)), seen)
 
 
 class SyntheticPages:
@@ -98,7 +98,7 @@ class SyntheticPages:
     def __init__(
         self,
         device: CalibratedDevice,
-        like: Likeness,
+        like: ModelMatch,
         localizer: CoherentLocalizer | None,
         seed: int,
         grid: FieldGrid | None = None,

@@ -18,7 +18,7 @@ from train.data.feature_store import FeatureStore, fill
 from train.data.known_light import Explained, explained
 from train.data.material import Material, Trained
 from train.data.patches import training_pages
-from train.data.synthetic import MOST_NOISE, SyntheticPages, likeness
+from train.data.synthetic import MOST_NOISE, SyntheticPages, model_match
 from train.fitting.concentration_scale import best_kappa_scale
 from train.fitting.fit import fit_network
 from train.fitting.fitted import Fitted
@@ -32,7 +32,7 @@ _SYNTHETIC_SYMBOLS = 470_000
 """Of all synthetic pages together, unless told otherwise: 96 pages of the bench device."""
 _SYNTHETIC_PAGES = 12, 96
 """Fewest and most: few large ones would show few drifted states, and more small ones teach no more."""
-LIKENESS_PAGES = 2
+MATCHED_PAGES = 2
 """Recorded pages that the wave model is compared with: each has thousands of symbols."""
 
 
@@ -171,7 +171,7 @@ class SymbolRecipe:
         """Recorded pages against the wave model; none where nothing is made of it."""
         if not (self.synthetic_pages or self.choices.refinements):
             return []
-        pages = known_pages(material.recording, material.profile, material.training[:LIKENESS_PAGES])
+        pages = known_pages(material.recording, material.profile, material.training[:MATCHED_PAGES])
         return explained(material.extractor, pages)
 
     def _synthetic(self, material: Material, known: list[Explained]) -> list[Path]:
@@ -179,7 +179,7 @@ class SymbolRecipe:
         if self.synthetic_pages == 0:
             return []
         profile, seed = material.profile, self.choices.seed
-        like = likeness(known)
+        like = model_match(known)
         if like.noise > MOST_NOISE:
             note(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
             return []

@@ -511,7 +511,7 @@ def _centre_of_spot(frame: np.ndarray, reach_px: float = 14) -> np.ndarray:
 def test_against_a_matched_reference_light_that_met_no_wall_is_flat() -> None:
     profile = small_profile()
 
-    def likeness(curvature: float) -> float:
+    def model_match(curvature: float) -> float:
         """Of an even page's light and the reference in the middle of the page."""
         optics = TrueOptics(profile, ideal_device().with_settings([f"reference.curvature_rad={curvature}"]))
         light = optics.camera_field(optics.exit_field(np.zeros((28 * 4, 44 * 4)))) / optics.reference()
@@ -519,5 +519,5 @@ def test_against_a_matched_reference_light_that_met_no_wall_is_flat() -> None:
         middle = light[np.ix_(np.abs(y) < 0.25e-3, np.abs(x) < 0.25e-3)]  # beyond 0.35 mm light meets a wall
         return float(abs(middle.sum()) / np.abs(middle).sum())
 
-    assert likeness(profile.light_curvature_rad) > 0.95
-    assert likeness(0) < 0.2
+    assert model_match(profile.light_curvature_rad) > 0.95
+    assert model_match(0) < 0.2

@@ -18,7 +18,7 @@ from lightpage.simulator.true_optics import perfectly_calibrated
 from tests.lightpage.small import small_profile
 from train.data.features import FeatureExtractor, PageFeatures
 from train.data.known_light import explained
-from train.data.synthetic import MOST_NOISE, PAGES_PER_STATE, Likeness, SyntheticPages, likeness
+from train.data.synthetic import MOST_NOISE, PAGES_PER_STATE, ModelMatch, SyntheticPages, model_match
 from train.models.localizers.coherent import CoherentLocalizer
 
 SEED = 5
@@ -45,8 +45,8 @@ def recorded() -> Recorded:
 
 
 @pytest.fixture(scope="module")
-def like(recorded: Recorded) -> Likeness:
-    return likeness(explained(recorded.extractor, [recorded.page]))
+def like(recorded: Recorded) -> ModelMatch:
+    return model_match(explained(recorded.extractor, [recorded.page]))
 
 
 def agreement(page: PageFeatures) -> float:
@@ -56,7 +56,7 @@ def agreement(page: PageFeatures) -> float:
     return float(abs(z.mean()) / np.sqrt(np.mean(np.abs(z) ** 2)))
 
 
-def test_the_fitted_waves_explain_the_recorded_light_and_its_fall_off(like: Likeness) -> None:
+def test_the_fitted_waves_explain_the_recorded_light_and_its_fall_off(like: ModelMatch) -> None:
     assert like.noise < 0.05
     constant, _, _, x2, _, y2 = like.illumination
     assert constant == pytest.approx(1)
@@ -64,17 +64,17 @@ def test_the_fitted_waves_explain_the_recorded_light_and_its_fall_off(like: Like
     assert -(x2 + y2).real == pytest.approx(FALLOFF, abs=0.03)
 
 
-def test_other_symbols_explain_nothing_and_another_angle_less(like: Likeness, recorded: Recorded) -> None:
+def test_other_symbols_explain_nothing_and_another_angle_less(like: ModelMatch, recorded: Recorded) -> None:
     others = replace(recorded.page, symbols=recorded.page.symbols[::-1])
-    assert likeness(explained(recorded.extractor, [others])).noise > MOST_NOISE
+    assert model_match(explained(recorded.extractor, [others])).noise > MOST_NOISE
     device = recorded.extractor.device
     other = device.parameters.copy()
     other[NAMES.index("pipe_angle_rad")] += np.deg2rad(0.5)
     turned = FeatureExtractor(replace(device, parameters=other))
-    assert likeness(explained(turned, [recorded.page])).noise > 3 * like.noise
+    assert model_match(explained(turned, [recorded.page])).noise > 3 * like.noise
 
 
-def test_synthetic_light_shows_its_symbols_as_the_recorded_light_does(like: Likeness, recorded: Recorded) -> None:
+def test_synthetic_light_shows_its_symbols_as_the_recorded_light_does(like: ModelMatch, recorded: Recorded) -> None:
     pages = list(islice(SyntheticPages(recorded.extractor.device, like, CoherentLocalizer(PROFILE), SEED).pages(), 4))
     found = np.array([agreement(page) for page in pages])
     # pages of this size differ by their symbols' chance neighbours
@@ -82,7 +82,7 @@ def test_synthetic_light_shows_its_symbols_as_the_recorded_light_does(like: Like
     assert pages[0].light.shape == recorded.features.light.shape
 
 
-def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: Likeness, recorded: Recorded) -> None:
+def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: ModelMatch, recorded: Recorded) -> None:
     made = SyntheticPages(recorded.extractor.device, like, CoherentLocalizer(PROFILE), SEED)
     count = PAGES_PER_STATE + 2
     all_pages = list(islice(made.pages(), count))
@@ -93,6 +93,6 @@ def test_pages_are_the_same_from_wherever_one_starts_and_states_differ(like: Lik
     assert np.abs(all_pages[0].positions - all_pages[-1].positions).max() > 1e-5
 
 
-def test_the_wave_localizer_has_synthetic_pages_too(like: Likeness, recorded: Recorded) -> None:
+def test_the_wave_localizer_has_synthetic_pages_too(like: ModelMatch, recorded: Recorded) -> None:
     page = next(SyntheticPages(recorded.extractor.device, like, None, SEED).pages())
     assert agreement(page) > 0.85
