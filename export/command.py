@@ -35,7 +35,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
 from runtime.execution.session import open_session
 from train.models.twin import RayTwin, TorchTwin
-from train.published.recipe import published_decoder
+from train.published.trainer import published_decoder
 from train.published.training import PublishedChoices
 from train.runs import GOLDEN as RUN_GOLDEN
 from train.runs import REFERENCES, Run, load_arrays, load_decoder, load_run, load_weights

@@ -43,8 +43,8 @@ from train.models.decoder import LOCALIZERS
 from train.models.hyperparameters import FAST, PRESETS, Hyperparameters
 from train.models.prediction import Prediction
 from train.published.localizers import NAMES as PUBLISHED
-from train.published.recipe import train_published
 from train.published.states import page_states
+from train.published.trainer import train_published
 from train.published.training import FramePages, PublishedChoices
 from train.runs import begin
 from train.trainers.refinement import RefinementPages, fit_prediction, fit_refinements, refined_pages

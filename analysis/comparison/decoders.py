@@ -39,7 +39,7 @@ from lightpage.files import write_json
 from train.fitting.memory import keep_freed_memory
 from train.models.hyperparameters import FAST, Hyperparameters
 from train.published.localizers import NAMES as PUBLISHED
-from train.published.recipe import published_choices
+from train.published.trainer import published_choices
 from train.runs import sole_writer
 
 

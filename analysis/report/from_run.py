@@ -30,7 +30,7 @@ from train.fitting.modules import DecoderTraining, SymbolTraining
 from train.fitting.validation import without_piston
 from train.models.network import Refiner, SymbolUNet
 from train.published.localizers import RayLocalizer
-from train.published.recipe import published_decoder
+from train.published.trainer import published_decoder
 from train.published.training import FramePages, PublishedChoices, PublishedTraining
 from train.runs import GOLDEN, REFERENCES, Run, load_arrays, load_decoder, load_run, load_weights
 

@@ -40,7 +40,7 @@ from runtime.execution.session import Session, open_session
 from train.models.decoder import SymbolDecoder
 from train.models.hyperparameters import FAST, PRESETS, Hyperparameters
 from train.models.twin import RayTwin, TorchTwin
-from train.published.recipe import published_decoder
+from train.published.trainer import published_decoder
 from train.published.training import PublishedChoices
 
 Tensors = dict[str, np.ndarray]

@@ -32,7 +32,7 @@ from train.fitting.concentration_scale import decode_pages, honest_factor, most_
 from train.fitting.curves import curves_of
 from train.fitting.validation import without_piston
 from train.models.parts import turned
-from train.published.recipe import published_choices, train_published
+from train.published.trainer import published_choices, train_published
 from train.published.training import (
     FramePages,
     PublishedChoices,

@@ -20,7 +20,7 @@ from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.recalibration import recalibrate
 from runtime.recalibration.refit import refit
 from train.commands.train import train
-from train.published.recipe import published_decoder
+from train.published.trainer import published_decoder
 from train.published.training import PublishedChoices
 from train.runs import load_run, load_weights
 

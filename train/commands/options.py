@@ -19,9 +19,9 @@ from train.models.hyperparameters import ACCURATE, FAST, PRESETS, Hyperparameter
 from train.models.localizers.coherent import BICUBIC, BILINEAR
 from train.published.decoder import LENS_CHOICES
 from train.published.localizers import NAMES as PUBLISHED
-from train.published.recipe import PublishedRecipe, published_choices
+from train.published.trainer import PublishedTrainer, published_choices
 from train.published.training import PublishedChoices
-from train.trainers.symbols import SymbolRecipe, default_synthetic_pages
+from train.trainers.symbols import SymbolTrainer, default_synthetic_pages
 
 _ALL = (*PUBLISHED, *LOCALIZERS)
 _COHERENT = tuple(name for name in LOCALIZERS if name != WAVE)
@@ -214,9 +214,9 @@ def given_choices(localizer: str, options: Mapping[str, Any]) -> dict[str, Any]:
     return given
 
 
-def chosen_recipe(
+def chosen_trainer(
     localizer: str, profile: Profile, pages: int, given: dict[str, Any]
-) -> SymbolRecipe | PublishedRecipe:
+) -> SymbolTrainer | PublishedTrainer:
     """The way of training that was chosen; what was not stays as it is by default, or as its authors had it.
 
     Args:
@@ -239,14 +239,14 @@ def chosen_recipe(
         raise InvalidInputError(f"--preset {FAST}", f"--localizer {localizer}", f"--localizer {' or '.join(_COHERENT)}")
     choices = replace(PRESETS[preset], **given)
     choices.grid(profile)
-    recipe = SymbolRecipe(localizer, choices, synthetic, start)
-    recipe.check_start(profile)
-    return recipe
+    trainer = SymbolTrainer(localizer, choices, synthetic, start)
+    trainer.check_start(profile)
+    return trainer
 
 
-def _published(localizer: str, defaults: PublishedChoices, given: dict[str, Any]) -> PublishedRecipe:
+def _published(localizer: str, defaults: PublishedChoices, given: dict[str, Any]) -> PublishedTrainer:
     if "channels" in given:
         given["channels"] = (given["channels"], 2 * given["channels"])
     if "learning_rate" in given:
         given["decoder_rate"] = given.pop("learning_rate")
-    return PublishedRecipe(localizer, replace(defaults, **given))
+    return PublishedTrainer(localizer, replace(defaults, **given))

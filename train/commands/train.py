@@ -23,7 +23,7 @@ from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording, hash_frames
 from train.commands.calibrate import DEFAULT_PAGES, calibrate_recording
-from train.commands.options import chosen_recipe, given_choices, with_choices
+from train.commands.options import chosen_trainer, given_choices, with_choices
 from train.data.features import FeatureExtractor
 from train.data.material import Material
 from train.fitting.memory import keep_freed_memory
@@ -44,7 +44,7 @@ from train.runs import (
     save_weights,
     sole_writer,
 )
-from train.trainers.symbols import MATCHED_PAGES, SymbolRecipe
+from train.trainers.symbols import MATCHED_PAGES, SymbolTrainer
 
 _FEWEST_PAGES = 6
 _RECORDED = "--recording (SHA-256 of its frames and symbols)"
@@ -102,21 +102,21 @@ def train(
         context.with_resource(sole_writer(out))
         hashes = _usable(recording)
         groups = _split(recording, list(hashes), validation_share, test_share)
-        recipe = chosen_recipe(localizer, profile, len(groups[0]), given)
+        trainer = chosen_trainer(localizer, profile, len(groups[0]), given)
         references = recording.references()
         options = {
             "--profile": profile.to_toml(),
             _RECORDED: _digest([*hashes.values(), hash_frames(references), _symbols_digest(recording, list(hashes))]),
             "--validation-share": validation_share,
             "--test-share": test_share,
-            **recipe.options(),
+            **trainer.options(),
         }
         check_begun(out, options)
         calibration = _calibration(recording, profile, list(hashes)[:DEFAULT_PAGES], calibration_path, out)
         calibration.check_profile(profile)
         options["calibration"] = calibration.to_toml()
         features = localizer if localizer in LOCALIZERS else LOCALIZERS[0]
-        choices = recipe.choices if isinstance(recipe, SymbolRecipe) else Hyperparameters()
+        choices = trainer.choices if isinstance(trainer, SymbolTrainer) else Hyperparameters()
         extractor = FeatureExtractor(CalibratedDevice.of(profile, calibration, references), features, choices)
         extractor.check(known_pages(recording, profile, groups[0][:1])[0], calibration.coherence_after)
         begin(out, options)
@@ -125,7 +125,7 @@ def train(
             return
         mask = recording.pilots()
         mask = pilot_mask(profile) if mask is None else mask
-        trained = recipe.train(
+        trained = trainer.train(
             Material(
                 out=out,
                 recording=recording,
@@ -152,7 +152,7 @@ def train(
             localizer=localizer,
             profile_toml=profile.to_toml(),
             calibration_toml=calibration.to_toml(),
-            hyperparameters=recipe.choices,
+            hyperparameters=trainer.choices,
             camera_bit_depth=recording.bit_depth,
             trained_pages=tuple(hashes[page] for page in known),
             validation_air=trained.validation_air,
@@ -160,7 +160,7 @@ def train(
             seconds=trained.seconds,
             pages=(len(groups[0]), len(groups[1]), len(groups[2])),
             synthetic_pages=trained.synthetic_pages,
-            provenance=provenance() | {"seed": recipe.choices.seed},
+            provenance=provenance() | {"seed": trainer.choices.seed},
         )
         run.save(out)
     _tell(run, out, json_path)

@@ -42,7 +42,7 @@ def default_synthetic_pages(profile: Profile) -> int:
 
 
 @dataclass(frozen=True)
-class SymbolRecipe:
+class SymbolTrainer:
     """Trains the network at symbol pitch.
 
     Attributes:

@@ -44,7 +44,7 @@ from lightpage.simulator.true_optics import TrueOptics
 from tests.lightpage.small import small_profile
 from train.data.features import PageState
 from train.published.decoder import PARAXIAL
-from train.published.recipe import published_choices
+from train.published.trainer import published_choices
 from train.published.training import PublishedChoices
 
 SMALL = small_profile()

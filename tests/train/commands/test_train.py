@@ -30,7 +30,7 @@ from tests.conftest import SMALL_PAGES
 from tests.lightpage.small import small_profile
 from tests.told import Told
 from train.commands import train as cli_train
-from train.commands.options import chosen_recipe
+from train.commands.options import chosen_trainer
 from train.commands.train import _own_pilots, train
 from train.data.feature_store import FeatureStore
 from train.fitting import provenance as origin
@@ -38,7 +38,7 @@ from train.fitting.curves import curves_of
 from train.fitting.provenance import provenance, provenance_of
 from train.models.hyperparameters import PRESETS, Hyperparameters
 from train.runs import FORMAT, begin, sole_writer
-from train.trainers.symbols import SymbolRecipe
+from train.trainers.symbols import SymbolTrainer
 
 SECONDS = 120
 
@@ -388,12 +388,12 @@ def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
     profile = small_profile()
 
     def chosen(**given: Any) -> Hyperparameters:
-        recipe = chosen_recipe("coherent", profile, 6, given)
-        assert isinstance(recipe, SymbolRecipe)
-        return recipe.choices
+        trainer = chosen_trainer("coherent", profile, 6, given)
+        assert isinstance(trainer, SymbolTrainer)
+        return trainer.choices
 
     assert chosen() == PRESETS["accurate"] == Hyperparameters(refinements=1)
     assert chosen(preset="standard") == Hyperparameters()
     assert chosen(preset="fast", channels=8) == replace(PRESETS["fast"], channels=8)
     with pytest.raises(InvalidInputError, match="--preset fast: got --localizer wave, wanted --localizer coherent"):
-        chosen_recipe("wave", profile, 6, {"preset": "fast"})
+        chosen_trainer("wave", profile, 6, {"preset": "fast"})

@@ -19,7 +19,7 @@ from tests.lightpage.small import THICK, small_profile
 from train.commands.train import train
 from train.data.features import PageState
 from train.data.pages import Page
-from train.published.recipe import published_choices, published_decoder, train_published
+from train.published.trainer import published_choices, published_decoder, train_published
 from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
 from train.runs import load_run
 
@@ -120,7 +120,7 @@ def test_pilots_are_not_learnt_from(classes: int) -> None:
 
 def test_training_hides_the_pilots(small_device: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
-    monkeypatch.setattr("train.published.recipe.fit", lambda *given, **_: seen.append(given[2]))
+    monkeypatch.setattr("train.published.trainer.fit", lambda *given, **_: seen.append(given[2]))
     profile = small_profile()
     with Recording.open(small_device[3]) as recording:
         pages = FramePages(recording, [2], [PageState((0.0, 0.0), 0.0)])

@@ -45,7 +45,7 @@ def published_choices(localizer: str, profile: Profile, pages: int, batch: int |
 
 
 @dataclass(frozen=True)
-class PublishedRecipe:
+class PublishedTrainer:
     """Trains a published decoder.
 
     Attributes:
