@@ -167,9 +167,9 @@ class Bench:
         pages = known_pages(self.recording, self.profile, self.training[:MATCHED_PAGES])
         prediction = fit_prediction(extractor, explained(extractor, pages))
         counts = len(self.training), len(self.validation)
-        material = RefinementPages(self.recording, self.pages, *counts, features)
+        inputs = RefinementPages(self.recording, self.pages, *counts, features)
         key = self.key(look)
-        refined = fit_refinements(folder, choices, material, extractor, prediction, first, key, devices=1)
+        refined = fit_refinements(folder, choices, inputs, extractor, prediction, first, key, devices=1)
         self.kept.keep(folder)
         at = folder / f"refinement-{choices.refinements}"
         held_out = self.held_out(at / "features")
@@ -203,12 +203,12 @@ class Bench:
                 for number in range(1, len(looks)):
                     assert prediction is not None
                     earlier = at / f"look-{number - 1}"
-                    material = RefinementPages(pages, numbers, len(numbers), 0, earlier)
+                    inputs = RefinementPages(pages, numbers, len(numbers), 0, earlier)
                     make = partial(
                         refined_pages,
                         self.extractor(name),
                         prediction,
-                        material,
+                        inputs,
                         FeatureStore(earlier),
                         looks[number - 1].module,
                     )

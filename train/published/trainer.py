@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from lightpage.device.lenses import lens_of
 from lightpage.device.profile import Profile
 from lightpage.recording.reader import FramePair
-from train.data.material import Material, Trained
+from train.data.inputs import Trained, TrainingInputs
 from train.fitting.concentration_scale import best_kappa_scale
 from train.fitting.fit import fit, seed_stretch
 from train.fitting.fitted import Fitted
@@ -61,29 +61,29 @@ class PublishedTrainer:
         chosen = {_OPTIONS.get(name, name): value for name, value in asdict(self.choices).items()}
         return {"--localizer": self.localizer, **chosen, "--channels": self.choices.channels[0]}
 
-    def train(self, material: Material) -> Trained:
+    def train(self, inputs: TrainingInputs) -> Trained:
         """Train, or go on with, the run; raises KeyboardInterrupt after Ctrl-C, with nothing lost."""
-        known = [*material.training, *material.validation]
-        path = material.out / "states.json"
-        states, preparing = page_states(path, material.key, material.recording, material.extractor, known)
-        count = len(material.training)
-        training = FramePages(material.recording, known[:count], states[:count])
-        validation = FramePages(material.recording, known[count:], states[count:])
+        known = [*inputs.training, *inputs.validation]
+        path = inputs.out / "states.json"
+        states, preparing = page_states(path, inputs.key, inputs.recording, inputs.extractor, known)
+        count = len(inputs.training)
+        training = FramePages(inputs.recording, known[:count], states[:count])
+        validation = FramePages(inputs.recording, known[count:], states[count:])
         fitted = train_published(
-            material.out,
+            inputs.out,
             self.localizer,
             self.choices,
-            material.profile,
-            material.calibration.turn_rad,
-            material.pilot_mask,
+            inputs.profile,
+            inputs.calibration.turn_rad,
+            inputs.pilot_mask,
             training,
             validation,
-            devices=material.devices,
+            devices=inputs.devices,
         )
         return Trained(
             weights=fitted.module.network.state_dict(),
             validation_air=fitted.validation_air,
-            kappa_scale=best_kappa_scale(fitted.module, validation, material.pilot_mask),
+            kappa_scale=best_kappa_scale(fitted.module, validation, inputs.pilot_mask),
             seconds=preparing + fitted.seconds,
         )
 

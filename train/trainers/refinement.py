@@ -98,7 +98,7 @@ class RefinementPages:
 def fit_refinements(
     folder: Path,
     choices: Hyperparameters,
-    material: RefinementPages,
+    inputs: RefinementPages,
     extractor: FeatureExtractor,
     prediction: Prediction,
     first: Fitted[SymbolTraining],
@@ -111,25 +111,25 @@ def fit_refinements(
     Args:
         folder: of the run.
         choices: the run's; `choices.refinements` of them, at least one.
-        material: pages.
+        inputs: pages.
         extractor, prediction: of the device.
         first: the first look's training.
         key: everything that the first look's features depend on.
         starts: networks whose weights the first of them begin with.
         devices: see `fit_network`.
     """
-    looks, features, seconds = [first], material.features, 0.0
-    count, seen = len(material.pages), material.training + material.validation
+    looks, features, seconds = [first], inputs.features, 0.0
+    count, seen = len(inputs.pages), inputs.training + inputs.validation
     chosen = choices.of_refinement()
     for number, start in zip(range(1, choices.refinements + 1), chain(starts, repeat(None)), strict=False):
-        make = partial(refined_pages, extractor, prediction, material, FeatureStore(features), looks[-1].module)
+        make = partial(refined_pages, extractor, prediction, inputs, FeatureStore(features), looks[-1].module)
         at = folder / f"refinement-{number}"
         features = at / "features"
         key = f"{key} {number} {looks[-1].validation_air}"
 
         seconds += fill(features, key, count, make, f"pages of refinement {number}")
         training, validation = (
-            FeatureStore(features, part) for part in (range(material.training), range(material.training, seen))
+            FeatureStore(features, part) for part in (range(inputs.training), range(inputs.training, seen))
         )
         mask, levels = first.module.pilot_mask, first.module.levels
         patches = training_pages([training], mask, chosen)
@@ -143,7 +143,7 @@ def fit_refinements(
 def refined_pages(
     extractor: FeatureExtractor,
     prediction: Prediction,
-    material: RefinementPages,
+    inputs: RefinementPages,
     earlier: FeatureStore,
     module: SymbolTraining,
     start: int,
@@ -153,16 +153,16 @@ def refined_pages(
 
     Args:
         extractor, prediction: of the device.
-        material: pages.
+        inputs: pages.
         earlier: their features for the look before.
         module: which was trained on such features.
         start: first page.
         shift_px: not asked for: the look before has found each page's.
     """
-    for number in range(start, len(material.pages)):
+    for number in range(start, len(inputs.pages)):
         *shown, phases = earlier[number]
         state = earlier.state(number)
-        measured, field = extractor.look(material.recording.frames(material.pages[number]), state.shift_px)
+        measured, field = extractor.look(inputs.recording.frames(inputs.pages[number]), state.shift_px)
         belief = module(*(part[None] for part in shown))[0]
         light = prediction(extractor.recovery, measured, field, turned(belief, state.piston_rad))
         yield PageFeatures(

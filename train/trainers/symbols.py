@@ -15,8 +15,8 @@ from lightpage.errors import InvalidInputError
 from lightpage.progress import note
 from lightpage.waves.grid import symbol_samples
 from train.data.feature_store import FeatureStore, fill
+from train.data.inputs import Trained, TrainingInputs
 from train.data.known_light import Explained, explained
-from train.data.material import Material, Trained
 from train.data.patches import training_pages
 from train.data.synthetic import MOST_NOISE, SyntheticPages, model_match
 from train.fitting.concentration_scale import best_kappa_scale
@@ -66,43 +66,43 @@ class SymbolTrainer:
             **{f"--{name.replace('_', '-')}": value for name, value in asdict(self.choices).items()},
         }
 
-    def train(self, material: Material) -> Trained:
+    def train(self, inputs: TrainingInputs) -> Trained:
         """Train, or go on with, the run; raises KeyboardInterrupt after Ctrl-C, with nothing lost.
 
         Raises:
             InvalidInputError: a start that is no finished run, or of another size.
         """
-        before = None if self.start is None else self._before(material.profile)
-        known = [*material.training, *material.validation]
-        features = material.out / "features"
+        before = None if self.start is None else self._before(inputs.profile)
+        known = [*inputs.training, *inputs.validation]
+        features = inputs.out / "features"
         preparing = fill(
             features,
-            f"{material.key} {self.localizer} {self.choices.first_look}",
+            f"{inputs.key} {self.localizer} {self.choices.first_look}",
             len(known),
-            lambda first, shift: material.extractor.pages(material.recording, known[first:], shift),
+            lambda first, shift: inputs.extractor.pages(inputs.recording, known[first:], shift),
             "recorded pages",
         )
-        count = len(material.training)
-        known_light = self._explained(material)
-        stores = [FeatureStore(features, range(count)), *map(FeatureStore, self._synthetic(material, known_light))]
-        training = training_pages(stores, material.pilot_mask, self.choices)
+        count = len(inputs.training)
+        known_light = self._explained(inputs)
+        stores = [FeatureStore(features, range(count)), *map(FeatureStore, self._synthetic(inputs, known_light))]
+        training = training_pages(stores, inputs.pilot_mask, self.choices)
         validation = FeatureStore(features, range(count, len(known)))
         fitted = fit_network(
-            material.out,
+            inputs.out,
             self.choices,
-            material.pilot_mask,
-            material.recording.levels,
+            inputs.pilot_mask,
+            inputs.recording.levels,
             training,
             validation,
             start=None if before is None else before.network,
-            devices=material.devices,
+            devices=inputs.devices,
         )
         weights = {f"network.{name}": value for name, value in fitted.module.network.state_dict().items()}
         seconds, last = preparing + fitted.seconds, fitted
         if self.choices.refinements:
             refined = self._refined(
-                material,
-                RefinementPages(material.recording, known, count, len(material.validation), features),
+                inputs,
+                RefinementPages(inputs.recording, known, count, len(inputs.validation), features),
                 fitted,
                 known_light,
                 () if before is None else before.refiners,
@@ -112,14 +112,14 @@ class SymbolTrainer:
         return Trained(
             weights=weights,
             validation_air=last.validation_air,
-            kappa_scale=best_kappa_scale(last.module, validation, material.pilot_mask),
+            kappa_scale=best_kappa_scale(last.module, validation, inputs.pilot_mask),
             seconds=seconds,
             synthetic_pages=sum(map(len, stores)) - count,
         )
 
     def _refined(
         self,
-        material: Material,
+        inputs: TrainingInputs,
         pages: RefinementPages,
         first: Fitted[SymbolTraining],
         known_light: list[Explained],
@@ -127,17 +127,17 @@ class SymbolTrainer:
         weights: dict[str, Tensor],
     ) -> Refined:
         """Trained refinements, which add what they have learnt to the weights."""
-        prediction = fit_prediction(material.extractor, known_light)
+        prediction = fit_prediction(inputs.extractor, known_light)
         refined = fit_refinements(
-            material.out,
+            inputs.out,
             self.choices,
             pages,
-            material.extractor,
+            inputs.extractor,
             prediction,
             first,
-            f"{material.key} {self.localizer} {self.choices.first_look}",
+            f"{inputs.key} {self.localizer} {self.choices.first_look}",
             starts,
-            material.devices,
+            inputs.devices,
         )
         for name, module in {
             "prediction": prediction,
@@ -167,28 +167,28 @@ class SymbolTrainer:
             )
         return load_decoder(self.start, run)
 
-    def _explained(self, material: Material) -> list[Explained]:
+    def _explained(self, inputs: TrainingInputs) -> list[Explained]:
         """Recorded pages against the wave model; none where nothing is made of it."""
         if not (self.synthetic_pages or self.choices.refinements):
             return []
-        pages = known_pages(material.recording, material.profile, material.training[:MATCHED_PAGES])
-        return explained(material.extractor, pages)
+        pages = known_pages(inputs.recording, inputs.profile, inputs.training[:MATCHED_PAGES])
+        return explained(inputs.extractor, pages)
 
-    def _synthetic(self, material: Material, known: list[Explained]) -> list[Path]:
+    def _synthetic(self, inputs: TrainingInputs, known: list[Explained]) -> list[Path]:
         """Folder with the features of synthetic pages; none where the wave model is not like the device."""
         if self.synthetic_pages == 0:
             return []
-        profile, seed = material.profile, self.choices.seed
+        profile, seed = inputs.profile, self.choices.seed
         like = model_match(known)
         if like.noise > MOST_NOISE:
             note(f"no synthetic pages: the wave model leaves {like.noise:.0%} of the light unexplained")
             return []
         note(f"the wave model leaves {like.noise:.1%} of the recorded light unexplained")
-        folder = material.out / "synthetic"
+        folder = inputs.out / "synthetic"
         reader = None if self.localizer == WAVE else self.choices.coherent_localizer(profile)
-        pages = SyntheticPages(material.extractor.device, like, reader, seed, material.extractor.grid)
+        pages = SyntheticPages(inputs.extractor.device, like, reader, seed, inputs.extractor.grid)
         key = f"{self.localizer} {self.choices.first_look} {seed} "
-        key += f"{profile.to_toml()} {material.calibration.to_toml()} {like.noise:.6f} "
+        key += f"{profile.to_toml()} {inputs.calibration.to_toml()} {like.noise:.6f} "
         key += f"{np.round(like.illumination, 6).tolist()}"
         fill(folder, key, self.synthetic_pages, lambda first, shift: pages.pages(first), "synthetic pages")
         return [folder]

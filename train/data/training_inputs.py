@@ -16,7 +16,7 @@ from train.data.features import FeatureExtractor
 
 
 @dataclass(frozen=True)
-class Material:
+class TrainingInputs:
     """A recording of a calibrated device, split.
 
     Attributes:
