@@ -17,9 +17,9 @@ import click
 from torch import nn
 
 from analysis.comparison.bench import Bench
-from analysis.comparison.kept import TRAINED, Kept
 from analysis.comparison.light import LEVELS, light_name, recorded
 from analysis.comparison.outcome import HEADER, Outcome
+from analysis.comparison.weight_store import TRAINED, WeightStore
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
@@ -122,7 +122,7 @@ def main(
     name = light_name(device, profile.page.symbol_size_px)
     choices = Hyperparameters(steps=steps, seed=seed)
     with recorded(profile, device, pages, seed, out / name) as recording:
-        kept = Kept(out / name, TRAINED / Path(profile_name).stem / name)
+        kept = WeightStore(out / name, TRAINED / Path(profile_name).stem / name)
         bench = Bench.of(recording, profile, device, (), seed, kept)
         outcomes: list[Outcome] = []
         for part in parts:

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from analysis.comparison.decoders_figure import MAP
-from analysis.comparison.kept import CALIBRATION, Kept
 from analysis.comparison.levels import LevelFigures, level_figures
 from analysis.comparison.light import CALIBRATED, LEVELS, calibrated, recorded
 from analysis.comparison.oracle import Oracle
 from analysis.comparison.outcome import Outcome, gained_at_the_end, symbols_by_walls
+from analysis.comparison.weight_store import CALIBRATION, WeightStore
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.known_pages import known_pages
@@ -96,7 +96,7 @@ class Bench:
     unseen: range
     levels: tuple[int, ...]
     seed: int
-    kept: Kept
+    kept: WeightStore
 
     @classmethod
     def of(
@@ -106,7 +106,7 @@ class Bench:
         device: Device,
         levels: tuple[int, ...],
         seed: int,
-        kept: Kept,
+        kept: WeightStore,
     ) -> Bench:
         """Calibrated, and split into pages for training, for validation and for the figures."""
         kept.bring_calibration()

@@ -27,10 +27,10 @@ import click
 
 from analysis.comparison.bench import ARMS, ORACLE, Bench
 from analysis.comparison.decoders_figure import draw, title
-from analysis.comparison.kept import TRAINED, Kept
 from analysis.comparison.levels import LEVEL_HEADER
 from analysis.comparison.light import light_name, recorded
 from analysis.comparison.outcome import FOOTNOTE, HEADER, Outcome
+from analysis.comparison.weight_store import TRAINED, WeightStore
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
@@ -157,7 +157,7 @@ def main(
         folder = out / light_name(device, size_px, "-ideal" if ideal else "")
         kept = trained / Path(profile_name).stem / folder.name
         with recorded(profile, device, pages, seed, folder) as recording:
-            bench = Bench.of(recording, profile, device, levels, seed, Kept(folder, kept, keeps))
+            bench = Bench.of(recording, profile, device, levels, seed, WeightStore(folder, kept, keeps))
             runs: list[Callable[[], Outcome]] = []
             for name in names:
                 if name in PUBLISHED:

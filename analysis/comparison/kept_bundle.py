@@ -15,8 +15,8 @@ import click
 import numpy as np
 import torch
 
-from analysis.comparison.kept import CALIBRATION
 from analysis.comparison.light import CALIBRATED
+from analysis.comparison.weight_store import CALIBRATION
 from export.command import export_run
 from export.graph import DecoderGraph, table_tensors
 from export.parity import torch_answer

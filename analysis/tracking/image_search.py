@@ -26,8 +26,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from analysis.comparison.kept import TRAINED
 from analysis.comparison.kept_bundle import export_kept, light_of
+from analysis.comparison.weight_store import TRAINED
 from analysis.tracking.figure import POINTS, draw
 from analysis.tracking.tables import (
     tell_apart,
@@ -361,7 +361,7 @@ def gaps(bundle: Path, recording: Path) -> Figures:
     return {"in_order": list(in_order), "after_a_gap": rows}
 
 
-class Kept:
+class WeightStore:
     """Figures that are kept as soon as they are measured."""
 
     def __init__(self, out: Path, options: Figures) -> None:
@@ -406,7 +406,7 @@ def main(
 ) -> None:
     """Measure how the image is found, followed and believed."""
     out.mkdir(parents=True, exist_ok=True)
-    kept = Kept(out, {"seeds": seeds, "pages": pages, "wrong": wrong})
+    kept = WeightStore(out, {"seeds": seeds, "pages": pages, "wrong": wrong})
     for point in points(out, names):
         name = point.name
         rows = kept.get(f"{name}: offsets", partial(offsets, point, seeds))["rows"]

@@ -25,7 +25,7 @@ from lightpage.recording.reader import Recording, hash_frames
 from train.commands.calibrate import DEFAULT_PAGES, calibrate_recording
 from train.commands.options import chosen_trainer, given_choices, with_choices
 from train.data.features import FeatureExtractor
-from train.data.inputs import TrainingInputs
+from train.data.training_inputs import TrainingInputs
 from train.fitting.memory import keep_freed_memory
 from train.fitting.provenance import provenance
 from train.models.decoder import LOCALIZERS

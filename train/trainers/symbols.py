@@ -15,10 +15,10 @@ from lightpage.errors import InvalidInputError
 from lightpage.progress import note
 from lightpage.waves.grid import symbol_samples
 from train.data.feature_store import FeatureStore, fill
-from train.data.inputs import Trained, TrainingInputs
 from train.data.known_light import Explained, explained
 from train.data.patches import training_pages
 from train.data.synthetic import MOST_NOISE, SyntheticPages, model_match
+from train.data.training_inputs import Trained, TrainingInputs
 from train.fitting.concentration_scale import best_kappa_scale
 from train.fitting.fit import fit_network
 from train.fitting.fitted import Fitted

@@ -21,8 +21,8 @@ from analysis.comparison.ablation import (
     main,
 )
 from analysis.comparison.bench import Bench
-from analysis.comparison.kept import Kept
 from analysis.comparison.light import light_name, recorded
+from analysis.comparison.weight_store import WeightStore
 from lightpage.device.state import Device, Sensor
 from lightpage.progress import reporting
 from tests.analysis.comparison.test_decoders import PROFILE, calibration_of
@@ -45,7 +45,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def bench(out: Path) -> Iterator[Bench]:
     folder = out / light_name(DEVICE, PROFILE.page.symbol_size_px)
     with recorded(PROFILE, DEVICE, 12, 5000, folder) as recording:
-        yield Bench.of(recording, PROFILE, DEVICE, (), 5000, Kept(folder, folder / "kept"))
+        yield Bench.of(recording, PROFILE, DEVICE, (), 5000, WeightStore(folder, folder / "kept"))
 
 
 def test_lights_are_told_apart_by_name() -> None:

@@ -17,9 +17,9 @@ from click.testing import CliRunner
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from analysis.comparison.decoders import main
-from analysis.comparison.kept import Kept
 from analysis.comparison.oracle import Oracle
 from analysis.comparison.outcome import HEADER, WALLS, Outcome, gained_at_the_end, symbols_by_walls
+from analysis.comparison.weight_store import WeightStore
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES
@@ -191,7 +191,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     for one, other in zip(outcomes, figures["outcomes"], strict=True):
         assert one["air"] == pytest.approx(other["air"], abs=0.01)  # large tensors are kept in half precision
         assert one["validation_curve"] == other["validation_curve"]
-    kept = Kept(light, tmp_path / "kept" / "small" / light.name, adds=True)
+    kept = WeightStore(light, tmp_path / "kept" / "small" / light.name, adds=True)
     assert "commit" in json.loads((kept.folder / "oracle" / "8x1x0-20" / FITTED).read_text())["made_by"]
     assert kept.is_of_this_light
     # only arms of this light, this calibration and these options are taken up

@@ -26,7 +26,7 @@ _LARGE = 1000
 
 
 @dataclass(frozen=True)
-class Kept:
+class WeightStore:
     """What is kept of a light.
 
     Attributes:
