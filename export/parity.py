@@ -27,7 +27,7 @@ def torch_answer(
     return {name: answer.numpy() for name, answer in zip(graph.outputs, answers, strict=True)}
 
 
-def check_parity(expected: NDArray[np.float32], got: NDArray[np.float32], thing: str) -> float:
+def check_parity(expected: NDArray[np.float32], got: NDArray[np.float32], subject: str) -> float:
     """Relative error of p.
 
     Raises:
@@ -35,5 +35,5 @@ def check_parity(expected: NDArray[np.float32], got: NDArray[np.float32], thing:
     """
     error = float(np.linalg.norm(got - expected) / max(float(np.linalg.norm(expected)), 1e-30))
     if not error <= TOLERANCE:
-        raise BundleError(f"parity of {thing} with torch", f"p off by {error:.3g} of its norm", f"<= {TOLERANCE:g}")
+        raise BundleError(f"parity of {subject} with torch", f"p off by {error:.3g} of its norm", f"<= {TOLERANCE:g}")
     return error

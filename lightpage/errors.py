@@ -1,4 +1,4 @@
-"""The one error hierarchy: every error names the thing, what came and what was wanted."""
+"""The one error hierarchy: every error names its subject, what came and what was wanted."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ class LightpageError(Exception):
     """Base of every error that Lightpage raises on purpose.
 
     Args:
-        thing: what the error is about, e.g. ``"recording R.h5: dataset 'in_phase'"``.
+        subject: what the error is about, e.g. ``"recording R.h5: dataset 'in_phase'"``.
         got: what came; of an error of the operating system, what it says without number and path.
-        wanted: what would have been right.
+        expected: what would have been right.
     """
 
-    def __init__(self, thing: str, got: object, wanted: object) -> None:
-        self.thing = thing
+    def __init__(self, subject: str, got: object, expected: object) -> None:
+        self.subject = subject
         self.got = (isinstance(got, OSError) and got.strerror) or str(got)
-        self.wanted = str(wanted)
-        super().__init__(f"{thing}: got {self.got}, wanted {self.wanted}")
+        self.expected = str(expected)
+        super().__init__(f"{subject}: got {self.got}, wanted {self.expected}")
 
 
 class InvalidInputError(LightpageError):

@@ -14,7 +14,7 @@ from typing import IO, Any
 from lightpage.errors import InvalidInputError
 
 
-def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], thing: str = "file") -> None:
+def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject: str = "file") -> None:
     """Have `write` fill a file, and replace what is at `path` by it in one step.
 
     Content and name are on the disk when this returns: a power cut leaves the earlier file or the new one, whole.
@@ -22,7 +22,7 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], thing: 
     Args:
         path: final name, in a folder that exists.
         write: writes the content.
-        thing: what the file is, for the error message.
+        subject: what the file is, for the error message.
 
     Raises:
         InvalidInputError: the path cannot be written.
@@ -39,7 +39,7 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], thing: 
             Path(name).unlink(missing_ok=True)
             raise
     except OSError as error:
-        raise InvalidInputError(f"{thing} {path}", error, "a path that can be written") from None
+        raise InvalidInputError(f"{subject} {path}", error, "a path that can be written") from None
 
 
 def move_into_place(made: str | Path, path: Path) -> None:
@@ -64,9 +64,9 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def replace_text(path: str | Path, text: str, thing: str = "file") -> None:
+def replace_text(path: str | Path, text: str, subject: str = "file") -> None:
     """Write `text` to `path` as UTF-8, replacing what is there in one step; see `replace_file`."""
-    replace_file(path, lambda file: file.write(text.encode()), thing)
+    replace_file(path, lambda file: file.write(text.encode()), subject)
 
 
 def write_json(path: str | Path, data: Any) -> None:

@@ -40,25 +40,25 @@ class LostPageError(LightpageError):
     """A page could not be read, and nothing that the caller sent need be wrong: write or read it again.
 
     Args:
-        thing, got, wanted: see `LightpageError`.
+        subject, got, expected: see `LightpageError`.
         reason: why.
         recalibration_due: whether the device has changed since it was calibrated, as far as this page shows.
     """
 
     def __init__(
         self,
-        thing: str,
+        subject: str,
         got: object,
-        wanted: object,
+        expected: object,
         reason: Reason = Reason.UNSPECIFIED,
         recalibration_due: bool = False,
     ) -> None:
-        super().__init__(thing, got, wanted)
+        super().__init__(subject, got, expected)
         self.reason, self.recalibration_due = reason, recalibration_due
 
     def about(self, page: str) -> Self:
         """The same error, and of which page it is."""
-        return type(self)(f"{page}: {self.thing}", self.got, self.wanted, self.reason, self.recalibration_due)
+        return type(self)(f"{page}: {self.subject}", self.got, self.expected, self.reason, self.recalibration_due)
 
 
 class UnconfirmedPageError(LostPageError):

@@ -110,8 +110,8 @@ def sole_writer(folder: Path) -> Iterator[None]:
             if is_first_process():
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            wanted = "another --out, or to wait for its end"
-            raise InvalidInputError(f"--out {folder}", "a run that another process is working on", wanted) from None
+            expected = "another --out, or to wait for its end"
+            raise InvalidInputError(f"--out {folder}", "a run that another process is working on", expected) from None
         yield
     finally:
         os.close(descriptor)
@@ -145,30 +145,30 @@ def check_begun(folder: Path, options: dict[str, Any]) -> bool:
             raise ValueError("no table of options")
     except FileNotFoundError:
         if (folder / CHECKPOINTS).exists() or (folder / FITTED).exists():
-            wanted = f"a run that says in {BEGUN} what it was begun with, or another --out"
-            raise InvalidInputError(f"run {folder}", "weights of unknown origin", wanted) from None
+            expected = f"a run that says in {BEGUN} what it was begun with, or another --out"
+            raise InvalidInputError(f"run {folder}", "weights of unknown origin", expected) from None
         return False
     except (OSError, ValueError) as error:
-        wanted = "the JSON that was written when the work began, or another --out"
-        raise InvalidInputError(f"run {folder}: {BEGUN}", error, wanted) from None
+        expected = "the JSON that was written when the work began, or another --out"
+        raise InvalidInputError(f"run {folder}: {BEGUN}", error, expected) from None
     _check_format(folder, kept.get("format"))
     unknown = [name for name, value in options.items() if name not in kept and value is not None]
     if unknown:
-        wanted = "the version that began the run, or another --out"
-        raise InvalidInputError(f"run {folder}", f"one that was begun without {', '.join(unknown)}", wanted)
+        expected = "the version that began the run, or another --out"
+        raise InvalidInputError(f"run {folder}", f"one that was begun without {', '.join(unknown)}", expected)
     for name, value in options.items():
         if kept.get(name) != value:
             now, then = _where_they_differ(value, kept.get(name))
-            wanted = f"{then!r}, with which it was begun, or another --out"
-            raise InvalidInputError(f"run {folder}: {name}", now, wanted)
+            expected = f"{then!r}, with which it was begun, or another --out"
+            raise InvalidInputError(f"run {folder}: {name}", now, expected)
     return True
 
 
 def _check_format(folder: Path, found: object) -> None:
     """Refuse a run of another version, whose networks or features are others."""
     if found != FORMAT:
-        wanted = f"{FORMAT}, which this version makes: train anew in another folder, or take the version that made it"
-        raise InvalidInputError(f"run {folder}: format", found, wanted)
+        expected = f"{FORMAT}, which this version makes: train anew in another folder, or take the version that made it"
+        raise InvalidInputError(f"run {folder}: format", found, expected)
 
 
 def _where_they_differ(now: object, then: object) -> tuple[object, object]:

@@ -51,8 +51,8 @@ class WeightStore:
             InvalidInputError: things are to be kept, where something of another light is kept.
         """
         if self.adds and (self.folder / BEGUN).exists() and not self.is_of_this_light:
-            wanted = "device, pages and seed of what is kept there, or another --trained"
-            raise InvalidInputError(f"--keep in {self.folder}", "another light", wanted)
+            expected = "device, pages and seed of what is kept there, or another --trained"
+            raise InvalidInputError(f"--keep in {self.folder}", "another light", expected)
         if self.is_of_this_light and not (self.light / CALIBRATION).exists():
             _copy(self.folder / CALIBRATION, self.light / CALIBRATION)
 

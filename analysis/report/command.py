@@ -27,8 +27,8 @@ def report(source: Path, out: Path, recording: Path | None) -> None:
     if source.is_dir():
         data = report_of_run(source, recording)
     elif recording is not None:
-        wanted = "none with an evaluation, whose frames come from its bundle"
-        raise InvalidInputError("--recording", recording, wanted)
+        expected = "none with an evaluation, whose frames come from its bundle"
+        raise InvalidInputError("--recording", recording, expected)
     else:
         data = report_of_evaluation(source)
     text = render(data)

@@ -118,18 +118,19 @@ def report_of_evaluation(path: Path) -> ReportData:
 
 
 def _read(path: Path) -> _Evaluation:
-    thing, wanted = f"{path}", "a finished training run, or the JSON that this version's `lightpage evaluate` writes"
+    subject = f"{path}"
+    expected = "a finished training run, or the JSON that this version's `lightpage evaluate` writes"
     try:
         text = path.read_bytes()
         if _PageCount.model_validate_json(text).pages == 0:
-            raise InvalidInputError(thing, "an evaluation that read no page", "one of pages that could be read")
+            raise InvalidInputError(subject, "an evaluation that read no page", "one of pages that could be read")
         return _Evaluation.model_validate_json(text)
     except OSError as error:
-        raise InvalidInputError(thing, error, wanted) from None
+        raise InvalidInputError(subject, error, expected) from None
     except ValidationError as error:
         problems = [f"{'.'.join(map(str, e['loc'])) or 'file'} ({e['msg']})" for e in error.errors()]
         more = f" and {len(problems) - _NAMED_PROBLEMS} more" if len(problems) > _NAMED_PROBLEMS else ""
-        raise InvalidInputError(thing, "; ".join(problems[:_NAMED_PROBLEMS]) + more, wanted) from None
+        raise InvalidInputError(subject, "; ".join(problems[:_NAMED_PROBLEMS]) + more, expected) from None
 
 
 def _page(path: Path, rows: Rows, shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -95,8 +95,8 @@ def _decodable(
     choices = run.hyperparameters
     if recording_path is None:
         if isinstance(choices, PublishedChoices):
-            wanted = f"the recording of the run: its decoder, {run.localizer}, reads camera frames"
-            raise InvalidInputError("--recording", "none", wanted)
+            expected = f"the recording of the run: its decoder, {run.localizer}, reads camera frames"
+            raise InvalidInputError("--recording", "none", expected)
         yield _at_symbol_pitch(folder, run, kept)
         return
     with Recording.open(recording_path) as recording:
@@ -150,18 +150,18 @@ def validation_pages(run: Run, recording: Recording) -> list[int]:
         RecordingError: it is not that recording.
     """
     recording.check_against(run.profile)
-    thing = f"recording {recording.path}"
+    subject = f"recording {recording.path}"
     if not recording.has_symbols:
-        raise RecordingError(thing, "no symbols", "the recording that the run was trained on")
-    wanted = run.trained_pages[run.pages[0] :]
+        raise RecordingError(subject, "no symbols", "the recording that the run was trained on")
+    expected = run.trained_pages[run.pages[0] :]
     found: dict[str, int] = {}
     for page in range(recording.pages):
         for page_hash in page_hashes(recording.frames(page)):
             found.setdefault(page_hash, page)
-        if all(page_hash in found for page_hash in wanted):
-            return [found[page_hash] for page_hash in wanted]
-    there = f"{sum(page_hash in found for page_hash in wanted)} of {len(wanted)} validation pages"
-    raise RecordingError(thing, there, "the recording that the run was trained on")
+        if all(page_hash in found for page_hash in expected):
+            return [found[page_hash] for page_hash in expected]
+    there = f"{sum(page_hash in found for page_hash in expected)} of {len(expected)} validation pages"
+    raise RecordingError(subject, there, "the recording that the run was trained on")
 
 
 def _states(folder: Path, run: Run) -> list[PageState]:

@@ -75,8 +75,8 @@ def study(
     if results_folder.exists() and not results_folder.is_dir():
         raise InvalidInputError(f"study {out}: {_RESULTS}", "a file", "a folder, or another --out")
     if results_folder.exists() and not (out / BEGUN).exists():
-        wanted = f"a study that says in {BEGUN} what it was begun with, or another --out"
-        raise InvalidInputError(f"study {out}", "results of unknown origin", wanted)
+        expected = f"a study that says in {BEGUN} what it was begun with, or another --out"
+        raise InvalidInputError(f"study {out}", "results of unknown origin", expected)
     begin(out, {"study": name, "results": RESULTS, **settings.key()})
     results_folder.mkdir(exist_ok=True)
     cases, results = chosen.cases(settings), []

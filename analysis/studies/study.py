@@ -119,8 +119,8 @@ def _load(path: Path) -> Result:
         arrays = load_arrays(_arrays(path))
         return dict(kept["values"]) | {name: arrays[name] for name in kept["arrays"]}
     except (OSError, ValueError, TypeError, KeyError, InvalidInputError) as error:
-        wanted = "a whole one with its arrays; where it is removed, the case is measured again"
-        raise InvalidInputError(f"result {path}", error, wanted) from None
+        expected = "a whole one with its arrays; where it is removed, the case is measured again"
+        raise InvalidInputError(f"result {path}", error, expected) from None
 
 
 def _arrays(path: Path) -> Path:

@@ -9,15 +9,15 @@ from typing import Any
 Rows = Sequence[dict[str, Any]]
 
 
-def tell_offsets(name: str, rows: Rows, offsets_px: Sequence[float], wanted: float) -> str:
-    """First pages whose image is off, by offset and by what the reference does; `wanted` is a share of tracked AIR."""
-    head = f"{'px':>5} {'reference':>10} {'found':>8} {f'>= {wanted:.0%}':>8} {'worst':>7} {'then':>7} {'more s':>7}"
+def tell_offsets(name: str, rows: Rows, offsets_px: Sequence[float], expected: float) -> str:
+    """First pages whose image is off, by offset and reference; `expected` is a share of tracked AIR."""
+    head = f"{'px':>5} {'reference':>10} {'found':>8} {f'>= {expected:.0%}':>8} {'worst':>7} {'then':>7} {'more s':>7}"
     lines = [f"{name}: image off at the first page; then the same page again by the same decoder", head]
     for offset in offsets_px:
         for stays in (False, True):
             here = [row for row in rows if row["offset_px"] == offset and row["reference_stays"] == stays]
             shares = [row["share_of_tracked"] for row in here]
-            found, good = sum(row.get("found", False) for row in here), sum(share >= wanted for share in shares)
+            found, good = sum(row.get("found", False) for row in here), sum(share >= expected for share in shares)
             lines.append(
                 f"{offset:>5g} {'stays' if stays else 'moves':>10} {found:>5}/{len(here):<2} {good:>5}/{len(here):<2} "
                 f"{min(shares):>7.3f} {min(row['next_share'] for row in here):>7.3f} "

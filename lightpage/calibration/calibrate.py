@@ -102,7 +102,7 @@ class _Stage:
     middle_only: bool = False
     use_phase: bool = False
     half_rate: bool = False
-    wanted: str = _WANTED
+    expected: str = _WANTED
 
 
 _SINGLE_CAMERA = (
@@ -111,7 +111,7 @@ _SINGLE_CAMERA = (
     _Stage("settle the cameras", 6, 2, _SHAPE_GROUPS),
 )
 _COMPLEX = (
-    _Stage("find the reflections", 32, 4, _ALL_GROUPS, _REFLECTED, half_rate=True, wanted=_WANTED_REFLECTIONS),
+    _Stage("find the reflections", 32, 4, _ALL_GROUPS, _REFLECTED, half_rate=True, expected=_WANTED_REFLECTIONS),
     _Stage("all branches, coarse", 8, 2, _ALL_GROUPS, COHERENT_BRANCHES),
     _Stage("all branches, fine", 3, 1, _ALL_GROUPS, COHERENT_BRANCHES),
 )
@@ -408,7 +408,7 @@ class _Registration:
             raise CalibrationError(
                 f"calibration, stage '{stage.name}'",
                 f"{len(good)} of {len(found)} patches of known symbols found (best significance {best:.1f})",
-                f"at least {_FEWEST} above {SIGNIFICANT:.0f}: {stage.wanted}",
+                f"at least {_FEWEST} above {SIGNIFICANT:.0f}: {stage.expected}",
             )
         self.fit = fit_parameters(
             self.twin,

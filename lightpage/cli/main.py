@@ -105,13 +105,13 @@ def _checked(command: click.Command) -> click.Command:
     return checked
 
 
-def missing(thing: str, error: ModuleNotFoundError) -> LightpageError:
+def missing(subject: str, error: ModuleNotFoundError) -> LightpageError:
     """The error that says which extra to install for a module that is not there."""
     top = (error.name or "").partition(".")[0]
     for extra, modules in EXTRAS.items():
         if top in modules:
-            return LightpageError(thing, f"no module {top}", f"the extra {extra}: pip install 'lightpage[{extra}]'")
-    return LightpageError(thing, f"no module {error.name}", "a complete installation of lightpage")
+            return LightpageError(subject, f"no module {top}", f"the extra {extra}: pip install 'lightpage[{extra}]'")
+    return LightpageError(subject, f"no module {error.name}", "a complete installation of lightpage")
 
 
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

@@ -53,12 +53,12 @@ class LensPrescription:
     diameter_m: float
 
     def __post_init__(self) -> None:
-        wanted = "a last surface of thickness 0 and index 1"
+        expected = "a last surface of thickness 0 and index 1"
         if not self.surfaces:
-            raise InvalidInputError(f"lens {self.name}", "no surface", wanted)
+            raise InvalidInputError(f"lens {self.name}", "no surface", expected)
         last = self.surfaces[-1]
         if (last.thickness_m, last.index) != (0, 1):
-            raise InvalidInputError(f"lens {self.name}", f"{last.thickness_m:g} m of index {last.index:g}", wanted)
+            raise InvalidInputError(f"lens {self.name}", f"{last.thickness_m:g} m of index {last.index:g}", expected)
         if self._matrix[1, 0] == 0:
             raise InvalidInputError(f"lens {self.name}", "surfaces that do not focus", "a focal length")
 

@@ -19,7 +19,7 @@ _POSITIONS, _VALUES = 0, 1
 """Independent random streams drawn from one pilot seed."""
 
 
-def check_levels(levels: int, thing: str = "levels") -> None:
+def check_levels(levels: int, subject: str = "levels") -> None:
     """Check a level count.
 
     Raises:
@@ -27,29 +27,29 @@ def check_levels(levels: int, thing: str = "levels") -> None:
     """
     whole = isinstance(levels, (int, np.integer)) and not isinstance(levels, bool)
     if not whole or not MIN_LEVELS <= levels <= MAX_LEVELS:
-        raise PageError(thing, repr(levels), f"a whole number from {MIN_LEVELS} to {MAX_LEVELS}")
+        raise PageError(subject, repr(levels), f"a whole number from {MIN_LEVELS} to {MAX_LEVELS}")
 
 
-def check_symbols(symbols: ArrayLike, page_shape: tuple[int, int], levels: int, thing: str) -> NDArray[np.uint8]:
+def check_symbols(symbols: ArrayLike, page_shape: tuple[int, int], levels: int, subject: str) -> NDArray[np.uint8]:
     """Check one page of symbols [ny, nx] or several [page, ny, nx], and return them as uint8 of the same shape.
 
     Args:
         symbols: whole numbers from 0 to levels - 1.
         page_shape: (ny, nx).
         levels: M, 2 to 256.
-        thing: what the symbols are, for the error message.
+        subject: what the symbols are, for the error message.
 
     Raises:
         PageError: wrong type, shape or range.
     """
-    check_levels(levels, f"{thing}: levels")
+    check_levels(levels, f"{subject}: levels")
     array = np.asarray(symbols)
     if array.dtype.kind not in "ui":
-        raise PageError(thing, f"type {array.dtype}", "whole numbers")
+        raise PageError(subject, f"type {array.dtype}", "whole numbers")
     if array.ndim not in (2, 3) or array.shape[-2:] != tuple(page_shape):
-        raise PageError(thing, f"shape {array.shape}", f"(..., {page_shape[0]}, {page_shape[1]})")
+        raise PageError(subject, f"shape {array.shape}", f"(..., {page_shape[0]}, {page_shape[1]})")
     if array.size and (int(array.min()) < 0 or int(array.max()) >= levels):
-        raise PageError(thing, f"values from {array.min()} to {array.max()}", f"values from 0 to {levels - 1}")
+        raise PageError(subject, f"values from {array.min()} to {array.max()}", f"values from 0 to {levels - 1}")
     return array.astype(np.uint8, copy=False)
 
 
@@ -85,10 +85,10 @@ def pilot_mask(profile: Profile) -> NDArray[np.bool_]:
 
 def _lattice(ny: int, nx: int, fraction: float) -> tuple[int, int]:
     """Rows and columns of the lattice whose cells are nearest to square and whose count is near the wanted one."""
-    wanted = min(max(MIN_PILOTS, round(fraction * ny * nx)), ny * nx)
-    rows = min(max(1, round(float(np.sqrt(wanted * ny / nx)))), ny)
-    columns = min(max(1, -(-wanted // rows)), nx)
-    return min(max(rows, -(-wanted // columns)), ny), columns
+    expected = min(max(MIN_PILOTS, round(fraction * ny * nx)), ny * nx)
+    rows = min(max(1, round(float(np.sqrt(expected * ny / nx)))), ny)
+    columns = min(max(1, -(-expected // rows)), nx)
+    return min(max(rows, -(-expected // columns)), ny), columns
 
 
 def pilot_symbols(profile: Profile, levels: int) -> NDArray[np.uint8]:

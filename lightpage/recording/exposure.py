@@ -17,14 +17,14 @@ SATURATED_FRACTION = 0.05
 """Share of pixels at full scale from which on a frame is overexposed; speckle peaks clip about one in a hundred."""
 
 
-def check_pair_light(thing: str, pair: FramePair, bit_depth: int) -> None:
-    """Check the counts of both frames of a pair; `thing` goes before the frame's name in the error.
+def check_pair_light(subject: str, pair: FramePair, bit_depth: int) -> None:
+    """Check the counts of both frames of a pair; `subject` goes before the frame's name in the error.
 
     Raises:
         FrameError: see `check_light`.
     """
-    check_light(f"{thing}in-phase frame", pair.in_phase, bit_depth)
-    check_light(f"{thing}quadrature frame", pair.quadrature, bit_depth)
+    check_light(f"{subject}in-phase frame", pair.in_phase, bit_depth)
+    check_light(f"{subject}quadrature frame", pair.quadrature, bit_depth)
 
 
 def check_light(name: str, frame: NDArray[np.integer[Any]], bit_depth: int) -> None:

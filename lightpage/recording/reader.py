@@ -183,13 +183,13 @@ class Recording:
         """
         if self.frame_shape != profile.frame_shape:
             raise RecordingError(
-                self._thing("in_phase"),
+                self._subject("in_phase"),
                 f"frames of {_size(self.frame_shape)} pixels",
                 f"{_size(profile.frame_shape)} (profile {profile.name})",
             )
         if self.page_shape not in (None, profile.page_shape):
             raise RecordingError(
-                self._thing("symbols" if self.has_symbols else "pilots"),
+                self._subject("symbols" if self.has_symbols else "pilots"),
                 f"pages of {_size(self.page_shape)} symbols",
                 f"{_size(profile.page_shape)} (profile {profile.name})",
             )
@@ -205,16 +205,16 @@ class Recording:
             own = None
         if own is None:
             return []
-        told, wanted = own.model_dump(), profile.model_dump()
+        told, expected = own.model_dump(), profile.model_dump()
         return [
-            f"{table}.{key} = {value} (profile {profile.name}: {wanted[table][key]})"
+            f"{table}.{key} = {value} (profile {profile.name}: {expected[table][key]})"
             for table, values in told.items()
             if isinstance(values, dict)
             for key, value in values.items()
-            if wanted[table][key] != value
+            if expected[table][key] != value
         ]
 
-    def _thing(self, name: str) -> str:
+    def _subject(self, name: str) -> str:
         return f"recording {self.path}: {name}"
 
     def _attribute(self, name: str, default: object = None) -> Any:
@@ -230,7 +230,7 @@ class Recording:
             value = int(value)
         if isinstance(value, bool) or not isinstance(value, int):
             raise RecordingError(
-                self._thing(f"attribute '{name}'"), "none" if value is None else repr(value), "a whole number"
+                self._subject(f"attribute '{name}'"), "none" if value is None else repr(value), "a whole number"
             )
         return value
 
@@ -238,41 +238,41 @@ class Recording:
         format_name = self._attribute("format")
         if format_name != FORMAT:
             got = "none" if format_name is None else repr(format_name)
-            raise RecordingError(self._thing("attribute 'format'"), got, repr(FORMAT))
+            raise RecordingError(self._subject("attribute 'format'"), got, repr(FORMAT))
         version = self._whole("version")
         if version != VERSION:
-            raise RecordingError(self._thing("attribute 'version'"), version, f"version {VERSION}")
+            raise RecordingError(self._subject("attribute 'version'"), version, f"version {VERSION}")
         self._bit_depth = self._whole("camera_bit_depth")
         if not MIN_BIT_DEPTH <= self._bit_depth <= MAX_BIT_DEPTH:
             raise RecordingError(
-                self._thing("attribute 'camera_bit_depth'"), self._bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}"
+                self._subject("attribute 'camera_bit_depth'"), self._bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}"
             )
         self._levels = self._whole("levels", MAX_LEVELS)
         if not MIN_LEVELS <= self._levels <= MAX_LEVELS:
             raise RecordingError(
-                self._thing("attribute 'levels'"), self._levels, f"a whole number from {MIN_LEVELS} to {MAX_LEVELS}"
+                self._subject("attribute 'levels'"), self._levels, f"a whole number from {MIN_LEVELS} to {MAX_LEVELS}"
             )
         self._black_level = self._whole("black_level", 0)
         full_scale = 2**self._bit_depth - 1
         if not 0 <= self._black_level < full_scale:
             raise RecordingError(
-                self._thing("attribute 'black_level'"), self._black_level, f"0 to {full_scale - 1} counts"
+                self._subject("attribute 'black_level'"), self._black_level, f"0 to {full_scale - 1} counts"
             )
         text = self._attribute("profile")
         if text is not None and not isinstance(text, str):
-            raise RecordingError(self._thing("attribute 'profile'"), type(text).__name__, "TOML text")
+            raise RecordingError(self._subject("attribute 'profile'"), type(text).__name__, "TOML text")
         self._profile_text: str | None = text
 
     def _dataset(self, name: str, dimensions: int) -> h5py.Dataset:
         found = self._file.get(name)
         if not isinstance(found, h5py.Dataset):
             raise RecordingError(
-                self._thing(f"dataset '{name}'"),
+                self._subject(f"dataset '{name}'"),
                 "none" if found is None else "a group",
                 f"an array of {dimensions} dimensions",
             )
         if found.ndim != dimensions:
-            raise RecordingError(self._thing(f"dataset '{name}'"), f"shape {found.shape}", f"{dimensions} dimensions")
+            raise RecordingError(self._subject(f"dataset '{name}'"), f"shape {found.shape}", f"{dimensions} dimensions")
         return found
 
     def _check_frames(self) -> None:
@@ -285,37 +285,39 @@ class Recording:
             "reference_quadrature": first.shape[1:],
         }.items():
             dataset = self._dataset(name, len(shape))
-            thing = self._thing(f"dataset '{name}'")
+            subject = self._subject(f"dataset '{name}'")
             # 8-bit counts may come in either type; more bits fit into uint16 only.
             fits = dataset.dtype.kind == "u" and wanted_type.itemsize <= dataset.dtype.itemsize <= 2
             if not fits:
-                raise RecordingError(thing, f"type {dataset.dtype}", f"{wanted_type} for {self._bit_depth} bits")
+                raise RecordingError(subject, f"type {dataset.dtype}", f"{wanted_type} for {self._bit_depth} bits")
             if dataset.shape != shape:
-                raise RecordingError(thing, f"shape {dataset.shape}", f"shape {shape}, as 'in_phase' has")
+                raise RecordingError(subject, f"shape {dataset.shape}", f"shape {shape}, as 'in_phase' has")
             if 0 in dataset.shape:
-                raise RecordingError(thing, f"shape {dataset.shape}", "at least one page and one pixel")
+                raise RecordingError(subject, f"shape {dataset.shape}", "at least one page and one pixel")
 
     def _check_page(self) -> None:
         if "pilots" in self._file:
             pilots = self._dataset("pilots", 2)
             if pilots.dtype.kind not in "bui":
-                raise RecordingError(self._thing("dataset 'pilots'"), f"type {pilots.dtype}", "booleans")
+                raise RecordingError(self._subject("dataset 'pilots'"), f"type {pilots.dtype}", "booleans")
             known = np.count_nonzero(self._read("pilots", ()))
             if not 0 < known < pilots.size:
                 raise RecordingError(
-                    self._thing("dataset 'pilots'"), f"{known} pilots of {pilots.size} symbols", "some of them, not all"
+                    self._subject("dataset 'pilots'"),
+                    f"{known} pilots of {pilots.size} symbols",
+                    "some of them, not all",
                 )
         if not self.has_symbols:
             return
         symbols = self._dataset("symbols", 3)
-        thing = self._thing("dataset 'symbols'")
+        subject = self._subject("dataset 'symbols'")
         if symbols.dtype != np.uint8:
-            raise RecordingError(thing, f"type {symbols.dtype}", "uint8")
+            raise RecordingError(subject, f"type {symbols.dtype}", "uint8")
         if symbols.shape[0] != self.pages or 0 in symbols.shape[1:]:
-            raise RecordingError(thing, f"shape {symbols.shape}", f"shape ({self.pages}, ny, nx), as 'in_phase' has")
+            raise RecordingError(subject, f"shape {symbols.shape}", f"shape ({self.pages}, ny, nx), as 'in_phase' has")
         if "pilots" in self._file and self._file["pilots"].shape != symbols.shape[1:]:
             raise RecordingError(
-                self._thing("dataset 'pilots'"),
+                self._subject("dataset 'pilots'"),
                 f"shape {self._file['pilots'].shape}",
                 f"shape {symbols.shape[1:]}, as 'symbols' has",
             )
@@ -323,12 +325,12 @@ class Recording:
             chunk = self._read("symbols", slice(start, start + _SYMBOL_PAGES_AT_ONCE))
             if int(chunk.max()) >= self._levels:
                 raise RecordingError(
-                    thing, f"a symbol of {chunk.max()}", f"0 to {self._levels - 1}, since levels = {self._levels}"
+                    subject, f"a symbol of {chunk.max()}", f"0 to {self._levels - 1}, since levels = {self._levels}"
                 )
 
     def _read_page(self, name: str, page: int) -> NDArray[Any]:
         if not 0 <= page < self.pages:
-            raise RecordingError(self._thing("page"), page, f"0 to {self.pages - 1}")
+            raise RecordingError(self._subject("page"), page, f"0 to {self.pages - 1}")
         frame = self._read(name, page)
         if name in FRAMES:
             self._check_counts(name, frame, f" page {page}")
@@ -339,7 +341,7 @@ class Recording:
         try:
             data: NDArray[Any] = np.asarray(self._file[name][where])
         except OSError as error:
-            raise RecordingError(self._thing(f"dataset '{name}'"), error, "data that can be read") from None
+            raise RecordingError(self._subject(f"dataset '{name}'"), error, "data that can be read") from None
         data = data.astype(data.dtype.newbyteorder("="), copy=False)  # torch takes no other byte order
         if name in REFERENCES:
             self._check_counts(name, data, "")
@@ -357,7 +359,7 @@ class Recording:
         full_scale = 2**self._bit_depth - 1
         if int(frame.max()) > full_scale:
             raise RecordingError(
-                self._thing(f"dataset '{name}'{where}"),
+                self._subject(f"dataset '{name}'{where}"),
                 f"a count of {frame.max()}",
                 f"at most {full_scale}, since camera_bit_depth = {self._bit_depth}",
             )

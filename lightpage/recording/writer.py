@@ -38,7 +38,7 @@ def _take(partial: Path, *, remove: bool) -> bool:
 
     HDF5 holds this same lock on a file as long as it is open for writing.
     """
-    thing = f"recording {partial}"
+    subject = f"recording {partial}"
     try:
         with partial.open("rb+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -48,10 +48,10 @@ def _take(partial: Path, *, remove: bool) -> bool:
         return False
     except BlockingIOError:
         raise RecordingError(
-            thing, "pages that another process is writing now", "another name, or to wait for its end"
+            subject, "pages that another process is writing now", "another name, or to wait for its end"
         ) from None
     except OSError as error:
-        raise RecordingError(thing, error, "a file that can be read and written") from None
+        raise RecordingError(subject, error, "a file that can be read and written") from None
     return True
 
 
@@ -134,9 +134,10 @@ class RecordingWriter:
         """
         data = {name: self._checked(name, getattr(frames, name)) for name in FRAMES}
         if symbols is not None:
-            data["symbols"] = check_symbols(symbols, self._profile.page_shape, self._levels, f"{self._thing}: symbols")
+            subject = f"{self._subject}: symbols"
+            data["symbols"] = check_symbols(symbols, self._profile.page_shape, self._levels, subject)
             if data["symbols"].ndim != 2:
-                raise PageError(f"{self._thing}: symbols", f"shape {data['symbols'].shape}", "one page [ny, nx]")
+                raise PageError(f"{self._subject}: symbols", f"shape {data['symbols'].shape}", "one page [ny, nx]")
         data |= {f"truth/{name}": np.asarray(value) for name, value in (truth or {}).items()}
         self._check_same_datasets(data)
         try:
@@ -146,7 +147,7 @@ class RecordingWriter:
             self._file.attrs["pages_complete"] = self._pages + 1
             self._file.flush()
         except OSError as error:
-            raise RecordingError(f"{self._thing}: page {self._pages}", error, "room for it on the disk") from None
+            raise RecordingError(f"{self._subject}: page {self._pages}", error, "room for it on the disk") from None
         self._pages += 1
 
     def set_truth(self, device_toml: str) -> None:
@@ -177,7 +178,7 @@ class RecordingWriter:
             self._file.close()
             move_into_place(self._partial, self.path)
         except OSError as error:
-            raise RecordingError(self._thing, error, "a file that can be completed") from None
+            raise RecordingError(self._subject, error, "a file that can be completed") from None
 
     def abandon(self) -> None:
         """Close the partial file and leave it for `resume`."""
@@ -185,11 +186,11 @@ class RecordingWriter:
 
     def _prepare(self, path: str | Path, profile: Profile, levels: int, bit_depth: int) -> None:
         self.path = Path(path)
-        self._thing = f"recording {self.path}"
+        self._subject = f"recording {self.path}"
         self._partial = partial_path(self.path)
-        check_levels(levels, f"{self._thing}: levels")
+        check_levels(levels, f"{self._subject}: levels")
         if not MIN_BIT_DEPTH <= bit_depth <= MAX_BIT_DEPTH:
-            raise RecordingError(f"{self._thing}: bit depth", bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}")
+            raise RecordingError(f"{self._subject}: bit depth", bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}")
         self._profile, self._levels, self._bit_depth = profile, levels, bit_depth
         self._pages = 0
 
@@ -204,14 +205,14 @@ class RecordingWriter:
 
     def _checked(self, name: str, frame: NDArray[Any]) -> NDArray[Any]:
         frame = np.asarray(frame)
-        thing = f"{self._thing}: {name}"
+        subject = f"{self._subject}: {name}"
         if frame.dtype.kind not in "ui":
-            raise RecordingError(thing, f"type {frame.dtype}", "whole counts")
+            raise RecordingError(subject, f"type {frame.dtype}", "whole counts")
         if frame.shape != self._profile.frame_shape:
-            raise RecordingError(thing, f"shape {frame.shape}", f"shape {self._profile.frame_shape}")
+            raise RecordingError(subject, f"shape {frame.shape}", f"shape {self._profile.frame_shape}")
         full_scale = 2**self._bit_depth - 1
         if int(frame.min()) < 0 or int(frame.max()) > full_scale:
-            raise RecordingError(thing, f"counts from {frame.min()} to {frame.max()}", f"0 to {full_scale}")
+            raise RecordingError(subject, f"counts from {frame.min()} to {frame.max()}", f"0 to {full_scale}")
         return frame.astype(frame_type(self._bit_depth), copy=False)
 
     def _checked_fixed(self, references: FramePair, pilots: ArrayLike | None) -> dict[str, NDArray[Any]]:
@@ -221,7 +222,7 @@ class RecordingWriter:
             mask = np.asarray(pilots)
             if mask.dtype != np.bool_ or mask.shape != self._profile.page_shape:
                 raise RecordingError(
-                    f"{self._thing}: pilots",
+                    f"{self._subject}: pilots",
                     f"{mask.dtype} of shape {mask.shape}",
                     f"bool of shape {self._profile.page_shape}",
                 )
@@ -290,14 +291,14 @@ class RecordingWriter:
     def _check_same_datasets(self, data: Mapping[str, NDArray[Any]]) -> None:
         if self._pages and set(self._growing()) != set(data):
             raise RecordingError(
-                f"{self._thing}: page {self._pages}",
+                f"{self._subject}: page {self._pages}",
                 f"datasets {', '.join(sorted(data))}",
                 f"{', '.join(sorted(self._growing()))}, as on the pages before",
             )
         for name, value in data.items():
             if name in self._file and self._file[name].shape[1:] != value.shape:
                 raise RecordingError(
-                    f"{self._thing}: {name}", f"shape {value.shape}", f"shape {self._file[name].shape[1:]}"
+                    f"{self._subject}: {name}", f"shape {value.shape}", f"shape {self._file[name].shape[1:]}"
                 )
 
     def _grow(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> h5py.Dataset:

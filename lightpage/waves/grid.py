@@ -75,11 +75,11 @@ def check_camera(profile: Profile) -> None:
     Raises:
         ProfileError: the camera's pixels are too coarse or too few; the message says what would do.
     """
-    camera, thing = profile.camera, f"profile {profile.name}: camera"
+    camera, subject = profile.camera, f"profile {profile.name}: camera"
     coarsest = profile.light.wavelength_m * profile.lens.focal_length_m / (2 * GRID_STEP_PX * profile.pipe.width_m)
     if camera.pitch_m > coarsest * (1 + _ROUNDING):
         raise ProfileError(
-            f"{thing}.pitch_m", f"{camera.pitch_m:.4g} m", f"at most {coarsest:.4g} m, to resolve the pipe's light"
+            f"{subject}.pitch_m", f"{camera.pitch_m:.4g} m", f"at most {coarsest:.4g} m, to resolve the pipe's light"
         )
     for key, count, extent in (
         ("columns_px", camera.columns_px, profile.page_width_m),
@@ -88,7 +88,7 @@ def check_camera(profile: Profile) -> None:
         least = int(np.ceil(extent / camera.pitch_m * (1 - _ROUNDING)))
         if count < least:
             raise ProfileError(
-                f"{thing}.{key}", count, f"at least {least}, to see the page's image of {extent * 1e3:.4g} mm"
+                f"{subject}.{key}", count, f"at least {least}, to see the page's image of {extent * 1e3:.4g} mm"
             )
 
 
@@ -114,8 +114,8 @@ def field_grid(profile: Profile, step_px: int = GRID_STEP_PX) -> FieldGrid:
     edge = profile.pipe.width_m / 2 / (profile.light.wavelength_m * profile.lens.focal_length_m)
     coarsest = int(_NYQUIST / (_BAND_STOP * edge * pixel))
     if not GRID_STEP_PX <= step_px <= coarsest:
-        wanted = f"{GRID_STEP_PX} to {coarsest}"
-        raise InvalidInputError("pitch of the common grid, camera pixels", step_px, wanted)
+        expected = f"{GRID_STEP_PX} to {coarsest}"
+        raise InvalidInputError("pitch of the common grid, camera pixels", step_px, expected)
     return FieldGrid(
         x_m=axis(profile.page_width_m),
         y_m=axis(profile.page_height_m),

@@ -48,7 +48,7 @@ class RecordingSource:
                 pair, symbols = narrow(recording.frames(page), self.bit_depth), recording.symbols(page)
                 return SourcePage(pair, page, symbols, recording.pilots())
             except RecordingError as error:
-                raise RecordingError(f"page {page}, {error.thing}", error.got, error.wanted) from None
+                raise RecordingError(f"page {page}, {error.subject}", error.got, error.expected) from None
 
     def references(self) -> FramePair:
         """The recording's reference frames."""

@@ -31,8 +31,8 @@ class SimulatorSource:
     def check_against(self, profile: Profile) -> None:
         """Raise `InvalidInputError` unless the simulated device's shapes are those of `profile`."""
         own = (self.profile.frame_shape, self.profile.page_shape)
-        if own != (wanted := (profile.frame_shape, profile.page_shape)):
-            raise InvalidInputError(f"source {self.name}", f"frames and pages of {own}", f"{wanted}")
+        if own != (expected := (profile.frame_shape, profile.page_shape)):
+            raise InvalidInputError(f"source {self.name}", f"frames and pages of {own}", f"{expected}")
 
     def set_device(self, device: Device) -> None:
         """Let the device drift to another true state; the next page shows it."""

@@ -62,13 +62,13 @@ class FrameSource(Protocol):
 
 
 @contextmanager
-def own_fault(thing: str = "") -> Iterator[None]:
+def own_fault(subject: str = "") -> Iterator[None]:
     """Turn what is wrong with a source's file or frames into the service's fault; a page that is not there stays.
 
     Raises:
-        SourceError: in place of a `RecordingError` or `FrameError`; `thing` goes before what it names.
+        SourceError: in place of a `RecordingError` or `FrameError`; `subject` goes before what it names.
     """
     try:
         yield
     except (RecordingError, FrameError) as error:
-        raise SourceError(thing + error.thing, error.got, error.wanted) from error
+        raise SourceError(subject + error.subject, error.got, error.expected) from error

@@ -28,7 +28,7 @@ def open_source(spec: str, points: Iterable[EntryPoint] | None = None) -> FrameS
     kinds = {point.name: point for point in (entry_points(group=GROUP) if points is None else points)}
     kind, colon, rest = spec.partition(":")
     if not (colon and rest and kind in kinds):
-        wanted = f"KIND:REST, KIND being one of {', '.join(sorted(kinds))}, e.g. recording:FILE or simulator:PROFILE"
-        raise InvalidInputError("source", repr(spec), wanted)
+        expected = f"KIND:REST, KIND being one of {', '.join(sorted(kinds))}, e.g. recording:FILE or simulator:PROFILE"
+        raise InvalidInputError("source", repr(spec), expected)
     opener: Opener = kinds[kind].load()
     return opener(rest)

@@ -101,12 +101,12 @@ class NothingReadError(InvalidInputError):
     """No page of a recording was read.
 
     Args:
-        thing, got, wanted: see `LightpageError`.
+        subject, got, expected: see `LightpageError`.
         figures: what there is to tell all the same, under the names of `Evaluation.to_json`.
     """
 
-    def __init__(self, thing: str, got: object, wanted: object, figures: dict[str, Any]) -> None:
-        super().__init__(thing, got, wanted)
+    def __init__(self, subject: str, got: object, expected: object, figures: dict[str, Any]) -> None:
+        super().__init__(subject, got, expected)
         self.figures = figures
 
 
@@ -181,7 +181,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
             "bundle": _describe(decoder, levels),
             **_refused_json(refused),
         }
-        raise NothingReadError(told.thing, told.got, told.wanted, figures)
+        raise NothingReadError(told.subject, told.got, told.expected, figures)
     if not timings:
         raise InvalidInputError(
             f"recording {recording.path}",

@@ -50,10 +50,10 @@ def unconfirmed(refused: Sequence[RefusedPage]) -> int:
     return sum(page.unconfirmed for page in refused)
 
 
-def refusal(thing: str, refused: Sequence[RefusedPage], pages: int) -> InvalidInputError:
-    """The error that a command ends with when `refused` of its `pages` pages of `thing` could not be decoded."""
+def refusal(subject: str, refused: Sequence[RefusedPage], pages: int) -> InvalidInputError:
+    """The error that a command ends with when `refused` of its `pages` pages of `subject` could not be decoded."""
     told = "; ".join(f"page {'unknown' if r.page is None else r.page}: {r.reason}" for r in refused[:_TOLD])
     more = f"; and {len(refused) - _TOLD} more" if len(refused) > _TOLD else ""
     return InvalidInputError(
-        thing, f"{len(refused)} of {pages} pages that were refused ({told}{more})", "pages that can be decoded"
+        subject, f"{len(refused)} of {pages} pages that were refused ({told}{more})", "pages that can be decoded"
     )

@@ -47,70 +47,70 @@ def read_files(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, bytes]:
     return _read_zip(path, max_bytes)
 
 
-def check_name(name: str, thing: str) -> None:
+def check_name(name: str, subject: str) -> None:
     """Refuse a name that could lead out of a bundle.
 
     Raises:
         BundleError: empty, with a separator, a drive or a NUL, or hidden.
     """
     if not name or name.startswith(".") or any(mark in name for mark in "/\\:\0"):
-        raise BundleError(f"{thing}: file name", repr(name), "a plain file name without a path")
+        raise BundleError(f"{subject}: file name", repr(name), "a plain file name without a path")
 
 
 def _read_folder(path: Path, max_bytes: int) -> dict[str, bytes]:
-    thing = f"bundle {path}"
+    subject = f"bundle {path}"
     names = sorted(os.listdir(path))
-    _check_count(len(names), thing)
+    _check_count(len(names), subject)
     files: dict[str, bytes] = {}
     left = max_bytes
     for name in names:
-        check_name(name, thing)
+        check_name(name, subject)
         try:
             # O_NOFOLLOW: a link is refused by the kernel, with no gap between a check and the use.
             descriptor = os.open(path / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
             with os.fdopen(descriptor, "rb") as file:
                 if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                    raise BundleError(f"{thing}: {name}", "no plain file", "a plain file")
+                    raise BundleError(f"{subject}: {name}", "no plain file", "a plain file")
                 files[name] = file.read(left + 1)
         except OSError as error:
-            raise BundleError(f"{thing}: {name}", error, "a readable plain file, no link or folder") from None
+            raise BundleError(f"{subject}: {name}", error, "a readable plain file, no link or folder") from None
         left -= len(files[name])
-        _check_left(left, max_bytes, thing)
+        _check_left(left, max_bytes, subject)
     return files
 
 
 def _read_zip(path: Path, max_bytes: int) -> dict[str, bytes]:
-    thing = f"bundle {path}"
+    subject = f"bundle {path}"
     files: dict[str, bytes] = {}
     left = max_bytes
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
-            _check_count(len(entries), thing)
+            _check_count(len(entries), subject)
             for entry in entries:
                 # filename is cut at a NUL and made portable by zipfile; orig_filename is what was written.
-                check_name(entry.orig_filename, thing)
-                check_name(entry.filename, thing)
+                check_name(entry.orig_filename, subject)
+                check_name(entry.filename, subject)
                 if entry.filename in files:
-                    raise BundleError(f"{thing}: {entry.filename}", "the same name twice", "one file of each name")
+                    raise BundleError(f"{subject}: {entry.filename}", "the same name twice", "one file of each name")
                 kind = stat.S_IFMT(entry.external_attr >> 16)
                 if kind not in (0, stat.S_IFREG):
-                    raise BundleError(f"{thing}: {entry.filename}", "a link or special file", "a plain file")
+                    raise BundleError(f"{subject}: {entry.filename}", "a link or special file", "a plain file")
                 # The size in the header may lie: read at most what is left, whatever it says.
                 with archive.open(entry) as file:
                     files[entry.filename] = file.read(left + 1)
                 left -= len(files[entry.filename])
-                _check_left(left, max_bytes, thing)
+                _check_left(left, max_bytes, subject)
     except _DAMAGE as error:
-        raise BundleError(thing, error, "a sound zip file") from None
+        raise BundleError(subject, error, "a sound zip file") from None
     return files
 
 
-def _check_count(count: int, thing: str) -> None:
+def _check_count(count: int, subject: str) -> None:
     if count > MAX_FILES:
-        raise BundleError(thing, f"{count} files", f"at most {MAX_FILES}")
+        raise BundleError(subject, f"{count} files", f"at most {MAX_FILES}")
 
 
-def _check_left(left: int, max_bytes: int, thing: str) -> None:
+def _check_left(left: int, max_bytes: int, subject: str) -> None:
     if left < 0:
-        raise BundleError(thing, f"more than {max_bytes} bytes unpacked", f"at most {max_bytes}")
+        raise BundleError(subject, f"more than {max_bytes} bytes unpacked", f"at most {max_bytes}")

@@ -73,22 +73,22 @@ class Bundle:
         """
         path = Path(path)
         files = read_files(path, max_bytes)
-        thing = f"bundle {path}"
+        subject = f"bundle {path}"
         if MANIFEST not in files:
-            raise BundleError(thing, f"no {MANIFEST}", f"a bundle with its {MANIFEST}")
-        manifest = parse_manifest(files.pop(MANIFEST), f"{thing}: {MANIFEST}")
-        _check_listing(set(manifest.files), thing)
+            raise BundleError(subject, f"no {MANIFEST}", f"a bundle with its {MANIFEST}")
+        manifest = parse_manifest(files.pop(MANIFEST), f"{subject}: {MANIFEST}")
+        _check_listing(set(manifest.files), subject)
         for name in sorted(set(manifest.files) | set(files)):
             if name not in files:
-                raise BundleError(f"{thing}: {name}", "nothing", "the file that the manifest lists")
+                raise BundleError(f"{subject}: {name}", "nothing", "the file that the manifest lists")
             if name not in manifest.files:
-                raise BundleError(f"{thing}: {name}", "a file that the manifest does not list", "listed files only")
+                raise BundleError(f"{subject}: {name}", "a file that the manifest does not list", "listed files only")
             if (found := sha256(files[name])) != manifest.files[name]:
-                raise BundleError(f"{thing}: {name}", f"SHA-256 {found}", manifest.files[name])
+                raise BundleError(f"{subject}: {name}", f"SHA-256 {found}", manifest.files[name])
         return cls(path, manifest, files)
 
     @property
-    def thing(self) -> str:
+    def subject(self) -> str:
         """What an error about this bundle calls it."""
         return f"bundle {self.path}"
 
@@ -105,9 +105,9 @@ class Bundle:
             BundleError: the manifest's profile does not validate.
         """
         try:
-            return parse_profile(self.manifest.profile, f"{self.thing}: profile")
+            return parse_profile(self.manifest.profile, f"{self.subject}: profile")
         except ProfileError as error:
-            raise BundleError(error.thing, error.got, error.wanted) from None
+            raise BundleError(error.subject, error.got, error.expected) from None
 
     @cached_property
     def table(self) -> Table:
@@ -130,7 +130,7 @@ class Bundle:
         names = ("in_phase", "quadrature", "p")
         arrays = self._arrays(GOLDEN, names)
         if missing := set(names) - set(arrays):
-            raise BundleError(f"{self.thing}: {GOLDEN}", f"no {', '.join(sorted(missing))}", f"all of {list(names)}")
+            raise BundleError(f"{self.subject}: {GOLDEN}", f"no {', '.join(sorted(missing))}", f"all of {list(names)}")
         return Golden(FramePair(arrays["in_phase"], arrays["quadrature"]), arrays["p"])
 
     @cached_property
@@ -145,7 +145,7 @@ class Bundle:
         mask = self._pilots.get("mask")
         if mask is None or mask.shape != self.profile.page_shape or mask.dtype != np.bool_ or not mask.any():
             got = "nothing" if mask is None else f"{mask.dtype} {mask.shape}, {np.count_nonzero(mask)} pilots"
-            raise BundleError(f"{self.thing}: {PILOTS}: mask", got, f"bool {self.profile.page_shape} with pilots")
+            raise BundleError(f"{self.subject}: {PILOTS}: mask", got, f"bool {self.profile.page_shape} with pilots")
         return mask
 
     @cached_property
@@ -160,11 +160,11 @@ class Bundle:
         phases = self._pilots.get("phases")
         if phases is None:
             return None
-        thing, count = f"{self.thing}: {PILOTS}: phases", int(np.count_nonzero(self.pilot_mask))
+        subject, count = f"{self.subject}: {PILOTS}: phases", int(np.count_nonzero(self.pilot_mask))
         if phases.shape != (count,) or phases.dtype != np.float32:
-            raise BundleError(thing, f"{phases.dtype} {phases.shape}", f"float32 ({count},), one a pilot")
+            raise BundleError(subject, f"{phases.dtype} {phases.shape}", f"float32 ({count},), one a pilot")
         if not np.isfinite(phases).all():
-            raise BundleError(thing, "NaN or infinity", "finite numbers")
+            raise BundleError(subject, "NaN or infinity", "finite numbers")
         return phases
 
     @cached_property
@@ -176,21 +176,21 @@ class Bundle:
 
         zipfile reads no more of a member than the size in its header, so those sizes bound what is unpacked.
         """
-        thing = f"{self.thing}: {name}"
+        subject = f"{self.subject}: {name}"
         try:
             with zipfile.ZipFile(io.BytesIO(self.files[name])) as archive:
                 entries = archive.infolist()
             found = [entry.filename for entry in entries]
             if set(found) - {f"{key}.npy" for key in expected} or len(found) != len(set(found)):
-                raise BundleError(thing, f"members {found[:MAX_FILES]}", f"{list(expected)} only, each once, as .npy")
+                raise BundleError(subject, f"members {found[:MAX_FILES]}", f"{list(expected)} only, each once, as .npy")
             if (size := sum(entry.file_size for entry in entries)) > MAX_ARRAY_BYTES:
-                raise BundleError(thing, f"{size} bytes unpacked", f"at most {MAX_ARRAY_BYTES}")
+                raise BundleError(subject, f"{size} bytes unpacked", f"at most {MAX_ARRAY_BYTES}")
             with np.load(io.BytesIO(self.files[name]), allow_pickle=False) as arrays:
                 return {key: arrays[key] for key in arrays.files}
         except BundleError:
             raise
         except Exception as error:  # numpy and zipfile raise many kinds on damaged data
-            raise BundleError(thing, error, "arrays in .npz format") from None
+            raise BundleError(subject, error, "arrays in .npz format") from None
 
 
 def npz(**arrays: NDArray[Any]) -> bytes:
@@ -216,20 +216,20 @@ def write_bundle(path: str | Path, manifest: Manifest, files: Mapping[str, bytes
             could not be read again.
     """
     path = Path(path)
-    thing = f"bundle {path}"
-    _check_listing(set(files), thing)
+    subject = f"bundle {path}"
+    _check_listing(set(files), subject)
     if path.exists() or path.is_symlink():
-        raise BundleError(thing, "something that exists", "a new path: bundles are never overwritten")
+        raise BundleError(subject, "something that exists", "a new path: bundles are never overwritten")
     full = manifest.model_copy(update={"files": {name: sha256(data) for name, data in files.items()}})
     # A manifest changed by `model_copy` has not been validated, and a bundle that cannot be read must not be written.
-    check_version(full.version, f"{thing}: version")
-    parse_manifest(full.to_json(), f"{thing}: {MANIFEST}")
+    check_version(full.version, f"{subject}: version")
+    parse_manifest(full.to_json(), f"{subject}: {MANIFEST}")
     contents = {MANIFEST: full.to_json(), **dict(sorted(files.items()))}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
     except OSError as error:
-        raise BundleError(thing, error, "a folder that can be written") from None
+        raise BundleError(subject, error, "a folder that can be written") from None
     try:
         if path.suffix == ".zip":
             _write_zip(work / "bundle.zip", contents)
@@ -244,7 +244,7 @@ def write_bundle(path: str | Path, manifest: Manifest, files: Mapping[str, bytes
             os.rename(folder, path)
         sync_folder(path.parent)
     except OSError as error:
-        raise BundleError(thing, error, "a new path that can be written") from None
+        raise BundleError(subject, error, "a new path that can be written") from None
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return path
@@ -270,10 +270,10 @@ def _write_file(path: Path, data: bytes) -> None:
         os.fsync(file.fileno())
 
 
-def _check_listing(names: set[str], thing: str) -> None:
+def _check_listing(names: set[str], subject: str) -> None:
     for name in names:
-        check_name(name, thing)
+        check_name(name, subject)
     if missing := REQUIRED_FILES - names:
-        raise BundleError(f"{thing}: files", f"no {', '.join(sorted(missing))}", f"{DECODER}, {TWIN} and {GOLDEN}")
+        raise BundleError(f"{subject}: files", f"no {', '.join(sorted(missing))}", f"{DECODER}, {TWIN} and {GOLDEN}")
     if extra := names - REQUIRED_FILES - OPTIONAL_FILES:
-        raise BundleError(f"{thing}: files", sorted(extra), f"{sorted(REQUIRED_FILES | OPTIONAL_FILES)} only")
+        raise BundleError(f"{subject}: files", sorted(extra), f"{sorted(REQUIRED_FILES | OPTIONAL_FILES)} only")

@@ -14,8 +14,8 @@ def calibration_of(bundle: Bundle) -> Calibration:
         CalibrationError: its text is no calibration of its profile.
     """
     try:
-        calibration = parse_calibration(bundle.manifest.calibration, f"{bundle.thing}: calibration")
+        calibration = parse_calibration(bundle.manifest.calibration, f"{bundle.subject}: calibration")
         calibration.check_profile(bundle.profile)
     except ProfileError as error:
-        raise CalibrationError(error.thing, error.got, error.wanted) from None
+        raise CalibrationError(error.subject, error.got, error.expected) from None
     return calibration

@@ -74,12 +74,12 @@ class Manifest(BaseModel):
         return (json.dumps(data | {_SELF_HASH: _digest(data)}, indent=2, sort_keys=True) + "\n").encode()
 
 
-def parse_manifest(text: bytes, thing: str) -> Manifest:
+def parse_manifest(text: bytes, subject: str) -> Manifest:
     """Read and check a manifest.
 
     Args:
         text: the bytes of manifest.json.
-        thing: what it is, for the error.
+        subject: what it is, for the error.
 
     Raises:
         BundleError: not JSON, another format, a newer schema, damaged, or a wrong key.
@@ -87,25 +87,25 @@ def parse_manifest(text: bytes, thing: str) -> Manifest:
     try:
         data = json.loads(text, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
-        raise BundleError(thing, f"text that is not JSON ({error})", "a JSON object") from None
+        raise BundleError(subject, f"text that is not JSON ({error})", "a JSON object") from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         got = data.get("format") if isinstance(data, dict) else type(data).__name__
-        raise BundleError(f"{thing}: format", repr(got), repr(FORMAT))
+        raise BundleError(f"{subject}: format", repr(got), repr(FORMAT))
     if data.get("schema_version") != SCHEMA_VERSION:
         raise BundleError(
-            f"{thing}: schema_version", repr(data.get("schema_version")), f"{SCHEMA_VERSION}, all this program reads"
+            f"{subject}: schema_version", repr(data.get("schema_version")), f"{SCHEMA_VERSION}, all this program reads"
         )
     claimed = data.pop(_SELF_HASH, None)
     if claimed != (actual := _digest(data)):
-        raise BundleError(f"{thing}: {_SELF_HASH}", f"{claimed} written, {actual} found", "two equal hashes")
+        raise BundleError(f"{subject}: {_SELF_HASH}", f"{claimed} written, {actual} found", "two equal hashes")
     try:
         return Manifest.model_validate(data)
     except ValidationError as error:
         problems = "; ".join(f"{'.'.join(map(str, e['loc']))} = {e['input']!r} ({e['msg']})" for e in error.errors())
-        raise BundleError(thing, problems, "a valid manifest") from None
+        raise BundleError(subject, problems, "a valid manifest") from None
 
 
-def check_version(version: str, thing: str) -> None:
+def check_version(version: str, subject: str) -> None:
     """Check the version of a bundle that is to be made.
 
     Raises:
@@ -114,8 +114,8 @@ def check_version(version: str, thing: str) -> None:
     try:
         TypeAdapter(Version).validate_python(version)
     except ValidationError:
-        wanted = "1 to 100 letters, digits and _ . + -, a letter or digit first"
-        raise BundleError(thing, repr(version), wanted) from None
+        expected = "1 to 100 letters, digits and _ . + -, a letter or digit first"
+        raise BundleError(subject, repr(version), expected) from None
 
 
 def sha256(data: bytes) -> str:

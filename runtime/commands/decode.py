@@ -64,12 +64,12 @@ def decode(
             if pages is not None and pages > file.pages:
                 raise RecordingError(f"recording {recording}", f"{file.pages} pages", f"at least {pages} (--pages)")
             count, levels = pages or file.pages, levels or file.levels
-            thing, decoded = f"recording {recording}", _sent(client, file, count, levels)
+            subject, decoded = f"recording {recording}", _sent(client, file, count, levels)
         else:
             count, levels = pages or 1, levels or client.describe().source_levels
             if not levels:
                 raise InvalidInputError(f"service at {target}", "no source", "a service started with --source")
-            thing, decoded = f"source of {target}", _read(client, count, levels)
+            subject, decoded = f"source of {target}", _read(client, count, levels)
         writer = stack.enter_context(DecodedWriter(out, levels)) if out is not None else None
         for page in track(decoded, "decode", total=count):
             if isinstance(page, RefusedPage):
@@ -83,7 +83,7 @@ def decode(
             data["pages_unconfirmed"] = unconfirmed(refused)
             write_json(json_path, data)
         if refused and not results:
-            raise refusal(thing, refused, count)
+            raise refusal(subject, refused, count)
     click.echo(table(results))
     rates = [rate for result in results if (rate := result["air_bits_per_symbol"]) is not None]
     if rates and fmean(rates) <= 0:
@@ -93,7 +93,7 @@ def decode(
     if doubtful := [result for result in results if result["pilot_coherence"] < LEAST_COHERENCE]:
         warn(unknown_pistons(doubtful))
     if refused:
-        raise refusal(thing, refused, count)
+        raise refusal(subject, refused, count)
 
 
 def page_report(page: RemotePage) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def _table_of(bundle: Bundle) -> Iterator[None]:
     try:
         yield
     except InvalidInputError as error:
-        raise BundleError(f"{bundle.thing}: {error.thing}", error.got, error.wanted) from None
+        raise BundleError(f"{bundle.subject}: {error.subject}", error.got, error.expected) from None
 
 
 def open_graph(bundle: Bundle, threads: int | None = None) -> TableGraph:
@@ -56,12 +56,12 @@ def open_graph(bundle: Bundle, threads: int | None = None) -> TableGraph:
     Raises:
         BundleError: no ONNX model, or its table is not the one of the manifest, or does not fit.
     """
-    thing = f"{bundle.thing}: {DECODER}"
-    file = GraphFile(bundle.files[DECODER], thing)
+    subject = f"{bundle.subject}: {DECODER}"
+    file = GraphFile(bundle.files[DECODER], subject)
     if set(file.table_inputs) != set(bundle.manifest.table_inputs):
-        raise BundleError(f"{thing}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
+        raise BundleError(f"{subject}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
     with _table_of(bundle):
-        return TableGraph(file, thing, inputs_left(bundle.profile), threads, bundle.table)
+        return TableGraph(file, subject, inputs_left(bundle.profile), threads, bundle.table)
 
 
 class Decoder:
@@ -241,36 +241,36 @@ class Decoder:
 
     def _check_graph(self) -> None:
         """Check names, types and shapes of the frames and of what the graph says of them."""
-        manifest, profile, thing = self.bundle.manifest, self.bundle.profile, f"{self.bundle.thing}: {DECODER}"
+        manifest, profile, subject = self.bundle.manifest, self.bundle.profile, f"{self.bundle.subject}: {DECODER}"
         inputs = {node.name: Port.of(node) for node in self.graph.session.get_inputs()}
         if set(inputs) != {"in_phase", "quadrature"}:
-            raise BundleError(f"{thing}: inputs", sorted(inputs), "in_phase and quadrature")
+            raise BundleError(f"{subject}: inputs", sorted(inputs), "in_phase and quadrature")
         for name, port in inputs.items():
             if not port.admits(manifest.frame_dtype, profile.frame_shape):
-                wanted = f"{manifest.frame_dtype} {profile.frame_shape}"
-                raise BundleError(f"{thing}: input {name}", f"{port.dtype} {port.shape}", wanted)
+                expected = f"{manifest.frame_dtype} {profile.frame_shape}"
+                raise BundleError(f"{subject}: input {name}", f"{port.dtype} {port.shape}", expected)
         outputs = {node.name: Port.of(node) for node in self.graph.session.get_outputs()}
         shapes = {"p": (2, *profile.page_shape), "phase": profile.page_shape, "concentration": profile.page_shape}
         for name, shape in shapes.items():
             if name not in outputs or not outputs[name].admits("float32", shape):
                 got = f"{outputs[name].dtype} {outputs[name].shape}" if name in outputs else "nothing"
-                raise BundleError(f"{thing}: output {name}", got, f"float32 {shape}")
+                raise BundleError(f"{subject}: output {name}", got, f"float32 {shape}")
         if manifest.residual_output is not None and manifest.residual_output not in outputs:
-            raise BundleError(f"{thing}: output {manifest.residual_output}", "nothing", "a scalar residual")
+            raise BundleError(f"{subject}: output {manifest.residual_output}", "nothing", "a scalar residual")
 
     def _check_golden(self) -> None:
-        golden, thing = self.bundle.golden, f"{self.bundle.thing}: {GOLDEN}"
+        golden, subject = self.bundle.golden, f"{self.bundle.subject}: {GOLDEN}"
         try:
             self.check(golden.pair)
             p = self.infer(golden.pair).p
         except BundleError:
             raise
         except Exception as error:  # onnxruntime's errors share no base class
-            raise BundleError(thing, error, "a golden page that decodes") from None
+            raise BundleError(subject, error, "a golden page that decodes") from None
         if golden.p.shape != p.shape:
-            raise BundleError(f"{thing}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
+            raise BundleError(f"{subject}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
         error_norm = float(np.linalg.norm(p - golden.p) / max(float(np.linalg.norm(golden.p)), 1e-30))
         if not error_norm <= GOLDEN_TOLERANCE:
             raise BundleError(
-                thing, f"an answer off by {error_norm:.3g} of its norm", f"the expected p within {GOLDEN_TOLERANCE:g}"
+                subject, f"an answer off by {error_norm:.3g} of its norm", f"the expected p within {GOLDEN_TOLERANCE:g}"
             )

@@ -36,10 +36,10 @@ class BundleFieldSolver:
         self._graph, self._profile = graph, bundle.profile
         self._alone = FIELD in bundle.files
         name = FIELD if self._alone else DECODER
-        self._thing = f"{bundle.thing}: {name}"
-        self._session = open_session(bundle.files[name], self._thing, threads)
+        self._subject = f"{bundle.subject}: {name}"
+        self._session = open_session(bundle.files[name], self._subject, threads)
         if missing := set(OUTPUTS) - {node.name for node in self._session.get_outputs()}:
-            raise BundleError(f"{self._thing}: outputs", f"no {', '.join(sorted(missing))}", "a graph with its field")
+            raise BundleError(f"{self._subject}: outputs", f"no {', '.join(sorted(missing))}", "a graph with its field")
 
     def __call__(
         self,
@@ -67,5 +67,5 @@ class BundleFieldSolver:
         (real, imaginary), left = self._session.run(OUTPUTS, feeds)
         if real.shape != (wanted := field_grid(self._profile).shape):
             expected = f"{wanted}, or a {FIELD} beside it"
-            raise BundleError(f"{self._thing}: output field", f"shape {real.shape}", expected)
+            raise BundleError(f"{self._subject}: output field", f"shape {real.shape}", expected)
         return np.asarray(real + 1j * imaginary, np.complex64), left

@@ -32,12 +32,12 @@ def check_pair(pair: FramePair, shape: tuple[int, int], dtype: str, bit_depth: i
 
 
 @contextmanager
-def named(thing: str) -> Iterator[None]:
-    """Put `thing` before what a `FrameError` names."""
+def named(subject: str) -> Iterator[None]:
+    """Put `subject` before what a `FrameError` names."""
     try:
         yield
     except FrameError as error:
-        raise FrameError(thing + error.thing, error.got, error.wanted) from error
+        raise FrameError(subject + error.subject, error.got, error.expected) from error
 
 
 def _check_frame(name: str, frame: NDArray[Any], shape: tuple[int, int], dtype: str, bit_depth: int) -> None:
@@ -53,9 +53,9 @@ def narrow(pair: FramePair, bit_depth: int) -> FramePair:
 
     A recording may hold 8-bit counts in 16 bits; a camera and a bundle do not.
     """
-    wanted = frame_type(bit_depth)
+    expected = frame_type(bit_depth)
     frames = [
-        frame.astype(wanted, copy=False) if int(frame.max(initial=0)) <= np.iinfo(wanted).max else frame
+        frame.astype(expected, copy=False) if int(frame.max(initial=0)) <= np.iinfo(expected).max else frame
         for frame in (pair.in_phase, pair.quadrature)
     ]
     return FramePair(frames[0], frames[1])

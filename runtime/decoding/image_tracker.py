@@ -348,7 +348,7 @@ def tracker_for(decoder: Decoder) -> Tracker:
     if decoder.has_field_graph:
         search = BundleSearch(decoder, twin)
     else:
-        _log.warning("%s: no field graph, so an image that is lost is not looked for", decoder.bundle.thing)
+        _log.warning("%s: no field graph, so an image that is lost is not looked for", decoder.bundle.subject)
     return ImageTracker(decoder, DriftModel.of_decoder(decoder, twin), BundleTables(decoder, twin), search)
 
 

@@ -88,13 +88,13 @@ def confirmed(page: DecodedPage, found: FoundImage | None = None) -> DecodedPage
     if check.agrees:
         reason = Reason.TOO_FEW_PILOTS
         told = f"{check.pilots} that tell {check.pilots * max(0.0, check.confirmed_bits):.0f} bits together{looked}"
-        wanted = "more pilots, or more light: as much may be chance"
+        expected = "more pilots, or more light: as much may be chance"
     else:
         reason = Reason.IMAGE_NOT_FOUND if lost else Reason.PILOTS_DISAGREE
         cure = "its image lies further off or it has changed, calibrate anew" if lost else "it has changed, recalibrate"
         share = f"at least {LEAST_CONFIRMED_SHARE:.0%} of them"
-        wanted = f"{share}: frames and pilots of this device, as it was calibrated (if {cure})"
-    error = UnconfirmedPageError("pilots", told, wanted, reason, check.recalibration_due)
+        expected = f"{share}: frames and pilots of this device, as it was calibrated (if {cure})"
+    error = UnconfirmedPageError("pilots", told, expected, reason, check.recalibration_due)
     error.page = page
     raise error
 

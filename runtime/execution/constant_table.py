@@ -29,7 +29,7 @@ class GraphFile:
 
     Args:
         model: the serialised model.
-        thing: what it is, for the error.
+        subject: what it is, for the error.
 
     Attributes:
         table_inputs: inputs that have a default, by name, of its type and shape.
@@ -38,15 +38,15 @@ class GraphFile:
         BundleError: the bytes are no ONNX model.
     """
 
-    def __init__(self, model: bytes, thing: str) -> None:
+    def __init__(self, model: bytes, subject: str) -> None:
         self._model = model
-        wanted = "an ONNX model of a Lightpage bundle"
+        expected = "an ONNX model of a Lightpage bundle"
         try:
             whole = pb.Model.FromString(model)
         except DecodeError as error:
-            raise BundleError(thing, error, wanted) from None
+            raise BundleError(subject, error, expected) from None
         if not whole.HasField("graph"):
-            raise BundleError(thing, "no graph", wanted)
+            raise BundleError(subject, "no graph", expected)
         fed = {entry.name for entry in whole.graph.input} if whole.ir_version >= _DEFAULTS_FROM else set()
         self.table_inputs = {
             tensor.name: Port(_DTYPES.get(tensor.data_type, str(tensor.data_type)), tuple(tensor.dims))

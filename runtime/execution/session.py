@@ -75,12 +75,12 @@ _ERRORS_ONLY = 3
 _NOWHERE = os.path.join(os.sep, "nonexistent", "lightpage")
 
 
-def open_session(model: bytes, thing: str, threads: int | None = None) -> Session:
+def open_session(model: bytes, subject: str, threads: int | None = None) -> Session:
     """Open an ONNX model held in memory on the CPU.
 
     Args:
         model: the serialised model; weights in other files are not looked for.
-        thing: what it is, for the error, e.g. ``"bundle B: decoder.onnx"``.
+        subject: what it is, for the error, e.g. ``"bundle B: decoder.onnx"``.
         threads: threads for one run; by default as many as this process has cores.
 
     Raises:
@@ -95,5 +95,5 @@ def open_session(model: bytes, thing: str, threads: int | None = None) -> Sessio
     try:
         session: Session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors share no base class
-        raise BundleError(thing, str(error).splitlines()[0], "an ONNX model of a Lightpage bundle") from None
+        raise BundleError(subject, str(error).splitlines()[0], "an ONNX model of a Lightpage bundle") from None
     return session

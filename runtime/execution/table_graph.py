@@ -19,7 +19,7 @@ class TableGraph:
 
     Args:
         file: the graph as stored.
-        thing: what it is, for errors.
+        subject: what it is, for errors.
         fed: names of table inputs that stay inputs, and are fed.
         threads: threads of one run; by default the cores that this process may use.
         table: values instead of the graph's defaults.
@@ -30,17 +30,17 @@ class TableGraph:
     """
 
     def __init__(
-        self, file: GraphFile, thing: str, fed: Collection[str], threads: int | None, table: Table | None = None
+        self, file: GraphFile, subject: str, fed: Collection[str], threads: int | None, table: Table | None = None
     ) -> None:
-        self._file, self._thing, self._fed_names, self._threads = file, thing, fed, threads
+        self._file, self._subject, self._fed_names, self._threads = file, subject, fed, threads
         self.table: Table = table or {}
         self.check(self.table)
         self._fed = {name: value for name, value in self.table.items() if name in fed}
-        self.session: Session = open_session(file.built_in(self.table, fed), thing, threads)
+        self.session: Session = open_session(file.built_in(self.table, fed), subject, threads)
 
     def with_table(self, table: Table) -> TableGraph:
         """The graph with other tensors in its table, by name; those left out stay. Errors as for the constructor."""
-        return TableGraph(self._file, self._thing, self._fed_names, self._threads, {**self.table, **table})
+        return TableGraph(self._file, self._subject, self._fed_names, self._threads, {**self.table, **table})
 
     @property
     def ports(self) -> Mapping[str, Port]:

@@ -33,17 +33,17 @@ class OnnxTwin:
     """
 
     def __init__(self, bundle: Bundle, threads: int | None = None) -> None:
-        thing = f"{bundle.thing}: {TWIN}"
-        self._session = open_session(bundle.files[TWIN], thing, threads)
+        subject = f"{bundle.subject}: {TWIN}"
+        self._session = open_session(bundle.files[TWIN], subject, threads)
         inputs = self._session.get_inputs()
         found = {node.name: (node.type, len(node.shape)) for node in inputs}
-        if found != (wanted := {name: ("tensor(double)", axes) for name, axes in INPUTS.items()}):
-            raise BundleError(f"{thing}: inputs", found, wanted)
+        if found != (expected := {name: ("tensor(double)", axes) for name, axes in INPUTS.items()}):
+            raise BundleError(f"{subject}: inputs", found, expected)
         size = next(node.shape for node in inputs if node.name == "parameters")[0]
         if isinstance(size, int) and size != len(NAMES):
-            raise BundleError(f"{thing}: parameters", size, f"{len(NAMES)}: {', '.join(NAMES)}")
+            raise BundleError(f"{subject}: parameters", size, f"{len(NAMES)}: {', '.join(NAMES)}")
         if missing := set(OUTPUTS) - {node.name for node in self._session.get_outputs()}:
-            raise BundleError(f"{thing}: outputs", f"no {', '.join(sorted(missing))}", ", ".join(OUTPUTS))
+            raise BundleError(f"{subject}: outputs", f"no {', '.join(sorted(missing))}", ", ".join(OUTPUTS))
 
     def trace(self, parameters: Real, points: Real, anchors: Real | None = None) -> Rays:
         """See `lightpage.calibration.interfaces.Twin`."""

@@ -59,7 +59,7 @@ def judge(before: float, judged: list[JudgedPage], levels: int) -> None:
     """
     for page in judged:
         if isinstance(page.lost, FrameError):
-            raise RecalibrationRefusedError(page.lost.thing, page.lost.got, page.lost.wanted)
+            raise RecalibrationRefusedError(page.lost.subject, page.lost.got, page.lost.expected)
     least, worst, after = (
         MIN_AIR_SHARE * math.log2(levels),
         min(page.air for page in judged),

@@ -76,7 +76,7 @@ def recalibrate(
         refitted = decoder.of_bundle(_refitted(decoder.bundle, result))
         judged = judged_pages(tracker.refitted(refitted), decoder.bundle, held_back, judging)
     except (CalibrationError, FrameError) as error:
-        raise RecalibrationRefusedError(error.thing, error.got, error.wanted) from error
+        raise RecalibrationRefusedError(error.subject, error.got, error.expected) from error
     after = fmean(page.air for page in judged)
     judge(before, judged, pages.levels)
     progress("write the new bundle", 0.95)

@@ -52,8 +52,8 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
     profile, earlier = bundle.profile, calibration_of(bundle)
     if not _REFITTED & decoder.graph.ports.keys():
         among = f"{' or '.join(sorted(_REFITTED))} among them"
-        wanted = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
-        raise BundleError(f"{bundle.thing}: table inputs", sorted(decoder.graph.ports), wanted)
+        expected = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
+        raise BundleError(f"{bundle.subject}: table inputs", sorted(decoder.graph.ports), expected)
     references = pages.references or _kept_references(bundle)
     if references is None:
         raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
@@ -78,8 +78,9 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         )
     except CalibrationError as error:
         if image is None:
-            wanted = f"{error.wanted}; an image within {REACH_PX:g} px of where it was last seen, else calibrate anew"
-            raise CalibrationError("re-fit", f"no image of the first page; then {error.got}", wanted) from None
+            near = f"an image within {REACH_PX:g} px of where it was last seen, else calibrate anew"
+            expected = f"{error.expected}; {near}"
+            raise CalibrationError("re-fit", f"no image of the first page; then {error.got}", expected) from None
         raise
     if registered.coherence_after < LEAST_KEPT * earlier.reference_coherence:
         raise CalibrationError(

@@ -106,12 +106,12 @@ class DataPlane:
         if 2 * shape[0] * shape[1] * np.dtype(dtype).itemsize > self.limits.pair_bytes:
             PairReceiver(shape, dtype, self.limits.pair_bytes)
         bundle = self.registry.current.decoder.bundle
-        wanted = (bundle.profile.frame_shape, bundle.manifest.frame_dtype, bundle.manifest.camera_bit_depth)
-        if (shape, dtype, bit_depth) != wanted:
+        expected = (bundle.profile.frame_shape, bundle.manifest.frame_dtype, bundle.manifest.camera_bit_depth)
+        if (shape, dtype, bit_depth) != expected:
             raise FrameError(
                 "frame pair",
                 f"{shape[0]}x{shape[1]} pixels, {dtype}, {bit_depth} bits",
-                f"{wanted[0][0]}x{wanted[0][1]} pixels, {wanted[1]}, {wanted[2]} bits",
+                f"{expected[0][0]}x{expected[0][1]} pixels, {expected[1]}, {expected[2]} bits",
             )
         with self.receives.held(caller):
             yield PairReceiver(shape, dtype, self.limits.pair_bytes)
@@ -174,9 +174,9 @@ class DataPlane:
                 pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
             else:
                 pilots = model.decoder.pilots(source.levels, mask)
-            thing = f"page {found.page_index} of {source.name}"
-            with own_fault(f"{thing}: "):
-                decoded = self._decode(model, found.pair, levels, pilots, thing)
+            subject = f"page {found.page_index} of {source.name}"
+            with own_fault(f"{subject}: "):
+                decoded = self._decode(model, found.pair, levels, pilots, subject)
         answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start)
         return ReadAnswer(answer, found, mask)
 
@@ -208,9 +208,9 @@ class DataPlane:
         return decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
 
     def _decode(
-        self, model: Model, pair: FramePair, levels: int, pilots: Pilots | None, thing: str, *, sure: bool = True
+        self, model: Model, pair: FramePair, levels: int, pilots: Pilots | None, subject: str, *, sure: bool = True
     ) -> DecodedPage:
-        """Decode with a model that was taken once, and count the page, which an error calls `thing`.
+        """Decode with a model that was taken once, and count the page, which an error calls `subject`.
 
         Of a page that its pilots do not confirm, only pilots that are `sure` say anything of the device: a caller's may
         be wrong.
@@ -219,7 +219,7 @@ class DataPlane:
             page = model.tracker.decode(pair, levels, pilots)
         except LostPageError as error:
             self.metrics.lost(error, tells=sure)
-            lost = error.about(thing)
+            lost = error.about(subject)
             lost.recalibration_due = lost.recalibration_due and sure
             raise lost from None
         self.metrics.page(page, model.version)

@@ -78,8 +78,8 @@ class Recalibrator:
         """
         source = self._plane.source
         self._check_count(len(pages) or count)
-        wanted: list[int | None] = list(pages) or [None] * count
-        return self._run(lambda heard: read_known(source, wanted, heard), caller)
+        expected: list[int | None] = list(pages) or [None] * count
+        return self._run(lambda heard: read_known(source, expected, heard), caller)
 
     def from_recording(self, name: str, count: int, caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
         """Recalibrate with the first `count` pages (0: all) of a recording in the recordings folder.

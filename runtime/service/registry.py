@@ -92,7 +92,7 @@ class ModelRegistry:
                 )
             self._check_replaces(decoder, current.decoder)
             if any(other.version == decoder.version for other in held):
-                raise BundleError(f"{decoder.bundle.thing}: version", decoder.version, "a version not held already")
+                raise BundleError(f"{decoder.bundle.subject}: version", decoder.version, "a version not held already")
             note(model)
             with self._lock:
                 self._models = [*held, model][-self._kept :]
@@ -124,4 +124,4 @@ class ModelRegistry:
             for d in (new, old)
         ]
         if shapes[0] != shapes[1]:
-            raise BundleError(f"{new.bundle.thing}: frames and page", shapes[0], f"{shapes[1]}, as in service")
+            raise BundleError(f"{new.bundle.subject}: frames and page", shapes[0], f"{shapes[1]}, as in service")

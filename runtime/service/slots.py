@@ -37,8 +37,8 @@ class Slots:
         while not self._free.acquire(timeout=min(_POLL_S, max(0.0, until - time.monotonic()))):
             caller.check()
             if time.monotonic() >= until:
-                wanted = "a free one within the deadline; try again later"
-                raise SlotsTakenError(f"concurrent {self._what}", "all taken", wanted)
+                expected = "a free one within the deadline; try again later"
+                raise SlotsTakenError(f"concurrent {self._what}", "all taken", expected)
 
     def give_back(self) -> None:
         """Give back a slot that was taken."""

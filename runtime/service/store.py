@@ -80,19 +80,19 @@ class ModelStore:
             return None
 
     def _noted(self) -> Path | None:
-        thing = f"model store {self.folder}"
+        subject = f"model store {self.folder}"
         try:
             note = json.loads((self.folder / CURRENT).read_text("utf-8"))
             name, base = note["bundle"], note["base"]
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise BundleError(f"{thing}: {CURRENT}", repr(error), "a note that can be read") from None
+            raise BundleError(f"{subject}: {CURRENT}", repr(error), "a note that can be read") from None
         if base != self._base or name is None:
             return None
         if not isinstance(name, str) or Path(name).name != name or name == MANIFEST:
-            raise BundleError(f"{thing}: {CURRENT}", repr(name), "the name of a bundle")
+            raise BundleError(f"{subject}: {CURRENT}", repr(name), "the name of a bundle")
         path = self.folder / name
         if not path.is_file():
-            raise BundleError(f"{thing}: {name}", "no such file", "the bundle that was in service")
+            raise BundleError(f"{subject}: {name}", "no such file", "the bundle that was in service")
         return path

@@ -82,8 +82,8 @@ def check_options(options: pb.DecodeOptions) -> None:
     if options.levels:
         check_levels(options.levels)
     if options.confidence_format not in _CONFIDENCE_FORMATS:
-        wanted = "CONFIDENCE_FORMAT_FLOAT32 or CONFIDENCE_FORMAT_UINT8"
-        raise InvalidInputError("confidence_format", options.confidence_format, wanted)
+        expected = "CONFIDENCE_FORMAT_FLOAT32 or CONFIDENCE_FORMAT_UINT8"
+        raise InvalidInputError("confidence_format", options.confidence_format, expected)
 
 
 def levels_of(options: pb.DecodeOptions) -> int:

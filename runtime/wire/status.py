@@ -76,13 +76,13 @@ def abort(context: grpc.ServicerContext, error: BaseException) -> None:
     """
     code = status_of(error)
     if isinstance(error, LightpageError):
-        thing, got, wanted = (without_folders(text)[:1000] for text in (error.thing, error.got, error.wanted))
-        detail = pb.ErrorDetail(kind=type(error).__name__, thing=thing, got=got, wanted=wanted)
+        subject, got, expected = (without_folders(text)[:1000] for text in (error.subject, error.got, error.expected))
+        detail = pb.ErrorDetail(kind=type(error).__name__, thing=subject, got=got, wanted=expected)
         if isinstance(error, LostPageError):
             detail.reason = _REASONS[error.reason]
             detail.recalibration_due = error.recalibration_due
         context.set_trailing_metadata(((DETAIL_KEY, detail.SerializeToString()),))
-        context.abort(code, f"{thing}: got {got}, wanted {wanted}"[:2000])
+        context.abort(code, f"{subject}: got {got}, wanted {expected}"[:2000])
     context.abort(code, f"{type(error).__name__} in the service; its log says more")
 
 
@@ -97,12 +97,12 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
                 return kind(*told, _reason(detail.reason), detail.recalibration_due)
             return kind(*told)
     code, text = call.code(), call.details() or "no details"
-    thing = f"service at {target}"
+    subject = f"service at {target}"
     if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
-        return LimitError(thing, text, "a smaller or a later request")
+        return LimitError(subject, text, "a smaller or a later request")
     if code == grpc.StatusCode.UNAVAILABLE:
-        return LightpageError(thing, f"no connection ({text})", "a running Lightpage service at this address")
-    return LightpageError(thing, f"{code.name}: {text}", "an answer")
+        return LightpageError(subject, f"no connection ({text})", "a running Lightpage service at this address")
+    return LightpageError(subject, f"{code.name}: {text}", "an answer")
 
 
 def _reason(code: pb.LossReason) -> Reason:

@@ -79,8 +79,8 @@ def test_constraints_are_plain_pins_that_resolve_anywhere() -> None:
 
 
 def test_every_direct_requirement_is_pinned() -> None:
-    wanted = [*PROJECT["dependencies"], *EXTRAS["train"], *EXTRAS["dev"]]
-    assert {normal(requirement) for requirement in wanted} <= pins().keys()
+    expected = [*PROJECT["dependencies"], *EXTRAS["train"], *EXTRAS["dev"]]
+    assert {normal(requirement) for requirement in expected} <= pins().keys()
 
 
 def test_torch_is_pinned_for_those_who_install_without_constraints_too() -> None:

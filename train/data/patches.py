@@ -56,8 +56,8 @@ class Patches(Dataset[Page]):
         # the last place lies on the step too
         self._sides = tuple(min(count, side - (side - count) % step) for count in mask.shape)
         if any(own < count and own <= 2 * rim for own, count in zip(self._sides, mask.shape, strict=True)):
-            wanted = f"at least {2 * rim + step}: more than twice what the network sees"
-            raise InvalidInputError("patch", f"{side} symbols", wanted)
+            expected = f"at least {2 * rim + step}: more than twice what the network sees"
+            raise InvalidInputError("patch", f"{side} symbols", expected)
         self._mask = torch.from_numpy(mask)
         self._each = int(np.prod([np.ceil(count / side) for count in mask.shape]))
 

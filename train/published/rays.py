@@ -197,9 +197,9 @@ class RayTracer(nn.Module):
 
 
 def _check(points: Tensor, angle: Tensor) -> None:
-    for thing, value in (("points", points), ("pipe angle", angle)):
+    for subject, value in (("points", points), ("pipe angle", angle)):
         if value.dtype != torch.float64:
-            raise InvalidInputError(thing, value.dtype, "torch.float64")
+            raise InvalidInputError(subject, value.dtype, "torch.float64")
     if points.ndim != 2 or points.shape[1] != 2:
         raise InvalidInputError("points", f"shape {tuple(points.shape)}", "shape (N, 2)")
     if angle.ndim != 0:

@@ -160,10 +160,10 @@ class SymbolTrainer:
         assert self.start is not None
         run = load_run(self.start)
         size = (run.localizer, run.profile.page_shape, *_size(run.hyperparameters, run.profile))
-        wanted = (self.localizer, profile.page_shape, *_size(self.choices, profile))
-        if size != wanted:
+        expected = (self.localizer, profile.page_shape, *_size(self.choices, profile))
+        if size != expected:
             raise InvalidInputError(
-                f"--start {self.start}: localizer, page, channels, blocks, levels, samples", size, f"{wanted}"
+                f"--start {self.start}: localizer, page, channels, blocks, levels, samples", size, f"{expected}"
             )
         return load_decoder(self.start, run)
 

@@ -115,10 +115,10 @@ class TestRecovery:
     def test_places_and_slopes_give_the_device_back(self) -> None:
         truth = some_device(2, 0.5)
         found = fit_parameters(TWIN, PROFILE, measured(truth), nominal(), EVERY, use_phase=False, evaluations=30)
-        predicted, wanted = (TWIN.trace(p, patch_centres()) for p in (found.parameters, truth))
+        predicted, expected = (TWIN.trace(p, patch_centres()) for p in (found.parameters, truth))
         assert abs(found.parameters[0] - truth[0]) < 0.05 * PRIORS[0]
         for b in range(3):
-            pixels, right = (TWIN.pixels(p, r.places[b]) for p, r in ((found.parameters, predicted), (truth, wanted)))
+            pixels, right = (TWIN.pixels(p, r.places[b]) for p, r in ((found.parameters, predicted), (truth, expected)))
             assert np.abs(pixels - right).max() < 0.1
         assert found.cost < 0.02
 
@@ -127,9 +127,9 @@ class TestRecovery:
         start = truth + some_device(4, 0.003)
         data = measured(truth, piston=2.5)
         found = fit_parameters(TWIN, PROFILE, data, start, EVERY, use_phase=True)
-        predicted, wanted = (TWIN.trace(p, patch_centres()).phases[:3] for p in (found.parameters, truth))
-        off = np.angle(np.exp(1j * (predicted + found.piston - wanted - 2.5)))
-        before = np.angle(np.exp(1j * (TWIN.trace(start, patch_centres()).phases[:3] - wanted)))
+        predicted, expected = (TWIN.trace(p, patch_centres()).phases[:3] for p in (found.parameters, truth))
+        off = np.angle(np.exp(1j * (predicted + found.piston - expected - 2.5)))
+        before = np.angle(np.exp(1j * (TWIN.trace(start, patch_centres()).phases[:3] - expected)))
         assert np.abs(off).max() < 5e-3 < 0.05 < np.abs(before).max()
 
     def test_the_carrier_takes_the_phase_to_its_true_place(self) -> None:
@@ -147,8 +147,9 @@ class TestRecovery:
         data = measured(truth)
         spoiled = [replace(m, pixels=m.pixels + 20) if i % 9 == 4 else m for i, m in enumerate(data)]
         robust = fit_parameters(TWIN, PROFILE, spoiled, nominal(), EVERY, use_phase=False)
-        places, wanted = (TWIN.pixels(p, TWIN.trace(p, patch_centres()).places[0]) for p in (robust.parameters, truth))
-        assert np.sqrt(np.mean((places - wanted) ** 2)) < 0.5
+        both = robust.parameters, truth
+        places, expected = (TWIN.pixels(p, TWIN.trace(p, patch_centres()).places[0]) for p in both)
+        assert np.sqrt(np.mean((places - expected) ** 2)) < 0.5
 
     def test_a_patch_on_one_camera_says_nothing_of_the_other_and_no_phase(self) -> None:
         one_camera = [replace(m, cameras=(0,)) for m in measured(some_device(8, 0.3), ("direct",))]

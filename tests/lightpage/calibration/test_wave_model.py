@@ -36,10 +36,10 @@ def missing_at_the_edge(angle_deg: float) -> float:
         patch.setattr(
             fitted_waves, "cells_for", lambda *given: tuple(int(ABUNDANT * cells) for cells in cells_for(*given))
         )
-        wanted = FittedWaves(PROFILE, as_vector(values), SAMPLES).to_camera(page)
+        expected = FittedWaves(PROFILE, as_vector(values), SAMPLES).to_camera(page)
     grid = field_grid(PROFILE)
     inside = np.ix_(abs(grid.y_m) < PROFILE.page_height_m / 2, abs(grid.x_m) < PROFILE.page_width_m / 2)
-    return float(np.linalg.norm((seen - wanted)[inside]) / np.linalg.norm(wanted[inside]))
+    return float(np.linalg.norm((seen - expected)[inside]) / np.linalg.norm(expected[inside]))
 
 
 @pytest.mark.parametrize("angle_deg", [3, -3, 5, -5])

@@ -29,12 +29,12 @@ def test_pages_one_by_one_give_the_figures_of_all_at_once(levels: int) -> None:
     )
     assert got_figures == pytest.approx(wanted_figures, rel=1e-12, nan_ok=True)
     assert accumulator.pages == tuple(measures.measure(*page, levels) for page in zip(mu, kappa, symbols, strict=True))
-    for got, wanted in zip(
+    for got, expected in zip(
         vars(accumulator.maps()).values(),
         vars(measures.symbol_maps(mu, kappa, symbols, levels, data)).values(),
         strict=True,
     ):
-        np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-14)
     decided, confidence = information.decide_with_confidence(mu, kappa, levels)
     for claims, wanted_claims in zip(
         accumulator.confidence_bins(), reliability.reliability(confidence, decided == symbols), strict=True

@@ -157,10 +157,10 @@ class TestReading:
                 file.create_dataset(name, data=data, dtype=other)
             assert not file["in_phase"].dtype.isnative
         with Recording.open(foreign) as recording:
-            for got, wanted in ((recording.frames(1), before), (recording.references(), references)):
+            for got, expected in ((recording.frames(1), before), (recording.references(), references)):
                 for name in ("in_phase", "quadrature"):
                     assert getattr(got, name).dtype.isnative
-                    assert np.array_equal(getattr(got, name), getattr(wanted, name))
+                    assert np.array_equal(getattr(got, name), getattr(expected, name))
             assert recording.page_hash(1) == page_hash
 
     @pytest.mark.parametrize("black", [0, 200, 4094])
@@ -216,7 +216,7 @@ class TestReading:
     def test_it_tells_where_its_own_profile_says_otherwise(self, foreign: Path) -> None:
         profile = load_profile("bench")
         other = profile.model_copy(update={"pipe": profile.pipe.model_copy(update={"length_m": 0.2})})
-        for text, wanted in (
+        for text, expected in (
             (other.to_toml(), [f"pipe.length_m = 0.2 (profile bench: {profile.pipe.length_m})"]),
             (profile.to_toml(), []),
             ("somebody else's notes", []),
@@ -224,7 +224,7 @@ class TestReading:
             with h5py.File(foreign, "r+") as file:
                 file.attrs["profile"] = text
             with Recording.open(foreign) as recording:
-                assert recording.differences(profile) == wanted
+                assert recording.differences(profile) == expected
 
     def test_a_page_that_is_not_there_is_refused(self, foreign: Path) -> None:
         with Recording.open(foreign) as recording:
@@ -357,10 +357,10 @@ class TestBadFiles:
     def test_an_inconsistent_recording_is_refused_with_its_name_what_came_and_what_was_wanted(
         self, foreign: Path, case: str
     ) -> None:
-        edit, thing, got = BAD[case]
+        edit, subject, got = BAD[case]
         with h5py.File(foreign, "r+") as file:
             edit(file)
-        with pytest.raises(RecordingError, match=rf"foreign\.h5: {thing}: got {got}.*, wanted "):
+        with pytest.raises(RecordingError, match=rf"foreign\.h5: {subject}: got {got}.*, wanted "):
             Recording.open(foreign)
 
     def test_a_group_in_place_of_a_dataset_is_refused(self, foreign: Path) -> None:

@@ -82,9 +82,9 @@ def test_the_devices_own_pilot_phases_hold_at_any_level_count(levels: int, tmp_p
 def test_pilots_without_phases_follow_the_profiles_pattern_at_their_own_places(tmp_path: Path) -> None:
     older = Decoder.load(toy.write_own_pilots_bundle(tmp_path / "older.zip", mask=toy.OWN_MASK), threads=1)
     assert older.bundle.pilot_phases is None
-    wanted = Pilots.of_profile(toy.PROFILE, 16, toy.OWN_MASK)
-    assert (older.pilots(16).mask == wanted.mask).all()
-    assert (older.pilots(16).phases == wanted.phases).all()
+    expected = Pilots.of_profile(toy.PROFILE, 16, toy.OWN_MASK)
+    assert (older.pilots(16).mask == expected.mask).all()
+    assert (older.pilots(16).phases == expected.phases).all()
 
 
 @pytest.mark.parametrize(

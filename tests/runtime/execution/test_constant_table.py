@@ -38,8 +38,8 @@ def test_a_graph_with_its_table_built_in_answers_as_one_that_is_fed(fed: tuple[s
     assert names_of(built) == FRAMES | set(fed)
     still_fed = {name: value for name, value in table.items() if name in fed}
     answers = open_session(built, "built in", 1).run(["p", "phase"], {**frames, **still_fed})
-    wanted = open_session(model, "fed", 1).run(["p", "phase"], {**frames, **table})
-    for answer, want in zip(answers, wanted, strict=True):
+    expected = open_session(model, "fed", 1).run(["p", "phase"], {**frames, **table})
+    for answer, want in zip(answers, expected, strict=True):
         np.testing.assert_array_equal(answer, want)
 
 

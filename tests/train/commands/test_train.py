@@ -184,8 +184,8 @@ def test_dark_pages_are_named_and_left_out(device: list[str], tmp_path: Path) ->
     assert "page 0, quadrature frame: got black" in dark
     assert "page 6, in-phase frame: got saturated" in bright
     with Recording.open(path) as recording:
-        wanted = [recording.page_hash(page) for page in (1, 2, 3, 4, 5)]
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["trained_pages"] == wanted
+        expected = [recording.page_hash(page) for page in (1, 2, 3, 4, 5)]
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["trained_pages"] == expected
 
 
 def test_two_processes_train_one_run_and_its_refinement(small_device: list[str], tmp_path: Path) -> None:

@@ -41,9 +41,9 @@ def test_the_rate_in_training_is_that_of_the_symbols_whatever_the_piston(levels:
     rng = np.random.default_rng(levels)
     symbols, kappa = rng.integers(levels, size=4000), rng.gamma(2.0, concentration / 2, 4000)
     mu = symbols * 2 * np.pi / levels + rng.vonmises(0, kappa)
-    wanted = achievable_rate(mu, kappa, symbols, levels).mean()
+    expected = achievable_rate(mu, kappa, symbols, levels).mean()
     for piston in (0.0, 2.1):
         p = torch.from_numpy(kappa * np.stack([np.cos(mu + piston), np.sin(mu + piston)]))
         phases = torch.from_numpy(symbols * 2 * np.pi / levels + piston)
-        assert training_rate(p, phases, levels) == pytest.approx(wanted, abs=2e-3)
-    assert wanted < np.log2(levels)
+        assert training_rate(p, phases, levels) == pytest.approx(expected, abs=2e-3)
+    assert expected < np.log2(levels)

@@ -92,9 +92,9 @@ def inside() -> np.ndarray:
 
 def error_db(field: np.ndarray, truth: np.ndarray) -> float:
     """Power of the error over that of the truth inside the page, the best complex scale given for free."""
-    got, wanted = field[inside()], truth[inside()]
-    scale = np.vdot(got, wanted) / np.vdot(got, got)
-    return float(10 * np.log10(np.sum(np.abs(wanted - scale * got) ** 2) / np.sum(np.abs(wanted) ** 2)))
+    got, expected = field[inside()], truth[inside()]
+    scale = np.vdot(got, expected) / np.vdot(got, got)
+    return float(10 * np.log10(np.sum(np.abs(expected - scale * got) ** 2) / np.sum(np.abs(expected) ** 2)))
 
 
 def left_over(field: np.ndarray, residual: np.ndarray) -> float:
