@@ -60,8 +60,8 @@ WAVE_REFINED = "wave-refined"
 
 ORACLE_REFINED = "oracle-refined"
 
-FIRST_LOOKS = {REFINED: "coherent", WAVE_REFINED: "wave", ORACLE_REFINED: ORACLE}
-"""Arms that look again, and the arm whose first look they share."""
+FIRST_PASSES = {REFINED: "coherent", WAVE_REFINED: "wave", ORACLE_REFINED: ORACLE}
+"""Arms that make another pass, and the arm whose first pass they share."""
 
 ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, WAVE_REFINED, ORACLE, ORACLE_REFINED)
 
@@ -144,7 +144,7 @@ class Bench:
         return CalibratedDevice.of(self.profile, self.fitted, references)
 
     def extractor(self, arm: str) -> FeatureExtractor:
-        """Of the calibrated device; of the true one for what an oracle looks at again, the signal's power left in."""
+        """Of the calibrated device; of the true one for what an oracle passes over again, the signal's power left in."""
         localizer = "coherent" if arm in (ORACLE, FAST) else arm
         return FeatureExtractor(self.calibrated_device(arm), localizer, PRESETS[FAST] if arm == FAST else None)
 
@@ -156,19 +156,19 @@ class Bench:
         else:
             channels, blocks, levels = map(int, size.split("x"))
             choices = replace(choices, channels=channels, blocks=blocks, levels=levels)
-        look = FIRST_LOOKS.get(name, name)
-        folder, features, first, preparing = self.first_look(look, size, choices)
-        if name not in FIRST_LOOKS:
+        base = FIRST_PASSES.get(name, name)
+        folder, features, first, preparing = self.first_pass(base, size, choices)
+        if name not in FIRST_PASSES:
             self.kept.keep(folder)
             drawn = choices.drawn(self.profile.page_shape)
             outcome = self.outcome(name, size, choices.steps, folder, first, *self.held_out(features), preparing, drawn)
             return replace(outcome, by_levels=self.at_levels(name, folder, [first], outcome.kappa_scale))
-        extractor = self.extractor(look)
+        extractor = self.extractor(base)
         pages = known_pages(self.recording, self.profile, self.training[:MATCHED_PAGES])
         prediction = fit_prediction(extractor, explained(extractor, pages))
         counts = len(self.training), len(self.validation)
         inputs = RefinementPages(self.recording, self.pages, *counts, features)
-        key = self.key(look)
+        key = self.key(base)
         refined = fit_refinements(folder, choices, inputs, extractor, prediction, first, key, devices=1)
         self.kept.keep(folder)
         at = folder / f"refinement-{choices.refinements}"
@@ -178,15 +178,15 @@ class Bench:
         drawn = again.drawn(self.profile.page_shape)
         arm = f"{name} {choices.refinements}"
         outcome = self.outcome(arm, size, again.steps, at, refined.last, *held_out, preparing, drawn)
-        looks = [first, *refined.trained]
-        by_levels = self.at_levels(look, at, looks, outcome.kappa_scale, prediction)
-        return replace(outcome, looks=len(looks), by_levels=by_levels)
+        passes = [first, *refined.trained]
+        by_levels = self.at_levels(base, at, passes, outcome.kappa_scale, prediction)
+        return replace(outcome, looks=len(passes), by_levels=by_levels)
 
     def at_levels(
         self,
         name: str,
         folder: Path,
-        looks: list[Fitted[SymbolTraining]],
+        passes: list[Fitted[SymbolTraining]],
         scale: float,
         prediction: Prediction | None = None,
     ) -> list[LevelFigures]:
@@ -200,7 +200,7 @@ class Bench:
                 numbers = list(range(pages.pages))
                 looked = partial(self.features_of, name, pages, numbers)
                 fill(at / "look-0", self.key(name), len(numbers), looked, f"pages of {levels} levels")
-                for number in range(1, len(looks)):
+                for number in range(1, len(passes)):
                     assert prediction is not None
                     earlier = at / f"look-{number - 1}"
                     inputs = RefinementPages(pages, numbers, len(numbers), 0, earlier)
@@ -210,29 +210,29 @@ class Bench:
                         prediction,
                         inputs,
                         FeatureStore(earlier),
-                        looks[number - 1].module,
+                        passes[number - 1].module,
                     )
-                    key = f"{self.key(name)} {looks[number - 1].validation_air}"
+                    key = f"{self.key(name)} {passes[number - 1].validation_air}"
                     fill(at / f"look-{number}", key, len(numbers), make, f"look {number} at them")
-                last = FeatureStore(at / f"look-{len(looks) - 1}")
-                found.append(level_figures(self.decoded(looks[-1].module, last, scale), pages, numbers, self.mask))
+                last = FeatureStore(at / f"look-{len(passes) - 1}")
+                found.append(level_figures(self.decoded(passes[-1].module, last, scale), pages, numbers, self.mask))
         return found
 
     def key(self, name: str) -> str:
         """What the features of an arm depend on, beside the recording."""
         if name == ORACLE:
             return ""
-        return self.fitted.to_toml() + (PRESETS[FAST].first_look if name == FAST else "")
+        return self.fitted.to_toml() + (PRESETS[FAST].first_pass if name == FAST else "")
 
     def features_of(
         self, name: str, recording: Recording, pages: Sequence[int], start: int, shift: tuple[float, float]
     ) -> Iterator[PageFeatures]:
-        """First looks of an arm at pages from a place in their order on, the image having moved by `shift` before."""
+        """First passes of an arm at pages from a place in their order on, the image having moved by `shift` before."""
         if name == ORACLE:
             return Oracle(recording, self.profile, self.device).pages(pages[start:], shift)
         return self.extractor(name).pages(recording, pages[start:], shift)
 
-    def first_look(
+    def first_pass(
         self, name: str, size: str, choices: Hyperparameters
     ) -> tuple[Path, Path, Fitted[SymbolTraining], float]:
         """Run, features, trained network, and seconds that the features took."""

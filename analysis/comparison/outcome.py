@@ -43,7 +43,7 @@ class Outcome:
     concentrations that the validation pages ask for, `own_mi_unscaled` what it claims without, `looks` how often it
     looks, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light meets the
     walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by step. The size is that of the
-    first look's network, steps, times and curves are those of the last look, which goes on from the ones before.
+    first pass's network, steps, times and curves are those of the last pass, which goes on from the ones before.
     `analysis.comparison.decoders.compared` tells `over_oracle` and `over_published`.
     """
 
@@ -94,10 +94,10 @@ HEADER = (
 )
 """Held-out pages, bits a symbol and kB a page; own-MI and what it claims beyond the AIR, concentrations multiplied by
 one factor that the validation pages ask for; AIR where a symbol's light meets no wall of the pipe, a wall of pair x,
-of pair y, or of both; AIR over the oracle's, and over that of the best published decoder; of the last look alone, as
+of pair y, or of both; AIR over the oracle's, and over that of the best published decoder; of the last pass alone, as
 its steps: what validation AIR gained in the last fifth of them (`FOOTNOTE`), minutes of features and of training, and
 pages it trained on a second, validation counted as time: of a kept arm, on the machine that trained it. The network's
-size is the first look's."""
+size is the first pass's."""
 
 UNSETTLED = "*"
 

@@ -60,7 +60,7 @@ class ReportData:
         measures: over the data symbols of all pages together.
         maps: means over the pages at every place.
         confidence_bins, concentration_bins: what was claimed against what happened.
-        curves: of the training, by TensorBoard's tag, for each look at the light.
+        curves: of the training, by TensorBoard's tag, for each validation at the light.
         golden: one page.
     """
 

@@ -220,7 +220,7 @@ def training(looks: Sequence[Mapping[str, Curve]]) -> list[Picture]:
 
 
 def _in_a_row(looks: Sequence[Mapping[str, Curve]], tag: str) -> list[Curve]:
-    """The curves of a tag, each look's steps counted on from those of the looks before it."""
+    """The curves of a tag, each look's steps counted on from those of the passes before it."""
     found, before = list[Curve](), 0
     for curves in looks:
         if curve := curves.get(tag):

@@ -112,7 +112,7 @@ CHOICES = (
     Choice(
         "--refinements",
         click.IntRange(min=0, max=4),
-        "How often the decoder looks again, for what the symbols decoded so far do not explain.",
+        "Further passes, for what the symbols decoded so far do not explain.",
         PRESETS[ACCURATE].refinements,
         localizers=LOCALIZERS,
         of_preset=True,

@@ -33,7 +33,7 @@ Maker = Callable[[int, tuple[float, float]], Iterator[PageFeatures]]
 class FeatureStore(Dataset[Page]):
     """Pages of features in a folder, as arrays that are mapped and not loaded.
 
-    An item is a page's light [2 C, ny, nx] float16, positions [2, ny, nx], what an earlier look believed [2, ny, nx]
+    An item is a page's light [2 C, ny, nx] float16, positions [2, ny, nx], what an earlier pass believed [2, ny, nx]
     if there was one, and true phases [ny, nx].
 
     Args:

@@ -56,7 +56,7 @@ class PageFeatures:
         positions: exit centroids [2, ny, nx], float32, over the pipe's width.
         phases: true phases [ny, nx], float32, radians.
         state: image shift and piston of the page that were taken off.
-        belief: p [2, ny, nx], float32, that an earlier look came to and this one starts from; None for the first look.
+        belief: p [2, ny, nx], float32, that an earlier pass came to and this one starts from; None for the first pass.
     """
 
     light: NDArray[np.float16]
@@ -106,7 +106,7 @@ class FeatureExtractor:
         """Recovered field on the common grid."""
         return self._solve(pair, self.device.references, self.table["registration"], self.table["homodyne"])[0]
 
-    def look(self, pair: FramePair, shift_px: tuple[float, float]) -> tuple[Measured, Tensor]:
+    def measure(self, pair: FramePair, shift_px: tuple[float, float]) -> tuple[Measured, Tensor]:
         """What was measured on the calibrated grid of a page whose image has moved by (x, y), and its field there."""
         registration = shifted(self.table["registration"], np.array(shift_px))
         seen = (pair.in_phase, pair.quadrature, self.device.references.in_phase, self.device.references.quadrature)

@@ -49,7 +49,7 @@ class Explained:
 def explained(extractor: FeatureExtractor, pages: Sequence[KnownPage]) -> list[Explained]:
     """Known pages as the calibrated device measured them and its fitted waves explain them, by least squares.
 
-    The waves are as exact as those of a decoder that looks again.
+    The waves are as exact as those of a decoder that makes another pass.
 
     Args:
         extractor: of the device.
@@ -67,7 +67,7 @@ def explained(extractor: FeatureExtractor, pages: Sequence[KnownPage]) -> list[E
         phases = np.angle(page.symbols)
         state = extractor.state(extractor.field(page.pair), phases, np.zeros(2))
         with torch.no_grad():
-            measured, solved = extractor.look(page.pair, state.shift_px)
+            measured, solved = extractor.measure(page.pair, state.shift_px)
         field, seen = solved[0].numpy() + 1j * solved[1].numpy(), measured.lit.numpy().astype(bool)
         written = on_modulator(phases, samples)
         few = seen[::stride, ::stride]

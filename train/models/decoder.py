@@ -1,4 +1,4 @@
-"""The decoder at symbol pitch: localizer and network, and refinements that look again."""
+"""The decoder at symbol pitch: localizer and network, and refinements that make another pass."""
 
 from __future__ import annotations
 

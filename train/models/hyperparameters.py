@@ -23,7 +23,7 @@ class Hyperparameters:
 
     Attributes:
         channels, blocks, levels: size of the network, see `SymbolUNet`.
-        refinements: how often the decoder looks again, see `train.trainers.refinement`.
+        refinements: further passes of the decoder, see `train.trainers.refinement`.
         field_rounds, binning: of the field's recovery, see `train.models.field.FieldRecovery`.
         field_step: pitch of the common grid, camera pixels.
         samples, interpolation: see `CoherentLocalizer`.
@@ -54,8 +54,8 @@ class Hyperparameters:
     precision: str = "auto"
 
     @property
-    def first_look(self) -> str:
-        """What the features of the first look depend on."""
+    def first_pass(self) -> str:
+        """What the features of the first pass depend on."""
         return f"{self.field_rounds} {self.binning} {self.field_step} {self.samples} {self.interpolation}"
 
     def grid(self, profile: Profile) -> FieldGrid:

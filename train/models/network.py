@@ -102,7 +102,7 @@ def belief(outputs: Tensor, before: Tensor | float = 0.0) -> Tensor:
 
     Args:
         outputs: of the network; zeros leave p as it was before.
-        before: p of an earlier look, [N, 2, ny, nx].
+        before: p of an earlier pass, [N, 2, ny, nx].
     """
     log_factor = torch.clamp(_LOG_KAPPA_UNIT * outputs[:, 2:], max=_MOST_LOG_FACTOR)
     return torch.as_tensor(torch.exp(log_factor) * (before + _KAPPA_UNIT * outputs[:, :2]))
@@ -170,7 +170,7 @@ class SymbolUNet(nn.Module):
 
 
 class Refiner(nn.Module):
-    """What an earlier look believed, and the light that this leaves unexplained, to a better belief.
+    """What an earlier pass believed, and the light that this leaves unexplained, to a better belief.
 
     Unexplained light adds to the natural parameter p of a von Mises belief, as any further measurement of the phase
     does. Who to trust is learnt.

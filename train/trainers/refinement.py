@@ -1,6 +1,6 @@
-"""Looking again: what the decoded page would have shown, against what was seen.
+"""A further pass: what the decoded page would have shown, against what was seen.
 
-A first look knows neither |E|^2 nor what neighbouring symbols spill into a symbol. Once most is decoded, the wave model
+A first pass knows neither |E|^2 nor what neighbouring symbols spill into a symbol. Once most is decoded, the wave model
 says both: the expected page is sent through the device, its light is taken off both frames with each measurement
 weighted by what it tells at that light, and what remains is brought back to the page. That is one step of Gauss and
 Newton towards the most likely page; a small network takes it, for the waves are not quite the device's.
@@ -85,7 +85,7 @@ class RefinementPages:
         recording: with their frames.
         pages: page numbers: those trained on, those validated on, then others.
         training, validation: how many of them.
-        features: their features for the first look, in the same order.
+        features: their features for the first pass, in the same order.
     """
 
     recording: Recording
@@ -113,19 +113,19 @@ def fit_refinements(
         choices: the run's; `choices.refinements` of them, at least one.
         inputs: pages.
         extractor, prediction: of the device.
-        first: the first look's training.
-        key: everything that the first look's features depend on.
+        first: the first pass's training.
+        key: everything that the first pass's features depend on.
         starts: networks whose weights the first of them begin with.
         devices: see `fit_network`.
     """
-    looks, features, seconds = [first], inputs.features, 0.0
+    passes, features, seconds = [first], inputs.features, 0.0
     count, seen = len(inputs.pages), inputs.training + inputs.validation
     chosen = choices.of_refinement()
     for number, start in zip(range(1, choices.refinements + 1), chain(starts, repeat(None)), strict=False):
-        make = partial(refined_pages, extractor, prediction, inputs, FeatureStore(features), looks[-1].module)
+        make = partial(refined_pages, extractor, prediction, inputs, FeatureStore(features), passes[-1].module)
         at = folder / f"refinement-{number}"
         features = at / "features"
-        key = f"{key} {number} {looks[-1].validation_air}"
+        key = f"{key} {number} {passes[-1].validation_air}"
 
         seconds += fill(features, key, count, make, f"pages of refinement {number}")
         training, validation = (
@@ -133,11 +133,11 @@ def fit_refinements(
         )
         mask, levels = first.module.pilot_mask, first.module.levels
         patches = training_pages([training], mask, chosen)
-        looks.append(
+        passes.append(
             fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, start=start, devices=devices)
         )
-        seconds += looks[-1].seconds
-    return Refined(looks[1:], validation, seconds)
+        seconds += passes[-1].seconds
+    return Refined(passes[1:], validation, seconds)
 
 
 def refined_pages(
@@ -154,15 +154,15 @@ def refined_pages(
     Args:
         extractor, prediction: of the device.
         inputs: pages.
-        earlier: their features for the look before.
+        earlier: their features for the pass before.
         module: which was trained on such features.
         start: first page.
-        shift_px: not asked for: the look before has found each page's.
+        shift_px: not asked for: the pass before has found each page's.
     """
     for number in range(start, len(inputs.pages)):
         *shown, phases = earlier[number]
         state = earlier.state(number)
-        measured, field = extractor.look(inputs.recording.frames(inputs.pages[number]), state.shift_px)
+        measured, field = extractor.measure(inputs.recording.frames(inputs.pages[number]), state.shift_px)
         belief = module(*(part[None] for part in shown))[0]
         light = prediction(extractor.recovery, measured, field, turned(belief, state.piston_rad))
         yield PageFeatures(

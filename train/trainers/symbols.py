@@ -77,7 +77,7 @@ class SymbolTrainer:
         features = inputs.out / "features"
         preparing = fill(
             features,
-            f"{inputs.key} {self.localizer} {self.choices.first_look}",
+            f"{inputs.key} {self.localizer} {self.choices.first_pass}",
             len(known),
             lambda first, shift: inputs.extractor.pages(inputs.recording, known[first:], shift),
             "recorded pages",
@@ -135,7 +135,7 @@ class SymbolTrainer:
             inputs.extractor,
             prediction,
             first,
-            f"{inputs.key} {self.localizer} {self.choices.first_look}",
+            f"{inputs.key} {self.localizer} {self.choices.first_pass}",
             starts,
             inputs.devices,
         )
@@ -156,7 +156,7 @@ class SymbolTrainer:
             self._before(profile)
 
     def _before(self, profile: Profile) -> SymbolDecoder:
-        """The decoder whose weights are begun with: those of its first look, and of as many refinements as it has."""
+        """The decoder whose weights are begun with: those of its first pass, and of as many refinements as it has."""
         assert self.start is not None
         run = load_run(self.start)
         size = (run.localizer, run.profile.page_shape, *_size(run.hyperparameters, run.profile))
@@ -187,7 +187,7 @@ class SymbolTrainer:
         folder = inputs.out / "synthetic"
         reader = None if self.localizer == WAVE else self.choices.coherent_localizer(profile)
         pages = SyntheticPages(inputs.extractor.device, like, reader, seed, inputs.extractor.grid)
-        key = f"{self.localizer} {self.choices.first_look} {seed} "
+        key = f"{self.localizer} {self.choices.first_pass} {seed} "
         key += f"{profile.to_toml()} {inputs.calibration.to_toml()} {like.noise:.6f} "
         key += f"{np.round(like.illumination, 6).tolist()}"
         fill(folder, key, self.synthetic_pages, lambda first, shift: pages.pages(first), "synthetic pages")

@@ -1,4 +1,4 @@
-"""Leaving out parts of one coherent look: what is left out is left out, and what the command prints."""
+"""Leaving out parts of one coherent pass: what is left out is left out, and what the command prints."""
 
 from __future__ import annotations
 

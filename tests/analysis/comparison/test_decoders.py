@@ -164,7 +164,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     assert none["over_oracle"] == pytest.approx(none["air"] / oracle["air"])
     assert coherent["over_published"] == pytest.approx(coherent["air"] / none["air"])
     assert none["over_published"] is None
-    # who looks twice is compared with an oracle that does
+    # who makes two passes is compared with an oracle that does
     assert (again["arm"], again["looks"], again["steps"], again["over_oracle"]) == ("oracle-refined 1", 2, 5, 1)
     assert refined["over_oracle"] == pytest.approx(refined["air"] / again["air"])
     assert (by_waves["arm"], by_waves["looks"], by_waves["run"]) == (

@@ -136,7 +136,7 @@ def test_training_that_is_stopped_loses_nothing_and_the_same_command_goes_on(
     out, steps = (
         tmp_path / "run",
         360,
-    )  # a multiple of sixty: the last look at the validation pages is after the last step
+    )  # a multiple of sixty: the last pass at the validation pages is after the last step
     arguments = [*device, "--steps", str(steps), "--synthetic-pages", "0", "--out", str(out)]
     command = [sys.executable, "-m", "lightpage.cli.main", "train", *arguments]
     last = out / "checkpoints" / "last.ckpt"
@@ -198,7 +198,7 @@ def test_two_processes_train_one_run_and_its_refinement(small_device: list[str],
     assert done.stdout.count("validation AIR") == 1
     assert json.loads((out / "run.json").read_text())["validation_air"] > 0.5
     looks = curves_of(out)["val_air"]
-    assert len(looks) == 60  # as many as one process takes
+    assert len(passes) == 60  # as many as one process takes
     kept = FeatureStore(out / "refinement-1" / "features")
     assert all(bool(light.any()) for light, *_ in (kept[index] for index in range(len(kept))))
 

@@ -1,4 +1,4 @@
-"""Looking again: what a believed page leaves unexplained says where, and which way, the belief is wrong."""
+"""A further pass: what a believed page leaves unexplained says where, and which way, the belief is wrong."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def dim() -> Known:
 def unexplained(known: Known, believed: np.ndarray) -> np.ndarray:
     """Light [ny, nx] that sure beliefs in phases leave, against them."""
     state = known.extractor.state(known.extractor.field(known.pair), known.phases, np.zeros(2))
-    measured, field = known.extractor.look(known.pair, state.shift_px)
+    measured, field = known.extractor.measure(known.pair, state.shift_px)
     p = SURE * torch.from_numpy(np.stack([np.cos(believed), np.sin(believed)]).astype(np.float32))
     light = known.prediction(known.extractor.recovery, measured, field, turned(p, state.piston_rad))
     seen = turned(light, -state.piston_rad).numpy()[:, 0].mean(1)
