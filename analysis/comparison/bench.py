@@ -144,7 +144,7 @@ class Bench:
         return CalibratedDevice.of(self.profile, self.fitted, references)
 
     def extractor(self, arm: str) -> FeatureExtractor:
-        """Of the calibrated device; of the true one for what an oracle passes over again, the signal's power left in."""
+        """Of the calibrated device; the true one for an oracle's further pass, the signal's power left in."""
         localizer = "coherent" if arm in (ORACLE, FAST) else arm
         return FeatureExtractor(self.calibrated_device(arm), localizer, PRESETS[FAST] if arm == FAST else None)
 
@@ -267,8 +267,10 @@ class Bench:
         size = "/".join(map(str, choices.channels))
         chosen = asdict(choices) | {"channels": list(choices.channels)}
         folder = self.begun(self.out / name / f"{size.replace('/', '-')}-{choices.steps}", chosen)
-        turn = self.fitted.turn_rad
-        trained = train_published(folder, name, choices, self.profile, turn, self.mask, training, validation, devices=1)
+        phase = self.fitted.turn_rad
+        trained = train_published(
+            folder, name, choices, self.profile, phase, self.mask, training, validation, devices=1
+        )
         self.kept.keep(folder)
         drawn = choices.steps * choices.batch
         return self.outcome(name, size, choices.steps, folder, trained, validation, unseen, preparing, drawn)

@@ -85,7 +85,7 @@ class Outcome:
 
 
 HEADER = (
-    f"{'seed':>6} {'angle':>9} {'error':>9} {'turn err.':>9} {'relation':>8} "
+    f"{'seed':>6} {'angle':>9} {'error':>9} {'Q phase':>9} {'relation':>8} "
     f"{'coherence':>9} {'oracle':>9} {'ratio':>7} {'seconds':>7}"
 )
 
@@ -108,9 +108,9 @@ class Bench:
         phasors = [np.exp(1j * symbol_phases(page, LEVELS)) for page in symbols]
         known = [KnownPage(page.pair, page_phasors) for page, page_phasors in zip(seen, phasors, strict=True)]
         truth = self._truth(device, np.mean([page.shift_px for page in seen], axis=0))
-        turn = device.homodyne.turn_rad
-        oracle = float(np.mean([self._coherence(page, references, truth, turn) for page in known]))
-        return self._outcome(seed, device.geometry.pipe_angle_deg, turn, references, known, oracle, truth)
+        quadrature_phase = device.homodyne.turn_rad
+        oracle = float(np.mean([self._coherence(page, references, truth, quadrature_phase) for page in known]))
+        return self._outcome(seed, device.geometry.pipe_angle_deg, quadrature_phase, references, known, oracle, truth)
 
     def foreign(self, seed: int) -> Outcome:
         """Draw a device of the other simulator, and calibrate through a recording."""
@@ -122,14 +122,14 @@ class Bench:
                 references = recording.references()
                 known = known_pages(recording, self.profile, range(self.pages))
         p = device.parameters
-        turn = p.quadrature_sign * np.deg2rad(90 + p.quadrature_error_deg)
-        return self._outcome(seed, p.pipe_angle_deg, turn, references, known, None)
+        quadrature_phase = p.quadrature_sign * np.deg2rad(90 + p.quadrature_error_deg)
+        return self._outcome(seed, p.pipe_angle_deg, quadrature_phase, references, known, None)
 
     def _outcome(
         self,
         seed: int,
         angle: float,
-        turn: float,
+        quadrature_phase: float,
         references: FramePair,
         known: list[KnownPage],
         oracle: float | None,
@@ -146,7 +146,7 @@ class Bench:
             seed=seed,
             angle_deg=angle,
             angle_error_deg=abs(self._angle(found) - angle),
-            turn_error_deg=abs(float(np.rad2deg(np.angle(np.exp(1j * (found.turn - turn)))))),
+            turn_error_deg=abs(float(np.rad2deg(np.angle(np.exp(1j * (found.quadrature_phase - quadrature_phase)))))),
             relation_error_px=self._relation_error_px(found.parameters, truth) if truth is not None else None,
             coherence=found.coherence_after,
             oracle_coherence=oracle,
@@ -173,9 +173,11 @@ class Bench:
             values[f"{camera}_shift_y_px"] += float(shift_px[1])
         return as_vector(values)
 
-    def _coherence(self, page: KnownPage, references: FramePair, parameters: NDArray[np.float64], turn: float) -> float:
+    def _coherence(
+        self, page: KnownPage, references: FramePair, parameters: NDArray[np.float64], quadrature_phase: float
+    ) -> float:
         registration = registration_coefficients(self.twin, parameters, self.profile)
-        homodyne = np.array([np.cos(turn), np.sin(turn)], dtype=np.float32)
+        homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32)
         field, _ = self.solve(page.pair, references, registration, homodyne)
         sampler = FieldSampler(field, field_grid(self.profile))
         return page_coherence(sampler, self.twin, parameters, self.profile, page.symbols)

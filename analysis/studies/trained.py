@@ -119,10 +119,10 @@ def trained(
             FramePages(recording, part, [states[page] for page in part])
             for part in (range(first), range(first, second), range(second, pages))
         )
-        turn, tell = device.homodyne.turn_rad, _Tell(progress, choices)
+        quadrature_phase, tell = device.homodyne.turn_rad, _Tell(progress, choices)
         with reporting(None):  # the case's own progress is shown
             fitted = train_published(
-                work, localizer, choices, profile, turn, mask, training, validation, callbacks=[tell]
+                work, localizer, choices, profile, quadrature_phase, mask, training, validation, callbacks=[tell]
             )
         p, phases = _beliefs(fitted.module, validation, mask, knows_piston)
         scale = honest_factor(p.reshape(2, -1), phases.ravel())

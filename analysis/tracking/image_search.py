@@ -311,8 +311,8 @@ def full_size(seeds: int) -> Figures:
     parameters, twin = true_parameters(profile, device), TorchTwin(RayTwin(profile))
     solve, search = TorchFieldSolver(FieldRecovery(profile)), ImageSearch(twin, parameters, profile)
     registration = registration_coefficients(twin, parameters, profile)
-    turn = device.homodyne.turn_rad
-    homodyne = np.array([np.cos(turn), np.sin(turn)], np.float32)
+    quadrature_phase = device.homodyne.turn_rad
+    homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], np.float32)
     pilots, rows = Pilots.of_profile(profile, LEVELS), []
     for seed in track(range(seeds), "full size", unit="page"):
         simulator = Simulator(profile, device, LEVELS, seed)

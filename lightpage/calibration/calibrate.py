@@ -75,7 +75,7 @@ class Registered:
     Attributes:
         parameters: [P] fitted vector.
         deviations: [P] standard deviations.
-        turn: angle between the homodyne arms, radians.
+        quadrature_phase: angle between the homodyne arms, radians.
         coherence_before, coherence_after: mean over the pages, at the start's geometry and at the fitted one.
         cost: mean squared normalised residual of the last fit of patches.
         significant: share of the measured patches that were found, in the last stage.
@@ -83,7 +83,7 @@ class Registered:
 
     parameters: Real
     deviations: Real
-    turn: float
+    quadrature_phase: float
     coherence_before: float
     coherence_after: float
     cost: float
@@ -169,21 +169,21 @@ def refine(
     references: FramePair,
     pages: Sequence[KnownPage],
     start: Real,
-    turn: float,
+    quadrature_phase: float,
     progress: Progress = lambda what, share: None,
 ) -> Registered:
     """Register known pages from an earlier calibration that has drifted: the reflections need no search from nominal.
 
     Args:
         start: [P] earlier parameters.
-        turn: earlier angle between the homodyne arms.
+        quadrature_phase: earlier angle between the homodyne arms.
         twin, solve_field, profile, references, pages, progress: as for `calibrate`.
 
     Raises:
         CalibrationError: the pages do not fit near the earlier calibration.
     """
     work = _Registration(twin, solve_field, profile, references, list(pages), progress)
-    work.parameters, work.turn = start.copy(), turn
+    work.parameters, work.quadrature_phase = start.copy(), quadrature_phase
     work.total = len(_DRIFTED) + 2
     for stage in _DRIFTED:
         work.complex_field(stage, start, _DRIFT_SCALE)
@@ -252,7 +252,7 @@ class _Registration:
         self.grid = field_grid(profile)
         self.parameters = nominal()
         self.deviations = np.zeros_like(self.parameters)
-        self.turn = np.pi / 2
+        self.quadrature_phase = np.pi / 2
         self.fit: Fit | None = None
         self.total = 1
         self._stage, self._done = "", 0
@@ -290,10 +290,12 @@ class _Registration:
             if min(one.significance, other.significance) > SIGNIFICANT:
                 weight = 1 / (1 / one.significance + 1 / other.significance)
                 total += weight * np.exp(1j * (one.phase - other.phase))
-        self.turn = float(np.angle(total))
-        if abs(np.sin(self.turn)) < _LEAST_QUADRATURE:
+        self.quadrature_phase = float(np.angle(total))
+        if abs(np.sin(self.quadrature_phase)) < _LEAST_QUADRATURE:
             raise CalibrationError(
-                "angle between the homodyne arms", f"{np.rad2deg(self.turn):.0f} degrees", "about +90 or -90 degrees"
+                "angle between the homodyne arms",
+                f"{np.rad2deg(self.quadrature_phase):.0f} degrees",
+                "about +90 or -90 degrees",
             )
 
     def waves(
@@ -303,8 +305,12 @@ class _Registration:
         self._begin(what)
         page = self.pages[0]
         fit = WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
-        found = fit.fit(self.parameters, self.turn, groups, centre, prior_scale, self._tell)
-        self.parameters, self.deviations, self.turn = found.parameters, found.deviations, found.turn
+        found = fit.fit(self.parameters, self.quadrature_phase, groups, centre, prior_scale, self._tell)
+        self.parameters, self.deviations, self.quadrature_phase = (
+            found.parameters,
+            found.deviations,
+            found.quadrature_phase,
+        )
 
     def result(self, before: Real) -> Registered:
         """Judge the outcome; `before` is the geometry that it is compared with."""
@@ -318,7 +324,7 @@ class _Registration:
         return Registered(
             parameters=self.parameters,
             deviations=self.deviations,
-            turn=self.turn,
+            quadrature_phase=self.quadrature_phase,
             coherence_before=self._coherence(before, 0.5),
             coherence_after=after,
             cost=self.fit.cost,
@@ -340,13 +346,13 @@ class _Registration:
         return float(np.mean(found))
 
     def _field(
-        self, page: KnownPage, parameters: Real | None = None, turn: float | None = None
+        self, page: KnownPage, parameters: Real | None = None, quadrature_phase: float | None = None
     ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         registration = registration_coefficients(
             self.twin, self.parameters if parameters is None else parameters, self.profile
         )
-        turn = self.turn if turn is None else turn
-        homodyne = np.array([np.cos(turn), np.sin(turn)], dtype=np.float32)
+        quadrature_phase = self.quadrature_phase if quadrature_phase is None else quadrature_phase
+        homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32)
         return self.solve_field(page.pair, self.references, registration, homodyne)
 
     def _frame_samplers(self, page: KnownPage) -> list[FrameSampler]:

@@ -85,7 +85,7 @@ class Calibration(Table):
         """
         return cls(
             profile_name=profile.name,
-            turn_rad=float(registered.turn),
+            turn_rad=float(registered.quadrature_phase),
             coherence_before=float(registered.coherence_before),
             coherence_after=float(registered.coherence_after),
             cost=float(registered.cost),

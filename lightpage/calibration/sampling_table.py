@@ -54,13 +54,13 @@ def shifted(registration: NDArray[np.float32], shift_px: Real) -> NDArray[np.flo
     return moved
 
 
-def sampling_table(twin: Twin, parameters: Real, turn: float, profile: Profile) -> Table:
+def sampling_table(twin: Twin, parameters: Real, quadrature_phase: float, profile: Profile) -> Table:
     """Trace the whole page.
 
     Args:
         twin: ray tracer of the device.
         parameters: [P] fitted parameters.
-        turn: angle between the homodyne arms, radians (90 degrees plus error, negative when Q is inverted).
+        quadrature_phase: angle between the homodyne arms, radians (90 degrees plus error, negative when Q is inverted).
         profile: the nominal device.
 
     Returns:
@@ -102,7 +102,7 @@ def sampling_table(twin: Twin, parameters: Real, turn: float, profile: Profile) 
     gradients = np.stack([along_x[..., 0], along_y[..., 0], along_x[..., 1], along_y[..., 1]], axis=-1)
     return {
         "registration": registration_coefficients(twin, parameters, profile),
-        "homodyne": np.array([np.cos(turn), np.sin(turn)], dtype=np.float32),
+        "homodyne": np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32),
         "parameters": parameters.astype(np.float32),
         "places": as_maps(middle),
         "place_gradients": as_maps(gradients),

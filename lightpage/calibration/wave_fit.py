@@ -65,14 +65,14 @@ class WaveFitted:
         parameters: [P] fitted vector; held parameters keep their value.
         deviations: [P] standard deviations, zero where held. What the model leaves unexplained counts as noise that
             differs from symbol to symbol.
-        turn: angle between the homodyne arms, radians.
+        quadrature_phase: angle between the homodyne arms, radians.
         residual: root mean square of what is left of the equations, in standard deviations of the reference's noise
             times an unknown factor: it says which of two fits is better.
     """
 
     parameters: Real
     deviations: Real
-    turn: float
+    quadrature_phase: float
     residual: float
 
 
@@ -80,7 +80,7 @@ class _State(NamedTuple):
     """What is fitted: parameters [P], the angle between the arms, coefficients [T] of the illumination's terms."""
 
     parameters: Real
-    turn: float
+    quadrature_phase: float
     light: Complex
 
 
@@ -135,7 +135,7 @@ class WaveFit:
     def fit(
         self,
         start: Real,
-        turn: float,
+        quadrature_phase: float,
         groups: tuple[str, ...],
         centre: Real | None = None,
         prior_scale: float | Real = 1.0,
@@ -145,7 +145,7 @@ class WaveFit:
 
         Args:
             start: [P], right to within about a speckle and a radian.
-            turn: angle between the arms to start from, good to some tens of degrees.
+            quadrature_phase: angle between the arms to start from, good to some tens of degrees.
             groups: of `lightpage.calibration.parameters`. Without ``launch``, the illumination may bend the page's
                 phases instead.
             centre: [P] centre of the priors, nominal (zero) if None.
@@ -159,8 +159,8 @@ class WaveFit:
         free = of_light + of_cameras
         precision = 1 / (PRIORS * prior_scale)[free] ** 2
         centre = np.zeros(len(PARAMETERS)) if centre is None else centre
-        state = self._start(start, turn)
-        best = WaveFitted(start, np.zeros(len(PARAMETERS)), turn, np.inf)
+        state = self._start(start, quadrature_phase)
+        best = WaveFitted(start, np.zeros(len(PARAMETERS)), quadrature_phase, np.inf)
         fall, whole = 1.0, False
         for number in range(_ROUNDS):
             progress(number / _ROUNDS)
@@ -181,7 +181,7 @@ class WaveFit:
             covariance = _inverse(information)
             deviations = np.zeros(len(PARAMETERS))
             deviations[free] = np.sqrt(np.diag(covariance)[others:])
-            best = WaveFitted(state.parameters, deviations, state.turn, residual)
+            best = WaveFitted(state.parameters, deviations, state.quadrature_phase, residual)
             state, whole = self._moved(state, covariance @ pull, directions, free)
         return best
 
@@ -192,14 +192,14 @@ class WaveFit:
         """The page's light on the common grid, [Gy, Gx]."""
         return self._waves(parameters).to_camera(np.tensordot(light, self._pages, 1))
 
-    def _start(self, parameters: Real, turn: float) -> _State:
+    def _start(self, parameters: Real, quadrature_phase: float) -> _State:
         """With the even illumination that fits best."""
         chosen, counts, amplitude = self._look(parameters)
         even = np.eye(1, len(self._pages), dtype=np.complex128)[0]
         here = self._light(parameters, even)[self._every][chosen] / amplitude
-        columns = np.concatenate([here * np.exp(-1j * arm) for arm in (0.0, turn)])
+        columns = np.concatenate([here * np.exp(-1j * arm) for arm in (0.0, quadrature_phase)])
         found = np.linalg.lstsq(np.stack([columns.real, -columns.imag], axis=1), counts.ravel(), rcond=None)[0]
-        return _State(parameters, turn, even * complex(*found))
+        return _State(parameters, quadrature_phase, even * complex(*found))
 
     def _slopes(
         self, state: _State, of_light: list[int], of_cameras: list[int], progress: Callable[[float], None]
@@ -262,7 +262,7 @@ class WaveFit:
         changes = [seen(part) for part in (*np.tensordot(directions, slopes.by_term, 1), *slopes.of_light)]
         moves = [pixels[:, chosen] for pixels in slopes.of_cameras]
         columns, left = [], []
-        for camera, arm in enumerate((0.0, state.turn)):
+        for camera, arm in enumerate((0.0, state.quadrature_phase)):
             phasor = np.exp(-1j * arm)
             weight = 1 / np.sqrt(np.abs(1 / phasor + here) ** 2 + READ_NOISE)
             along = (phasor + here.conj()) * weight  # derivative of the count by e
@@ -284,7 +284,7 @@ class WaveFit:
         share = min(1.0, _LARGEST_MOVE_PX / max(furthest, 1e-9))
         moved = _State(
             state.parameters + share * change,
-            state.turn + share * float(step[len(directions)]),
+            state.quadrature_phase + share * float(step[len(directions)]),
             state.light + share * step[: len(directions)] @ directions,
         )
         return moved, share == 1

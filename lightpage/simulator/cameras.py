@@ -52,10 +52,10 @@ class CameraView:
         """Points (x, y) of the camera plane that land on the pixels, two arrays [rows, columns], metres."""
         column = np.arange(self.camera.columns_px) - (self.camera.columns_px - 1) / 2 - self.pose.shift_x_px
         row = np.arange(self.camera.rows_px) - (self.camera.rows_px - 1) / 2 - self.pose.shift_y_px
-        turn = np.deg2rad(self.pose.rotation_deg)
+        rotation = np.deg2rad(self.pose.rotation_deg)
         per_px = self.camera.pitch_m / (1 + self.pose.scale_relative_error)
-        x = per_px * (np.cos(turn) * column[None, :] + np.sin(turn) * row[:, None])
-        y = per_px * (-np.sin(turn) * column[None, :] + np.cos(turn) * row[:, None])
+        x = per_px * (np.cos(rotation) * column[None, :] + np.sin(rotation) * row[:, None])
+        y = per_px * (-np.sin(rotation) * column[None, :] + np.cos(rotation) * row[:, None])
         shrink = 1 - self.distortion_relative * (x**2 + y**2) / self.distortion_radius_m**2
         return x * shrink, y * shrink
 

@@ -189,13 +189,13 @@ def true_parameters(profile: Profile, device: Device) -> NDArray[np.float64]:
         "distortion_relative": device.aberration.distortion_relative,
     }
     for camera, pose in (("in_phase", device.in_phase_camera), ("quadrature", device.quadrature_camera)):
-        scale, turn = 1 + pose.scale_relative_error, np.deg2rad(pose.rotation_deg)
+        scale, rotation = 1 + pose.scale_relative_error, np.deg2rad(pose.rotation_deg)
         values |= {
             f"{camera}_shift_x_px": pose.shift_x_px,
             f"{camera}_shift_y_px": pose.shift_y_px,
-            f"{camera}_scale_x_relative": scale * np.cos(turn) - 1,
-            f"{camera}_scale_y_relative": scale * np.cos(turn) - 1,
-            f"{camera}_turn_xy_slope": -scale * np.sin(turn),
-            f"{camera}_turn_yx_slope": scale * np.sin(turn),
+            f"{camera}_scale_x_relative": scale * np.cos(rotation) - 1,
+            f"{camera}_scale_y_relative": scale * np.cos(rotation) - 1,
+            f"{camera}_turn_xy_slope": -scale * np.sin(rotation),
+            f"{camera}_turn_yx_slope": scale * np.sin(rotation),
         }
     return as_vector(values)

@@ -73,7 +73,7 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
             references,
             known,
             start=start,
-            turn=earlier.turn_rad,
+            quadrature_phase=earlier.turn_rad,
             progress=progress,
         )
     except CalibrationError as error:
@@ -94,7 +94,7 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
     table = {
         "reference_in_phase": references.in_phase,
         "reference_quadrature": references.quadrature,
-        **sampling_table(twin, registered.parameters, registered.turn, profile),
+        **sampling_table(twin, registered.parameters, registered.quadrature_phase, profile),
     }
     return FitResult(
         table={name: value for name, value in table.items() if name in decoder.graph.ports},

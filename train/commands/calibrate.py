@@ -112,6 +112,6 @@ def table(calibration: Calibration, profile: Profile) -> str:
         factor = nominal if unit is None else unit
         fitted, deviation = nominal + factor * value, factor * calibration.deviations[name]
         lines.append(f"{label:<32}{fitted:>12.6g}   {deviation:<10.2g}{nominal:>10.6g}")
-    turn = np.rad2deg(calibration.turn_rad)
-    lines.append(f"{'between the arms, degree':<32}{turn:>12.6g}   {'':<10}{'+90 or -90':>10}")
+    quadrature_phase = np.rad2deg(calibration.turn_rad)
+    lines.append(f"{'between the arms, degree':<32}{quadrature_phase:>12.6g}   {'':<10}{'+90 or -90':>10}")
     return "\n".join(lines)

@@ -5,7 +5,7 @@ With the reference-only frame R of a camera and e = E/r, E the signal against a 
     A = (I - R_I) / (2 R_I) = Re e + |e|^2 / 2
     B = (Q - R_Q) / (2 R_Q) = Re(e exp(-i turn)) + |e|^2 / 2
 
-where `turn` is +90 or -90 degrees, by the sign of Q, plus the quadrature error. The cameras' gains cancel.
+where `quadrature_phase` is +90 or -90 degrees, by the sign of Q, plus the quadrature error. The cameras' gains cancel.
 """
 
 from __future__ import annotations

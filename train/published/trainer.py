@@ -93,7 +93,7 @@ def train_published(
     localizer: str,
     choices: PublishedChoices,
     profile: Profile,
-    turn: float,
+    quadrature_phase: float,
     mask: NDArray[np.bool_],
     training: FramePages,
     validation: FramePages,
@@ -105,14 +105,14 @@ def train_published(
 
     Args:
         run: folder.
-        localizer, choices, profile, turn: as for `published_decoder`.
+        localizer, choices, profile, quadrature_phase: as for `published_decoder`.
         mask: pilots, bool [ny, nx], which are not learnt from.
         training, validation: pages of one recording.
         callbacks, devices: as for `train.fitting.fit.fit`.
     """
     seed_stretch(run, choices.seed)
     recording = training.recording
-    decoder = published_decoder(localizer, choices, profile, recording.references(), turn)
+    decoder = published_decoder(localizer, choices, profile, recording.references(), quadrature_phase)
     module = PublishedTraining(decoder, choices, mask, recording.levels)
     return fit(
         run,
@@ -127,7 +127,7 @@ def train_published(
 
 
 def published_decoder(
-    localizer: str, choices: PublishedChoices, profile: Profile, references: FramePair, turn: float
+    localizer: str, choices: PublishedChoices, profile: Profile, references: FramePair, quadrature_phase: float
 ) -> PublishedDecoder:
     """A published decoder with its first weights.
 
@@ -136,12 +136,12 @@ def published_decoder(
         choices: its size and lenses.
         profile: the nominal device.
         references: reference-only frames.
-        turn: angle between the homodyne arms, whose sign the mode localizer must know.
+        quadrature_phase: angle between the homodyne arms, whose sign the mode localizer must know.
 
     Raises:
         InvalidInputError: no such localizer or lens.
     """
-    sign = 1 if np.sin(turn) > 0 else -1
+    sign = 1 if np.sin(quadrature_phase) > 0 else -1
     samples = samples_for(profile.page.symbol_size_px)
     chosen = make_localizer(localizer, profile, samples, choices.lenses, sign)
     return PublishedDecoder(profile, references, chosen, choices.channels, choices.classes)

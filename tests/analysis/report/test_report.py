@@ -119,7 +119,7 @@ def test_a_run_at_symbol_pitch(coherent: Path, tmp_path: Path) -> None:
 
 def test_the_steps_of_another_look_are_counted_on() -> None:
     passes = [{"train_nll": [(4, 1.0), (9, 0.5)]}, {"train_nll": [(4, 0.4)]}]
-    (loss,) = training(looks)
+    (loss,) = training(passes)
     assert "0.40 nat/symbol at step 14" in loss.alt
 
 

@@ -26,7 +26,7 @@ def calibration() -> Calibration:
     registered = Registered(
         parameters=rng.normal(size=len(NAMES)) * PRIORS,
         deviations=PRIORS / 30,
-        turn=-1.55,
+        quadrature_phase=-1.55,
         coherence_before=0.01,
         coherence_after=0.8,
         cost=1.3,

@@ -50,7 +50,7 @@ def test_both_cameras_and_the_angle_between_the_arms_come_back(ratio: float, ful
     start[indices("in_phase")] += [0.3, 0.1, 1e-3, 0, 1e-3, 0]
     start[indices("quadrature")] += [-0.4, 0.2, -1e-3, 1e-3, 0, 2e-3]
     result = seen_by(device, 1).fit(start, TURN + np.deg2rad(8), ("in_phase", "quadrature"))
-    found, turn = result.parameters, result.turn
+    found, turn = result.parameters, result.quadrature_phase
 
     grid = field_grid(PROFILE)
     half = np.array([PROFILE.page_width_m, PROFILE.page_height_m]) / 2
@@ -80,7 +80,7 @@ def test_a_realistic_device_is_told_from_near_it_with_honest_deviations(seed: in
     found = seen_by(device, seed).fit(start, device.homodyne.turn_rad, EVERY)
     assert abs(found.parameters[angle] - truth[angle]) < 5e-5
     assert found.deviations[angle] < 2e-4
-    assert np.rad2deg(abs(found.turn - device.homodyne.turn_rad)) < 0.3
+    assert np.rad2deg(abs(found.quadrature_phase - device.homodyne.turn_rad)) < 0.3
     moving = indices("in_phase", "quadrature")[::6], indices("in_phase", "quadrature")[1::6]
     lenses = NAMES.index("lens_path_relative")
     assert found.deviations[lenses] == 0  # these are ideal, and it does nothing

@@ -93,8 +93,8 @@ def test_small_losses_do_not_add_up_unseen(tmp_path: Path, monkeypatch: pytest.M
     def late(bundle: Bundle) -> object:
         return calibration_of(bundle).model_copy(update={"coherence_at_first": 1.0})
 
-    def fitted(*_: object, start: np.ndarray, turn: float, **__: object) -> Registered:
-        return Registered(start, np.ones(len(start)), turn, 0.0, 0.5, 1.0, 0.5)
+    def fitted(*_: object, start: np.ndarray, quadrature_phase: float, **__: object) -> Registered:
+        return Registered(start, np.ones(len(start)), quadrature_phase, 0.0, 0.5, 1.0, 0.5)
 
     monkeypatch.setattr(module, "calibration_of", late)
     monkeypatch.setattr(module, "refine", fitted)

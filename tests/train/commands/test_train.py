@@ -197,7 +197,7 @@ def test_two_processes_train_one_run_and_its_refinement(small_device: list[str],
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("validation AIR") == 1
     assert json.loads((out / "run.json").read_text())["validation_air"] > 0.5
-    looks = curves_of(out)["val_air"]
+    passes = curves_of(out)["val_air"]
     assert len(passes) == 60  # as many as one process takes
     kept = FeatureStore(out / "refinement-1" / "features")
     assert all(bool(light.any()) for light, *_ in (kept[index] for index in range(len(kept))))

@@ -33,7 +33,7 @@ def run(arguments: list[str]) -> str:
 def module(localizer: str, choices: PublishedChoices) -> PublishedTraining:
     profile = small_profile()
     references = FramePair(*np.full((2, *profile.frame_shape), 100, dtype=np.uint8))
-    decoder = published_decoder(localizer, choices, profile, references, turn=1.5)
+    decoder = published_decoder(localizer, choices, profile, references, quadrature_phase=1.5)
     return PublishedTraining(decoder, choices, pilot_mask(profile), 256)
 
 
