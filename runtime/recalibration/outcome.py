@@ -14,7 +14,7 @@ from runtime.recalibration.known_pages import KnownPages
 
 
 @dataclass(frozen=True)
-class FitReport:
+class RefitReport:
     """What a fit says of itself; None where it does not know.
 
     Attributes:
@@ -33,7 +33,7 @@ class FitReport:
 
 
 @dataclass(frozen=True)
-class FitResult:
+class RefitResult:
     """A re-fitted device.
 
     Attributes:
@@ -44,13 +44,13 @@ class FitResult:
 
     table: Table
     calibration_toml: str
-    report: FitReport
+    report: RefitReport
 
 
-class Fit(Protocol):
+class Refit(Protocol):
     """Re-fits the geometry with the exported twin and re-traces the table."""
 
-    def __call__(self, bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> FitResult:
+    def __call__(self, bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:
         """Fit on all `pages`.
 
         Raises:
@@ -68,7 +68,7 @@ class RecalibrationOutcome:
     path: Path
     version: str
     previous_version: str
-    report: FitReport
+    report: RefitReport
     air_before: float
     air_after: float
     pages_lost_before: int

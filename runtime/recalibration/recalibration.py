@@ -22,7 +22,7 @@ from runtime.decoding.image_tracker import tracker_for
 from runtime.decoding.tracking import Tracker
 from runtime.recalibration.judgement import judge, judged_pages
 from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import Fit, FitResult, RecalibrationOutcome
+from runtime.recalibration.outcome import RecalibrationOutcome, Refit, RefitResult
 
 _RECALIBRATED = re.compile(r"(.*)\+r(\d+)")
 
@@ -35,7 +35,7 @@ def recalibrate(
     pages: KnownPages,
     out: Path,
     version: str,
-    fit: Fit,
+    fit: Refit,
     progress: Progress,
     tracker: Tracker | None = None,
 ) -> RecalibrationOutcome:
@@ -113,7 +113,7 @@ def _within(progress: Progress, step: str, start: float, share: float) -> None:
     progress(step, start + 0.05 * share)
 
 
-def _refitted(bundle: Bundle, result: FitResult) -> Bundle:
+def _refitted(bundle: Bundle, result: RefitResult) -> Bundle:
     """The bundle with the re-fitted table and calibration, in memory; its golden page is still the earlier one's."""
     files = {**bundle.files, TABLE: npz(**{**bundle.table, **result.table})}
     manifest = bundle.manifest.model_copy(update={"calibration": result.calibration_toml})

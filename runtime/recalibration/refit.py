@@ -23,7 +23,7 @@ from runtime.decoding.image_search import BundleSearch
 from runtime.decoding.page import ImagePosition
 from runtime.execution.twin import TWIN_THREADS, OnnxTwin
 from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import FitReport, FitResult
+from runtime.recalibration.outcome import RefitReport, RefitResult
 
 Real = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ _SEARCHED_SYMBOLS = 300
 """Known symbols by which the image is looked for: enough in any light that can be calibrated in, and soon done."""
 
 
-def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> FitResult:
+def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:
     """Fit on `pages`, starting from the bundle's calibration, moved to where their image is found.
 
     The table holds the re-traced geometry and the reference frames that it was fitted with.
@@ -96,10 +96,10 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         "reference_quadrature": references.quadrature,
         **sampling_table(twin, registered.parameters, registered.quadrature_phase, profile),
     }
-    return FitResult(
+    return RefitResult(
         table={name: value for name, value in table.items() if name in decoder.graph.ports},
         calibration_toml=fitted.to_toml(),
-        report=FitReport(
+        report=RefitReport(
             angle_deg=fitted.angle_deg(profile),
             coherence_before=fitted.coherence_before,
             coherence_after=fitted.coherence_after,

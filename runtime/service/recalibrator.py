@@ -29,7 +29,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
 from runtime.errors import CallerLeft, SourceError, StoppingError
 from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import Fit, RecalibrationOutcome
+from runtime.recalibration.outcome import RecalibrationOutcome, Refit
 from runtime.recalibration.recalibration import next_version, recalibrate
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
@@ -59,7 +59,7 @@ class Recalibrator:
         recordings: folder whose recordings a caller may name, or None for none.
     """
 
-    def __init__(self, plane: DataPlane, fit: Fit, recordings: Path | None = None) -> None:
+    def __init__(self, plane: DataPlane, fit: Refit, recordings: Path | None = None) -> None:
         self._plane, self._fit, self._recordings = plane, fit, recordings
         self._busy = threading.Lock()
         """Held from the first page read to the swap; a second recalibration finds it taken and is turned away."""

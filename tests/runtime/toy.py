@@ -23,7 +23,7 @@ from runtime.bundle.bundle import Bundle, npz, write_bundle
 from runtime.bundle.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
 from runtime.decoding.decoder import Decoder
 from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import FitReport, FitResult
+from runtime.recalibration.outcome import RefitReport, RefitResult
 
 PROFILE_TOML = """
 schema_version = 1
@@ -249,7 +249,7 @@ def write_toy_recording(
     return symbols
 
 
-def fit_references(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> FitResult:
+def fit_references(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:
     """A fit for the toy device: its geometry is the offset of each camera, read from the reference frames."""
     progress("fit", 0.5)
     if pages.references is None:
@@ -258,7 +258,7 @@ def fit_references(bundle: Bundle, pages: KnownPages, progress: Progress, decode
         "reference_in_phase": pages.references.in_phase.astype(np.float32),
         "reference_quadrature": pages.references.quadrature.astype(np.float32),
     }
-    return FitResult(table, "angle_deg = 0.5\n", FitReport(0.5, 0.4, 0.9))
+    return RefitResult(table, "angle_deg = 0.5\n", RefitReport(0.5, 0.4, 0.9))
 
 
 class ToySource:

@@ -21,7 +21,7 @@ from lightpage.recording.reader import FramePair, hash_frames
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.recalibration.known_pages import KnownPages
-from runtime.recalibration.outcome import FitReport, FitResult
+from runtime.recalibration.outcome import RefitReport, RefitResult
 from runtime.recalibration.recalibration import next_version, recalibrate
 from runtime.service.registry import ModelRegistry
 from runtime.service.store import CURRENT, KEPT_BUNDLES, ModelStore
@@ -60,8 +60,8 @@ def test_a_second_recalibration_keeps_what_the_first_found(decoder: Decoder, tmp
     recalibrate(decoder, known(), tmp_path / "1.zip", "toy-1+r1", toy.fit_references, quiet)
     first = Decoder.load(tmp_path / "1.zip", threads=1)
 
-    def gain_only(*_: object) -> FitResult:
-        return FitResult({"homodyne": np.array([5.7, 1.0], np.float32)}, "x = 1\n", FitReport())
+    def gain_only(*_: object) -> RefitResult:
+        return RefitResult({"homodyne": np.array([5.7, 1.0], np.float32)}, "x = 1\n", RefitReport())
 
     recalibrate(first, known(), tmp_path / "2.zip", "toy-1+r2", gain_only, quiet)
     assert set(Bundle.open(tmp_path / "2.zip").table) == {"homodyne", "reference_in_phase", "reference_quadrature"}
@@ -83,7 +83,7 @@ def test_wrong_pilots_are_refused_and_nothing_is_written(which: slice, decoder: 
 
 
 def test_a_fit_that_finds_nothing_is_a_refusal(decoder: Decoder, tmp_path: Path) -> None:
-    def lost(*_: object) -> FitResult:
+    def lost(*_: object) -> RefitResult:
         raise CalibrationError("known pages", "no significant peak", "a device within the capture range")
 
     with pytest.raises(RecalibrationRefusedError, match="capture range"):
@@ -92,9 +92,9 @@ def test_a_fit_that_finds_nothing_is_a_refusal(decoder: Decoder, tmp_path: Path)
 
 
 def test_a_table_worse_than_the_one_in_use_is_refused(decoder: Decoder, tmp_path: Path) -> None:
-    def away(*_: object) -> FitResult:
+    def away(*_: object) -> RefitResult:
         table = {"reference_in_phase": np.full(toy.SHAPE, 140, np.float32)}
-        return FitResult(table, "x = 1\n", FitReport())
+        return RefitResult(table, "x = 1\n", RefitReport())
 
     with pytest.raises(RecalibrationRefusedError, match="model in service"):
         recalibrate(decoder, known(toy.OFFSETS), tmp_path / "n.zip", "toy-1+r1", away, quiet)
@@ -102,7 +102,7 @@ def test_a_table_worse_than_the_one_in_use_is_refused(decoder: Decoder, tmp_path
 
 
 def test_a_version_that_is_none_is_refused_before_the_fit(decoder: Decoder, tmp_path: Path) -> None:
-    def never(*_: object) -> FitResult:
+    def never(*_: object) -> RefitResult:
         raise AssertionError("fitted")
 
     for version in ("v 2", "", "+r1", "x" * 101):

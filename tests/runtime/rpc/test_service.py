@@ -36,7 +36,7 @@ from runtime.decoding.tracking import NoTracker
 from runtime.errors import Reason, SourceError, StoppingError, UnconfirmedPageError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.recalibration.outcome import Fit, FitResult
+from runtime.recalibration.outcome import Refit, RefitResult
 from runtime.rpc.server import SERVICE, LightpageServer
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
@@ -83,7 +83,7 @@ def start(toy_zip: Path, tmp_path: Path) -> Iterator[Start]:
 
     def begin(
         limits: Limits | None = None,
-        fit: Fit = toy.fit_references,
+        fit: Refit = toy.fit_references,
         bundle: Path = toy_zip,
         store: Path | None = None,
         tracker: TrackerFactory = no_tracker,
@@ -578,9 +578,9 @@ def test_recalibration_with_wrong_pilots_is_refused_and_the_old_model_stays(star
 
 
 def test_recalibration_that_would_decode_worse_is_refused(start: Start) -> None:
-    def worse(*arguments: object) -> FitResult:
+    def worse(*arguments: object) -> RefitResult:
         good = toy.fit_references(*arguments)  # type: ignore[arg-type]
-        return FitResult({"homodyne": np.array([5.7, 0.7], np.float32)}, good.calibration_toml, good.report)
+        return RefitResult({"homodyne": np.array([5.7, 0.7], np.float32)}, good.calibration_toml, good.report)
 
     service = start(fit=worse)
     with pytest.raises(RecalibrationRefusedError, match="model in service"):
@@ -641,10 +641,10 @@ def test_a_lost_page_of_the_source_is_named_and_says_why_on_the_wire(start: Star
 def test_a_re_fit_is_judged_against_what_the_tracker_makes_of_the_old_model(
     start: Start,
 ) -> None:
-    def half_way(*arguments: object) -> FitResult:
+    def half_way(*arguments: object) -> RefitResult:
         good = toy.fit_references(*arguments)  # type: ignore[arg-type]
         table = {name: values - 8 for name, values in good.table.items()}
-        return FitResult(table, good.calibration_toml, good.report)
+        return RefitResult(table, good.calibration_toml, good.report)
 
     tracked = start(fit=half_way, tracker=DriftTracker)
     tracked.device.offsets = DRIFTED
@@ -726,7 +726,7 @@ def test_a_recalibration_that_is_stopped_reads_and_decodes_no_more_pages(start: 
 def test_the_service_ends_in_time_beside_a_recalibration_that_does_not_stop(start: Start) -> None:
     entered, go = threading.Event(), threading.Event()
 
-    def deaf(*arguments: object) -> FitResult:
+    def deaf(*arguments: object) -> RefitResult:
         entered.set()
         go.wait(20)
         return toy.fit_references(*arguments)  # type: ignore[arg-type]
