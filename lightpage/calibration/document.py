@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, field_serializer
 
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.parameters import NAMES, as_dict, as_vector
-from lightpage.device.profile import Count, Finite, Profile, Table, to_toml, validate
+from lightpage.device.profile import Count, Finite, Profile, TomlTable, to_toml, validate
 from lightpage.errors import ProfileError
 from lightpage.files import replace_text
 
@@ -40,7 +40,7 @@ def _just_the_names(values: dict[str, float]) -> dict[str, float]:
     return {name: values[name] for name in NAMES}
 
 
-class Calibration(Table):
+class Calibration(TomlTable):
     """Fitted geometry of one device against its nominal profile.
 
     Attributes:

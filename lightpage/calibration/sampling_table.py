@@ -14,7 +14,7 @@ from lightpage.device.profile import Profile
 from lightpage.waves.grid import field_grid
 
 Real = NDArray[np.float64]
-Table = dict[str, NDArray[np.float32]]
+SamplingTable = dict[str, NDArray[np.float32]]
 
 SAMPLING_TABLE = ("registration", "homodyne", "parameters", "places", "place_gradients", "phases", "positions")
 """Names of the table's tensors, as inputs of an exported decoder."""
@@ -54,7 +54,7 @@ def shifted(registration: NDArray[np.float32], shift_px: Real) -> NDArray[np.flo
     return moved
 
 
-def sampling_table(twin: Twin, parameters: Real, quadrature_phase: float, profile: Profile) -> Table:
+def sampling_table(twin: Twin, parameters: Real, quadrature_phase: float, profile: Profile) -> SamplingTable:
     """Trace the whole page.
 
     Args:

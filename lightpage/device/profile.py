@@ -29,28 +29,28 @@ _MOST_REFLECTIONS = 100
 SHIPPED = ("bench", "paper")
 
 
-class Table(BaseModel):
+class TomlTable(BaseModel):
     """A checked TOML table: frozen, no unknown keys, no NaN or infinity."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-T = TypeVar("T", bound=Table)
+T = TypeVar("T", bound=TomlTable)
 
 
-class Light(Table):
+class Light(TomlTable):
     """The laser."""
 
     wavelength_m: Length
 
 
-class Lens(Table):
+class Lens(TomlTable):
     """The launch and the de-launch lens, both in a 2f arrangement."""
 
     focal_length_m: Length
 
 
-class LensPath(Table):
+class LensPath(TomlTable):
     """Optical path of either lens beyond an ideal one's, by its terms, for the page's corner at the pipe's wall."""
 
     piston_rad: Radians = 0.0
@@ -77,7 +77,7 @@ class LensPath(Table):
         return validate(LensPath, larger, f"lens_path of lenses {factor:g} times as large")
 
 
-class Pipe(Table):
+class Pipe(TomlTable):
     """The light-pipe: a glass prism whose cross-section is a rhombus of height `width_m`, sheared by `angle_deg`."""
 
     length_m: Length
@@ -86,13 +86,13 @@ class Pipe(Table):
     angle_deg: Annotated[float, Field(ge=-5, le=5)] = 0.0
 
 
-class Slm(Table):
+class Slm(TomlTable):
     """The spatial light modulator."""
 
     pitch_m: Length
 
 
-class PageLayout(Table):
+class PageLayout(TomlTable):
     """How symbols lie on the SLM, and which of them are pilots."""
 
     columns: Count
@@ -102,7 +102,7 @@ class PageLayout(Table):
     pilot_seed: Annotated[int, Field(ge=0)] = 0
 
 
-class Camera(Table):
+class Camera(TomlTable):
     """The sensor of both cameras."""
 
     columns_px: Side
@@ -110,7 +110,7 @@ class Camera(Table):
     pitch_m: Length
 
 
-class Profile(Table):
+class Profile(TomlTable):
     """What the data sheet of a device says. Lengths in metres, angles in degrees, pixels where the key says so."""
 
     schema_version: Literal[1]
@@ -214,7 +214,7 @@ class Profile(Table):
         return to_toml(self, without=("lens_path",) if self.ideal_lenses else ())
 
 
-def to_toml(table: Table, without: tuple[str, ...] = ()) -> str:
+def to_toml(table: TomlTable, without: tuple[str, ...] = ()) -> str:
     """Write a checked table (scalars first, then its sub-tables one level down) as TOML text, some keys left out."""
     scalars: list[str] = []
     tables: list[str] = []

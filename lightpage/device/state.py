@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from lightpage.device.profile import Table, validate
+from lightpage.device.profile import TomlTable, validate
 from lightpage.errors import ProfileError
 
 # Bounds lie far beyond any device that can be built; they keep a slip of the pen from filling the machine's memory.
@@ -22,7 +22,7 @@ Pixels = Annotated[float, Field(ge=-500, le=500, allow_inf_nan=False)]
 Few = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 
 
-class Geometry(Table):
+class Geometry(TomlTable):
     """Pipe, lenses and page against their nominal values."""
 
     pipe_angle_deg: Angle = -0.6
@@ -35,7 +35,7 @@ class Geometry(Table):
     pipe_roll_deg: Angle = 0.1
 
 
-class CameraPose(Table):
+class CameraPose(TomlTable):
     """Where one camera truly sits: similarity transform about its centre, shift in camera pixels."""
 
     scale_relative_error: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
@@ -44,7 +44,7 @@ class CameraPose(Table):
     shift_y_px: Pixels = 0.0
 
 
-class Aberration(Table):
+class Aberration(TomlTable):
     """Phase at the page's corner, and radial distortion of the image, common to both cameras."""
 
     distortion_relative: Annotated[float, Field(ge=-0.2, le=0.2, allow_inf_nan=False)] = 0.001
@@ -56,7 +56,7 @@ class Aberration(Table):
     """Of the lenses' path beyond the ideal one, against the profile's: -1 is an ideal lens."""
 
 
-class Reference(Table):
+class Reference(TomlTable):
     """The reference beam at the cameras."""
 
     amplitude_ratio: Annotated[float, Field(ge=0.01, le=1000, allow_inf_nan=False)] = 1.6
@@ -71,7 +71,7 @@ class Reference(Table):
     """Phase at the corner of the page's image."""
 
 
-class Homodyne(Table):
+class Homodyne(TomlTable):
     """The quadrature arm against the in-phase arm."""
 
     quadrature_error_deg: Annotated[float, Field(ge=-89, le=89, allow_inf_nan=False)] = 3.0
@@ -84,7 +84,7 @@ class Homodyne(Table):
         return self.quadrature_sign * math.pi / 2 + math.radians(self.quadrature_error_deg)
 
 
-class SlmDefects(Table):
+class SlmDefects(TomlTable):
     """The modulator and its illumination."""
 
     phase_noise_rad: Few = 0.05
@@ -93,7 +93,7 @@ class SlmDefects(Table):
     """Loss of illumination amplitude at the page's corner."""
 
 
-class Sensor(Table):
+class Sensor(TomlTable):
     """Both cameras' electronics."""
 
     full_well_e: Annotated[float, Field(ge=1, le=1e12, allow_inf_nan=False)] = 15_000.0
@@ -103,14 +103,14 @@ class Sensor(Table):
     """Light on both cameras, against what lets the brightest fringes just fill the well."""
 
 
-class Drift(Table):
+class Drift(TomlTable):
     """Standard deviation of the change from one page to the next (a random walk)."""
 
     piston_rad: Few = 0.2
     shift_px: Few = 0.02
 
 
-class Device(Table):
+class Device(TomlTable):
     """The true state of a simulated device. The default is a realistic one."""
 
     geometry: Geometry = Geometry()

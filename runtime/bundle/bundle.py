@@ -37,7 +37,7 @@ from runtime.bundle.manifest import (
     sha256,
 )
 
-Table = dict[str, NDArray[Any]]
+SamplingTable = dict[str, NDArray[Any]]
 """Tensors that a decoder takes instead of its graph's defaults, by input name."""
 
 MAX_ARRAY_BYTES = MAX_BYTES
@@ -110,7 +110,7 @@ class Bundle:
             raise BundleError(error.subject, error.got, error.expected) from None
 
     @cached_property
-    def table(self) -> Table:
+    def table(self) -> SamplingTable:
         """Re-traced tensors that replace the graph's defaults, by input name; empty where there are none.
 
         Raises:

@@ -18,7 +18,7 @@ from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
 from lightpage.page.symbols import MAX_LEVELS, check_levels
 from lightpage.recording.reader import FramePair
-from runtime.bundle.bundle import Bundle, Table
+from runtime.bundle.bundle import Bundle, SamplingTable
 from runtime.bundle.manifest import DECODER, FIELD, GOLDEN
 from runtime.decoding.field_solver import BundleFieldSolver
 from runtime.decoding.frames import check_pair
@@ -29,15 +29,15 @@ from runtime.execution.table_graph import TableGraph
 
 OUTPUTS = ("p", "phase", "concentration")
 PAGE_INPUTS = frozenset(["registration"])
-"""Table inputs that may differ from page to page, as the image shifts."""
+"""SamplingTable inputs that may differ from page to page, as the image shifts."""
 _LARGE_WITH_REAL_LENSES = frozenset(["parameters"])
-"""Table inputs from which gigabytes follow, with lenses that are not ideal: no sooner read than made again."""
+"""SamplingTable inputs from which gigabytes follow, with lenses that are not ideal: no sooner read than made again."""
 GOLDEN_TOLERANCE = 1e-3
 """Largest error of p on the golden page, relative to its norm: room for another CPU's rounding, not for another net."""
 
 
 def inputs_left(profile: Profile) -> frozenset[str]:
-    """Table inputs of a device's decoder that are not built into its graph."""
+    """SamplingTable inputs of a device's decoder that are not built into its graph."""
     return PAGE_INPUTS if profile.ideal_lenses else PAGE_INPUTS | _LARGE_WITH_REAL_LENSES
 
 
@@ -93,7 +93,7 @@ class Decoder:
         """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
         return cls(Bundle.open(path), threads)
 
-    def with_table(self, table: Table) -> Decoder:
+    def with_table(self, table: SamplingTable) -> Decoder:
         """This decoder with other tensors in its table, by name; those left out stay. The golden page is not looked at.
 
         Raises:
@@ -155,7 +155,7 @@ class Decoder:
         manifest = self.bundle.manifest
         check_pair(pair, self.bundle.profile.frame_shape, manifest.frame_dtype, manifest.camera_bit_depth)
 
-    def infer(self, pair: FramePair, table: Table | None = None) -> Inference:
+    def infer(self, pair: FramePair, table: SamplingTable | None = None) -> Inference:
         """Run the graph on a checked pair.
 
         Args:
@@ -198,7 +198,7 @@ class Decoder:
         return FIELD in self.bundle.files
 
     def decode(
-        self, pair: FramePair, levels: int = 256, table: Table | None = None, pilots: Pilots | None = None
+        self, pair: FramePair, levels: int = 256, table: SamplingTable | None = None, pilots: Pilots | None = None
     ) -> DecodedPage:
         """Decode a frame pair into symbols of `levels` levels.
 

@@ -11,7 +11,7 @@ from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.phases import tilt_of_shift
 from lightpage.calibration.sampling_table import sampling_table, shifted
-from runtime.bundle.bundle import Table
+from runtime.bundle.bundle import SamplingTable
 from runtime.bundle.calibrated import calibration_of
 from runtime.decoding.decoder import Decoder
 
@@ -21,7 +21,7 @@ Real = NDArray[np.float64]
 class DriftTables(Protocol):
     """Applies drift to the tables of a decoder."""
 
-    def shifted(self, shift_px: Real) -> Table:
+    def shifted(self, shift_px: Real) -> SamplingTable:
         """Tensors to feed for an image `shift_px` (x, y) from where calibration saw it; empty for no shift."""
 
     def traced(self, tilt_rad: Real) -> Decoder:
@@ -46,7 +46,7 @@ class BundleTables:
         self._decoder, self._twin, self._calibration = decoder, twin, calibration_of(decoder.bundle)
         self._registration = decoder.graph.value("registration")
 
-    def shifted(self, shift_px: Real) -> Table:
+    def shifted(self, shift_px: Real) -> SamplingTable:
         """See `DriftTables`."""
         return {"registration": shifted(self._registration, shift_px)} if np.any(shift_px) else {}
 

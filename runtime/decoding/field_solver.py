@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lightpage.errors import BundleError
 from lightpage.recording.reader import FramePair
 from lightpage.waves.grid import field_grid
-from runtime.bundle.bundle import Bundle, Table
+from runtime.bundle.bundle import Bundle, SamplingTable
 from runtime.bundle.manifest import DECODER, FIELD
 from runtime.execution.session import open_session
 from runtime.execution.table_graph import TableGraph
@@ -54,7 +54,7 @@ class BundleFieldSolver:
             BundleError: the field is not on the common grid.
             InvalidInputError: a tensor that does not fit.
         """
-        table: Table = {
+        table: SamplingTable = {
             "reference_in_phase": references.in_phase,
             "reference_quadrature": references.quadrature,
             "registration": registration,

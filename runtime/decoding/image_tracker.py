@@ -14,7 +14,7 @@ from lightpage.calibration.image_search import FEWEST_SEARCHED, FoundImage
 from lightpage.page.pilots import PilotCheck, Pilots, read_pilots
 from lightpage.page.symbols import check_levels
 from lightpage.recording.reader import FramePair
-from runtime.bundle.bundle import Table
+from runtime.bundle.bundle import SamplingTable
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.drift_tables import BundleTables, DriftTables
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
@@ -107,7 +107,7 @@ class ImageState:
     drift: Real
     covariance: Real
     decoder: Decoder
-    table: Table
+    table: SamplingTable
     traced_tilt: Real
     walk: Real
     settled: bool = False

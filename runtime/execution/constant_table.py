@@ -12,7 +12,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from lightpage.errors import BundleError
-from runtime.bundle.bundle import Table
+from runtime.bundle.bundle import SamplingTable
 from runtime.execution.session import Port
 from runtime.pb.lightpage.onnx import graph_pb2 as pb
 
@@ -70,7 +70,7 @@ class GraphFile:
             values = np.array(getattr(tensor, _LISTS.get(port.dtype, "int32_data")), dtype)
         return values.reshape([int(size) for size in tensor.dims])
 
-    def built_in(self, table: Table, fed: Collection[str]) -> bytes:
+    def built_in(self, table: SamplingTable, fed: Collection[str]) -> bytes:
         """The model without table inputs but those `fed`.
 
         Args:

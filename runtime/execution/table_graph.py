@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError
-from runtime.bundle.bundle import Table
+from runtime.bundle.bundle import SamplingTable
 from runtime.execution.constant_table import GraphFile
 from runtime.execution.session import Port, Session, open_session
 
@@ -30,15 +30,20 @@ class TableGraph:
     """
 
     def __init__(
-        self, file: GraphFile, subject: str, fed: Collection[str], threads: int | None, table: Table | None = None
+        self,
+        file: GraphFile,
+        subject: str,
+        fed: Collection[str],
+        threads: int | None,
+        table: SamplingTable | None = None,
     ) -> None:
         self._file, self._subject, self._fed_names, self._threads = file, subject, fed, threads
-        self.table: Table = table or {}
+        self.table: SamplingTable = table or {}
         self.check(self.table)
         self._fed = {name: value for name, value in self.table.items() if name in fed}
         self.session: Session = open_session(file.built_in(self.table, fed), subject, threads)
 
-    def with_table(self, table: Table) -> TableGraph:
+    def with_table(self, table: SamplingTable) -> TableGraph:
         """The graph with other tensors in its table, by name; those left out stay. Errors as for the constructor."""
         return TableGraph(self._file, self._subject, self._fed_names, self._threads, {**self.table, **table})
 
@@ -57,7 +62,7 @@ class TableGraph:
             raise InvalidInputError("table", repr(name), f"one of {sorted(self.ports)}")
         return self.table[name] if name in self.table else self._file.default(name)
 
-    def check(self, table: Table) -> None:
+    def check(self, table: SamplingTable) -> None:
         """Check tensors that are to stand in the table instead of the graph's defaults.
 
         Raises:

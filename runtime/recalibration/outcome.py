@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from lightpage.progress import Progress
-from runtime.bundle.bundle import Bundle, Table
+from runtime.bundle.bundle import Bundle, SamplingTable
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import ImagePosition
 from runtime.recalibration.known_pages import KnownPages
@@ -42,7 +42,7 @@ class RefitResult:
         report: the fit's own figures.
     """
 
-    table: Table
+    table: SamplingTable
     calibration_toml: str
     report: RefitReport
 

@@ -16,7 +16,7 @@ from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.coherence import COHERENT_BRANCHES, branch_shares, page_coherence
 from lightpage.calibration.interfaces import BRANCHES
 from lightpage.calibration.samplers import FieldSampler
-from lightpage.calibration.sampling_table import Table, sampling_table, shifted
+from lightpage.calibration.sampling_table import SamplingTable, sampling_table, shifted
 from lightpage.errors import CalibrationError
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.reader import FramePair, Recording
@@ -88,7 +88,7 @@ class FeatureExtractor:
         profile, parameters = device.profile, device.parameters
         self.device = device
         self._twin = TorchTwin(RayTwin(profile))
-        self.table: Table = sampling_table(self._twin, parameters, device.quadrature_phase_rad, profile)
+        self.table: SamplingTable = sampling_table(self._twin, parameters, device.quadrature_phase_rad, profile)
         self.recovery = choices.field_recovery(profile, with_signal_power=with_signal_power)
         self._solve = TorchFieldSolver(self.recovery)
         self._coherent = choices.coherent_localizer(profile)
@@ -204,7 +204,7 @@ class FeatureExtractor:
 
 
 def demodulate(
-    localizer: CoherentLocalizer, field: NDArray[np.complexfloating], table: Table, shift: Real | None = None
+    localizer: CoherentLocalizer, field: NDArray[np.complexfloating], table: SamplingTable, shift: Real | None = None
 ) -> NDArray[np.float32]:
     """The coherent localizer's light [2, B, S, ny, nx] of a field [Gy, Gx], seen `shift` (x, y) camera pixels on."""
     places = table["places"]

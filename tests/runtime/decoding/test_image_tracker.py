@@ -11,7 +11,7 @@ import pytest
 from lightpage.calibration.image_search import REACH_PX, FoundImage
 from lightpage.page.pilots import PilotCheck, Pilots
 from lightpage.recording.reader import FramePair
-from runtime.bundle.bundle import Table
+from runtime.bundle.bundle import SamplingTable
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
 from runtime.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageTracker
@@ -64,7 +64,7 @@ class FakeDecoder:
     def __getattr__(self, name: str) -> object:
         return getattr(self._decoder, name)
 
-    def infer(self, pair: FramePair, table: Table | None = None) -> Inference:
+    def infer(self, pair: FramePair, table: SamplingTable | None = None) -> Inference:
         device = self._device
         shift = (table or {}).get("shift", np.zeros(2))
         device.held = np.concatenate([np.asarray(shift, np.float64), self._tilt])
@@ -99,7 +99,7 @@ class FakeTables:
     def __init__(self, device: FakeDevice) -> None:
         self._device = device
 
-    def shifted(self, shift_px: Real) -> Table:
+    def shifted(self, shift_px: Real) -> SamplingTable:
         return {"shift": shift_px.astype(np.float32)} if np.any(shift_px) else {}
 
     def tilt_of(self, shift_px: Real) -> Real:
@@ -317,7 +317,7 @@ def test_attempts_are_bounded_where_the_image_flees(device: FakeDevice) -> None:
     tracker = settled(device)
     infer = FakeDecoder.infer
 
-    def fleeing(self: FakeDecoder, pair: FramePair, table: Table | None = None) -> Inference:
+    def fleeing(self: FakeDecoder, pair: FramePair, table: SamplingTable | None = None) -> Inference:
         device.drift[SHIFT] += 1.0
         return infer(self, pair, table)
 
@@ -345,7 +345,7 @@ def test_pages_decoded_at_the_same_time_teach_once(device: FakeDevice) -> None:
     first, go = threading.Event(), threading.Event()
     infer = FakeDecoder.infer
 
-    def waiting(self: FakeDecoder, pair: FramePair, table: Table | None = None) -> Inference:
+    def waiting(self: FakeDecoder, pair: FramePair, table: SamplingTable | None = None) -> Inference:
         if threading.current_thread() is slow:
             first.set()
             assert go.wait(10)
@@ -411,7 +411,7 @@ class NoiseDecoder(FakeDecoder):
 
     rng = np.random.default_rng(8)
 
-    def infer(self, pair: FramePair, table: Table | None = None) -> Inference:
+    def infer(self, pair: FramePair, table: SamplingTable | None = None) -> Inference:
         sure = replace(self._decoder.infer(pair), concentration=np.full(toy.PAGE, 300.0, np.float32))
         return sure.turned(self.rng.uniform(-np.pi, np.pi, toy.PAGE))
 
@@ -449,7 +449,7 @@ def test_noise_is_not_given_out_however_few_the_pilots_are(device: FakeDevice, p
 class PhaseDecoder(FakeDecoder):
     """Shows drift in its phases alone, by the slopes of `tests.runtime.decoding.test_image_drift`."""
 
-    def infer(self, pair: FramePair, table: Table | None = None) -> Inference:
+    def infer(self, pair: FramePair, table: SamplingTable | None = None) -> Inference:
         device = self._device
         shift = (table or {}).get("shift", np.zeros(2))
         device.held = np.concatenate([np.asarray(shift, np.float64), self._tilt])

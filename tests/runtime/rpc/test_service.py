@@ -29,7 +29,7 @@ from lightpage.metrics.measures import measure
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.sources import open_source
-from runtime.bundle.bundle import Bundle, Table
+from runtime.bundle.bundle import Bundle, SamplingTable
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
@@ -593,7 +593,7 @@ class DriftTracker(NoTracker):
 
     def __init__(self, decoder: Decoder) -> None:
         references = toy.ToyDevice(DRIFTED).references()
-        table: Table = {
+        table: SamplingTable = {
             "reference_in_phase": references.in_phase.astype(np.float32),
             "reference_quadrature": references.quadrature.astype(np.float32),
         }
