@@ -16,9 +16,9 @@ from lightpage.von_mises import mean_resultant
 _BELIEF = 20.0
 """Pilots that count for the decoder before any is seen: noise of 54 pilots then costs under 0.01 bit a symbol."""
 
-_SPOILT = 0.01
+_OUTLIERS = 0.01
 """Share of pilots that are expected to say nothing: a dead place of the modulator, a value that was not written."""
-_MOST_SPOILT = 0.05
+_MOST_OUTLIERS = 0.05
 """Where more of them contradict the rest, it is the device that has changed, and all of them count."""
 _ROUNDS = 10
 _MEDIAN_CHI2 = 0.4549
@@ -177,7 +177,7 @@ def estimate_trust(p: NDArray[np.floating], pilots: Pilots, angle_rad: float) ->
 
     Args:
         p: (px, py), [2, ny, nx].
-        pilots: the known symbols of this page, those left out that are spoilt.
+        pilots: the known symbols of this page, those left out that are outliers.
         angle_rad: the page's piston, as `estimate_piston` found it.
 
     Raises:
@@ -197,7 +197,7 @@ def check_claims(
 
     Args:
         p: (px, py), [2, ny, nx].
-        pilots: the known symbols of this page, those left out that are spoilt.
+        pilots: the known symbols of this page, those left out that are outliers.
         angle_rad: the page's piston, as `estimate_piston` found it.
         trust: factor on the concentrations, as `estimate_trust` found it.
         gained_nats: the same of whatever else was fitted to these pilots.
@@ -222,10 +222,10 @@ def check_claims(
     )
 
 
-def without_spoilt(p: NDArray[np.floating], pilots: Pilots) -> Pilots:
+def without_outliers(p: NDArray[np.floating], pilots: Pilots) -> Pilots:
     """The pilots less those few that contradict all others, as a dead place of the modulator does.
 
-    A pilot is left out where its error is more likely one of any size, `_SPOILT` of all pilots having such, than what
+    A pilot is left out where its error is more likely one of any size, `_OUTLIERS` of all pilots having such, than what
     the concentration claimed there allows after the others have told how far claims may be believed.
 
     Args:
@@ -241,11 +241,11 @@ def without_spoilt(p: NDArray[np.floating], pilots: Pilots) -> Pilots:
         missed = _missed(errors, float(np.angle(errors[sound].sum())))
         over_claim = float(np.mean(missed[sound]) if quadrature_phase else np.median(missed) / _MEDIAN_CHI2)
         trust = 1 / max(1.0, over_claim)
-        odds = np.log((1 - _SPOILT) / _SPOILT) - np.log(i0e(trust * kappa)) - trust * missed / 2
+        odds = np.log((1 - _OUTLIERS) / _OUTLIERS) - np.log(i0e(trust * kappa)) - trust * missed / 2
         before, sound = sound, odds > 0
         if np.array_equal(before, sound) or not sound.any():
             break
-    if np.count_nonzero(~sound) > _MOST_SPOILT * len(sound):
+    if np.count_nonzero(~sound) > _MOST_OUTLIERS * len(sound):
         return pilots
     mask = pilots.mask.copy()
     mask[pilots.mask] = sound
@@ -278,7 +278,7 @@ def read_pilots(p: NDArray[np.floating], pilots: Pilots, gained_nats: float = 0.
     Raises:
         PageError: the page has another shape than the pilots.
     """
-    sound = without_spoilt(p, pilots)
+    sound = without_outliers(p, pilots)
     piston = estimate_piston(p, sound)
     trust = estimate_trust(p, sound, piston.angle_rad)
     return PilotReading(piston, trust, check_claims(p, sound, piston.angle_rad, trust, gained_nats))

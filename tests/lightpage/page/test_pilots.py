@@ -7,7 +7,7 @@ import pytest
 
 from lightpage.errors import PageError
 from lightpage.metrics.information import achievable_rate, own_information
-from lightpage.page.pilots import Pilots, estimate_piston, estimate_trust, read_pilots, remove_piston, without_spoilt
+from lightpage.page.pilots import Pilots, estimate_piston, estimate_trust, read_pilots, remove_piston, without_outliers
 from tests.runtime import toy
 
 
@@ -94,15 +94,15 @@ class TestTrust:
         assert estimate_trust(p, wrong, estimate_piston(p, wrong).angle_rad) < 0.01
 
     @pytest.mark.parametrize("kappa", [100, 1000, 4000])
-    @pytest.mark.parametrize("spoilt", [1, 2])
+    @pytest.mark.parametrize("outliers", [1, 2])
     @pytest.mark.parametrize("off_rad", [1.5, 2.0, np.pi])
-    def test_few_dead_places_cost_nothing(self, kappa: float, spoilt: int, off_rad: float) -> None:
+    def test_few_dead_places_cost_nothing(self, kappa: float, outliers: int, off_rad: float) -> None:
         p, pilots = self.noisy(kappa, kappa, 0)
         phases = pilots.phases.copy()
-        phases[:spoilt] += off_rad
+        phases[:outliers] += off_rad
         broken = Pilots(pilots.mask, phases)
-        left = without_spoilt(p, broken)
-        assert len(left.phases) == 54 - spoilt
+        left = without_outliers(p, broken)
+        assert len(left.phases) == 54 - outliers
         whole, piston = estimate_piston(p, pilots), estimate_piston(p, left)
         assert piston.angle_rad == pytest.approx(whole.angle_rad, abs=0.2 / np.sqrt(kappa))
         before = estimate_trust(p, pilots, whole.angle_rad)
@@ -110,7 +110,7 @@ class TestTrust:
 
     @pytest.mark.parametrize(("kappa", "claim"), [(400, 400), (400, 4000), (40, 400), (4, 400)])
     def test_pilots_of_a_sound_page_all_count(self, kappa: float, claim: float) -> None:
-        kept = [len(without_spoilt(*self.noisy(kappa, claim, seed)).phases) for seed in range(40)]
+        kept = [len(without_outliers(*self.noisy(kappa, claim, seed)).phases) for seed in range(40)]
         assert np.mean(kept) > 53.9
 
     def test_a_device_that_changed_in_part_is_not_excused(self) -> None:
@@ -118,8 +118,8 @@ class TestTrust:
         phases = pilots.phases.copy()
         phases[:10] += 2.0
         changed = Pilots(pilots.mask, phases)
-        assert without_spoilt(p, changed) is changed
-        left = without_spoilt(p, Pilots(pilots.mask, np.roll(pilots.phases, 1)))
+        assert without_outliers(p, changed) is changed
+        left = without_outliers(p, Pilots(pilots.mask, np.roll(pilots.phases, 1)))
         assert estimate_trust(p, left, estimate_piston(p, left).angle_rad) < 0.01
 
 
