@@ -35,7 +35,7 @@ class DecoderGraph(nn.Module):
     Args:
         profile: the nominal device.
         decoder: trained; the weights of its parts in `HALVED` are rounded to float16.
-        kappa_scale: factor on p that makes its length an honest concentration.
+        kappa_scale: factor on p that makes its length a calibrated concentration.
     """
 
     outputs = OUTPUTS
@@ -82,7 +82,7 @@ class PublishedGraph(nn.Module):
 
     Args:
         decoder: trained.
-        kappa_scale: factor on p that makes its length an honest concentration.
+        kappa_scale: factor on p that makes its length a calibrated concentration.
     """
 
     outputs = ANSWERS

@@ -55,7 +55,7 @@ class Run:
         validation_air: bits per data symbol.
         pages: recorded pages for training, for validation, and left for evaluation.
         synthetic_pages: synthetic pages trained on beside the recorded ones.
-        kappa_scale: factor on p that makes the claimed concentration honest on the validation pages.
+        kappa_scale: factor on p that calibrates the claimed concentration on the validation pages.
         seconds: training time, that of the recorded pages' features included, simulation not.
         provenance: command, seed, commit.
     """

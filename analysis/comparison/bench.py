@@ -284,7 +284,7 @@ class Bench:
         return folder
 
     def decoded(self, module: DecoderTraining[Any], pages: Dataset[Page], scale: float) -> NDArray[np.float32]:
-        """p of all data symbols of pages, piston off and made honest, [2, symbols]."""
+        """p of all data symbols of pages, piston off and calibrated, [2, symbols]."""
         found = zip(*decode_pages(module, pages), strict=True)
         return np.concatenate([without_piston(p * scale, t, self.mask)[:, ~self.mask] for p, t in found], axis=1)
 
@@ -300,7 +300,7 @@ class Bench:
         preparing: float,
         drawn: float,
     ) -> Outcome:
-        """Figures of the held-out pages, kappa made honest on the validation pages."""
+        """Figures of the held-out pages, kappa calibrated on the validation pages."""
         module: DecoderTraining[Any] = trained.module
         scale = best_kappa_scale(module, validation, self.mask)
         px, py = self.decoded(module, unseen, scale)

@@ -2,7 +2,7 @@
 
     python -m analysis.comparison.kept_bundle --kept analysis/weights/bench/-0.6deg-32e-4px --out bundle.zip
 
-A few pages of the light are simulated anew: they say how strong the light is, and how honest the claims are.
+A few pages of the light are simulated anew: they say how strong the light is, and how well calibrated the claims are.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from lightpage.recording.reader import Recording, hash_frames
 from lightpage.simulator.recording_job import RecordingJob
 from train.data.features import FeatureExtractor
 from train.data.known_light import explained
-from train.fitting.concentration_scale import honest_factor
+from train.fitting.concentration_scale import calibrating_factor
 from train.fitting.fitted import FITTED, FITTED_WEIGHTS
 from train.fitting.validation import without_piston
 from train.models.decoder import COHERENT, SymbolDecoder
@@ -46,7 +46,7 @@ from train.trainers.symbols import MATCHED_PAGES
 
 LEVELS = 256
 JUDGED = 3
-"""Pages by which claims are made honest: thousands of symbols each."""
+"""Pages by which claims are calibrated: thousands of symbols each."""
 
 
 def light_of(kept: Path) -> tuple[Profile, Device, int]:
@@ -156,7 +156,7 @@ def _kappa_scale(
         p = torch_answer(graph, recording.frames(page), tensors)["p"]
         shown.append(without_piston(p, truth, mask)[:, ~mask])
         truths.append(truth[~mask])
-    return honest_factor(np.concatenate(shown, axis=1), np.concatenate(truths))
+    return calibrating_factor(np.concatenate(shown, axis=1), np.concatenate(truths))
 
 
 @click.command()

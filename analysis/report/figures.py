@@ -138,7 +138,7 @@ def reliability(data: ReportData) -> Picture:
     figure = _figure()
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     most = max(max(b.high for b in bins), max(b.accuracy for b in bins))
-    above.plot([0, most], [0, most], color=GREY, linewidth=1, linestyle="dashed", label="honest")
+    above.plot([0, most], [0, most], color=GREY, linewidth=1, linestyle="dashed", label="calibrated")
     above.plot(
         [b.confidence for b in bins], [b.accuracy for b in bins], "o-", color=BLUE, markersize=4, label="measured"
     )

@@ -32,7 +32,7 @@ def render(data: ReportData) -> str:
             geometry=geometry(data),
             zones=zones(data, centroids),
             maps=figures.maps(data, centroids),
-            honesty=[figures.reliability(data), figures.concentration(data)],
+            reliability=[figures.reliability(data), figures.concentration(data)],
             training=data.curves if isinstance(data.curves, str) else figures.training(data.curves),
             page=data.golden if isinstance(data.golden, str) else figures.page(data.golden),
             rays=figures.rays(data),

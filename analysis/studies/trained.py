@@ -28,7 +28,7 @@ from lightpage.progress import Progress, reporting
 from lightpage.recording.reader import Recording
 from lightpage.simulator.recording_job import RecordingJob
 from train.data.features import PageState
-from train.fitting.concentration_scale import decode_pages, honest_factor, most_likely_factor
+from train.fitting.concentration_scale import calibrating_factor, decode_pages, most_likely_factor
 from train.fitting.curves import curves_of
 from train.fitting.validation import without_piston
 from train.models.parts import turned
@@ -125,7 +125,7 @@ def trained(
                 work, localizer, choices, profile, quadrature_phase, mask, training, validation, callbacks=[tell]
             )
         p, phases = _beliefs(fitted.module, validation, mask, knows_piston)
-        scale = honest_factor(p.reshape(2, -1), phases.ravel())
+        scale = calibrating_factor(p.reshape(2, -1), phases.ravel())
         p, phases = _beliefs(fitted.module, unseen, mask, knows_piston)
         figures = _of_p(scale * p, phases, mask, levels)
         if choices.classes:

@@ -1,1 +1,1 @@
-"""How much a decoded page carries, and how honest its confidences are."""
+"""How much a decoded page carries, and how well calibrated its confidences are."""

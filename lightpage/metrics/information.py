@@ -1,4 +1,4 @@
-"""How much a decoded page carries and how honest its confidence is: decisions, rates, calibration of beliefs.
+"""How much a decoded page carries and how well calibrated its confidence is: decisions and rates.
 
 A decoder believes of every symbol that its phase follows a von Mises density with mean phase `mu` (radians) and
 concentration `kappa`. All figures are computed in float64. `levels` is M: symbol s stands for the phase 2 pi s / M.

@@ -29,15 +29,15 @@ from runtime.execution.table_graph import TableGraph
 
 OUTPUTS = ("p", "phase", "concentration")
 PAGE_INPUTS = frozenset(["registration"])
-"""SamplingTable inputs that may differ from page to page, as the image shifts."""
+"""Table inputs that may differ from page to page, as the image shifts."""
 _LARGE_WITH_REAL_LENSES = frozenset(["parameters"])
-"""SamplingTable inputs from which gigabytes follow, with lenses that are not ideal: no sooner read than made again."""
+"""Table inputs from which gigabytes follow, with lenses that are not ideal: no sooner read than made again."""
 GOLDEN_TOLERANCE = 1e-3
 """Largest error of p on the golden page, relative to its norm: room for another CPU's rounding, not for another net."""
 
 
 def inputs_left(profile: Profile) -> frozenset[str]:
-    """SamplingTable inputs of a device's decoder that are not built into its graph."""
+    """Table inputs of a device's decoder that are not built into its graph."""
     return PAGE_INPUTS if profile.ideal_lenses else PAGE_INPUTS | _LARGE_WITH_REAL_LENSES
 
 

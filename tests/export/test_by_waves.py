@@ -52,7 +52,7 @@ def test_the_bundle_decodes_without_torch_what_the_run_decoded(
     assert error <= 1e-3
     asked = ["--bundle", str(bundle), "--recording", small_device[3], "--json", str(tmp_path / "E.json")]
     CliRunner().invoke(evaluate, asked, standalone_mode=False, catch_exceptions=False)
-    # of the same light as the validation page, with honest concentrations on top; a dozen pilots show the piston
+    # of the same light as the validation page, with calibrated concentrations on top; a dozen pilots show the piston
     found = json.loads((tmp_path / "E.json").read_text())["air_bits_per_symbol"]
     assert found > load_run(run).validation_air - 0.6 > 1
 

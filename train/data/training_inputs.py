@@ -50,7 +50,7 @@ class Trained:
     Attributes:
         weights: by name.
         validation_air: bits per data symbol.
-        kappa_scale: factor on p that makes the claimed concentration honest on the validation pages.
+        kappa_scale: factor on p that calibrates the claimed concentration on the validation pages.
         seconds: preparing the pages and training, all stretches together.
         synthetic_pages: trained on beside the recorded ones.
     """

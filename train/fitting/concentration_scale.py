@@ -19,7 +19,7 @@ from train.fitting.modules import DecoderTraining
 from train.fitting.validation import without_piston
 
 _SCALE_BOUNDS = (-3.0, 3.0)
-"""Bounds of the logarithm of a factor that makes a decoder's claims honest: hardly trained ones were off by five."""
+"""Bounds of the logarithm of a factor that calibrates a decoder's claims: hardly trained ones were off by five."""
 
 _AT_A_BOUND = 1e-3
 
@@ -35,7 +35,7 @@ def decode_pages(module: DecoderTraining[Any], pages: Dataset[Page]) -> tuple[ND
 
 
 def best_kappa_scale(module: DecoderTraining[Any], pages: Dataset[Page], mask: NDArray[np.bool_]) -> float:
-    """Factor on p under which held-out pages are most likely: the network's claim, made honest.
+    """Factor on p under which held-out pages are most likely: the network's claim, calibrated.
 
     Piston is taken off by the pilots first, as the runtime does it.
     """
@@ -43,10 +43,10 @@ def best_kappa_scale(module: DecoderTraining[Any], pages: Dataset[Page], mask: N
     for p, truth in zip(*decode_pages(module, pages), strict=True):
         outputs.append(without_piston(p, truth, mask)[:, ~mask])
         truths.append(truth[~mask])
-    return honest_factor(np.concatenate(outputs, axis=1), np.concatenate(truths))
+    return calibrating_factor(np.concatenate(outputs, axis=1), np.concatenate(truths))
 
 
-def honest_factor(p: NDArray[np.float32], phases: NDArray[np.float32]) -> float:
+def calibrating_factor(p: NDArray[np.float32], phases: NDArray[np.float32]) -> float:
     """Factor on p [2, N] under which the true phases [N] are most likely."""
     shown, asked = torch.from_numpy(p)[None], torch.from_numpy(phases)[None]
     return most_likely_factor(lambda factor: float(von_mises_nll(shown * factor, asked).mean()))
@@ -61,6 +61,6 @@ def most_likely_factor(nll: Callable[[float], float]) -> float:
     found = optimize.minimize_scalar(lambda log: nll(math.exp(log)), bounds=_SCALE_BOUNDS, method="bounded")
     log_factor = float(found.x)
     if min(log_factor - _SCALE_BOUNDS[0], _SCALE_BOUNDS[1] - log_factor) < _AT_A_BOUND:
-        what = f"claims would be more honest still beyond the factor {math.exp(log_factor):.3g}, where the search ends"
+        what = f"claims would be calibrated still better beyond the factor {math.exp(log_factor):.3g}, where the search ends"
         warn(f"{what}: is the decoder trained?")
     return math.exp(log_factor)

@@ -15,7 +15,7 @@ from lightpage.simulator.recording_job import RecordingJob
 from tests.lightpage.small import small_profile
 
 
-def test_honest_beliefs_have_the_error_rate_that_they_claim_and_bold_ones_do_not(tmp_path: Path) -> None:
+def test_calibrated_beliefs_have_the_error_rate_that_they_claim_and_bold_ones_do_not(tmp_path: Path) -> None:
     profile, rng = small_profile(), np.random.default_rng(0)
     mask, pages = pilot_mask(profile), [0, 1]
     job = RecordingJob(profile, Device(), 4, 3, truth=False, out=tmp_path / "R.h5")
@@ -28,9 +28,9 @@ def test_honest_beliefs_have_the_error_rate_that_they_claim_and_bold_ones_do_not
         # a symbol is as likely to be the true one as its belief says, where the belief is drawn about the true phase
         seen = phases + rng.vonmises(0, kappa, phases.shape)
         p = kappa * np.stack([np.cos(seen), np.sin(seen)]).astype(np.float32)
-        honest, bold = (level_figures(scale * p, recording, pages, mask) for scale in (1, 3))
+        calibrated, bold = (level_figures(scale * p, recording, pages, mask) for scale in (1, 3))
     wrong = np.abs(np.angle(np.exp(1j * (seen - phases)))) > np.pi / 4
-    assert honest.symbol_error_rate == bold.symbol_error_rate == pytest.approx(wrong.mean(), abs=1e-9)
-    assert 0.1 < honest.symbol_error_rate < 0.3
-    assert honest.ece < 0.03 < bold.ece
-    assert "not judged" not in honest.line("arm", "size")
+    assert calibrated.symbol_error_rate == bold.symbol_error_rate == pytest.approx(wrong.mean(), abs=1e-9)
+    assert 0.1 < calibrated.symbol_error_rate < 0.3
+    assert calibrated.ece < 0.03 < bold.ece
+    assert "not judged" not in calibrated.line("arm", "size")

@@ -34,7 +34,7 @@ from train.commands.train import train
 from train.fitting.curves import curves_of
 from train.runs import load_run
 
-SECTIONS = ["figures", "geometry", "maps", "zones", "honesty", "training", "page", "rays"]
+SECTIONS = ["figures", "geometry", "maps", "zones", "reliability", "training", "page", "rays"]
 DATA_SYMBOLS = int(np.count_nonzero(~pilot_mask(small_profile())))
 STEPS = "12"
 ROUNDING = 5e-5
@@ -112,7 +112,7 @@ def test_a_run_at_symbol_pitch(coherent: Path, tmp_path: Path) -> None:
     text, seen = page_of(coherent, tmp_path / "R.html")
     check_whole(text, seen)
     counts = {name: len(pictures) for name, pictures in seen.pictures.items()}
-    assert counts == {"maps": 4, "honesty": 2, "training": 2, "page": 3, "rays": 4}
+    assert counts == {"maps": 4, "reliability": 2, "training": 2, "page": 3, "rays": 4}
     assert "the validation pages of this run (2)" in text
     assert "8 channels, 1 blocks" in text
 
@@ -203,7 +203,7 @@ def test_the_pipe_angle_is_told_in_degrees_with_what_is_nominal(coherent: Path) 
 def test_an_evaluation(evaluation: Path, tmp_path: Path) -> None:
     text, seen = page_of(evaluation, tmp_path / "E.html")
     check_whole(text, seen)
-    assert set(seen.pictures) == {"maps", "honesty", "page", "rays"}
+    assert set(seen.pictures) == {"maps", "reliability", "page", "rays"}
     assert "an evaluation does not hold how its decoder was trained" in text
     assert "version small-1" in text
 

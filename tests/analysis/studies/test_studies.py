@@ -353,7 +353,7 @@ def test_each_that_trains_makes_maps_of_every_case_and_each_light_once(
                 assert bool(maps["angles"][:, 1].any()) == (name != "pipe-length")  # whose pipes are known to be square
 
 
-def test_beliefs_in_classes_are_made_honest_before_they_are_judged() -> None:
+def test_beliefs_in_classes_are_made_calibrated_before_they_are_judged() -> None:
     classes, spread, shape = 4, 0.6, (40, 50)
     generator, mask = torch.Generator().manual_seed(0), np.zeros(shape, dtype=bool)
     mask[::10, ::10] = True
@@ -364,19 +364,19 @@ def test_beliefs_in_classes_are_made_honest_before_they_are_judged() -> None:
         observed = observed + spread * torch.randn(observed.shape, generator=generator)
         return observed, torch.zeros(3), truth * (2 * np.pi / classes)
 
-    def boasting(by: float) -> SimpleNamespace:
+    def overconfident(by: float) -> SimpleNamespace:
         """Scores that claim the evidence of `by` as many observations."""
         network = SimpleNamespace(scores=lambda frames, shift: frames * by / spread**2)
         return SimpleNamespace(choices=PublishedChoices(classes=classes), network=network)
 
     validation, unseen = [page() for _ in range(4)], [page() for _ in range(8)]
-    honest, loud = (_of_classes(boasting(by), validation, unseen, mask) for by in (1.0, 3.0))  # type: ignore[arg-type]
-    for found in (honest, loud):
+    calibrated, loud = (_of_classes(overconfident(by), validation, unseen, mask) for by in (1.0, 3.0))  # type: ignore[arg-type]
+    for found in (calibrated, loud):
         air, own = (float(np.nanmean(found[name])) for name in ("air_map", "own_mi_map"))
         assert own == pytest.approx(air, abs=0.03)
         assert found["ece"] < 0.02
-    np.testing.assert_allclose(loud["air_map"], honest["air_map"], atol=1e-3)
-    assert np.array_equal(np.isnan(honest["air_map"]), mask)
+    np.testing.assert_allclose(loud["air_map"], calibrated["air_map"], atol=1e-3)
+    assert np.array_equal(np.isnan(calibrated["air_map"]), mask)
 
 
 def test_a_share_of_the_steps_is_said_in_the_table(tmp_path: Path) -> None:

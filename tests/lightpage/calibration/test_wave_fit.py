@@ -1,4 +1,4 @@
-"""Claims about the fit to waves: a known page places both cameras and tells the device, with honest deviations."""
+"""Claims about the fit to waves: a known page places both cameras and tells the device, with calibrated deviations."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_both_cameras_and_the_angle_between_the_arms_come_back(ratio: float, ful
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_realistic_device_is_told_from_near_it_with_honest_deviations(seed: int) -> None:
+def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations(seed: int) -> None:
     device = draw_device(np.random.default_rng(seed))
     truth = true_parameters(PROFILE, device)
     rng, angle = np.random.default_rng([seed, 1]), NAMES.index("pipe_angle_rad")

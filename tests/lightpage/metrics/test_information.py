@@ -65,7 +65,7 @@ def test_decision_is_the_nearest_level_whatever_the_winding(levels: int) -> None
 
 
 @pytest.mark.parametrize("levels", [3, 4, 8, 16, 256])
-def test_air_of_honest_beliefs_equals_own_information(levels: int) -> None:
+def test_air_of_calibrated_beliefs_equals_own_information(levels: int) -> None:
     kappa = np.random.default_rng(0).lognormal(np.log(10), 1, 200_000)
     symbols, mu = drawn_page(levels, kappa, 1)
     air = information.achievable_rate(mu, kappa, symbols, levels).mean()
@@ -83,11 +83,11 @@ def test_air_at_256_levels_agrees_with_the_continuous_form() -> None:
 def test_overconfident_beliefs_claim_more_than_they_achieve() -> None:
     kappa = np.full(50_000, 8.0)
     symbols, mu = drawn_page(16, kappa, 3)
-    honest = measures.measure(mu, kappa, symbols, 16)
-    boastful = measures.measure(mu, 6 * kappa, symbols, 16)
-    assert boastful.air_bits_per_symbol < honest.air_bits_per_symbol - 0.3
-    assert boastful.over_claim_bits_per_symbol > honest.over_claim_bits_per_symbol + 1
-    assert boastful.ece > 0.1 > 0.01 > honest.ece
+    calibrated = measures.measure(mu, kappa, symbols, 16)
+    overconfident = measures.measure(mu, 6 * kappa, symbols, 16)
+    assert overconfident.air_bits_per_symbol < calibrated.air_bits_per_symbol - 0.3
+    assert overconfident.over_claim_bits_per_symbol > calibrated.over_claim_bits_per_symbol + 1
+    assert overconfident.ece > 0.1 > 0.01 > calibrated.ece
 
 
 def test_gray_rate_is_a_brute_force_bit_posterior_and_never_above_air() -> None:

@@ -1,4 +1,4 @@
-"""The decoder finds the symbols, is honest about them, and refuses models and frames that are not its own."""
+"""The decoder finds the symbols, says how sure it is, and refuses models and frames that are not its own."""
 
 from __future__ import annotations
 

@@ -103,19 +103,19 @@ def test_a_claim_that_is_too_bold_is_scaled_down(tmp_path: Path, mask: np.ndarra
     training, validation = pages(12, 0), pages(3, 1)
     choices = replace(CHOICES, steps=60)
     module = fit_network(tmp_path, choices, mask, LEVELS, training, validation).module
-    honest = best_kappa_scale(module, validation, mask)
+    calibrated = best_kappa_scale(module, validation, mask)
     with torch.no_grad():
         assert module.network.head.bias is not None
         for value in (module.network.head.weight, module.network.head.bias):
             value[:2] *= 3
-    assert best_kappa_scale(module, validation, mask) == pytest.approx(honest / 3, rel=0.02)
+    assert best_kappa_scale(module, validation, mask) == pytest.approx(calibrated / 3, rel=0.02)
 
 
 def test_a_factor_at_the_end_of_the_search_is_said_to_be_there(caplog: pytest.LogCaptureFixture) -> None:
     assert most_likely_factor(lambda factor: (math.log(factor) - 1) ** 2) == pytest.approx(math.e, rel=1e-4)
     assert caplog.text == ""
     most_likely_factor(lambda factor: -factor)
-    assert "more honest still beyond the factor 20" in caplog.text
+    assert "calibrated still better beyond the factor 20" in caplog.text
 
 
 def test_air_does_not_see_the_piston_and_leaves_pilots_out(mask: np.ndarray) -> None:
