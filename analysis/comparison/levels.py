@@ -1,4 +1,4 @@
-"""How well calibrated a decoder's confidence is where pages are written with few levels, and decisions are mostly right."""
+"""How well calibrated confidences are on pages of few levels, where decisions are mostly right."""
 
 from __future__ import annotations
 

@@ -61,6 +61,6 @@ def most_likely_factor(nll: Callable[[float], float]) -> float:
     found = optimize.minimize_scalar(lambda log: nll(math.exp(log)), bounds=_SCALE_BOUNDS, method="bounded")
     log_factor = float(found.x)
     if min(log_factor - _SCALE_BOUNDS[0], _SCALE_BOUNDS[1] - log_factor) < _AT_A_BOUND:
-        what = f"claims would be calibrated still better beyond the factor {math.exp(log_factor):.3g}, where the search ends"
-        warn(f"{what}: is the decoder trained?")
+        what = f"claims would be calibrated still better beyond the factor {math.exp(log_factor):.3g}"
+        warn(f"{what}, where the search ends: is the decoder trained?")
     return math.exp(log_factor)
