@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lightpage.calibration.coherence import branch_shares
 from lightpage.calibration.interfaces import BRANCHES, Twin
@@ -103,7 +103,7 @@ class ImageSearch:
         trials = np.unique(_lattice(np.rint(around / COARSE_PX) * COARSE_PX, REACH_PX, COARSE_PX), axis=0)
         scores = self._scores(field, self._template(pilots, _COARSE_SAMPLES), trials, order=1)
         best = trials[int(np.argmax(scores))]
-        smooth = ndimage.spline_filter(field.real, 3) + 1j * ndimage.spline_filter(field.imag, 3)
+        smooth = scipy.ndimage.spline_filter(field.real, 3) + 1j * scipy.ndimage.spline_filter(field.imag, 3)
         template, score = self._template(pilots, symbol_samples(self._profile)), 0.0
         for step in _FINE_PX:
             near = _lattice(best[None], step, step)
@@ -140,7 +140,8 @@ class ImageSearch:
             column, row = np.moveaxis(template.places + shift, -1, 0)
             at = [row.ravel(), column.ravel()]
             real, imaginary = (
-                ndimage.map_coordinates(part, at, order=order, prefilter=False) for part in (field.real, field.imag)
+                scipy.ndimage.map_coordinates(part, at, order=order, prefilter=False)
+                for part in (field.real, field.imag)
             )
             light = (real + 1j * imaginary).reshape(row.shape)
             by_pilot = np.sum(light * template.conjugate, axis=(0, 2))

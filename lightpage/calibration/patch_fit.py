@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import optimize
 
 from lightpage.calibration.interfaces import BRANCHES, Twin
 from lightpage.calibration.parameters import PRIORS
@@ -88,7 +88,7 @@ def fit_parameters(
     def jacobian(vector: Real) -> Real:
         return design.jacobian(unpack(vector)[0], free, scale, use_phase=use_phase)
 
-    solved = optimize.least_squares(
+    solved = scipy.optimize.least_squares(
         residuals,
         np.append((start[free] - centre[free]) / scale[free], design.piston(start)),
         loss="soft_l1",

@@ -13,8 +13,8 @@ from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
@@ -128,7 +128,7 @@ class WaveFit:
         self._inside = np.all(np.abs(self._places) < half, axis=-1)
         self._levels = [smooth_reference(frame) for frame in (references.in_phase, references.quadrature)]
         self._images = [
-            ndimage.spline_filter((frame.astype(np.float32) - level) / (2 * level), order=3, output=np.float32)
+            scipy.ndimage.spline_filter((frame.astype(np.float32) - level) / (2 * level), order=3, output=np.float32)
             for frame, level in zip((pair.in_phase, pair.quadrature), self._levels, strict=True)
         ]
 
@@ -312,5 +312,5 @@ def _inverse(information: Real) -> Real:
 
 def _at(image: NDArray[np.float32], pixels: Real, order: Literal[1, 3]) -> Real:
     """Values at pixels [N, 2] (column, row)."""
-    values = ndimage.map_coordinates(image, [pixels[:, 1], pixels[:, 0]], order=order, prefilter=False)
+    values = scipy.ndimage.map_coordinates(image, [pixels[:, 1], pixels[:, 0]], order=order, prefilter=False)
     return np.asarray(values, dtype=np.float64)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lightpage.device.profile import Camera
 from lightpage.device.state import CameraPose, Sensor
@@ -65,7 +65,9 @@ def resample(image: Real, x_m: Real, y_m: Real, at_x_m: Real, at_y_m: Real) -> R
     rows = (at_y_m - y_m[0]) / (y_m[1] - y_m[0])
     columns = (at_x_m - x_m[0]) / (x_m[1] - x_m[0])
     return np.asarray(
-        ndimage.map_coordinates(image.astype(np.float32), [rows, columns], order=3, mode="nearest", prefilter=True)
+        scipy.ndimage.map_coordinates(
+            image.astype(np.float32), [rows, columns], order=3, mode="nearest", prefilter=True
+        )
     )
 
 

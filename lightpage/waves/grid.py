@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import signal
 
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError, ProfileError
@@ -152,7 +152,7 @@ def splitting_steps(profile: Profile, share: float = 1.0) -> int:
 
 def _low_pass(taps: int, passed: float, stopped: float) -> Real:
     """Equiripple low-pass with unit gain at zero; band edges in cycles per sample."""
-    kernel = signal.remez(taps, [0, passed, stopped, 0.5], [1, 0], weight=[3, 1], fs=1.0)
+    kernel = scipy.signal.remez(taps, [0, passed, stopped, 0.5], [1, 0], weight=[3, 1], fs=1.0)
     return np.asarray(kernel / kernel.sum())
 
 
@@ -161,5 +161,5 @@ def _before_linear(taps: int, passed: float, stopped: float) -> Real:
     steps = np.linspace(0, passed, _PASS_STEPS + 1)
     bands = [*np.repeat(steps, 2)[1:-1], stopped, 0.5]
     gains = [*(1 / np.sinc(bands[:-2]) ** 2), 0, 0]
-    kernel = signal.firls(taps, bands, gains, weight=[1] * _PASS_STEPS + [1.3], fs=1.0)
+    kernel = scipy.signal.firls(taps, bands, gains, weight=[1] * _PASS_STEPS + [1.3], fs=1.0)
     return np.asarray(kernel / kernel.sum())

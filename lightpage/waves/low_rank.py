@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.polynomial.legendre import leggauss, legvander
 from numpy.typing import NDArray
-from scipy.linalg import qr
 
 Complex = NDArray[np.complexfloating]
 Real = NDArray[np.floating]
@@ -93,7 +93,7 @@ class Interpolation:
         basis = _leading_vectors(kernels, tolerance)
         x, y = finest[:2]
         root = np.sqrt(np.outer(x.weights, y.weights)).reshape(-1, 1)
-        _, _, pivots = qr(basis.T, pivoting=True, mode="economic")
+        _, _, pivots = scipy.linalg.qr(basis.T, pivoting=True, mode="economic")
         chosen = pivots[: basis.shape[1]]
         weights = (basis @ np.linalg.inv(basis[chosen] / root[chosen])).T
         places = np.stack(np.meshgrid(x.places, y.places, indexing="ij"), axis=-1).reshape(-1, 2)

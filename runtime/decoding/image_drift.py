@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lightpage.calibration.coherence import branch_shares
 from lightpage.calibration.interfaces import BRANCHES, Twin
@@ -110,7 +110,7 @@ class DriftModel:
             for axis in np.eye(2)
         ]
         by_table = [np.angle(np.exp(1j * (plus - minus))) / (2 * PROBE_PX) for plus, minus in moved]
-        by_shift = [-ndimage.median_filter(slope, SMOOTHING).astype(np.float64) for slope in by_table]
+        by_shift = [-scipy.ndimage.median_filter(slope, SMOOTHING).astype(np.float64) for slope in by_table]
         by_tilt = tilt_slopes(twin, calibration_of(decoder.bundle).vector, profile)
         return cls(np.stack([*by_shift, *by_tilt]))
 
