@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from export.graph import FRAME_INPUTS, DecoderGraph, table_tensors
 from export.onnx_files import decoder_onnx
@@ -29,6 +30,7 @@ QUICK = Hyperparameters(channels=8, blocks=1, field_rounds=0, binning=2, samples
 COARSE = replace(QUICK, field_step=3)
 
 
+@pytest.mark.long
 def test_it_agrees_with_torch_and_sees_nearly_what_the_standard_one_sees() -> None:
     device = Device()
     simulator = Simulator(PROFILE, device, seed=1)

@@ -25,7 +25,9 @@ from train.published.training import PublishedChoices
 from train.runs import load_run, load_weights
 
 
-@pytest.mark.parametrize("localizer", ["none", "mode", "ray"])
+@pytest.mark.parametrize(
+    "localizer", [pytest.param("none", marks=pytest.mark.long), "mode", pytest.param("ray", marks=pytest.mark.long)]
+)
 def test_a_published_decoder_runs_without_torch_and_says_the_same(
     localizer: str, small_device: list[str], tmp_path: Path
 ) -> None:

@@ -17,7 +17,7 @@ from analysis.foreign_device import ForeignDevice
 MINUTES = 20
 """Machines differ by a factor of three, and other tests run beside these."""
 TRAININGS = {
-    "short": (10, ["--preset", "standard", "--channels", "32", "--blocks", "1", "--steps", "250"], 0),
+    "short": (9, ["--preset", "standard", "--channels", "32", "--blocks", "1", "--steps", "200"], 0),
     "long": (16, ["--preset", "accurate", "--steps", "300"], 48),
 }
 """Pages, choices and synthetic pages: enough to read a page, and all that a decoder is made of."""

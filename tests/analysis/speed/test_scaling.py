@@ -12,6 +12,7 @@ from analysis.speed.scaling import main
 from tests.lightpage.small import small_profile
 
 
+@pytest.mark.long
 def test_pages_grow_by_the_square_of_the_factor(tmp_path: Path) -> None:
     profile, figures = tmp_path / "small.toml", tmp_path / "F.json"
     profile.write_text(small_profile().to_toml())

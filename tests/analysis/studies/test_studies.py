@@ -323,7 +323,10 @@ def test_the_device_for_studies_that_train_has_the_zones_of_the_full_one() -> No
     assert ratio[0] == pytest.approx(ratio[1], rel=0.02)
 
 
-@pytest.mark.parametrize(("name", "lights"), LIGHTS.items())
+@pytest.mark.parametrize(
+    ("name", "lights"),
+    [pytest.param(*each, marks=[] if each[0] == "heads" else pytest.mark.long) for each in LIGHTS.items()],
+)
 def test_each_that_trains_makes_maps_of_every_case_and_each_light_once(
     name: str, lights: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -334,7 +334,7 @@ class TestLight:
             ("ideal", {"focal_length_relative_error": -0.3}),
             ("ideal", {"pipe_angle_deg": -5.0, "pipe_roll_deg": 5.0}),
             ("real", {}),
-            ("real", {"pipe_width_relative_error": 0.2}),
+            pytest.param("real", {"pipe_width_relative_error": 0.2}, marks=pytest.mark.long),
         ],
     )
     def test_light_between_the_computed_samples_is_what_the_lens_makes_there(

@@ -34,6 +34,7 @@ def test_anything_else_is_a_path(given: str) -> None:
     assert bundle_path(given) == Path(given)
 
 
+@pytest.mark.long
 def test_the_shipped_decoder_follows_an_image_that_moves_over_its_reference() -> None:
     """Which tilts it; so far off, the table is traced again, and holds the tilt from then on."""
     decoder = Decoder.load(bundle_path(DEFAULT))

@@ -40,7 +40,7 @@ def refused(device: Device, told: Callable[[np.ndarray], list[np.ndarray]], matc
     assert list(folder.iterdir()) == []
 
 
-@pytest.mark.parametrize("wrong", [(0, 1), (1,)])
+@pytest.mark.parametrize("wrong", [pytest.param((0, 1), marks=pytest.mark.long), (1,)])
 def test_wrong_symbols_are_refused(wrong: tuple[int, ...], tmp_path: Path) -> None:
     def told(written: np.ndarray) -> list[np.ndarray]:
         return [written[2 + page] if page in wrong else written[page] for page in (0, 1)]

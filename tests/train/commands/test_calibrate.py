@@ -67,7 +67,7 @@ def fake_registration(monkeypatch: pytest.MonkeyPatch, outcome: Registered | Bas
 REGISTERED = Registered(
     parameters=np.where(np.array(NAMES) == "pipe_angle_rad", np.deg2rad(-0.6), 0.001 * PRIORS),
     deviations=PRIORS / 50,
-    turn=np.deg2rad(-88.0),
+    quadrature_phase=np.deg2rad(-88.0),
     coherence_before=0.02,
     coherence_after=0.71,
     cost=1.0,

@@ -79,6 +79,7 @@ def test_recorded_and_synthetic_pages_are_trained_on_and_the_last_are_left(devic
         run([*again, "--channels", "16", "--out", str(tmp_path / "other")])
 
 
+@pytest.mark.long
 def test_a_run_begins_with_the_refinements_of_another_too(small_device: list[str], tmp_path: Path) -> None:
     small = [*small_device, "--channels", "8", "--blocks", "1", "--synthetic-pages", "0"]
     run([*small, "--steps", "60", "--out", str(tmp_path / "run")])
@@ -129,7 +130,9 @@ def test_options_of_the_first_look_are_kept_and_those_that_do_nothing_refused(
         run([*small, *start])
 
 
-@pytest.mark.parametrize(("kind", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("kind", "status"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.long)]
+)
 def test_training_that_is_stopped_loses_nothing_and_the_same_command_goes_on(
     kind: signal.Signals, status: int, device: list[str], tmp_path: Path
 ) -> None:
