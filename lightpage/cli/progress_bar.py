@@ -22,8 +22,15 @@ class _Lines(tqdm):  # type: ignore[type-arg]
     """A line now and then in place of a bar, so that a log can be read."""
 
     def __init__(self, items: Iterable[Any] | None = None, **settings: Any) -> None:
-        settings["bar_format"] = "lightpage: {desc}: {percentage:.0f}% after {elapsed}, about {remaining} left{postfix}"
-        super().__init__(items, mininterval=LINE_S, miniters=1, **settings)
+        settings["bar_format"] = "lightpage: {desc} {percentage:.0f}% after {elapsed}, about {remaining} left{postfix}"
+        super().__init__(items, mininterval=LINE_S, miniters=1, delay=LINE_S, **settings)
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        """What a line is made of; tqdm itself ends some descriptions with a colon and some without."""
+        parts = dict(super().format_dict)
+        parts["prefix"] = f"{str(parts['prefix']).rstrip(': ')}:"
+        return parts
 
     @staticmethod
     def status_printer(file: Any) -> Callable[[str], None]:
