@@ -121,6 +121,7 @@ def test_an_arm_that_still_learns_is_marked() -> None:
         assert learning.line() == outcome.line().replace("0.019 ", f"{gained:>5.3f}*")
 
 
+@pytest.mark.long
 def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path) -> None:
     profile = tmp_path / "small.toml"
     profile.write_text(PROFILE.to_toml())
