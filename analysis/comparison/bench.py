@@ -40,8 +40,9 @@ from train.fitting.fitted import Fitted
 from train.fitting.modules import DecoderTraining, SymbolTraining
 from train.fitting.validation import without_piston
 from train.models.decoder import LOCALIZERS
-from train.models.hyperparameters import FAST, PRESETS, Hyperparameters
+from train.models.hyperparameters import Hyperparameters
 from train.models.prediction import Prediction
+from train.models.presets import FAST, PRESETS
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.states import page_states
 from train.published.trainer import train_published

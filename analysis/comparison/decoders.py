@@ -37,7 +37,8 @@ from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, Sensor, ideal_device
 from lightpage.files import write_json
 from train.fitting.memory import keep_freed_memory
-from train.models.hyperparameters import FAST, Hyperparameters
+from train.models.hyperparameters import Hyperparameters
+from train.models.presets import FAST
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.trainer import published_choices
 from train.runs import sole_writer

@@ -38,7 +38,8 @@ from runtime.execution.constant_table import GraphFile
 from runtime.execution.cpus import available_cpus
 from runtime.execution.session import Session, open_session
 from train.models.decoder import SymbolDecoder
-from train.models.hyperparameters import FAST, PRESETS, Hyperparameters
+from train.models.hyperparameters import Hyperparameters
+from train.models.presets import FAST, PRESETS
 from train.models.twin import RayTwin, TorchTwin
 from train.published.trainer import published_decoder
 from train.published.training import PublishedChoices

@@ -15,8 +15,9 @@ from lightpage.errors import InvalidInputError
 from lightpage.waves.grid import GRID_STEP_PX
 from train.fitting.precision import PRECISIONS
 from train.models.decoder import LOCALIZERS, WAVE
-from train.models.hyperparameters import ACCURATE, FAST, PRESETS, Hyperparameters
+from train.models.hyperparameters import Hyperparameters
 from train.models.localizers.coherent import BICUBIC, BILINEAR
+from train.models.presets import ACCURATE, FAST, PRESETS
 from train.published.decoder import LENS_CHOICES
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.trainer import PublishedTrainer, published_choices

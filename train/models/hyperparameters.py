@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from lightpage.device.profile import Profile
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid, field_grid
 from train.models.field import ROUNDS, FieldRecovery
-from train.models.localizers.coherent import BICUBIC, BILINEAR, CoherentLocalizer
+from train.models.localizers.coherent import BICUBIC, CoherentLocalizer
 
 _REFINEMENT_STEPS = 0.25
 """Steps of a refinement's network over those of the first."""
@@ -85,15 +85,3 @@ class Hyperparameters:
         """The choices for a refinement's network, which starts from a good belief and sees little light."""
         steps = max(_FEWEST_STEPS, round(_REFINEMENT_STEPS * self.steps))
         return replace(self, channels=max(1, self.channels * 2 // 3), blocks=1, levels=0, refinements=0, steps=steps)
-
-
-FAST, STANDARD, ACCURATE = "fast", "standard", "accurate"
-PRESETS = {
-    FAST: Hyperparameters(channels=48, field_rounds=0, binning=2, field_step=3, samples=3, interpolation=BILINEAR),
-    STANDARD: Hyperparameters(),
-    ACCURATE: Hyperparameters(refinements=1),
-}
-"""Decoders by how much time a page they may take: one quick pass, one pass, two passes.
-
-A second pass adds more than anything else does. With ideal lenses it takes twice the time a page; with real ones its
-waves pass each of them in fifty terms, which takes much longer at the full size."""

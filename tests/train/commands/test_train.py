@@ -36,7 +36,8 @@ from train.data.feature_store import FeatureStore
 from train.fitting import provenance as origin
 from train.fitting.curves import curves_of
 from train.fitting.provenance import provenance, provenance_of
-from train.models.hyperparameters import PRESETS, Hyperparameters
+from train.models.hyperparameters import Hyperparameters
+from train.models.presets import PRESETS
 from train.runs import FORMAT, begin, sole_writer
 from train.trainers.symbols import SymbolTrainer
 
