@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -44,15 +45,28 @@ class FieldGrid:
 
     Attributes:
         x_m, y_m: uniform axes, metres from the optical axis, [nx] and [ny].
-        prefilter: taps applied along each axis of a raw frame before it is resampled to the grid, linearly: they make
-            good, on average over the places between two pixels, what that takes off high frequencies.
-        band: taps applied along each axis of the field on the grid: the pipe's band.
+        step_px: pitch in camera pixels.
+        edge: of the pipe's band, cycles per camera pixel.
     """
 
     x_m: Real
     y_m: Real
-    prefilter: Real
-    band: Real
+    step_px: int
+    edge: float
+
+    @cached_property
+    def prefilter(self) -> Real:
+        """Taps applied along each axis of a raw frame before it is resampled to the grid, linearly.
+
+        They make good, on average over the places between two pixels, what that takes off high frequencies.
+        """
+        return _before_linear(_PREFILTER_TAPS, 2 * self.edge, max(1 / self.step_px - self.edge, _PREFILTER_STOP))
+
+    @cached_property
+    def band(self) -> Real:
+        """Taps applied along each axis of the field on the grid: the pipe's band."""
+        edge = self.edge * self.step_px
+        return _low_pass(_BAND_TAPS, _BAND_HEADROOM * edge, _BAND_STOP * edge)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -111,17 +125,12 @@ def field_grid(profile: Profile, step_px: int = GRID_STEP_PX) -> FieldGrid:
         count = int(np.ceil((extent_m + 2 * _MARGIN_PX * pixel) / pitch / 2)) * 2
         return np.asarray((np.arange(count) - (count - 1) / 2) * pitch)
 
-    edge = profile.pipe.width_m / 2 / (profile.light.wavelength_m * profile.lens.focal_length_m)
-    coarsest = int(_NYQUIST / (_BAND_STOP * edge * pixel))
+    edge = profile.pipe.width_m / 2 / (profile.light.wavelength_m * profile.lens.focal_length_m) * pixel
+    coarsest = int(_NYQUIST / (_BAND_STOP * edge))
     if not GRID_STEP_PX <= step_px <= coarsest:
         expected = f"{GRID_STEP_PX} to {coarsest}"
         raise InvalidInputError("pitch of the common grid, camera pixels", step_px, expected)
-    return FieldGrid(
-        x_m=axis(profile.page_width_m),
-        y_m=axis(profile.page_height_m),
-        prefilter=_before_linear(_PREFILTER_TAPS, 2 * edge * pixel, max(1 / step_px - edge * pixel, _PREFILTER_STOP)),
-        band=_low_pass(_BAND_TAPS, _BAND_HEADROOM * edge * pitch, _BAND_STOP * edge * pitch),
-    )
+    return FieldGrid(axis(profile.page_width_m), axis(profile.page_height_m), step_px, edge)
 
 
 def symbol_samples(profile: Profile) -> int:
