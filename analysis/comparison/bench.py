@@ -52,22 +52,15 @@ from train.trainers.refinement import RefinementPages, fit_prediction, fit_refin
 from train.trainers.symbols import MATCHED_PAGES
 
 Real = NDArray[np.float64]
-
 ORACLE = "oracle"
-
 REFINED = "refined"
-
 WAVE_REFINED = "wave-refined"
-
 ORACLE_REFINED = "oracle-refined"
-
 FIRST_PASSES = {REFINED: "coherent", WAVE_REFINED: "wave", ORACLE_REFINED: ORACLE}
 """Arms that make another pass, and the arm whose first pass they share."""
 
 ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, WAVE_REFINED, ORACLE, ORACLE_REFINED)
-
 HELD_OUT_SHARE = 0.05
-
 LEVEL_PAGES = 4
 """Of each number of levels, and as many as are calibrated on: thirty thousand symbols on the bench device."""
 

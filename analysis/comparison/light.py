@@ -19,7 +19,6 @@ from train.models.twin import RayTwin, TorchTwin
 from train.runs import begin
 
 LEVELS = 256
-
 CALIBRATED = 2
 
 

@@ -17,7 +17,6 @@ WALLS = {"no wall": (0, 0), "x": (1, 0), "y": (0, 1), "both": (1, 1)}
 """Whether a symbol's light meets walls of a pair, as the columns of the table say it."""
 
 LAST_SHARE = 0.2
-
 SETTLED_BITS = 0.02
 """A decoder whose validation AIR gains as much in that last share of its steps has not learnt what it could."""
 
@@ -100,7 +99,6 @@ pages it trained on a second, validation counted as time: of a kept arm, on the 
 size is the first pass's."""
 
 UNSETTLED = "*"
-
 FOOTNOTE = (
     f"{UNSETTLED} still learning: validation AIR gained {SETTLED_BITS} bit or more in the last {LAST_SHARE:.0%} of the"
     " steps; no comparison with it counts yet"

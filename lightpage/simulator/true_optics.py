@@ -22,7 +22,6 @@ from lightpage.waves.grid import splitting_steps
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
-
 _CLIPPING_AMPLITUDE = 2.4
 """Signal amplitude over its root mean square that, in phase with the reference, just fills the well: about one sample
 in twenty thousand clips."""
