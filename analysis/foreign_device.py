@@ -226,7 +226,7 @@ class ForeignDevice:
         padded = np.zeros(PADDED_PX, complex)
         top, left = ((a - b) // 2 for a, b in zip(PADDED_PX, PAGE_PX, strict=True))
         padded[top : top + PAGE_PX[0], left : left + PAGE_PX[1]] = page
-        turned = quadrature_phase(padded, -roll)
+        turned = rotated(padded, -roll)
         right, down = self.parameters.page_centre_px
         centre_x, centre_y = rotate(right * SLM_PITCH, down * SLM_PITCH, -roll)
         y0, x0 = (float(c) - (n - 1) / 2 * SLM_PITCH for c, n in zip((centre_y, centre_x), PADDED_PX, strict=True))
@@ -443,7 +443,7 @@ def rotate(x: FloatArray | float, y: FloatArray | float, angle: float) -> tuple[
     )
 
 
-def quadrature_phase(page: ComplexArray, angle: float) -> ComplexArray:
+def rotated(page: ComplexArray, angle: float) -> ComplexArray:
     """Turn a sampled field about its centre from x towards y by three shears, exact for band-limited lines."""
     if angle == 0:
         return page.copy()

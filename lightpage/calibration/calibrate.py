@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.coherence import COHERENT_BRANCHES, page_coherence
 from lightpage.calibration.interfaces import FieldSolver, Twin
 from lightpage.calibration.parameters import PARAMETERS, indices, nominal
-from lightpage.calibration.patch_fit import Refit, fit_parameters
+from lightpage.calibration.patch_fit import PatchFit, fit_parameters
 from lightpage.calibration.patches import (
     Measurement,
     Patch,
@@ -253,7 +253,7 @@ class _Registration:
         self.parameters = nominal()
         self.deviations = np.zeros_like(self.parameters)
         self.quadrature_phase = np.pi / 2
-        self.fit: Refit | None = None
+        self.fit: PatchFit | None = None
         self.total = 1
         self._stage, self._done = "", 0
         self._pixel = profile.camera.pitch_m

@@ -30,7 +30,7 @@ _DIFFERENCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Refit:
+class PatchFit:
     """Outcome of a least-squares fit.
 
     Attributes:
@@ -57,7 +57,7 @@ def fit_parameters(
     centre: Real | None = None,
     prior_scale: float | Real = 1.0,
     evaluations: int = 12,
-) -> Refit:
+) -> PatchFit:
     """Fit the free parameters to measurements.
 
     Args:
@@ -102,7 +102,7 @@ def fit_parameters(
     slopes = np.asarray(solved.jac, dtype=np.float64)
     covariance = np.linalg.pinv(slopes.T @ slopes)
     deviations[free] = np.sqrt(np.clip(np.diag(covariance)[:-1], 0, None)) * scale[free]
-    return Refit(parameters, deviations, piston, float(np.mean(np.minimum(data**2, 25.0))))
+    return PatchFit(parameters, deviations, piston, float(np.mean(np.minimum(data**2, 25.0))))
 
 
 class _Design:

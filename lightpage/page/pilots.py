@@ -237,9 +237,9 @@ def without_outliers(p: NDArray[np.floating], pilots: Pilots) -> Pilots:
     """
     errors = _errors(p, pilots)
     kappa, sound = np.abs(errors), np.ones(len(errors), bool)
-    for quadrature_phase in range(_ROUNDS):
+    for iteration in range(_ROUNDS):
         missed = _missed(errors, float(np.angle(errors[sound].sum())))
-        over_claim = float(np.mean(missed[sound]) if quadrature_phase else np.median(missed) / _MEDIAN_CHI2)
+        over_claim = float(np.mean(missed[sound]) if iteration else np.median(missed) / _MEDIAN_CHI2)
         trust = 1 / max(1.0, over_claim)
         odds = np.log((1 - _OUTLIERS) / _OUTLIERS) - np.log(i0e(trust * kappa)) - trust * missed / 2
         before, sound = sound, odds > 0

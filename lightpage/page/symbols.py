@@ -85,10 +85,10 @@ def pilot_mask(profile: Profile) -> NDArray[np.bool_]:
 
 def _lattice(ny: int, nx: int, fraction: float) -> tuple[int, int]:
     """Rows and columns of the lattice whose cells are nearest to square and whose count is near the wanted one."""
-    expected = min(max(MIN_PILOTS, round(fraction * ny * nx)), ny * nx)
-    rows = min(max(1, round(float(np.sqrt(expected * ny / nx)))), ny)
-    columns = min(max(1, -(-expected // rows)), nx)
-    return min(max(rows, -(-expected // columns)), ny), columns
+    count = min(max(MIN_PILOTS, round(fraction * ny * nx)), ny * nx)
+    rows = min(max(1, round(float(np.sqrt(count * ny / nx)))), ny)
+    columns = min(max(1, -(-count // rows)), nx)
+    return min(max(rows, -(-count // columns)), ny), columns
 
 
 def pilot_symbols(profile: Profile, levels: int) -> NDArray[np.uint8]:

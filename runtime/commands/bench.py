@@ -44,11 +44,11 @@ def bench(bundle: str, rounds: int, threads: int | None, json_path: Path | None)
             "grpc": lambda: client.decode(pair, LEVELS),
         }
         seconds: dict[str, list[float]] = {name: [] for name in ways}
-        for quadrature_phase in track(range(rounds + WARM_UP), "bench", unit="round"):
+        for iteration in track(range(rounds + WARM_UP), "bench", unit="round"):
             for name, way in ways.items():
                 start = time.perf_counter()
                 way()
-                if quadrature_phase >= WARM_UP:
+                if iteration >= WARM_UP:
                     seconds[name].append(time.perf_counter() - start)
     median = {name: float(np.median(values)) for name, values in seconds.items()}
     figures = {

@@ -99,9 +99,9 @@ class SymbolTraining(DecoderTraining[SymbolNetwork]):
     def training_step(self, batch: Page, index: int) -> Tensor:
         """Loss of pages whose field and symbols were turned by one random angle each: piston is no information."""
         light, positions, *belief, phases = batch
-        quadrature_phase = 2 * math.pi * torch.rand(len(light), 1, 1, device=light.device)
-        shown = [_turned(part, quadrature_phase) for part in (light.float(), *belief)]
-        return self.loss(self(shown[0], positions, *shown[1:]), phases + quadrature_phase)
+        rotation = 2 * math.pi * torch.rand(len(light), 1, 1, device=light.device)
+        shown = [_turned(part, rotation) for part in (light.float(), *belief)]
+        return self.loss(self(shown[0], positions, *shown[1:]), phases + rotation)
 
     def configure_optimizers(self) -> Any:
         """AdamW under a one-cycle schedule."""

@@ -36,5 +36,5 @@ def without_piston(p: NDArray[np.float32], phases: NDArray[np.float32], mask: ND
         phases: true phases [ny, nx].
         mask: pilots, bool [ny, nx].
     """
-    quadrature_phase = estimate_piston(p, Pilots(mask, phases[mask].astype(np.float64))).angle_rad
-    return np.asarray(turned(torch.tensor(p), -quadrature_phase).numpy(), dtype=np.float32)
+    piston = estimate_piston(p, Pilots(mask, phases[mask].astype(np.float64))).angle_rad
+    return np.asarray(turned(torch.tensor(p), -piston).numpy(), dtype=np.float32)
