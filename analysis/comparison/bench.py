@@ -52,6 +52,7 @@ from train.trainers.refinement import RefinementPages, fit_prediction, fit_refin
 from train.trainers.symbols import MATCHED_PAGES
 
 Real = NDArray[np.float64]
+
 ORACLE = "oracle"
 REFINED = "refined"
 WAVE_REFINED = "wave-refined"

@@ -13,15 +13,14 @@ from lightpage.calibration.wave_model import fitted_geometry
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
 from lightpage.recording.reader import FramePair
-from lightpage.simulator.cameras import (
-    CameraView,
-)
+from lightpage.simulator.cameras import CameraView
 from lightpage.waves.channel import WaveChannel
 from lightpage.waves.geometry import WaveGeometry, cells_for
 from lightpage.waves.grid import splitting_steps
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
+
 _CLIPPING_AMPLITUDE = 2.4
 """Signal amplitude over its root mean square that, in phase with the reference, just fills the well: about one sample
 in twenty thousand clips."""
