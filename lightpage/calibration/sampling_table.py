@@ -6,6 +6,8 @@ decoder rebuilds both at every sample of the symbol: places are linear in the of
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +16,8 @@ from lightpage.device.profile import Profile
 from lightpage.waves.grid import field_grid
 
 Real = NDArray[np.float64]
-SamplingTable = dict[str, NDArray[np.float32]]
+SamplingTable = dict[str, NDArray[Any]]
+"""Tensors by their names as inputs of an exported decoder, float32 where `sampling_table` makes them."""
 
 SAMPLING_TABLE = ("registration", "homodyne", "parameters", "places", "place_gradients", "phases", "positions")
 """Names of the table's tensors, as inputs of an exported decoder."""

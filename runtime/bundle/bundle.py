@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import BundleError, ProfileError
 from lightpage.files import sync_folder
@@ -36,9 +37,6 @@ from runtime.bundle.manifest import (
     parse_manifest,
     sha256,
 )
-
-SamplingTable = dict[str, NDArray[Any]]
-"""Tensors that a decoder takes instead of its graph's defaults, by input name."""
 
 MAX_ARRAY_BYTES = MAX_BYTES
 """All arrays of one .npz file, unpacked: it is compressed by itself, and may be a bomb inside a small bundle."""

@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.device.profile import Profile
 from lightpage.errors import BundleError, FrameError, InvalidInputError
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
 from lightpage.page.symbols import MAX_LEVELS, check_levels
 from lightpage.recording.reader import FramePair
-from runtime.bundle.bundle import Bundle, SamplingTable
+from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import DECODER, FIELD, GOLDEN
 from runtime.decoding.field_solver import BundleFieldSolver
 from runtime.decoding.frames import check_pair

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.phases import tilt_of_shift
-from lightpage.calibration.sampling_table import sampling_table, shifted
-from runtime.bundle.bundle import SamplingTable
+from lightpage.calibration.sampling_table import SamplingTable, sampling_table, shifted
 from runtime.bundle.calibrated import calibration_of
 from runtime.decoding.decoder import Decoder
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import BundleError
 from lightpage.recording.reader import FramePair
 from lightpage.waves.grid import field_grid
-from runtime.bundle.bundle import Bundle, SamplingTable
+from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import DECODER, FIELD
 from runtime.execution.session import open_session
 from runtime.execution.table_graph import TableGraph

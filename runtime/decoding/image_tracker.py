@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.image_search import FEWEST_SEARCHED, FoundImage
+from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.page.pilots import PilotCheck, Pilots, read_pilots
 from lightpage.page.symbols import check_levels
 from lightpage.recording.reader import FramePair
-from runtime.bundle.bundle import SamplingTable
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.drift_tables import BundleTables, DriftTables
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate

@@ -11,8 +11,8 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import BundleError
-from runtime.bundle.bundle import SamplingTable
 from runtime.execution.session import Port
 from runtime.pb.lightpage.onnx import graph_pb2 as pb
 

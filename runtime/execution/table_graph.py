@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import InvalidInputError
-from runtime.bundle.bundle import SamplingTable
 from runtime.execution.constant_table import GraphFile
 from runtime.execution.session import Port, Session, open_session
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.progress import Progress
-from runtime.bundle.bundle import Bundle, SamplingTable
+from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import ImagePosition
 from runtime.recalibration.known_pages import KnownPages

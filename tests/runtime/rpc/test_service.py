@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
+from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import (
     BundleError,
     BusyError,
@@ -29,7 +30,7 @@ from lightpage.metrics.measures import measure
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.sources import open_source
-from runtime.bundle.bundle import Bundle, SamplingTable
+from runtime.bundle.bundle import Bundle
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
