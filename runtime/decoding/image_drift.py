@@ -7,6 +7,7 @@ while the image moves over it shows as a tilt, for its wavefront is curved.
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from lightpage.calibration.coherence import branch_shares
 from lightpage.calibration.interfaces import BRANCHES, Twin
 from lightpage.calibration.sampling_table import shifted, symbol_centres
 from lightpage.device.profile import Profile
+from lightpage.errors import BundleError, FrameError
 from lightpage.page.pilots import Pilots, read_pilots
 from runtime.bundle.calibrated import calibration_of
 from runtime.decoding.decoder import Decoder
@@ -83,15 +85,21 @@ class DriftModel:
     """What drift does to decoded phases.
 
     Args:
-        slopes: change of each symbol's decoded phase with the image's drift, [4, ny, nx], radians a unit of drift.
+        slopes: change of each symbol's decoded phase with the image's drift, [4, ny, nx], radians a unit of drift;
+            or the promise of it.
     """
 
-    def __init__(self, slopes: Real) -> None:
-        self._slopes = slopes
+    def __init__(self, slopes: Real | Future[Real]) -> None:
+        self._measured = slopes
+
+    @property
+    def slopes(self) -> Real:
+        """See the constructor; waits for it if it is still being measured."""
+        return self._measured.result() if isinstance(self._measured, Future) else self._measured
 
     @classmethod
     def of_decoder(cls, decoder: Decoder, twin: Twin) -> DriftModel:
-        """Find what shift does on the golden page, with four runs of the graph; what tilt does follows from the twin.
+        """Measure the slopes on a thread of its own: a service is ready before that ends, and its first page waits.
 
         Args:
             decoder: of a bundle.
@@ -100,23 +108,15 @@ class DriftModel:
         Raises:
             CalibrationError: the bundle holds no calibration.
         """
-        registration = decoder.graph.value("registration")
-        pair, profile = decoder.bundle.golden.pair, decoder.bundle.profile
-        moved = [
-            [
-                decoder.infer(pair, {"registration": shifted(registration, sign * PROBE_PX * axis)}).phase
-                for sign in (1, -1)
-            ]
-            for axis in np.eye(2)
-        ]
-        by_table = [np.angle(np.exp(1j * (plus - minus))) / (2 * PROBE_PX) for plus, minus in moved]
-        by_shift = [-scipy.ndimage.median_filter(slope, SMOOTHING).astype(np.float64) for slope in by_table]
-        by_tilt = tilt_slopes(twin, calibration_of(decoder.bundle).vector, profile)
-        return cls(np.stack([*by_shift, *by_tilt]))
+        parameters = calibration_of(decoder.bundle).vector
+        thread = ThreadPoolExecutor(1, thread_name_prefix="lightpage-drift")
+        slopes = thread.submit(drift_slopes, decoder, twin, parameters)
+        thread.shutdown(wait=False)
+        return cls(slopes)
 
     def phase_change(self, drift: Real) -> Real:
         """What `drift` [4] adds to decoded phases [ny, nx], radians, first order."""
-        return np.asarray(np.tensordot(drift, self._slopes, 1))
+        return np.asarray(np.tensordot(drift, self.slopes, 1))
 
     def estimate(self, inference: Inference, levels: int, pilots: Pilots, prior: Real) -> Estimate | None:
         """Drift that a page still shows, from its pilots and then from safe decisions too; None where pilots disagree.
@@ -135,7 +135,7 @@ class DriftModel:
         residual, weight = _wrapped(phase[at] - pilots.phases), np.minimum(concentration[at], _CAP)
         if not weight.sum() > 0 or abs(np.sum(weight * np.exp(1j * residual))) < LEAST_COHERENCE * weight.sum():
             return None
-        coarse = _solve(residual, self._slopes[:, at], weight, prior)
+        coarse = _solve(residual, self.slopes[:, at], weight, prior)
         if coarse is None:
             return None
         concentration /= coarse.over_claim
@@ -146,9 +146,37 @@ class DriftModel:
         decided[at] = pilots.phases
         chosen = safe | at
         weight = np.minimum(concentration[chosen], _CAP)
-        fine = _solve(_wrapped(phase - decided)[chosen], self._slopes[:, chosen], weight, prior)
+        fine = _solve(_wrapped(phase - decided)[chosen], self.slopes[:, chosen], weight, prior)
         # a page of more levels than it is read with is decided wrongly throughout
         return coarse if fine is None or fine.over_claim > _MOST_OVER_CLAIM else fine
+
+
+def drift_slopes(decoder: Decoder, twin: Twin, parameters: Real) -> Real:
+    """Change of each symbol's decoded phase with drift, [4, ny, nx], radians a unit of drift.
+
+    What shift does shows on the golden page, with four runs of the graph; what tilt does follows from the twin.
+
+    Args:
+        decoder: of a bundle.
+        twin, parameters: of its device.
+
+    Raises:
+        BundleError: the golden page is refused when its image is looked for a little off its place.
+    """
+    registration = decoder.graph.value("registration")
+    pair, profile = decoder.bundle.golden.pair, decoder.bundle.profile
+
+    def phase(shift_px: Real) -> NDArray[np.float32]:
+        try:
+            return decoder.infer(pair, {"registration": shifted(registration, shift_px)}).phase
+        except FrameError as error:
+            subject = f"{decoder.bundle.subject}: golden page, moved by {PROBE_PX} px"
+            raise BundleError(subject, error.got, error.expected) from None
+
+    moved = [[phase(sign * PROBE_PX * axis) for sign in (1, -1)] for axis in np.eye(2)]
+    by_table = [np.angle(np.exp(1j * (plus - minus))) / (2 * PROBE_PX) for plus, minus in moved]
+    by_shift = [-scipy.ndimage.median_filter(slope, SMOOTHING).astype(np.float64) for slope in by_table]
+    return np.stack([*by_shift, *tilt_slopes(twin, parameters, profile)])
 
 
 def tilt_slopes(twin: Twin, parameters: Real, profile: Profile) -> Real:

@@ -196,6 +196,7 @@ class ImageTracker:
         What is learnt counts for the next page only where this one's pilots confirm it: a page that is not this
         device's moves nothing.
         """
+        _ = self._model.slopes  # of a new tracker still being measured; two inferences at once may not fit the memory
         begun, clock = self.state, _Clock()
         check_levels(levels)
         self._decoder.check(pair)
