@@ -41,7 +41,7 @@ def modes(numbers: list[tuple[int, int]], amplitudes: np.ndarray, length: float)
 def test_nothing_of_the_project_is_imported() -> None:
     code = (
         "import sys, analysis.foreign_device;"
-        "print([m for m in sys.modules if m.split('.')[0] in ('optics', 'train', 'export', 'runtime', 'torch')])"
+        "print([m for m in sys.modules if m.split('.')[0] in ('lightpage', 'train', 'export', 'runtime', 'torch')])"
     )
     root = Path(__file__).parents[2]
     done = subprocess.run(

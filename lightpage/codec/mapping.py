@@ -1,0 +1,141 @@
+"""Bits on phases: labels of levels, log-likelihood ratios of their bits from a von Mises posterior, coset decisions.
+
+Level s of M = 2^m is split: c = s mod 2^b tells its coset, and gets the b label bits c ^ (c >> 1), a Gray code that is
+cyclic; s >> b is its number within the coset, m - b bits that are decided once the coset is known, when the nearest
+other candidate is 2^b levels away. b = m is plain Gray-labelled coded modulation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import PageError
+from lightpage.page.symbols import check_levels
+
+MOST_LLR = 40.0
+"""Largest magnitude of a bit's log-likelihood ratio."""
+
+_CHUNK = 1 << 18
+"""Probabilities at once: few enough for the cache."""
+
+
+def level_bits(levels: int) -> int:
+    """m of M = 2^m levels.
+
+    Raises:
+        PageError: no power of two from 2 to 256.
+    """
+    check_levels(levels)
+    if levels & (levels - 1):
+        raise PageError("levels that carry bits", levels, "a power of two from 2 to 256")
+    return levels.bit_length() - 1
+
+
+def _check_label(levels: int, label_bits: int) -> None:
+    if not 1 <= label_bits <= level_bits(levels):
+        raise PageError(f"label bits of {levels} levels", label_bits, f"1 to {level_bits(levels)}")
+
+
+def labels(label_bits: int) -> NDArray[np.uint8]:
+    """Label of each coset number 0 .. 2^b - 1, uint8; its bit 0 is the first."""
+    number = np.arange(1 << label_bits)
+    return np.asarray(number ^ (number >> 1), np.uint8)
+
+
+def bit_llrs(
+    phase: NDArray[np.floating], concentration: NDArray[np.floating], levels: int, label_bits: int | None = None
+) -> NDArray[np.float32]:
+    """Log-likelihood ratios ln P(0) / P(1) of the label bits of symbols whose levels are equally likely.
+
+    The posterior of a level at theta is proportional to exp(kappa cos(theta - mu)); those of all levels whose label has
+    the bit are added up.
+
+    Args:
+        phase: decoded phases mu, radians, any shape; piston removed.
+        concentration: kappa, the same shape.
+        levels: M, a power of two.
+        label_bits: b, 1 to log2 M; all bits, in Gray code, if left out.
+
+    Returns:
+        float32, the shape of `phase` and b; -40 to 40.
+
+    Raises:
+        PageError: shapes differ, a value that is not finite, a negative concentration, levels that carry no bits.
+    """
+    bits = level_bits(levels) if label_bits is None else label_bits
+    _check_label(levels, bits)
+    mu, kappa = np.asarray(phase, np.float64).ravel(), np.asarray(concentration, np.float64).ravel()
+    if np.shape(phase) != np.shape(concentration):
+        raise PageError("phase, concentration", (np.shape(phase), np.shape(concentration)), "two equal shapes")
+    if not (np.isfinite(mu).all() and np.isfinite(kappa).all() and (kappa >= 0).all()):
+        raise PageError("phase, concentration", "NaN, infinity or a negative concentration", "finite numbers")
+    ratios = np.empty((mu.size, bits), np.float32)
+    step = 2 * np.pi / levels
+    offsets = np.arange(levels) * step
+    # kappa (cos(offset - away) - cos(away)) as a product
+    waves = np.stack([np.cos(offsets) - 1, np.sin(offsets)])
+    ones = labels(bits)[:, None] >> np.arange(bits) & 1
+    rows = max(1, _CHUNK // levels)
+    for start in range(0, mu.size, rows):
+        some = slice(start, start + rows)
+        nearest = np.rint(mu[some] / step)
+        # about the nearest level: float32 then keeps what a large concentration makes of small differences
+        away = mu[some] - nearest * step
+        drop = (kappa[some] * np.stack([np.cos(away), np.sin(away)])).T @ waves
+        weight = np.exp(drop.astype(np.float32)).reshape(len(away), -1, 1 << bits).sum(axis=1)
+        first = nearest.astype(np.int64) % (1 << bits)
+        by_coset = np.take_along_axis(weight, (np.arange(1 << bits) - first[:, None]) % (1 << bits), axis=1)
+        one, zero = by_coset @ ones.astype(np.float32), by_coset @ (1 - ones).astype(np.float32)
+        tiny = np.float32(np.finfo(np.float32).tiny)
+        ratios[some] = np.log(np.maximum(zero, tiny)) - np.log(np.maximum(one, tiny))
+    return np.clip(ratios, -MOST_LLR, MOST_LLR).reshape(*np.shape(phase), bits)
+
+
+def to_levels(label: NDArray[np.uint8], upper: NDArray[np.integer], levels: int) -> NDArray[np.uint8]:
+    """Levels of label bits and upper bits.
+
+    Args:
+        label: bits of each symbol, [symbols, b].
+        upper: number of each within its coset, [symbols].
+        levels: M, a power of two.
+    """
+    bits = label.shape[1]
+    _check_label(levels, bits)
+    number = np.argsort(labels(bits))[label @ (1 << np.arange(bits))]
+    return np.asarray(number + (upper.astype(np.int64) << bits), np.uint8)
+
+
+def decide_in_coset(phase: NDArray[np.floating], label: NDArray[np.uint8], levels: int) -> NDArray[np.int64]:
+    """Number within its coset of the level that lies nearest to each phase, its label being known.
+
+    Args:
+        phase: decoded phases, radians, [symbols].
+        label: bits of each symbol, [symbols, b].
+        levels: M, a power of two.
+    """
+    bits = label.shape[1]
+    _check_label(levels, bits)
+    number = np.argsort(labels(bits))[label @ (1 << np.arange(bits))]
+    step = 2 * np.pi / levels
+    nearest = np.rint((np.asarray(phase, np.float64) - number * step) / (step * (1 << bits))).astype(np.int64)
+    return np.asarray(nearest % (levels >> bits))
+
+
+def bit_information(llrs: NDArray[np.floating], bits: NDArray[np.uint8] | None = None) -> float:
+    """Mean information of bits in their LLRs, 0 to 1 bit, negative where they mislead.
+
+    Where the true bits are known it is 1 - log2(1 + exp(-L)), L the ratio in favour of the truth: what a code can
+    carry. Else it is what the ratios claim themselves: 1 less the entropy of the bit.
+
+    Args:
+        llrs: ln P(0) / P(1).
+        bits: the true ones, the same shape.
+    """
+    ratio = np.asarray(llrs, np.float64)
+    if bits is not None:
+        return float(1 - np.mean(np.logaddexp(0, np.where(bits == 0, -ratio, ratio))) / np.log(2))
+    size = np.abs(ratio)
+    wrong = 1 / (1 + np.exp(size))
+    entropy = wrong * np.logaddexp(0, size) + (1 - wrong) * np.logaddexp(0, -size)
+    return float(1 - np.mean(entropy) / np.log(2))

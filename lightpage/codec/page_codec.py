@@ -1,0 +1,293 @@
+"""User bytes on a page and back: checksum, scrambler, Reed-Solomon words, LDPC blocks, interleaver, levels.
+
+`docs/formats.md` specifies the page bit by bit; this file follows its order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.codec.checksum import CRC32C_BYTES, crc32c
+from lightpage.codec.code import Code
+from lightpage.codec.header import Header, decode_header, encode_headers, header_symbols
+from lightpage.codec.ldpc.code import MOST_INFORMATION_BITS, Bits, LdpcCode
+from lightpage.codec.ldpc.decoder import decode
+from lightpage.codec.mapping import bit_information, bit_llrs, decide_in_coset, to_levels
+from lightpage.codec.random_bits import random_bytes, random_order
+from lightpage.codec.reed_solomon import LONGEST_WORD, SYMBOL_BITS, parity, repair
+from lightpage.errors import InvalidInputError, PageError
+
+_INTERLEAVER_SEED = 0x4C50_494C
+_FILLING_SEED = 0x4C50_464C
+_GROUP_BYTES = 2
+"""Data and parity pages of a group, one byte each, before the user bytes."""
+
+
+class Loss(StrEnum):
+    """Why a page gives no bytes."""
+
+    OPTICS = "optics"
+    """It could not be decoded into symbols."""
+    HEADER = "header"
+    """Its header could not be read, and it is not the page that was expected."""
+    CODE = "code"
+    """Its header names another code."""
+    BODY = "body"
+    """Its blocks did not converge, and the rest could not be mended."""
+    CHECKSUM = "checksum"
+    """Its blocks converged, and the checksum does not hold all the same."""
+
+
+@dataclass(frozen=True)
+class PageBytes:
+    """What a page gave.
+
+    Attributes:
+        header: as it stands on the page; to be believed only where there is data. None where it could not be read.
+        data: user bytes, None where the page is lost: nothing that fails its checksum is given out.
+        data_pages, parity_pages: k and m of the page's group, 0 where the page is lost.
+        loss: why there is no data, None where there is.
+        iterations: mean of the LDPC blocks.
+        failed_blocks: LDPC blocks that did not converge.
+        blocks: all of them.
+        corrected: Reed-Solomon symbols that were mended.
+        margin_bits: information of a symbol's coded bits beyond what the code needs, bits; negative where the page
+            should be lost. Of a lost page, by what its confidences claim.
+    """
+
+    header: Header | None
+    data: bytes | None
+    data_pages: int
+    parity_pages: int
+    loss: Loss | None
+    iterations: float
+    failed_blocks: int
+    blocks: int
+    corrected: int
+    margin_bits: float
+
+
+class PageCodec:
+    """Puts bytes on pages, and takes them off.
+
+    Args:
+        code: its parameters.
+        pilots: where the pilots are, bool [ny, nx].
+
+    Raises:
+        InvalidInputError: the page is too small for this code.
+    """
+
+    def __init__(self, code: Code, pilots: NDArray[np.bool_]) -> None:
+        self.code, self.pilots = code, pilots
+        data = int(np.count_nonzero(~pilots))
+        count = header_symbols(code.levels)
+        if count >= data:
+            raise InvalidInputError("page", f"{data} data symbols", f"more than the {count} of a header")
+        in_header = np.zeros(data, np.bool_)
+        in_header[(2 * np.arange(count) + 1) * data // (2 * count)] = True
+        places = np.flatnonzero(~pilots)
+        self._header, self._body = places[in_header], places[~in_header]
+        self._coded_bits = len(self._body) * code.coded_bits
+        self._upper_bits = code.level_bits - code.coded_bits
+        self.blocks = -(-self._coded_bits * code.rate_per_mille // (1000 * MOST_INFORMATION_BITS))
+        sent = self._coded_bits // self.blocks
+        self.ldpc = LdpcCode(sent * code.rate_per_mille // 1000, sent)
+        self._information = self.blocks * self.ldpc.information_bits
+        self._total_bits = self._information + len(self._body) * self._upper_bits
+        self._words = -(-(self._total_bits // SYMBOL_BITS) // LONGEST_WORD)
+        parity_symbols = 2 * code.corrections * self._words
+        self._data_symbols = self._total_bits // SYMBOL_BITS - parity_symbols if code.corrections else 0
+        data_bits = SYMBOL_BITS * self._data_symbols if code.corrections else self._total_bits
+        self._bytes = data_bits // 8
+        self.user_bytes = self._bytes - _GROUP_BYTES - CRC32C_BYTES
+        if self.user_bytes < 1:
+            raise InvalidInputError("page", f"{data} data symbols", f"more, to hold user bytes ({code.describe()})")
+
+    @cached_property
+    def _order(self) -> NDArray[np.intp]:
+        """Bit of the body that each sent bit goes to."""
+        return random_order(_INTERLEAVER_SEED, self._coded_bits)
+
+    @cached_property
+    def _filling(self) -> Bits:
+        """Bits of the body that no block reaches."""
+        count = self._coded_bits - self.blocks * self.ldpc.sent_bits
+        return np.unpackbits(random_bytes(_FILLING_SEED, -(-count // 8)))[:count]
+
+    def encode(
+        self, headers: Sequence[Header], data: NDArray[np.uint8], group: tuple[int, int], pilots: NDArray[np.uint8]
+    ) -> NDArray[np.uint8]:
+        """Symbols of pages.
+
+        Args:
+            headers: one a page; their code id must be this code's.
+            data: user bytes, uint8 [pages, user_bytes].
+            group: (k, m) of the volume, 0 to 255 each.
+            pilots: levels of the pilots in row order, uint8 [pilots].
+
+        Returns:
+            uint8 [pages, ny, nx], pilots included.
+
+        Raises:
+            PageError: data of another shape, or pilots that are not as many.
+        """
+        if data.shape != (len(headers), self.user_bytes):
+            raise PageError("user data", f"shape {data.shape}", f"({len(headers)}, {self.user_bytes})")
+        if pilots.shape != (int(np.count_nonzero(self.pilots)),):
+            raise PageError("pilot levels", f"shape {pilots.shape}", f"({np.count_nonzero(self.pilots)},)")
+        body = np.zeros((len(headers), self._bytes), np.uint8)
+        body[:, :_GROUP_BYTES] = group
+        body[:, _GROUP_BYTES:-CRC32C_BYTES] = data
+        for row, header in zip(body, headers, strict=True):
+            check = crc32c(header.fields() + row[:-CRC32C_BYTES].tobytes())
+            row[-CRC32C_BYTES:] = np.frombuffer(check.to_bytes(CRC32C_BYTES, "big"), np.uint8)
+            row ^= self._scrambler(header)
+        bits = np.zeros((len(headers), self._total_bits), np.uint8)
+        bits[:, : 8 * self._bytes] = np.unpackbits(body, axis=1)
+        if self.code.corrections:
+            self._add_parity(bits)
+        pages = np.empty((len(headers), self.pilots.size), np.uint8)
+        pages[:, np.flatnonzero(self.pilots)] = pilots
+        pages[:, self._header] = encode_headers(list(headers), self.code.levels)
+        label = self._labels(bits[:, : self._information])
+        upper = bits[:, self._information :].reshape(len(label), self._upper_bits) @ self._upper_weights
+        pages[:, self._body] = to_levels(label, upper, self.code.levels).reshape(len(headers), -1)
+        return pages.reshape(len(headers), *self.pilots.shape)
+
+    def decode(
+        self,
+        phase: NDArray[np.floating],
+        concentration: NDArray[np.floating],
+        expected: Header | None = None,
+    ) -> PageBytes:
+        """User bytes of a decoded page.
+
+        Args:
+            phase: radians, piston removed, [ny, nx].
+            concentration: von Mises kappa, [ny, nx].
+            expected: the page that should be here; taken where its own header cannot be read, and believed only if
+                the body's checksum confirms it.
+
+        Raises:
+            PageError: another shape, or values that are not finite.
+        """
+        if phase.shape != self.pilots.shape or concentration.shape != self.pilots.shape:
+            shapes = phase.shape, concentration.shape
+            raise PageError("phase, concentration", shapes, f"{self.pilots.shape} twice, as the pilots have")
+        mu, kappa = phase.ravel(), concentration.ravel()
+        header = decode_header(mu[self._header], kappa[self._header], self.code.levels)
+        other = header is not None and header.code_id != self.code.id
+        llrs = bit_llrs(mu[self._body], kappa[self._body], self.code.levels, self.code.coded_bits).ravel()
+        blocks = llrs[self._order[: self.blocks * self.ldpc.sent_bits]].reshape(self.blocks, -1)
+        if other:
+            return self._lost(header, Loss.CODE, blocks, 0, 0.0)
+        found = decode(self.ldpc, blocks)
+        failed, iterations = int(np.count_nonzero(~found.converged)), float(found.iterations.mean())
+        label = self._interleaved(found.sent[None])
+        upper = decide_in_coset(mu[self._body], label, self.code.levels)
+        high = (upper[:, None] >> np.arange(self._upper_bits)[::-1] & 1).astype(np.uint8)
+        bits = np.concatenate([found.information.ravel(), high.ravel()])
+        for candidate in (header, expected) if header is None else (header,):
+            if candidate is None:
+                continue
+            body, corrected = self._checked(bits, candidate)
+            if body is not None:
+                # the code words are right where the checksum holds, but for what Reed-Solomon has mended
+                information = bit_information(blocks, found.sent)
+                margin = self.code.coded_bits * (information - self.code.needed_information)
+                data = body[_GROUP_BYTES:-CRC32C_BYTES].tobytes()
+                groups = int(body[0]), int(body[1])
+                return PageBytes(candidate, data, *groups, None, iterations, failed, self.blocks, corrected, margin)
+        loss = Loss.BODY if failed else Loss.CHECKSUM
+        return self._lost(header, Loss.HEADER if header is None and not failed else loss, blocks, failed, iterations)
+
+    def _lost(
+        self, header: Header | None, loss: Loss, blocks: NDArray[np.float32], failed: int, iterations: float
+    ) -> PageBytes:
+        margin = self.code.coded_bits * (bit_information(blocks) - self.code.needed_information)
+        return PageBytes(header, None, 0, 0, loss, iterations, failed, self.blocks, 0, margin)
+
+    def _checked(self, bits: Bits, header: Header) -> tuple[NDArray[np.uint8] | None, int]:
+        """The body in the bits of a page where its checksum holds, mended if need be; and how much was mended."""
+        body = np.packbits(bits[: 8 * self._bytes]) ^ self._scrambler(header)
+        if self._holds(body, header):
+            return body, 0
+        if not self.code.corrections:
+            return None, 0
+        mended, corrected = self._mended(bits)
+        body = np.packbits(mended[: 8 * self._bytes]) ^ self._scrambler(header)
+        return (body, corrected) if corrected and self._holds(body, header) else (None, 0)
+
+    @staticmethod
+    def _holds(body: NDArray[np.uint8], header: Header) -> bool:
+        check = int.from_bytes(body[-CRC32C_BYTES:].tobytes(), "big")
+        return crc32c(header.fields() + body[:-CRC32C_BYTES].tobytes()) == check
+
+    def _scrambler(self, header: Header) -> NDArray[np.uint8]:
+        return random_bytes(header.volume << 24 | header.page, self._bytes)
+
+    @property
+    def _upper_weights(self) -> NDArray[np.int64]:
+        """Of the bits of a number within its coset, the highest first."""
+        return 1 << np.arange(self._upper_bits)[::-1]
+
+    def _labels(self, information: Bits) -> Bits:
+        """Label bits of the body's symbols, [pages * symbols, b], of information bits [pages, bits]."""
+        sent = self.ldpc.encode(information.reshape(-1, self.ldpc.information_bits))
+        return self._interleaved(sent.reshape(len(information), self.blocks, -1))
+
+    def _interleaved(self, sent: Bits) -> Bits:
+        """Sent bits [pages, blocks, n] in the places that they have on the page, [pages * symbols, b]."""
+        pages = len(sent)
+        label = np.empty((pages, self._coded_bits), np.uint8)
+        reached = self.blocks * self.ldpc.sent_bits
+        label[:, self._order[:reached]] = sent.reshape(pages, -1)
+        label[:, self._order[reached:]] = self._filling
+        return label.reshape(-1, self.code.coded_bits)
+
+    def _symbols(self, bits: Bits) -> NDArray[np.int64]:
+        """All whole 12-bit symbols of bits [..., total bits], the highest bit first."""
+        whole = self._total_bits // SYMBOL_BITS
+        parts = bits[..., : whole * SYMBOL_BITS].reshape(*bits.shape[:-1], whole, SYMBOL_BITS)
+        return np.asarray(parts @ (1 << np.arange(SYMBOL_BITS, dtype=np.int64)[::-1]))
+
+    def _add_parity(self, bits: Bits) -> None:
+        """Fill in the Reed-Solomon parity behind the data, [pages, total bits]; symbol i is of word i mod words."""
+        for page in bits:
+            symbols = self._symbols(page)
+            for word in range(self._words):
+                ends = parity(symbols[None, word : self._data_symbols : self._words], self.code.corrections)[0]
+                symbols[self._data_symbols + word :: self._words] = ends
+            self._put(page, symbols, self._data_symbols)
+
+    def _put(self, page: Bits, symbols: NDArray[np.int64], start: int) -> None:
+        """Write symbols from `start` on into the bits of a page."""
+        parts = symbols[start:, None] >> np.arange(SYMBOL_BITS)[::-1] & 1
+        page[start * SYMBOL_BITS : len(symbols) * SYMBOL_BITS] = parts.ravel()
+
+    def _mended(self, bits: Bits) -> tuple[Bits, int]:
+        """The bits of a page with what Reed-Solomon mends, and how many symbols that were; 0 where a word fails."""
+        symbols, corrected = self._symbols(bits), 0
+        for word in range(self._words):
+            places = np.concatenate(
+                [
+                    np.arange(word, self._data_symbols, self._words),
+                    np.arange(self._data_symbols + word, len(symbols), self._words),
+                ]
+            )
+            found = repair(symbols[places], self.code.corrections)
+            if found is None:
+                return bits, 0
+            data, wrong = found
+            symbols[places[: len(data)]] = data
+            corrected += wrong
+        mended = bits.copy()
+        self._put(mended, symbols, 0)
+        return mended, corrected

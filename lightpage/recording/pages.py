@@ -1,0 +1,195 @@
+"""Pages to write: the symbols that a modulator shows, in one HDF5 file, whole or not at all.
+
+Root attributes: `format` = "lightpage-pages", `version` = 1, `levels` (M), `profile` (the nominal profile as TOML text)
+and `code` (JSON text: what the pages hold). Dataset `symbols` uint8 [page, ny, nx], pilots included.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.device.profile import Profile
+from lightpage.errors import RecordingError
+from lightpage.files import move_into_place
+from lightpage.page.symbols import check_levels, check_symbols
+
+FORMAT = "lightpage-pages"
+VERSION = 1
+
+
+def read_attribute(file: h5py.File, name: str) -> Any:
+    """A root attribute as a plain Python value, None where there is none."""
+    value = file.attrs.get(name)
+    if isinstance(value, (np.generic, np.ndarray)) and value.size == 1:
+        value = value.item()
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+
+
+def parse_code_attribute(text: object, subject: str) -> dict[str, Any]:
+    """What the attribute `code` says.
+
+    Raises:
+        RecordingError: no JSON object.
+    """
+    try:
+        told = json.loads(text) if isinstance(text, str) else None
+    except ValueError:
+        told = None
+    if not isinstance(told, dict):
+        raise RecordingError(f"{subject}: attribute 'code'", repr(text), "a JSON object")
+    return told
+
+
+class PagesWriter:
+    """Writes pages to `<path>.partial`, and moves it to `path` when the `with` statement ends well.
+
+    Args:
+        path: final name.
+        profile: nominal device.
+        levels: M.
+        code: what the pages hold, kept as JSON.
+
+    Raises:
+        RecordingError: the file cannot be written.
+        PageError: a level count outside 2..256.
+    """
+
+    def __init__(self, path: Path, profile: Profile, levels: int, code: dict[str, Any]) -> None:
+        check_levels(levels, f"pages {path}: levels")
+        self.path, self._partial = path, path.with_name(path.name + ".partial")
+        self._shape, self._levels = profile.page_shape, levels
+        try:
+            self._file = h5py.File(str(self._partial), "w")
+        except OSError as error:
+            raise RecordingError(f"pages {self._partial}", error, "a file that can be written") from None
+        attributes = {"format": FORMAT, "version": VERSION, "levels": levels, "profile": profile.to_toml()}
+        for name, value in {**attributes, "code": json.dumps(code)}.items():
+            self._file.attrs[name] = value
+        self._symbols = self._file.create_dataset(
+            "symbols", shape=(0, *self._shape), maxshape=(None, *self._shape), chunks=(1, *self._shape), dtype=np.uint8
+        )
+
+    def append(self, symbols: NDArray[np.uint8]) -> None:
+        """Append pages [page, ny, nx].
+
+        Raises:
+            PageError: another shape, or a symbol beyond the levels.
+            RecordingError: no room for them.
+        """
+        pages = check_symbols(symbols, self._shape, self._levels, f"pages {self.path}").reshape(-1, *self._shape)
+        count = self._symbols.shape[0]
+        try:
+            self._symbols.resize(count + len(pages), axis=0)
+            self._symbols[count:] = pages
+            self._file.flush()
+        except OSError as error:
+            raise RecordingError(f"pages {self.path}", error, "room for them on the disk") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            self._file.close()
+            self._partial.unlink(missing_ok=True)
+            return
+        try:
+            self._file.close()
+            move_into_place(self._partial, self.path)
+        except OSError as failure:
+            self._partial.unlink(missing_ok=True)
+            raise RecordingError(f"pages {self.path}", failure, "a file that can be completed") from None
+
+
+class Pages:
+    """A file of pages opened for reading and checked; use it in a `with` statement."""
+
+    def __init__(self, file: h5py.File, path: Path) -> None:
+        """Check `file`; `Pages.open` is the usual way in.
+
+        Raises:
+            RecordingError: it holds no pages, or is inconsistent.
+        """
+        self._file, self.path = file, path
+        for name, expected in (("format", FORMAT), ("version", VERSION)):
+            if (got := read_attribute(file, name)) != expected:
+                raise RecordingError(f"pages {path}: attribute '{name}'", repr(got), repr(expected))
+        levels = read_attribute(file, "levels")
+        check_levels(levels, f"pages {path}: attribute 'levels'")
+        self.levels = int(levels)
+        symbols, subject = file.get("symbols"), f"pages {path}: dataset 'symbols'"
+        expected = "uint8 (pages, ny, nx), at least one page"
+        if not isinstance(symbols, h5py.Dataset):
+            raise RecordingError(subject, "none", expected)
+        if symbols.ndim != 3 or symbols.dtype != np.uint8 or 0 in symbols.shape:
+            raise RecordingError(subject, f"{symbols.dtype} {symbols.shape}", expected)
+        self._symbols = symbols
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Open and check a file of pages.
+
+        Raises:
+            RecordingError: missing, truncated, foreign or inconsistent.
+        """
+        try:
+            file = h5py.File(str(path), "r")
+        except OSError as error:
+            raise RecordingError(f"pages {path}", error, "a readable, complete HDF5 file") from None
+        try:
+            return cls(file, path)
+        except BaseException:
+            file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def __len__(self) -> int:
+        return int(self._symbols.shape[0])
+
+    @property
+    def code(self) -> str | None:
+        """What the pages hold, JSON text, or None."""
+        text = read_attribute(self._file, "code")
+        return text if isinstance(text, str) else None
+
+    @property
+    def page_shape(self) -> tuple[int, int]:
+        """Symbols as (rows, columns)."""
+        _, rows, columns = self._symbols.shape
+        return int(rows), int(columns)
+
+    def __getitem__(self, page: int) -> NDArray[np.uint8]:
+        """The symbols [ny, nx] of one page.
+
+        Raises:
+            RecordingError: its data cannot be read, or are no symbols of the levels.
+        """
+        try:
+            symbols: NDArray[np.uint8] = np.asarray(self._symbols[page])
+        except OSError as error:
+            raise RecordingError(f"pages {self.path}: page {page}", error, "data that can be read") from None
+        if int(symbols.max()) >= self.levels:
+            raise RecordingError(
+                f"pages {self.path}: page {page}", f"a symbol of {symbols.max()}", f"0 to {self.levels - 1}"
+            )
+        return symbols
+
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+        return (self[page] for page in range(len(self)))
