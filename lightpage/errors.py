@@ -39,6 +39,10 @@ class PageError(InvalidInputError):
     """Symbols of the wrong shape, type or range."""
 
 
+class LostDataError(LightpageError):
+    """Bytes of a file could not be read back from its pages, nor restored from its parity pages."""
+
+
 class BundleError(LightpageError):
     """A bundle that is damaged, incomplete, foreign, or newer than this program."""
 

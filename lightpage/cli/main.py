@@ -16,7 +16,7 @@ import click
 
 from lightpage.cli.paths import check_outputs
 from lightpage.cli.progress_bar import Bars
-from lightpage.errors import LightpageError
+from lightpage.errors import LightpageError, LostDataError
 from lightpage.progress import reporting
 
 GROUP = "lightpage.commands"
@@ -27,6 +27,8 @@ RESUME_KEY = "lightpage.resume"
 RESUME = "run the same command again; nothing half-written was left under a final name"
 
 EXIT_ERROR = 2
+EXIT_LOST = 3
+"""Data are lost."""
 EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
 """128 + SIGINT, 128 + SIGTERM, as shells have it."""
 
@@ -37,12 +39,15 @@ EXTRAS = {
 
 SUMMARIES = {
     "bench": "Measure speed: inference alone, whole decode, through gRPC.",
+    "code": "Choose how user bytes are protected on a device's pages.",
     "calibrate": "Find a device's geometry from nominal with a few known pages.",
     "decode": "Decode a recording, or pages of the service's source, with a running service.",
     "demo": "See it all work on the simulated device.",
+    "encode": "Put a file on pages to write.",
     "evaluate": "Measure a bundle on a recording with known symbols.",
     "export": "Turn a training run into a bundle.",
     "recalibrate": "Re-fit a drifted device's geometry and write a new bundle.",
+    "recover": "Read a file back from recorded pages.",
     "report": "Show a training run or an evaluation as an HTML page.",
     "rollback": "Put a service's previous model back in service.",
     "serve": "Run the service.",
@@ -121,7 +126,9 @@ def lightpage() -> None:
 
 
 def run(command: click.Command, arguments: Sequence[str] | None = None, name: str = "lightpage") -> int:
-    """Run a command line and return its exit status: 0, 2 for a foreseen error, 130 after Ctrl-C, 143 after SIGTERM.
+    """Run a command line and return its exit status.
+
+    That is 0, 2 for a foreseen error, 3 where data are lost, 130 after Ctrl-C, 143 after SIGTERM.
 
     SIGTERM ends a command as Ctrl-C does, so that it clears up behind itself.
 
@@ -181,7 +188,7 @@ class _Termination:
 
 def _fail(error: LightpageError) -> int:
     click.echo("lightpage: error: " + " ".join(str(error).split()), err=True)
-    return EXIT_ERROR
+    return EXIT_LOST if isinstance(error, LostDataError) else EXIT_ERROR
 
 
 def main() -> NoReturn:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import click
@@ -10,14 +11,21 @@ from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
+from lightpage.recording.pages import Pages
 from lightpage.simulator.recording_job import RecordingJob
 
 
 @click.command()
 @click.option("--profile", "profile_name", required=True, metavar="P", help="Nominal device: a shipped name or a file.")
-@click.option("--pages", required=True, type=click.IntRange(min=1), help="How many pages.")
+@click.option("--pages", type=click.IntRange(min=1), help="How many pages of random symbols.")
+@click.option("--symbols", type=click.Path(path_type=Path), help="Pages to write, PAGES.h5, as `encode` makes them.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The recording, R.h5.")
-@click.option("--levels", default=MAX_LEVELS, show_default=True, type=click.IntRange(MIN_LEVELS, MAX_LEVELS))
+@click.option(
+    "--levels",
+    type=click.IntRange(MIN_LEVELS, MAX_LEVELS),
+    show_default=f"{MAX_LEVELS}, or those of --symbols",
+    help="Of random symbols.",
+)
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Of symbols, noise and drift.")
 @click.option("--device", "device_file", type=click.Path(), help="True state of the device, TOML; realistic if absent.")
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of that state.")
@@ -25,9 +33,10 @@ from lightpage.simulator.recording_job import RecordingJob
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists, or pages begun with other settings.")
 def simulate(
     profile_name: str,
-    pages: int,
+    pages: int | None,
+    symbols: Path | None,
     out: Path,
-    levels: int,
+    levels: int | None,
     seed: int,
     device_file: str | None,
     settings: tuple[str, ...],
@@ -44,6 +53,14 @@ def simulate(
         raise InvalidInputError(f"--out {out}", "a folder", "a file")
     if out.exists() and not force:
         raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
-    job = RecordingJob(profile, device, levels, seed, truth, out)
-    job.claim(force)
-    job.run(pages)
+    if (pages is None) == (symbols is None):
+        got = "neither --pages nor --symbols" if pages is None else "both --pages and --symbols"
+        raise InvalidInputError("options", got, "one of them")
+    with ExitStack() as stack:
+        written = None if symbols is None else stack.enter_context(Pages.open(symbols))
+        if written is not None and levels not in (None, written.levels):
+            raise InvalidInputError("--levels", levels, f"{written.levels}, as {symbols} has, or nothing")
+        many = levels or MAX_LEVELS if written is None else written.levels
+        job = RecordingJob(profile, device, many, seed, truth, out, written)
+        job.claim(force)
+        job.run(pages or len(written or ()))

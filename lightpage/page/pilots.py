@@ -162,8 +162,8 @@ def estimate_piston(p: NDArray[np.floating], pilots: Pilots) -> Piston:
     return Piston(float(np.angle(total)), float(abs(total) / weight) if weight > 0 else 0.0)
 
 
-def remove_piston(phase: NDArray[np.floating], angle_rad: float) -> NDArray[np.float32]:
-    """`phase` less the piston, wrapped to -pi..pi, float32, same shape."""
+def remove_piston(phase: NDArray[np.floating], angle_rad: float | NDArray[np.floating]) -> NDArray[np.float32]:
+    """`phase` less the piston, or less an angle a symbol, wrapped to -pi..pi, float32, same shape."""
     turned = phase.astype(np.float64) - angle_rad
     return np.asarray(turned - 2 * np.pi * np.rint(turned / (2 * np.pi)), np.float32)
 

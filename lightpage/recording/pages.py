@@ -33,21 +33,6 @@ def read_attribute(file: h5py.File, name: str) -> Any:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 
-def parse_code_attribute(text: object, subject: str) -> dict[str, Any]:
-    """What the attribute `code` says.
-
-    Raises:
-        RecordingError: no JSON object.
-    """
-    try:
-        told = json.loads(text) if isinstance(text, str) else None
-    except ValueError:
-        told = None
-    if not isinstance(told, dict):
-        raise RecordingError(f"{subject}: attribute 'code'", repr(text), "a JSON object")
-    return told
-
-
 class PagesWriter:
     """Writes pages to `<path>.partial`, and moves it to `path` when the `with` statement ends well.
 

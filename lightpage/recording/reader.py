@@ -131,6 +131,17 @@ class Recording:
         return "symbols" in self._file
 
     @property
+    def declared_levels(self) -> int | None:
+        """Level count as the file states it, None where it does not."""
+        return self._levels if "levels" in self._file.attrs else None
+
+    @property
+    def code_text(self) -> str | None:
+        """What the pages hold, JSON text, or None: then they were not made by an encoder, or it was not noted."""
+        text = self._attribute("code")
+        return text if isinstance(text, str) else None
+
+    @property
     def profile_text(self) -> str | None:
         """The nominal profile as TOML text, or None."""
         return self._profile_text

@@ -72,6 +72,7 @@ class RecordingWriter:
         pilots: ArrayLike | None = None,
         *,
         resume: bool = False,
+        code: str | None = None,
     ) -> None:
         """Start a new recording; a partial file of the same name that nobody is writing is overwritten.
 
@@ -83,12 +84,14 @@ class RecordingWriter:
             references: reference-only frames.
             pilots: boolean [ny, nx]; None leaves the profile's default positions in force.
             resume: as `RecordingWriter.resume` does.
+            code: what the pages hold, JSON text, where they were made by an encoder.
 
         Raises:
             RecordingError: wrong bit depth, frames or pilots, or the file cannot be written or is being written.
             PageError: a level count outside 2..256.
         """
         self._prepare(path, profile, levels, bit_depth)
+        self._code = code
         if not (resume and self._continue(references, pilots)):
             self._create(references, pilots)
 
@@ -101,12 +104,13 @@ class RecordingWriter:
         bit_depth: int,
         references: FramePair,
         pilots: ArrayLike | None = None,
+        code: str | None = None,
     ) -> Self:
         """Go on with `<path>.partial` if it was started with the same arguments, else start anew.
 
         `pages` tells how many pages are there already. Arguments and errors as for the constructor.
         """
-        return cls(path, profile, levels, bit_depth, references, pilots, resume=True)
+        return cls(path, profile, levels, bit_depth, references, pilots, resume=True, code=code)
 
     @property
     def pages(self) -> int:
@@ -201,6 +205,7 @@ class RecordingWriter:
             "camera_bit_depth": self._bit_depth,
             "levels": self._levels,
             "profile": self._profile.to_toml(),
+            **({} if self._code is None else {"code": self._code}),
         }
 
     def _checked(self, name: str, frame: NDArray[Any]) -> NDArray[Any]:

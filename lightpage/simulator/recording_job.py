@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 
 from lightpage.device.profile import Profile, to_toml
 from lightpage.device.state import Device
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
+from lightpage.recording.pages import Pages
 from lightpage.recording.reader import RecordingWriter
 from lightpage.recording.writer import discard_partial, partial_path
 from lightpage.simulator.simulator import LIGHT, Simulator
@@ -29,11 +31,27 @@ class RecordingJob:
         seed: of symbols, noise and drift.
         truth: whether to keep what only a simulator knows beside the pages.
         out: the recording.
+        written: pages that the modulator shows; random ones if left out.
+
+    Raises:
+        RecordingError: pages for another profile.
     """
 
-    def __init__(self, profile: Profile, device: Device, levels: int, seed: int, truth: bool, out: Path) -> None:
+    def __init__(
+        self,
+        profile: Profile,
+        device: Device,
+        levels: int,
+        seed: int,
+        truth: bool,
+        out: Path,
+        written: Pages | None = None,
+    ) -> None:
         self.profile, self.device, self.levels, self.seed, self.truth = profile, device, levels, seed, truth
-        self.out = out
+        self.out, self._written = out, written
+        if written is not None and written.page_shape != profile.page_shape:
+            expected = f"{profile.page_shape} (profile {profile.name})"
+            raise RecordingError(f"pages {written.path}", f"pages of {written.page_shape} symbols", expected)
         self._simulator = Simulator(profile, device, levels, seed)
         self.partial = partial_path(out)
         self.settings = out.with_name(out.name + ".partial.toml")
@@ -46,6 +64,8 @@ class RecordingJob:
         """
         # references alone would not tell two devices apart: the pipe does not show in them
         text = f"light = {LIGHT}\nlevels = {self.levels}\nseed = {self.seed}\ntruth = {str(self.truth).lower()}\n"
+        if self._written is not None:
+            text += f"symbols = {sha256(self._written.path.read_bytes()).hexdigest()}\n"
         text += f"{to_toml(self.device)}\n# profile\n{self.profile.to_toml()}"
         try:
             begun = self.settings.read_text("utf-8") if self.settings.exists() else None
@@ -70,7 +90,9 @@ class RecordingJob:
         """
         simulator = self._simulator
         bits = self.device.sensor.bit_depth
-        with RecordingWriter.resume(self.out, self.profile, self.levels, bits, simulator.references()) as writer:
+        code = None if self._written is None else self._written.code
+        writer = RecordingWriter.resume(self.out, self.profile, self.levels, bits, simulator.references(), code=code)
+        with writer:
             if writer.pages > pages:
                 raise InvalidInputError("--pages", pages, f"at least the {writer.pages} pages that are there already")
             if self.truth:
@@ -81,8 +103,11 @@ class RecordingJob:
         self.settings.unlink(missing_ok=True)
 
     def _append(self, writer: RecordingWriter, simulator: Simulator, page: int) -> None:
-        rng = np.random.default_rng([self.seed, _SYMBOLS, page])
-        symbols = random_symbols(self.profile, self.levels, 1, rng)[0]
+        if self._written is None:
+            rng = np.random.default_rng([self.seed, _SYMBOLS, page])
+            symbols = random_symbols(self.profile, self.levels, 1, rng)[0]
+        else:
+            symbols = self._written[page]
         seen = simulator.simulate(symbols)
         truth = {
             "exit_field": np.asarray(seen.exit_field, dtype=np.complex64),

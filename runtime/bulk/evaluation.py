@@ -10,7 +10,7 @@ import numpy as np
 
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.metrics.accumulator import Accumulator
-from lightpage.metrics.information import page_kilobytes
+from lightpage.metrics.information import achievable_rate, page_kilobytes
 from lightpage.metrics.measures import PageMeasures, SymbolMaps
 from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.page.pilots import Pilots, estimate_piston
@@ -47,6 +47,7 @@ class Evaluation:
         bundle: what made the bundle and where it lay, as JSON can keep it.
         recalibration_due: pages whose pilots show that the device is no longer as it was calibrated.
         refused: pages that could not be decoded, or were not confirmed; no figure counts them.
+        air_before_refit: AIR with the smooth phase errors that decoding takes off still in, bits per symbol.
     """
 
     bundle_version: str
@@ -63,6 +64,7 @@ class Evaluation:
     bundle: dict[str, Any]
     recalibration_due: int = 0
     refused: tuple[RefusedPage, ...] = ()
+    air_before_refit: float = float("nan")
 
     @property
     def page_kb(self) -> float:
@@ -79,6 +81,7 @@ class Evaluation:
             "symbols_per_page": self.symbols_per_page,
             "levels": figures.levels,
             "air_bits_per_symbol": figures.air_bits_per_symbol,
+            "air_before_refit_bits_per_symbol": self.air_before_refit,
             "own_mi_bits_per_symbol": figures.own_mi_bits_per_symbol,
             "over_claim_bits_per_symbol": figures.over_claim_bits_per_symbol,
             "gmi_bits_per_symbol": figures.gmi_bits_per_symbol,
@@ -159,6 +162,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     timings: list[Timings] = []
     refused: list[RefusedPage] = []
     due = 0
+    before: list[float] = []
     for index in track(range(recording.pages), "evaluate"):
         page = None
         try:
@@ -170,6 +174,8 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
             refused.append(RefusedPage.of(index, error))
         if page is not None and symbols is not None:
             accumulator.add(page.phase[data], page.concentration[data], symbols[data])
+            unfitted = (page.phase + page.phase_error)[data]
+            before.append(float(achievable_rate(unfitted, page.concentration[data], symbols[data], levels).mean()))
             timings.append(page.timings)
             due += page.check.recalibration_due
     if not timings and refused:
@@ -203,6 +209,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         bundle=_describe(decoder, levels),
         recalibration_due=due,
         refused=tuple(refused),
+        air_before_refit=float(np.mean(before)),
     )
 
 

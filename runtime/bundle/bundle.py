@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.codec.code import Code, parse_code
 from lightpage.device.profile import Profile, parse_profile
-from lightpage.errors import BundleError, ProfileError
+from lightpage.errors import BundleError, InvalidInputError, ProfileError
 from lightpage.files import sync_folder
-from lightpage.page.symbols import pilot_mask
+from lightpage.metrics.information import decide
+from lightpage.page.symbols import check_levels, pilot_mask, pilot_symbols
 from lightpage.recording.reader import FramePair
 from runtime.bundle.archive import MAX_BYTES, MAX_FILES, check_name, read_files
 from runtime.bundle.manifest import (
@@ -164,6 +166,34 @@ class Bundle:
         if not np.isfinite(phases).all():
             raise BundleError(subject, "NaN or infinity", "finite numbers")
         return phases
+
+    @cached_property
+    def code(self) -> Code | None:
+        """How user bytes are protected on this device's pages, None where that was not chosen.
+
+        Raises:
+            BundleError: the manifest's code does not validate.
+        """
+        if self.manifest.code is None:
+            return None
+        try:
+            return parse_code(self.manifest.code, f"{self.subject}: code")
+        except InvalidInputError as error:
+            raise BundleError(error.subject, error.got, error.expected) from None
+
+    def written_pilots(self, levels: int) -> NDArray[np.uint8]:
+        """Levels of the pilots on pages that are written for this device, in row order, uint8 [pilots].
+
+        The device's own phases, each to its nearest level, or else the profile's seeded pattern.
+
+        Raises:
+            BundleError: see `pilot_mask` and `pilot_phases`.
+            PageError: a level count outside 2..256.
+        """
+        if self.pilot_phases is None:
+            return pilot_symbols(self.profile, levels)[self.pilot_mask]
+        check_levels(levels)
+        return decide(self.pilot_phases, levels)
 
     @cached_property
     def _pilots(self) -> dict[str, NDArray[Any]]:

@@ -66,11 +66,15 @@ class Manifest(BaseModel):
     """Optional scalar output of decoder.onnx: how badly the pair fits the homodyne equations."""
     residual_limit: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     """A pair with a larger residual is refused: swapped frames, or frames of two shots."""
+    code: str | None = None
+    """How user bytes are protected on this device's pages, TOML of a `lightpage.codec.code.Code`; None: not chosen."""
     provenance: Provenance = Provenance()
 
     def to_json(self) -> bytes:
         """The manifest as JSON with a hash of itself, so that a damaged manifest is noticed like any other file."""
         data = self.model_dump(mode="json")
+        if data["code"] is None:  # programs of before know no such key
+            del data["code"]
         return (json.dumps(data | {_SELF_HASH: _digest(data)}, indent=2, sort_keys=True) + "\n").encode()
 
 

@@ -67,6 +67,7 @@ def describe(result: Evaluation) -> str:
         ("not confirmed", f"{lost} whose pilots do not bear out what is claimed"),
         ("data symbols a page", f"{result.symbols_per_page}"),
         ("AIR", f"{figures.air_bits_per_symbol:.3f} bit/symbol"),
+        ("before phase refit", f"{result.air_before_refit:.3f} bit/symbol"),
         ("own MI", f"{figures.own_mi_bits_per_symbol:.3f} bit/symbol"),
         ("over-claim", f"{figures.over_claim_bits_per_symbol:.3f} bit/symbol"),
         ("GMI", "no Gray labels" if gmi is None else f"{gmi:.3f} bit/symbol"),

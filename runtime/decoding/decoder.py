@@ -24,6 +24,7 @@ from runtime.bundle.manifest import DECODER, FIELD, GOLDEN
 from runtime.decoding.field_solver import BundleFieldSolver
 from runtime.decoding.frames import check_pair
 from runtime.decoding.page import DecodedPage, Inference, Timings
+from runtime.decoding.phase_refit import PhaseRefit
 from runtime.execution.constant_table import GraphFile
 from runtime.execution.session import Port
 from runtime.execution.table_graph import TableGraph
@@ -193,6 +194,12 @@ class Decoder:
         """
         return BundleFieldSolver(self.bundle, self.graph, self.threads)
 
+    @cached_property
+    def phase_refit(self) -> PhaseRefit:
+        """Takes smooth phase errors off this device's pages."""
+        positions = self.graph.value("positions") if "positions" in self.graph.ports else None
+        return PhaseRefit(self.bundle.profile.page_shape, positions)
+
     @property
     def has_field_graph(self) -> bool:
         """Whether `field_solver` runs the field alone, and not all of the decoder."""
@@ -222,9 +229,12 @@ class Decoder:
         return replace(page, timings=Timings(checked - start, inferred - checked, time.perf_counter() - inferred))
 
     def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
-        """Piston, trust and decision: everything behind the graph, timings left at zero."""
-        reading = read_pilots(inference.p, pilots or self.pilots(levels))
+        """Piston, smooth phase error, trust and decision: all that is behind the graph, timings left at zero."""
+        known = pilots or self.pilots(levels)
+        reading = read_pilots(inference.p, known)
         phase = remove_piston(inference.phase, reading.piston.angle_rad)
+        error = self.phase_refit.error(phase, inference.concentration, levels, known)
+        phase = remove_piston(phase, error)
         concentration = inference.concentration * np.float32(reading.trust)
         symbols, confidence = decide_with_confidence(phase, concentration, levels)
         return DecodedPage(
@@ -238,6 +248,7 @@ class Decoder:
             pilot_trust=reading.trust,
             check=reading.check,
             timings=Timings(0.0, 0.0, 0.0),
+            phase_error=error,
         )
 
     def _check_graph(self) -> None:

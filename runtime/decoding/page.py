@@ -82,6 +82,7 @@ class DecodedPage:
         pilot_trust: share of the network's claimed concentration that they bear out, 0..1; low after a drift.
         check: information that is claimed of the pilots, and what of it they confirm.
         timings: seconds.
+        phase_error: float32 [ny, nx], smooth error that was taken off `phase`, radians.
         image: where the image lies as this page shows it, None where it is not followed.
     """
 
@@ -95,4 +96,5 @@ class DecodedPage:
     pilot_trust: float
     check: PilotCheck
     timings: Timings
+    phase_error: NDArray[np.float32]
     image: ImagePosition | None = None

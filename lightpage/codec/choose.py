@@ -1,0 +1,224 @@
+"""Chooses a page's code from pages whose data are known: the levels, the rate and the corrections that carry most.
+
+A page of any level count is drawn from a known one: the decoder's phase errors and concentrations stay, the symbols are
+new. That holds because the channel does not depend on the phase that is sent. What counts is how pages differ: the rate
+is the one that the weakest page of a thousand still carries, as far as the pages that were seen can say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import poisson
+
+from lightpage.codec.code import MOST_CODED_BITS, Code
+from lightpage.codec.ldpc.code import LdpcCode
+from lightpage.codec.ldpc.decoder import decode
+from lightpage.codec.mapping import bit_information, bit_llrs, decide_in_coset, labels, level_bits
+from lightpage.codec.page_codec import PageCodec
+from lightpage.errors import InvalidInputError
+
+FEWEST_PAGES = 3
+"""Fewer say nothing of how pages differ."""
+
+_QUANTILE = 3.09
+"""Standard deviations below the mean of the page that one of a thousand falls short of."""
+_CONFIDENCE = 1.645
+"""Standard deviations of what few pages know of mean and deviation: right in 95% of cases."""
+_RATE_STEP = 5
+"""Thousandths."""
+_CORRECTIONS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+_PAGE_LOSS = 1e-3
+"""Of a page whose upper bits Reed-Solomon does not mend: small beside the loss that the rate allows."""
+_BISECTIONS = 7
+_LOWEST_RATE, _HIGHEST_RATE = 340, 960
+_DRAWS = 3
+"""Code words drawn for each page when a choice is checked."""
+
+
+@dataclass(frozen=True)
+class DrawnPage:
+    """A page with drawn symbols.
+
+    Attributes:
+        phase: decoded, radians, of the data symbols, [symbols].
+        concentration: kappa, [symbols].
+        symbols: what was drawn.
+    """
+
+    phase: NDArray[np.float64]
+    concentration: NDArray[np.float64]
+    symbols: NDArray[np.uint8]
+
+
+Draw = Callable[[int, np.random.Generator], Sequence[DrawnPage]]
+"""Draws every known page anew, at so many levels."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A code with what was found of it.
+
+    Attributes:
+        code: its parameters.
+        user_bytes: of a page.
+        information: mean information of a coded bit.
+        deviation: its standard deviation from page to page.
+        upper_errors: mean wrong upper numbers of a page.
+    """
+
+    code: Code
+    user_bytes: int
+    information: float
+    deviation: float
+    upper_errors: float
+
+    def line(self) -> str:
+        """The choice for people."""
+        return (
+            f"{self.code.levels:>6} {self.information:>9.4f} {self.deviation:>9.4f} "
+            f"{self.code.needed_information:>9.4f} {self.code.rate_per_mille / 1000:>7.3f} "
+            f"{self.upper_errors:>9.3f} {self.code.corrections:>4} {self.user_bytes:>9}"
+        )
+
+
+HEADER = f"{'levels':>6} {'carried':>9} {'deviation':>9} {'needed':>9} {'rate':>7} {'wrong':>9} {'t':>4} {'bytes':>9}"
+"""Information of a coded bit that pages carry, its deviation from page to page, what the code needs; rate; wrong upper
+numbers of a page, corrections of a Reed-Solomon word, user bytes of a page."""
+
+
+def choose(draw: Draw, air_bits: float, pilots: NDArray[np.bool_], seed: int = 0) -> tuple[Choice, list[Choice]]:
+    """The code that carries most, and the best of each level count.
+
+    Args:
+        draw: draws the known pages.
+        air_bits: what a symbol carries, bits: level counts near it are tried.
+        pilots: bool [ny, nx].
+        seed: of what is drawn.
+
+    Raises:
+        InvalidInputError: too few pages, or no code carries a page.
+    """
+    tried: list[Choice] = []
+    for bits in range(max(1, int(air_bits) - 1), min(8, int(np.ceil(air_bits)) + 1) + 1):
+        choice = _best_of(draw, 1 << bits, pilots, np.random.default_rng([seed, bits]))
+        if choice is not None:
+            tried.append(choice)
+    if not tried:
+        raise InvalidInputError(
+            "pages to choose a code by", f"{air_bits:.2f} bits a symbol", "pages that some code carries"
+        )
+    return max(tried, key=lambda choice: choice.user_bytes), tried
+
+
+def _best_of(draw: Draw, levels: int, pilots: NDArray[np.bool_], rng: np.random.Generator) -> Choice | None:
+    """The best code of a level count, None where none carries the pages."""
+    coded = min(MOST_CODED_BITS, level_bits(levels))
+    pages = draw(levels, rng)
+    if len(pages) < FEWEST_PAGES:
+        raise InvalidInputError("pages to choose a code by", len(pages), f"at least {FEWEST_PAGES}")
+    seen = [_information(page, levels, coded) for page in pages]
+    information, wrong = np.array([each[0] for each in seen]), np.array([each[1] for each in seen])
+    corrections = _corrections(wrong)
+    if corrections is None:
+        return None
+    count, deviation = len(pages), float(information.std(ddof=1))
+    spread = _QUANTILE + _CONFIDENCE * np.sqrt(1 / count + _QUANTILE**2 / (2 * count))
+    weakest = float(information.mean()) - spread * deviation
+    gap = 0.03
+    code: Code | None = None
+    for _ in range(3):  # the gap to the code's limit changes little with the rate
+        rate = int(1000 * (weakest - gap) / _RATE_STEP) * _RATE_STEP
+        if rate < _LOWEST_RATE:
+            return None
+        rate = min(rate, _HIGHEST_RATE)
+        code = Code(levels=levels, coded_bits=coded, rate_per_mille=rate, corrections=corrections)
+        needed = needed_information(PageCodec(code, pilots).ldpc, pages, levels, coded, rng)
+        code, gap = code.model_copy(update={"needed_information": needed}), needed - rate / 1000
+        if needed <= weakest:
+            break
+    while code is not None and not _all_decode(draw, code, pilots, rng):
+        rate = code.rate_per_mille - 2 * _RATE_STEP
+        updated = {"rate_per_mille": rate, "needed_information": rate / 1000 + gap}
+        code = code.model_copy(update=updated) if rate >= _LOWEST_RATE else None
+    if code is None:
+        return None
+    user_bytes = PageCodec(code, pilots).user_bytes
+    return Choice(code, user_bytes, float(information.mean()), deviation, float(wrong.mean()))
+
+
+def _label_bits(symbols: NDArray[np.uint8], coded: int) -> NDArray[np.uint8]:
+    """Label bits of symbols, [symbols, b]."""
+    return np.asarray(labels(coded)[symbols % (1 << coded)][:, None] >> np.arange(coded) & 1, np.uint8)
+
+
+def _information(page: DrawnPage, levels: int, coded: int) -> tuple[float, int]:
+    """Information of a coded bit of a page, and how many of its symbols' upper numbers are decided wrongly."""
+    label = _label_bits(page.symbols, coded)
+    llrs = bit_llrs(page.phase, page.concentration, levels, coded)
+    wrong = decide_in_coset(page.phase, label, levels) != page.symbols >> coded
+    return bit_information(llrs, label), int(np.count_nonzero(wrong))
+
+
+def _corrections(wrong: NDArray[np.int64]) -> int | None:
+    """Corrections that a page needs; None where no word has so many. An upper number may spread over two symbols."""
+    expected = 2 * (float(wrong.sum()) + (3 if wrong.any() else 0)) / len(wrong)
+    # a word of a large page has only its share of them; counting all of them is on the safe side
+    return next((t for t in _CORRECTIONS if poisson.sf(t, expected) <= _PAGE_LOSS), None)
+
+
+def _blocks(
+    pages: Sequence[DrawnPage], code: LdpcCode, levels: int, coded: int, noise: float, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], float]:
+    """LLRs of the zero word in the light of pages with more noise, [blocks, n], and their information.
+
+    The bits' LLRs are taken with the sign that says they are right: the decoder is as good for one word as for another.
+    """
+    ratios = []
+    for page in pages:
+        worse = page.phase + noise * rng.standard_normal(page.phase.shape) / np.sqrt(
+            np.maximum(page.concentration, 1.0)
+        )
+        label = _label_bits(page.symbols, coded)
+        llrs = bit_llrs(worse, page.concentration / (1 + noise**2), levels, coded)
+        right = np.where(label == 0, llrs, -llrs).ravel()
+        whole = len(right) // code.sent_bits * code.sent_bits
+        ratios.append(rng.permutation(right)[:whole].reshape(-1, code.sent_bits))
+    blocks = np.concatenate(ratios).astype(np.float32)
+    return blocks, bit_information(blocks, np.zeros(blocks.shape, np.uint8))
+
+
+def needed_information(
+    code: LdpcCode, pages: Sequence[DrawnPage], levels: int, coded: int, rng: np.random.Generator
+) -> float:
+    """Information per bit from which nearly all blocks decode: the pages' light is made noisier until 2% of them fail.
+
+    Args:
+        code: of the blocks.
+        pages: with their light.
+        levels: M.
+        coded: b.
+        rng: of noise.
+    """
+    low, high = 0.0, 3.0
+    needed = 1.0
+    for _ in range(_BISECTIONS):
+        noise = (low + high) / 2
+        blocks, information = _blocks(pages, code, levels, coded, noise, rng)
+        if np.mean(~decode(code, blocks).converged) <= 0.02:
+            low, needed = noise, information
+        else:
+            high = noise
+    return needed
+
+
+def _all_decode(draw: Draw, code: Code, pilots: NDArray[np.bool_], rng: np.random.Generator) -> bool:
+    """Whether every page decodes, drawn some times."""
+    ldpc = PageCodec(code, pilots).ldpc
+    return all(
+        decode(ldpc, _blocks(draw(code.levels, rng), ldpc, code.levels, code.coded_bits, 0.0, rng)[0]).converged.all()
+        for _ in range(_DRAWS)
+    )

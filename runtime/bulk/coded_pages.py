@@ -1,0 +1,86 @@
+"""Decoded pages as a codec takes them: pages drawn anew to choose a code by, and pages of a file to read back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.codec.choose import Choice, DrawnPage, choose
+from lightpage.errors import InvalidInputError, RecordingError
+from lightpage.metrics.information import achievable_rate
+from lightpage.page.pilots import Pilots, remove_piston
+from lightpage.page.symbols import symbol_phases
+from lightpage.progress import track
+from lightpage.recording.reader import Recording
+from runtime.bulk.evaluation import check_recording, was_seen
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.frames import narrow
+from runtime.decoding.page import DecodedPage
+from runtime.decoding.tracking import Tracker
+from runtime.errors import LostPageError
+
+CONTINUOUS_LEVELS = 256
+"""AIR is stated over so many levels: log2 of what a phase that may take any value carries, to 1e-9 bit."""
+
+
+def phase_errors(page: DecodedPage, symbols: NDArray[np.uint8], levels: int) -> NDArray[np.float32]:
+    """Phase error of each symbol of a page, its smooth part still in it, radians [ny, nx]."""
+    return remove_piston(page.phase + page.phase_error - symbol_phases(symbols, levels), 0.0)
+
+
+def air_bits(page: DecodedPage, symbols: NDArray[np.uint8], data: NDArray[np.bool_], levels: int) -> float:
+    """AIR of a page as delivered, over 256 levels whatever its own count is, bits per data symbol."""
+    error = (page.phase - symbol_phases(symbols, levels))[data]
+    rates = achievable_rate(error, page.concentration[data], np.zeros(error.shape, np.int64), CONTINUOUS_LEVELS)
+    return float(rates.mean())
+
+
+def choose_code(decoder: Decoder, recording: Recording, tracker: Tracker) -> tuple[Choice, list[Choice]]:
+    """Choose a code by the pages of a recording that the bundle has not seen.
+
+    Args:
+        decoder: of the device.
+        recording: with known symbols.
+        tracker: follows the device from page to page.
+
+    Raises:
+        RecordingError: another device's recording, or one without symbols.
+        InvalidInputError: too few pages that the bundle has not seen and can decode, or no code carries them.
+    """
+    check_recording(decoder, recording)
+    if not recording.has_symbols:
+        raise RecordingError(f"recording {recording.path}", "no symbols", "known symbols to choose a code by")
+    own, levels = recording.pilots(), recording.levels
+    mask = decoder.bundle.pilot_mask if own is None else own
+    errors: list[NDArray[np.float32]] = []
+    concentrations: list[NDArray[np.float32]] = []
+    for index in track(range(recording.pages), "choose a code"):
+        frames, symbols = recording.frames(index), recording.symbols(index)
+        if symbols is None or was_seen(decoder, frames):
+            continue
+        try:
+            pair, pilots = narrow(frames, recording.bit_depth), Pilots.of_symbols(mask, symbols, levels)
+            page = tracker.decode(pair, levels, pilots)
+        except (InvalidInputError, LostPageError):
+            continue  # a page that is lost to the optics is lost to every code
+        errors.append(phase_errors(page, symbols, levels))
+        concentrations.append(page.concentration)
+    data = ~mask
+    rates = [
+        achievable_rate(error[data], kappa[data], np.zeros(int(data.sum()), np.int64), CONTINUOUS_LEVELS).mean()
+        for error, kappa in zip(errors, concentrations, strict=True)
+    ]
+
+    def draw(levels: int, rng: np.random.Generator) -> Sequence[DrawnPage]:
+        pages = []
+        for error, kappa in zip(errors, concentrations, strict=True):
+            symbols = rng.integers(0, levels, mask.shape, dtype=np.int64).astype(np.uint8)
+            phase = symbol_phases(symbols, levels) + error
+            pilots = Pilots.of_symbols(mask, symbols, levels)
+            phase = phase - decoder.phase_refit.error(phase, kappa, levels, pilots)
+            pages.append(DrawnPage(phase[data], kappa[data].astype(np.float64), symbols[data]))
+        return pages
+
+    return choose(draw, float(np.mean(rates)) if rates else 1.0, mask)

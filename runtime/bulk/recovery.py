@@ -1,0 +1,319 @@
+"""Reads a file back from recorded pages: frames to symbols, symbols to bytes, parity for what is lost."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+from lightpage.codec.code import Code
+from lightpage.codec.header import Header
+from lightpage.codec.page_codec import Loss, PageBytes, PageCodec
+from lightpage.codec.volume import Volume
+from lightpage.codec.volume_file import VolumeFile, ranges
+from lightpage.errors import InvalidInputError, LostDataError, RecordingError
+from lightpage.page.pilots import Pilots
+from lightpage.page.symbols import symbol_phases
+from lightpage.progress import track
+from lightpage.recording.reader import Recording
+from runtime.bulk.coded_pages import air_bits
+from runtime.bulk.evaluation import check_recording
+from runtime.bundle.bundle import Bundle
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.frames import narrow
+from runtime.decoding.page import DecodedPage
+from runtime.decoding.tracking import Tracker
+from runtime.errors import LostPageError
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class RecoveredPage:
+    """What became of one recorded page.
+
+    Attributes:
+        page: its number in the recording.
+        number: its number in its volume: as read, or of a lost page as its header claims it; None where unknown.
+        volume: the same of the volume.
+        loss: why it gave no bytes; None where it did.
+        reason: the same for people; empty where it did.
+        margin_bits: information of a symbol's coded bits beyond what the code needs; None where there was no light.
+        corrected: Reed-Solomon symbols that were mended.
+        failed_blocks: LDPC blocks that did not converge.
+        iterations: mean of the LDPC blocks.
+        air_bits: AIR of the page as delivered, bits a data symbol; None where its symbols are not known.
+        seconds: of the optical decode.
+        code_seconds: of the code.
+    """
+
+    page: int
+    number: int | None
+    volume: int | None
+    loss: Loss | None
+    reason: str
+    margin_bits: float | None = None
+    corrected: int = 0
+    failed_blocks: int = 0
+    iterations: float = 0.0
+    air_bits: float | None = None
+    seconds: float = 0.0
+    code_seconds: float = 0.0
+
+
+_REASONS = {
+    Loss.HEADER: "its header cannot be read",
+    Loss.CODE: "its header names another code",
+    Loss.BODY: "its code does not converge",
+    Loss.CHECKSUM: "its checksum does not hold",
+}
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """A file that was read back, or what is left of it.
+
+    Attributes:
+        code: of the pages.
+        volume: of the file; None where no page could be read.
+        pages: every page of the recording.
+        restored, lost: see `lightpage.codec.volume_file.Restored`.
+        missing: numbers of pages of the volume that gave no bytes, parity included.
+        foreign: pages of other volumes, by id.
+        repeated: pages that came again.
+        user_bytes_per_page: that a page holds.
+        symbols_per_page: all of them, pilots included.
+        data_symbols_per_page: without pilots.
+    """
+
+    code: Code
+    volume: Volume | None
+    pages: tuple[RecoveredPage, ...]
+    restored: tuple[int, ...]
+    lost: tuple[int, ...]
+    missing: tuple[int, ...]
+    foreign: dict[int, int]
+    repeated: int
+    user_bytes_per_page: int
+    symbols_per_page: int
+    data_symbols_per_page: int
+
+    @property
+    def unread(self) -> tuple[RecoveredPage, ...]:
+        """Recorded pages that gave no bytes."""
+        return tuple(page for page in self.pages if page.loss is not None)
+
+    @property
+    def failure_bound(self) -> float:
+        """Rate of unread pages that is not exceeded with 95% confidence (Clopper and Pearson)."""
+        failed, count = len(self.unread), len(self.pages)
+        return 1.0 if failed >= count else float(beta.ppf(CONFIDENCE, failed + 1, count - failed))
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures under the names that other programs read."""
+        rates = [page.air_bits for page in self.pages if page.air_bits is not None]
+        air_bytes = float(np.mean(rates)) * self.data_symbols_per_page / 8 if rates else None
+        user, volume = self.user_bytes_per_page, self.volume
+        bits = 8 * user / self.symbols_per_page
+        read = [page for page in self.pages if page.loss is None]
+        return {
+            "pages": len(self.pages),
+            "pages_unread": len(self.unread),
+            "pages_restored": len(self.restored),
+            "pages_lost": len(self.lost),
+            "pages_missing": len(self.missing),
+            "pages_repeated": self.repeated,
+            "lost": list(self.lost),
+            "restored": list(self.restored),
+            "missing": list(self.missing),
+            "other_volumes": {str(key): count for key, count in self.foreign.items()},
+            "user_bytes": 0 if volume is None else volume.file_bytes,
+            "user_bytes_per_page": user,
+            "air_bits_per_symbol": float(np.mean(rates)) if rates else None,
+            "air_bytes_per_page": air_bytes,
+            "share_of_air": user / air_bytes if air_bytes else None,
+            "Q": bits,
+            "q": bits / self.code.level_bits,
+            "page_failure_rate": len(self.unread) / len(self.pages) if self.pages else None,
+            "page_failure_rate_bound_95": self.failure_bound,
+            "margin_bits_mean": float(np.mean([p.margin_bits for p in read])) if read else None,
+            "margin_bits_least": float(min(p.margin_bits for p in read if p.margin_bits is not None)) if read else None,
+            "corrected": sum(page.corrected for page in self.pages),
+            "iterations": float(np.mean([page.iterations for page in read])) if read else None,
+            "seconds_per_page": float(np.median([p.seconds + p.code_seconds for p in self.pages])),
+            "code_seconds_per_page": float(np.median([p.code_seconds for p in read])) if read else None,
+            "code": self.code.model_dump(),
+            "volume": None if volume is None else volume.to_json(),
+            "page_results": [asdict(page) for page in self.pages],
+        }
+
+
+def code_of(recording: Recording, bundle: Bundle) -> Code:
+    """The code of a recording's pages: as it says itself, or else the bundle's.
+
+    Raises:
+        RecordingError: the recording's attribute `code` cannot be understood.
+        InvalidInputError: neither has one.
+    """
+    text = recording.code_text
+    if text is None:
+        if bundle.code is None:
+            expected = "--code CODE.toml, as `lightpage code` makes it"
+            raise InvalidInputError(f"{bundle.subject}, recording {recording.path}", "no code in either", expected)
+        return bundle.code
+    try:
+        told = json.loads(text)
+        return Code.model_validate({key: told[key] for key in Code.model_fields if key in told})
+    except (ValueError, TypeError) as error:
+        expected = "the parameters of a code as JSON"
+        raise RecordingError(f"recording {recording.path}: attribute 'code'", error, expected) from None
+
+
+def recover(
+    decoder: Decoder,
+    recording: Recording,
+    tracker: Tracker,
+    code: Code,
+    out: Path,
+    volume_id: int | None = None,
+    holes: bool = False,
+) -> Recovery:
+    """Read the file of one volume back.
+
+    Args:
+        decoder: of the device.
+        recording: of its pages, in any order.
+        tracker: follows the device from page to page.
+        code: of the pages.
+        out: the file; written whole, or not at all.
+        volume_id: which volume; if left out, the recording must hold only one.
+        holes: write zeros where data are lost, in place of no file.
+
+    Raises:
+        RecordingError: another device's recording, or one of another level count.
+        InvalidInputError: several volumes and no choice between them, pages that contradict each other, or no room.
+    """
+    check_recording(decoder, recording)
+    if recording.declared_levels not in (None, code.levels):
+        raise RecordingError(f"recording {recording.path}: levels", recording.levels, f"{code.levels}, as the code has")
+    bundle = decoder.bundle
+    codec = PageCodec(code, bundle.pilot_mask)
+    pilots = Pilots(bundle.pilot_mask, symbol_phases(bundle.written_pilots(code.levels), code.levels))
+    reader = PageReader(codec, lambda pair: tracker.decode(pair, code.levels, pilots))
+    pages: list[RecoveredPage] = []
+    with VolumeFile(out, codec.user_bytes, volume_id) as file:
+        for index in track(range(recording.pages), "recover"):
+            pages += [_read_page(reader, recording, index, file)]
+        if volume_id is None and file.foreign and file.volume is not None:
+            found = ", ".join(map(str, sorted({file.volume.id, *file.foreign})))
+            raise InvalidInputError(f"recording {recording.path}", f"pages of volumes {found}", "one of them: --volume")
+        missing = tuple(file.missing())
+        done = file.restore()
+        if file.volume is not None and (holes or not done.lost):
+            file.complete()
+        return Recovery(
+            code,
+            file.volume,
+            tuple(pages),
+            done.restored,
+            done.lost,
+            missing,
+            file.foreign,
+            file.repeated,
+            codec.user_bytes,
+            bundle.pilot_mask.size,
+            int(np.count_nonzero(~bundle.pilot_mask)),
+        )
+
+
+class PageReader:
+    """Frames to bytes, page after page.
+
+    Args:
+        codec: of the pages.
+        decode: frame pair to decoded page.
+    """
+
+    def __init__(self, codec: PageCodec, decode: Callable[[Any], DecodedPage]) -> None:
+        self.codec, self._decode = codec, decode
+        self.expected: Header | None = None
+        """The page that should come next, where that is known."""
+
+    def read(self, pair: Any) -> tuple[DecodedPage, PageBytes, float, float]:
+        """A page, its bytes, and the seconds of the optical decode and of the code.
+
+        Raises:
+            LostPageError, InvalidInputError: the frames cannot be decoded.
+        """
+        start = time.perf_counter()
+        page = self._decode(pair)
+        decoded = time.perf_counter()
+        found = self.codec.decode(page.phase, page.concentration, self.expected)
+        return page, found, decoded - start, time.perf_counter() - decoded
+
+
+def _read_page(reader: PageReader, recording: Recording, index: int, file: VolumeFile) -> RecoveredPage:
+    """Read one page of a recording into a file."""
+    expected = reader.expected
+    try:
+        pair = narrow(recording.frames(index), recording.bit_depth)
+        page, found, seconds, code_seconds = reader.read(pair)
+    except (InvalidInputError, LostPageError) as error:
+        _expect_next(reader, expected, file)
+        number, volume = (None, None) if expected is None else (expected.page, expected.volume)
+        return RecoveredPage(index, number, volume, Loss.OPTICS, str(error))
+    header = found.header if found.header is not None else expected
+    if found.loss is None:
+        file.add(found)
+        _expect_next(reader, found.header, file)
+    else:
+        _expect_next(reader, header, file)
+    symbols, data = recording.symbols(index), ~reader.codec.pilots
+    rate = None if symbols is None else air_bits(page, symbols, data, reader.codec.code.levels)
+    return RecoveredPage(
+        index,
+        None if header is None else header.page,
+        None if header is None else header.volume,
+        found.loss,
+        "" if found.loss is None else _REASONS[found.loss],
+        found.margin_bits,
+        found.corrected,
+        found.failed_blocks,
+        found.iterations,
+        rate,
+        seconds,
+        code_seconds,
+    )
+
+
+def _expect_next(reader: PageReader, header: Header | None, file: VolumeFile) -> None:
+    """After this page the next one of the same volume is expected."""
+    reader.expected = None
+    if header is not None and file.volume is not None and header.volume == file.volume.id:
+        following = file.volume.following(header.page)
+        reader.expected = None if following is None else replace(header, page=following)
+
+
+def lost_data(recovery: Recovery, out: Path, holes: bool) -> LostDataError | None:
+    """The error that `recover` ends with where data are lost, which names every page; None where none are."""
+    if recovery.volume is not None and not recovery.lost:
+        return None
+    told = "; ".join(
+        f"recorded page {page.page}"
+        + ("" if page.number is None else f" (page {page.number} of volume {page.volume})")
+        + f": {page.reason}"
+        for page in recovery.unread
+    )
+    unread = f"{len(recovery.unread)} of {len(recovery.pages)} pages gave no bytes ({told})" if told else ""
+    if recovery.volume is None:
+        return LostDataError(f"file {out}", unread or "no page", "at least one page that can be read")
+    data = f"data pages {ranges(recovery.lost)} of volume {recovery.volume.id} lost"
+    state = "written with zeros in their place" if holes else "not written; --holes writes it with zeros"
+    got = f"{data}, {state}" + (f"; {unread}" if unread else "")
+    return LostDataError(f"file {out}", got, f"at most {recovery.volume.parity_pages} lost pages a group")

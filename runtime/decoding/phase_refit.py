@@ -1,0 +1,92 @@
+"""Takes a smooth phase error off a decoded page without knowing its data.
+
+What a page's drift, its modulator's warping or a geometry slightly off leave behind varies slowly over the page and
+jumps where the light meets another number of walls. So the error is a plane in each wall zone. Which level a symbol is,
+is not known; expectation maximisation takes its posterior instead: the mean distance to the levels, weighted by it, is
+fitted, and again with what is left. Pilots are known. Where symbols are too uncertain to tell one level from the next,
+the distances average out and nothing is taken off.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.page.pilots import Pilots
+
+ROUNDS = 5
+"""Of expectation maximisation. More gain nothing where levels are told apart, and fit noise where they are not."""
+
+_NEIGHBOURS = 4
+"""Levels on either side of the nearest one that may be the true one."""
+
+_MOST_SYMBOLS = 20_000
+"""A dozen coefficients are known well enough from so many."""
+
+_CAP = 1e5
+"""Largest concentration that counts as such."""
+
+_PRIOR_RAD = 1.0
+"""Standard deviation of every coefficient beforehand: wide, and enough where a zone has hardly a symbol."""
+
+
+class PhaseRefit:
+    """The refit of one device's pages.
+
+    Args:
+        page_shape: (ny, nx).
+        positions: exit centroid of each symbol's light over the pipe's width, [2, ny, nx]; None where that is unknown,
+            and the page is one zone.
+    """
+
+    def __init__(self, page_shape: tuple[int, int], positions: NDArray[np.floating] | None = None) -> None:
+        ny, nx = page_shape
+        y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
+        walls = np.zeros((2, ny, nx)) if positions is None else np.rint(np.abs(positions)) % 2
+        zones = walls[0] + 2 * walls[1]
+        plane = np.stack([np.ones_like(x), x, y])
+        self._basis = np.concatenate([plane * (zones == zone) for zone in np.unique(zones)]).reshape(-1, ny * nx)
+        self._shape = page_shape
+        self._taken = np.arange(0, ny * nx, -(-ny * nx // _MOST_SYMBOLS))
+
+    def error(
+        self, phase: NDArray[np.floating], concentration: NDArray[np.floating], levels: int, pilots: Pilots
+    ) -> NDArray[np.float32]:
+        """The smooth error of a page's phases, radians [ny, nx]: to be taken off.
+
+        Args:
+            phase: radians, piston removed, [ny, nx].
+            concentration: von Mises kappa, [ny, nx].
+            levels: M.
+            pilots: the known symbols of this page.
+        """
+        known = np.full(self._shape, np.nan)
+        known[pilots.mask] = pilots.phases
+        truth = known.ravel()[self._taken]
+        is_known = ~np.isnan(truth)
+        mu = np.asarray(phase, np.float64).ravel()[self._taken]
+        kappa = np.minimum(np.asarray(concentration, np.float64).ravel()[self._taken], _CAP)
+        basis = self._basis[:, self._taken]
+        normal = (basis * kappa) @ basis.T + np.eye(len(basis)) / _PRIOR_RAD**2
+        step, coefficients = 2 * np.pi / levels, np.zeros(len(basis))
+        for _ in range(ROUNDS):
+            left = mu - coefficients @ basis
+            distance = _mean_distance(left, kappa, step)
+            distance[is_known] = _wrapped(left[is_known] - truth[is_known])
+            gradient = basis @ (kappa * distance) - coefficients / _PRIOR_RAD**2
+            coefficients = coefficients + np.linalg.solve(normal, gradient)
+        return np.asarray((coefficients @ self._basis).reshape(self._shape), np.float32)
+
+
+def _mean_distance(mu: NDArray[np.float64], kappa: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """Distance of each phase to the levels about it, the mean over their posterior, radians [symbols]."""
+    few = min(_NEIGHBOURS, max(0, round(2 * np.pi / step) - 1) // 2)
+    offsets = np.arange(-few, few + 1) * step
+    away = mu - np.rint(mu / step) * step
+    distance = (away[:, None] - offsets).astype(np.float32)
+    weight = np.exp(kappa[:, None].astype(np.float32) * (np.cos(distance) - np.cos(away)[:, None].astype(np.float32)))
+    return np.asarray((weight * distance).sum(axis=1) / weight.sum(axis=1), np.float64)
+
+
+def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(angle - 2 * np.pi * np.rint(angle / (2 * np.pi)))
