@@ -23,6 +23,8 @@ from runtime.decoding.decoder import Decoder
 from tests.lightpage.small import small_profile
 from tests.runtime import toy
 
+pytest_plugins = ["pytester", "tests.skips"]
+
 BENCH_PAGES = 3
 SMALL_PAGES = 8
 

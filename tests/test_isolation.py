@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.skips import NO_FILTERS
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("lightpage", "train", "runtime", "export", "analysis")
 ROOMS = (
@@ -240,7 +242,7 @@ def without_internet(argument: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", NO_INTERNET, argument]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     if done.stderr.strip() == "no filters here":
-        pytest.skip("this kernel lets no process filter its own system calls")
+        pytest.skip(NO_FILTERS)
     return done
 
 

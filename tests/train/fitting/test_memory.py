@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from tests.skips import NO_GLIBC
 from train.fitting.memory import keep_freed_memory
 
 _PROGRAM = """
@@ -31,7 +32,7 @@ def _faults(keep: bool) -> int:
     return int(subprocess.check_output([sys.executable, "-c", _PROGRAM.format(keep=keep)], text=True, timeout=120))
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason=NO_GLIBC)
 def test_arrays_take_the_memory_of_those_before_them() -> None:
     page = 1 << 12
     assert _faults(keep=False) >= 5 * (1 << 26) // (1 << 21)  # huge pages at the most

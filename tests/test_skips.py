@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tests.skips import NO_FILTERS, REQUIRE_ALL
+
+ROOT = Path(__file__).resolve().parents[1]
+TESTS = f"""
+import pytest
+
+def test_passes():
+    pass
+
+def test_lacks_something():
+    pytest.skip("no oscilloscope")
+
+@pytest.mark.skipif(True, reason="no laser")
+def test_lacks_something_before_it_begins():
+    pass
+
+def test_is_on_another_kernel():
+    pytest.skip({NO_FILTERS!r})
+
+@pytest.mark.xfail
+def test_is_known_to_fail():
+    assert False
+"""
+FILE = 'import pytest\n\npytest.importorskip("no_such_package")'
+
+
+@pytest.fixture
+def project(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytest.Pytester:
+    """A folder of tests, with this project's options and plug."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    addopts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["pytest"]["ini_options"]["addopts"]
+    pytester.makeini(f"[pytest]\naddopts = {addopts} -p tests.skips")
+    pytester.makepyfile(test_tests=TESTS, test_file=FILE)
+    return pytester
+
+
+def test_what_a_machine_lacks_is_skipped_with_its_reason(
+    project: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(REQUIRE_ALL, raising=False)
+    found = project.runpytest_subprocess()
+    found.assert_outcomes(passed=1, skipped=4, xfailed=1)
+    found.stdout.fnmatch_lines_random(["SKIPPED*no oscilloscope", "SKIPPED*no laser", "SKIPPED*no_such_package*"])
+
+
+@pytest.mark.parametrize("options", [(), ("-n", "1")])
+def test_it_fails_with_its_reason_where_everything_is_required(
+    options: tuple[str, ...], project: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(REQUIRE_ALL, "1")
+    found = project.runpytest_subprocess("--continue-on-collection-errors", *options)
+    found.assert_outcomes(passed=1, failed=1, errors=2, skipped=1, xfailed=1)
+    for reason in ("no oscilloscope", "no laser", "could not import 'no_such_package'*"):
+        found.stdout.fnmatch_lines_random([f"{REQUIRE_ALL}=1 allows no skip: {reason}"])
+
+
+def test_continuous_integration_requires_everything() -> None:
+    assert f"export {REQUIRE_ALL}=1\n" in (ROOT / ".ci" / "run").read_text("utf-8")
