@@ -14,7 +14,7 @@ IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo test test-long bench bench-speed bench-service bench-image-search bench-decoders train-decoders image check-image proto lint format clean
+.PHONY: help setup demo test test-long bench bench-speed bench-service bench-image-search bench-decoders train-decoders results image check-image proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -90,6 +90,10 @@ bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 
 bench-image-search: $(STAMP)  ## how the image is found, followed and confirmed: tables and a picture, in more than an hour
 	$(BIN)/python -m analysis.tracking.image_search --out runs/bench-image-search
+
+RESULTS_ARGS ?=
+results: $(STAMP)  ## write docs/results.md from analysis/results: RESULTS_ARGS="--from runs/bench-decoders" collects first
+	$(BIN)/python -m analysis.results.page $(RESULTS_ARGS)
 
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
 	$(BIN)/python proto/generate.py

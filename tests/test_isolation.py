@@ -61,6 +61,7 @@ ROOMS = (
     "analysis.comparison",
     "analysis.speed",
     "analysis.tracking",
+    "analysis.results",
     "analysis",
 )
 """From the ground up: a room may use itself and those before it."""

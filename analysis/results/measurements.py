@@ -1,0 +1,183 @@
+"""Measured figures as `analysis/results` keeps them: what a benchmark wrote, without what the page never shows."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from lightpage.errors import InvalidInputError
+from lightpage.files import write_json
+
+Figures = dict[str, Any]
+
+KEPT = Path(__file__).parent
+COMPARISONS = (
+    "sheared",
+    "square",
+    "dim",
+    "small-symbols",
+    "dim-small-symbols",
+    "full-size",
+    "full-size-small-symbols",
+    "ideal",
+)
+"""Folders of `make bench-decoders`."""
+EVALUATION, DEMO, IMAGE_SEARCH = "evaluation", "demo", "image-search"
+SPEED = "speed-"
+"""Before the name of a profile."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Figures with where they are from.
+
+    Attributes:
+        figures: under the names that the benchmark gave them.
+        source: "measured DATE on COMMIT", or the document that they were copied from.
+        note: what a reader must know of them, if anything.
+    """
+
+    figures: Figures
+    source: str
+    note: str = ""
+
+    @classmethod
+    def read(cls, path: Path) -> Measurement:
+        """What `write` has written.
+
+        Raises:
+            InvalidInputError: another file.
+        """
+        kept = read_object(path)
+        try:
+            return cls(kept["figures"], kept["source"], kept.get("note", ""))
+        except KeyError as error:
+            raise InvalidInputError(f"figures {path}", f"no {error}", "a file of analysis/results") from None
+
+    def write(self, path: Path) -> None:
+        """Write it as JSON."""
+        note = {"note": self.note} if self.note else {}
+        write_json(path, {"source": self.source, **note, "figures": self.figures})
+
+
+def read_object(path: Path) -> Figures:
+    """A JSON object.
+
+    Raises:
+        InvalidInputError: there is none, or something else.
+    """
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"figures {path}", error, "a benchmark's JSON") from None
+    if not isinstance(found, dict):
+        raise InvalidInputError(f"figures {path}", type(found).__name__, "a JSON object")
+    return found
+
+
+def kept_measurements(folder: Path = KEPT) -> dict[str, Measurement]:
+    """All that a folder keeps, by name."""
+    return {path.stem: Measurement.read(path) for path in sorted(folder.glob("*.json"))}
+
+
+def collected(name: str, path: Path, commit: str | None = None) -> Measurement:
+    """What a benchmark has written, slimmed.
+
+    Args:
+        name: of the measurement.
+        path: of its JSON, whose date is taken for the measurement's.
+        commit: that was measured; the one that is checked out where the JSON lies if None.
+
+    Raises:
+        InvalidInputError: no JSON of that benchmark, or a checkout that is younger than it or missing.
+    """
+    figures = slim(name, read_object(path))
+    written = path.stat().st_mtime
+    if commit is None:
+        commit, committed = checked_out(path.parent)
+        if not commit or committed > written:
+            got = "a younger commit checked out" if commit else "no checkout"
+            raise InvalidInputError(f"figures {path}", got, "--commit with the commit that was measured")
+    return Measurement(figures, f"measured {datetime.fromtimestamp(written, UTC):%Y-%m-%d} on commit {commit[:7]}")
+
+
+def checked_out(folder: Path) -> tuple[str, int]:
+    """The commit that is checked out where a folder lies, and its time, seconds since 1970; "" and 0 without one."""
+    command = ["git", "-C", str(folder), "log", "-1", "--format=%H %ct"]
+    try:
+        told = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    except OSError:
+        told = ""
+    commit, _, committed = told.strip().partition(" ")
+    return commit, int(committed or 0)
+
+
+def slim(name: str, figures: Figures) -> Figures:
+    """The figures of a measurement without long curves, maps and lists of single pages.
+
+    Raises:
+        InvalidInputError: another benchmark's.
+    """
+    take = comparison if name in COMPARISONS else _TAKE.get(name, speed)
+    try:
+        return take(figures)
+    except (KeyError, TypeError, IndexError) as error:
+        raise InvalidInputError(f"figures of {name}", repr(error), "the JSON of that benchmark, all of it") from None
+
+
+def comparison(figures: Figures) -> Figures:
+    """Of `analysis.comparison.decoders`, without its curves."""
+    curves = {"training_curve", "validation_curve"}
+    lights = [
+        light | {"outcomes": [{key: of[key] for key in of if key not in curves} for of in light["outcomes"]]}
+        for light in figures["lights"]
+    ]
+    return figures | {"lights": lights}
+
+
+def methods(measurement: Measurement) -> set[str]:
+    """Methods of a comparison with the angle that each was measured at; of another measurement none."""
+    lights = measurement.figures.get("lights", [])
+    return {f"{of['arm']} at {light['angle_deg']:g} degree" for light in lights for of in light["outcomes"]}
+
+
+def evaluation(figures: Figures) -> Figures:
+    """Of `lightpage evaluate`, its numbers alone."""
+    return {"air_bits_per_symbol": figures["air_bits_per_symbol"]} | {
+        key: value for key, value in figures.items() if isinstance(value, int | float | str)
+    }
+
+
+def demo(figures: Figures) -> Figures:
+    """Of `lightpage demo`."""
+    return {key: figures[key] for key in ("seed", "pages", "phases", "recalibration")}
+
+
+def image_search(figures: Figures) -> Figures:
+    """Of `analysis.tracking.image_search`, counted over both operating points."""
+    first = [row for part, of in figures.items() if part.endswith(": offsets") for row in of["rows"]]
+    kinds = [kind for part, of in figures.items() if part.endswith(": wrong pages") for kind in of["kinds"].values()]
+    return {
+        "first_pages": len(first),
+        "first_pages_found": sum(row.get("found", False) for row in first),
+        "largest_offset_px": max((row["offset_px"] for row in first), default=None),
+        "wrong_pages": sum(kind["pages"] for kind in kinds),
+        "wrong_pages_given_out": sum(kind["given_out"] for kind in kinds),
+    }
+
+
+def speed(figures: Figures) -> Figures:
+    """Of `analysis.speed.speed`."""
+    return {key: figures[key] for key in ("profile", "threads", "repeats", "decoders")}
+
+
+_TAKE: dict[str, Callable[[Figures], Figures]] = {
+    EVALUATION: evaluation,
+    DEMO: demo,
+    IMAGE_SEARCH: image_search,
+}

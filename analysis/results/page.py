@@ -1,0 +1,204 @@
+"""Writes docs/results.md from the figures in analysis/results, after collecting newer ones if asked to.
+
+    python -m analysis.results.page --from runs/bench-decoders
+
+A figure that is missing leaves its row out, and the command says which. A comparison without a method
+that is kept is not collected: it is not finished.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import click
+from jinja2 import Environment, StrictUndefined
+
+from analysis.comparison.outcome import SETTLED_BITS
+from analysis.results.measurements import (
+    COMPARISONS,
+    DEMO,
+    EVALUATION,
+    IMAGE_SEARCH,
+    KEPT,
+    SPEED,
+    Figures,
+    Measurement,
+    collected,
+    kept_measurements,
+    methods,
+    read_object,
+)
+from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
+from lightpage.device.profile import load_profile
+from lightpage.device.state import Device
+from lightpage.files import replace_file, replace_text
+
+ROOT = Path(__file__).parents[2]
+PAGE, PICTURE = ROOT / "docs" / "results.md", Path("images") / "decoders.png"
+PICTURED = "sheared"
+"""The comparison whose picture the page shows."""
+TEMPLATE = "results.md.j2"
+
+
+@dataclass(frozen=True)
+class Results:
+    """What the template asks for; what it does not get is remembered.
+
+    Attributes:
+        measurements: by name.
+        missing: what was asked for and is not there.
+    """
+
+    measurements: Mapping[str, Measurement]
+    missing: list[str] = field(default_factory=list)
+
+    def figures(self, name: str) -> Figures | None:
+        """The figures of a measurement."""
+        if name in self.measurements:
+            return self.measurements[name].figures
+        self._miss(name)
+        return None
+
+    def outcome(self, name: str, angle_deg: float, arm: str) -> Figures | None:
+        """The outcome of a comparison's method at a pipe angle, with its exposure."""
+        for light in (self.figures(name) or {"lights": []})["lights"]:
+            for outcome in light["outcomes"]:
+                # the name of a method with several passes ends with their number
+                if light["angle_deg"] == angle_deg and outcome["arm"].removesuffix(" 1") == arm:
+                    return {"exposure": light["exposure"], **outcome}
+        self._miss(f"{name}, {angle_deg:g} degree, {arm}")
+        return None
+
+    def outcomes(self, name: str, angle_deg: float, *arms: str) -> list[Figures] | None:
+        """The outcomes of several methods, None if one is missing."""
+        found = [self.outcome(name, angle_deg, arm) for arm in arms]
+        whole = [outcome for outcome in found if outcome is not None]
+        return whole if len(whole) == len(arms) else None
+
+    def times(self, profile: str, decoder: str, other: str) -> float | None:
+        """How many times another decoder's time one takes, in the speed benchmark."""
+        name = f"{SPEED}{profile}"
+        seconds = {timed["decoder"]: timed["seconds"] for timed in (self.figures(name) or {"decoders": []})["decoders"]}
+        lacking = [f"{name}, {one}" for one in (decoder, other) if one not in seconds]
+        for what in lacking:
+            self._miss(what)
+        return None if lacking else float(seconds[decoder] / seconds[other])
+
+    def _miss(self, what: str) -> None:
+        if what not in self.missing:
+            self.missing.append(what)
+
+
+def render(results: Results) -> str:
+    """The page, Markdown."""
+    environment = Environment(
+        autoescape=False, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+    )
+    environment.filters |= {"digits": digits, "kilobytes": kilobytes, "thousands": thousands}
+    source = Path(__file__).with_name(TEMPLATE).read_text("utf-8")
+    return environment.from_string(source).render(
+        results=results, device=Device(), symbols=symbols, learning_bits=SETTLED_BITS
+    )
+
+
+def digits(value: float, count: int) -> str:
+    """So many digits behind the point."""
+    return f"{value:.{count}f}"
+
+
+def thousands(value: float) -> str:
+    """A whole number with commas."""
+    return f"{value:,.0f}"
+
+
+def kilobytes(value: float) -> str:
+    """Two digits behind the point of a small page, fewer of a large one."""
+    return digits(value, 2 if value < 20 else 1 if value < 100 else 0)
+
+
+def symbols(profile: str, size_px: int) -> str:
+    """How many symbols a page of a profile has if they are of this size."""
+    rows, columns = load_profile(profile).with_symbols_of(size_px).page_shape
+    return f"{columns} x {rows} of {size_px}x{size_px}"
+
+
+def copy_picture(path: Path, to: Path) -> None:
+    """Copy a picture whole, into a folder that is made if it is not there.
+
+    Raises:
+        InvalidInputError: it cannot be written.
+    """
+    picture = path.read_bytes()
+    to.parent.mkdir(exist_ok=True)
+    replace_file(to, lambda file: file.write(picture), "picture")
+
+
+@click.command()
+@click.option(
+    "--from",
+    "comparisons",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Collect the comparisons below this folder.",
+)
+@click.option("--evaluation", type=click.Path(path_type=Path), help="Collect the JSON of `lightpage evaluate`.")
+@click.option("--demo", type=click.Path(path_type=Path), help="Collect the demo.json of `lightpage demo`.")
+@click.option("--image-search", type=click.Path(path_type=Path), help="Collect the figures.json of the image search.")
+@click.option(
+    "--speed",
+    "speeds",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Collect a JSON of `analysis.speed.speed`.",
+)
+@click.option("--commit", help="That was measured; the one checked out where the JSON lies if left out.")
+@click.option(
+    "--kept",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    default=KEPT,
+    show_default="analysis/results",
+    help="Folder of the figures.",
+)
+@click.option("--out", type=OutputFile(), default=PAGE, show_default="docs/results.md", help="The page.")
+def main(
+    comparisons: Path | None,
+    evaluation: Path | None,
+    demo: Path | None,
+    image_search: Path | None,
+    speeds: tuple[Path, ...],
+    commit: str | None,
+    kept: Path,
+    out: Path,
+) -> None:
+    """Write docs/results.md from the kept figures."""
+    given = {EVALUATION: evaluation, DEMO: demo, IMAGE_SEARCH: image_search}
+    found = {name: path for name, path in given.items() if path is not None}
+    found |= {f"{SPEED}{read_object(path).get('profile')}": path for path in speeds}
+    if comparisons is not None:
+        below = {name: comparisons / name / "figures.json" for name in COMPARISONS}
+        found |= {name: path for name, path in below.items() if path.exists()}
+        for name in [name for name in below if name not in found]:
+            click.echo(f"not collected, no {below[name]}")
+    before = kept_measurements(kept)
+    for name, path in found.items():
+        measurement = collected(name, path, commit)
+        lacking = methods(before[name]) - methods(measurement) if name in before else set()
+        if lacking:  # a comparison writes its figures method by method
+            click.echo(f"not collected, unfinished: {path} lacks {', '.join(sorted(lacking))}")
+            continue
+        measurement.write(kept / f"{name}.json")
+        click.echo(f"{name}: {measurement.source}")
+        if name == PICTURED and (drawn := path.with_name("figure.png")).exists():
+            copy_picture(drawn, out.parent / PICTURE)
+    results = Results(kept_measurements(kept))
+    replace_text(out, render(results), "page")
+    for what in results.missing:
+        click.echo(f"left out, no figures: {what}")
+    click.echo(f"written to {out}")
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, name="python -m analysis.results.page"))
