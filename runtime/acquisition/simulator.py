@@ -3,24 +3,51 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 from urllib.parse import parse_qsl
 
 import numpy as np
 
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device, load_device
-from lightpage.errors import InvalidInputError, PageError
+from lightpage.errors import InvalidInputError, PageError, RecordingError
 from lightpage.page.symbols import pilot_mask, random_symbols
+from lightpage.recording.pages import Pages
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.source import SourcePage
 
 
 class SimulatorSource:
-    """A simulated device that writes a random page whenever one is read; the seed and the number fix its symbols."""
+    """A simulated device that writes a page whenever one is read.
 
-    def __init__(self, profile: Profile, device: Device, levels: int = 16, seed: int = 0, name: str = "") -> None:
+    Args:
+        profile: nominal device.
+        device: true state.
+        levels: M of random pages.
+        seed: it and the number fix a random page's symbols.
+        name: for people.
+        written: pages that the modulator shows in place of random ones; their level count holds.
+
+    Raises:
+        RecordingError: pages for another profile.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        device: Device,
+        levels: int = 16,
+        seed: int = 0,
+        name: str = "",
+        written: Pages | None = None,
+    ) -> None:
         from lightpage.simulator.simulator import Simulator
 
+        if written is not None and written.page_shape != profile.page_shape:
+            expected = f"{profile.page_shape} (profile {profile.name})"
+            raise RecordingError(f"pages {written.path}", f"pages of {written.page_shape} symbols", expected)
+        levels = levels if written is None else written.levels
+        self._written = written
         self._simulator = Simulator(profile, device, levels, seed)
         self._lock = threading.Lock()
         """Guards the simulator and the position; held while one page is simulated."""
@@ -40,18 +67,24 @@ class SimulatorSource:
             self._simulator.set_device(device)
 
     def read(self, page: int | None = None) -> SourcePage:
-        """Write and record page number `page`, or the next one.
+        """Write and record page number `page`, or the next one; after the last page to write the next is the first.
 
         Raises:
-            PageError: a negative page number.
+            PageError: no such page.
+            RecordingError: it cannot be read from the pages to write.
         """
         with self._lock:
             if page is None:
                 page, self._next = self._next, self._next + 1
-            if page < 0:
-                raise PageError(f"page of {self.name}", page, "a number of at least 0")
-            rng = np.random.default_rng([self._seed, page])
-            symbols = random_symbols(self.profile, self.levels, 1, rng)[0]
+                page = page if self._written is None else page % len(self._written)
+            if page < 0 or (self._written is not None and page >= len(self._written)):
+                expected = "a number of at least 0" if self._written is None else f"0..{len(self._written) - 1}"
+                raise PageError(f"page of {self.name}", page, expected)
+            if self._written is not None:
+                symbols = self._written[page]
+            else:
+                rng = np.random.default_rng([self._seed, page])
+                symbols = random_symbols(self.profile, self.levels, 1, rng)[0]
             return SourcePage(self._simulator.page(symbols), page, symbols, pilot_mask(self.profile))
 
     def references(self) -> FramePair:
@@ -60,7 +93,9 @@ class SimulatorSource:
             return self._simulator.references()
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Close the pages to write."""
+        if self._written is not None:
+            self._written.close()
 
 
 def open_simulator(rest: str) -> SimulatorSource:
@@ -74,9 +109,13 @@ def open_simulator(rest: str) -> SimulatorSource:
     settings = dict(parse_qsl(query, keep_blank_values=True))
     device = load_device(path) if (path := settings.pop("device", None)) else Device()
     try:
+        symbols = settings.pop("symbols", None)
         levels, seed = int(settings.pop("levels", "16")), int(settings.pop("seed", "0"))
     except ValueError as error:
         raise InvalidInputError(f"source {spec}", error, "whole numbers for levels and seed") from None
     if settings or seed < 0:
-        raise InvalidInputError(f"source {spec}", sorted(settings) or seed, "levels, seed (at least 0) and device only")
-    return SimulatorSource(load_profile(profile), device, levels, seed, spec)
+        raise InvalidInputError(
+            f"source {spec}", sorted(settings) or seed, "levels, seed (at least 0), device and symbols only"
+        )
+    written = None if symbols is None else Pages.open(Path(symbols))
+    return SimulatorSource(load_profile(profile), device, levels, seed, spec, written)

@@ -18,8 +18,6 @@ from lightpage.codec.page_codec import Loss, PageBytes, PageCodec
 from lightpage.codec.volume import Volume
 from lightpage.codec.volume_file import VolumeFile, ranges
 from lightpage.errors import InvalidInputError, LostDataError, RecordingError
-from lightpage.page.pilots import Pilots
-from lightpage.page.symbols import symbol_phases
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
 from runtime.bulk.coded_pages import air_bits
@@ -204,7 +202,7 @@ def recover(
         raise RecordingError(f"recording {recording.path}: levels", recording.levels, f"{code.levels}, as the code has")
     bundle = decoder.bundle
     codec = PageCodec(code, bundle.pilot_mask)
-    pilots = Pilots(bundle.pilot_mask, symbol_phases(bundle.written_pilots(code.levels), code.levels))
+    pilots = decoder.written_pilots(code.levels)
     reader = PageReader(codec, lambda pair: tracker.decode(pair, code.levels, pilots))
     pages: list[RecoveredPage] = []
     with VolumeFile(out, codec.user_bytes, volume_id) as file:

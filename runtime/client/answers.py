@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.codec.page_codec import PageBytes
 from runtime.decoding.page import ImagePosition
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.wire.messages import image_of
+from runtime.wire.messages import image_of, user_data_of
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,31 @@ class Description:
     pilot_mask: NDArray[np.bool_]
     pilot_phases: NDArray[np.float32] | None
     """Radians, one a True of `pilot_mask` in row order; None for the profile's pattern."""
+    code_toml: str = ""
+    """How user bytes are protected on this device's pages; empty where the model has no code."""
+    user_bytes_per_page: int = 0
+
+
+@dataclass(frozen=True)
+class RemoteData:
+    """The bytes of a page of the source.
+
+    Attributes:
+        page: number in the source; None where the bytes were restored from other pages of the group.
+        user_data: what the page gave; its header says which page of which volume it is.
+        error: why it was not decoded, for people; empty where it was.
+    """
+
+    page: int | None
+    user_data: PageBytes
+    error: str = ""
+
+
+def remote_data(reply: pb.ReadDataReply) -> RemoteData:
+    """A message as a page's bytes."""
+    told = reply.error
+    error = f"{told.thing}: got {told.got}, wanted {told.wanted}" if reply.HasField("error") else ""
+    return RemoteData(None if reply.restored else reply.page, user_data_of(reply.user_data), error)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, LightpageError
 from lightpage.recording.reader import FramePair
-from runtime.client.answers import Description, ModelInfo, Recalibrated, model_info, recalibrated
+from runtime.client.answers import (
+    Description,
+    ModelInfo,
+    Recalibrated,
+    RemoteData,
+    model_info,
+    recalibrated,
+    remote_data,
+)
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.wire.address import check_address
@@ -23,6 +31,9 @@ from runtime.wire.status import error_of
 
 CALL_S = 60.0
 """Deadline of a call where none is given."""
+
+DATA_S = 600.0
+"""Deadline of a range of pages where none is given."""
 
 RECALIBRATION_S = 600.0
 """Deadline of a recalibration where none is given."""
@@ -82,6 +93,8 @@ class LightpageClient:
             profile_toml=reply.profile_toml,
             calibration_toml=reply.calibration_toml,
             pilot_mask=np.frombuffer(reply.pilot_mask, np.uint8).reshape(reply.page.rows, reply.page.columns) != 0,
+            code_toml=reply.code_toml,
+            user_bytes_per_page=reply.user_bytes_per_page,
             pilot_phases=np.array(reply.pilot_phases, np.float32) if reply.pilot_phases else None,
         )
         return self._description
@@ -96,6 +109,7 @@ class LightpageClient:
         want_concentration: bool = False,
         want_phase: bool = False,
         quantised: bool = False,
+        user_data: bool = False,
     ) -> RemotePage:
         """Send a frame pair and get its symbols.
 
@@ -107,6 +121,7 @@ class LightpageClient:
             want_concentration: also get kappa.
             want_phase: also get the phase.
             quantised: get the confidence in one byte a symbol.
+            user_data: also get the page's bytes; `levels` must then be those of the model's code, or 0.
 
         Raises:
             FrameError: frames that cannot be sent, or that the service refuses.
@@ -128,7 +143,7 @@ class LightpageClient:
             columns_px=frames[0].shape[1],
             pixel_type=PIXEL_CODES[frames[0].dtype.name],
             bit_depth=bit_depth,
-            options=_options(levels, want_concentration, want_phase, quantised),
+            options=_options(levels, want_concentration, want_phase, quantised, user_data),
             pilots=pilots_message(pilots) if pilots is not None else None,
         )
         reply: pb.DecodeReply = self._unary(self._stub.DecodeFrames, _parts(header, frames))
@@ -143,6 +158,7 @@ class LightpageClient:
         want_phase: bool = False,
         want_written: bool = False,
         quantised: bool = False,
+        user_data: bool = False,
     ) -> RemotePage:
         """Have the service read a page from its source; None stands for the next page and the source's levels.
 
@@ -151,13 +167,31 @@ class LightpageClient:
             PageError: no such page, or an impossible level count.
             SlotsTakenError: the service had no free slot until the deadline.
         """
-        request = pb.ReadPageRequest(
-            options=_options(levels or 0, want_concentration, want_phase, quantised), want_written=want_written
-        )
+        options = _options(levels or 0, want_concentration, want_phase, quantised, user_data)
+        request = pb.ReadPageRequest(options=options, want_written=want_written)
         if page is not None:
             request.page = page
         reply: pb.ReadPageReply = self._unary(self._stub.ReadPage, request)
         return remote_page(reply.decoded, reply)
+
+    def read_data(self, first: int, pages: int, timeout_s: float = DATA_S) -> Iterator[RemoteData]:
+        """Have the service read the bytes of pages `first` to `first + pages - 1` of its source.
+
+        Lost pages come as such; those that parity restores follow at the end of their group.
+
+        Raises:
+            BundleError: the model in service has no code.
+            SourceError: the service has no source, or one that is damaged or dark.
+            PageError: no such page.
+        """
+        call = self._stub.ReadData(pb.ReadDataRequest(first_page=first, pages=pages), timeout=timeout_s)
+        try:
+            for reply in call:
+                yield remote_data(reply)
+        except grpc.RpcError as error:
+            raise error_of(error, self.target) from None
+        finally:
+            call.cancel()
 
     def recalibrate(
         self,
@@ -235,6 +269,12 @@ def _parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> It
             yield pb.DecodeFramesRequest(chunk=data[start : start + CHUNK_BYTES].tobytes())
 
 
-def _options(levels: int, concentration: bool, phase: bool, quantised: bool) -> pb.DecodeOptions:
+def _options(levels: int, concentration: bool, phase: bool, quantised: bool, user_data: bool) -> pb.DecodeOptions:
     code = pb.CONFIDENCE_FORMAT_UINT8 if quantised else pb.CONFIDENCE_FORMAT_FLOAT32
-    return pb.DecodeOptions(levels=levels, confidence_format=code, want_concentration=concentration, want_phase=phase)
+    return pb.DecodeOptions(
+        levels=levels,
+        confidence_format=code,
+        want_concentration=concentration,
+        want_phase=phase,
+        want_user_data=user_data,
+    )

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from lightpage.device.profile import Profile
 from lightpage.errors import BundleError, FrameError, InvalidInputError
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
-from lightpage.page.symbols import MAX_LEVELS, check_levels
+from lightpage.page.symbols import MAX_LEVELS, check_levels, symbol_phases
 from lightpage.recording.reader import FramePair
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import DECODER, FIELD, GOLDEN
@@ -28,6 +29,9 @@ from runtime.decoding.phase_refit import PhaseRefit
 from runtime.execution.constant_table import GraphFile
 from runtime.execution.session import Port
 from runtime.execution.table_graph import TableGraph
+
+if TYPE_CHECKING:
+    from lightpage.codec.page_codec import PageCodec
 
 OUTPUTS = ("p", "phase", "concentration")
 PAGE_INPUTS = frozenset(["registration"])
@@ -199,6 +203,30 @@ class Decoder:
         """Takes smooth phase errors off this device's pages."""
         positions = self.graph.value("positions") if "positions" in self.graph.ports else None
         return PhaseRefit(self.bundle.profile.page_shape, positions)
+
+    @cached_property
+    def page_codec(self) -> PageCodec:
+        """Takes user bytes off this device's pages.
+
+        Raises:
+            BundleError: the bundle has no code, or one that does not fit its page.
+        """
+        from lightpage.codec.page_codec import PageCodec
+
+        if self.bundle.code is None:
+            raise BundleError(f"{self.bundle.subject}: code", "none", "one, as `lightpage code --out-bundle` adds it")
+        try:
+            return PageCodec(self.bundle.code, self.bundle.pilot_mask)
+        except InvalidInputError as error:
+            raise BundleError(f"{self.bundle.subject}: {error.subject}", error.got, error.expected) from None
+
+    def written_pilots(self, levels: int) -> Pilots:
+        """The pilots of pages that were written at `levels` levels, each on one of them.
+
+        Raises:
+            PageError: a level count outside 2..256.
+        """
+        return Pilots(self.bundle.pilot_mask, symbol_phases(self.bundle.written_pilots(levels), levels))
 
     @property
     def has_field_graph(self) -> bool:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.codec.page_codec import PageBytes
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.service.dataplane import Answer, ReadAnswer
 from runtime.service.registry import Model
-from runtime.wire.messages import FLOAT, image_message
+from runtime.service.user_data import DataPage
+from runtime.wire.messages import DATA_LOSSES, FLOAT, image_message
+from runtime.wire.status import detail_of
 
 
 def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
     """An answer as its message, for `options` that have been checked."""
-    page = answer.page
+    page, found = answer.page, answer.user_data
     rows, columns = page.symbols.shape
     return pb.DecodeReply(
         rows=rows,
@@ -32,6 +35,7 @@ def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
         confirmed_bits=page.check.confirmed_bits,
         recalibration_due=page.check.recalibration_due,
         image=None if page.image is None else image_message(page.image),
+        user_data=None if found is None else user_data_message(found),
         model_version=answer.model_version,
         timings=pb.Timings(
             receive_s=answer.receive_s,
@@ -46,6 +50,39 @@ def _confidence_bytes(confidence: NDArray[np.float32], code: int) -> bytes:
     if code == pb.CONFIDENCE_FORMAT_UINT8:
         return np.floor(confidence * 255).astype(np.uint8).tobytes()
     return confidence.astype(FLOAT).tobytes()
+
+
+def user_data_message(found: PageBytes) -> pb.UserData:
+    """What a page gave as its message."""
+    header = found.header
+    return pb.UserData(
+        data=found.data or b"",
+        loss=DATA_LOSSES[found.loss],
+        header=None
+        if header is None
+        else pb.PageHeader(
+            volume=header.volume, page=header.page, volume_bytes=header.volume_bytes, code_id=header.code_id
+        ),
+        data_pages=found.data_pages,
+        parity_pages=found.parity_pages,
+        margin_bits=found.margin_bits,
+        corrected=found.corrected,
+        blocks=found.blocks,
+        failed_blocks=found.failed_blocks,
+        iterations=found.iterations,
+    )
+
+
+def data_reply(page: DataPage) -> pb.ReadDataReply:
+    """A page of a range as its message."""
+    found = pb.UserData(loss=pb.DATA_LOSS_OPTICS) if page.found is None else user_data_message(page.found)
+    return pb.ReadDataReply(
+        page=page.source_page or 0,
+        user_data=found,
+        restored=page.source_page is None,
+        error=None if page.error is None else detail_of(page.error),
+        model_version=page.model_version,
+    )
 
 
 def read_reply(read: ReadAnswer, request: pb.ReadPageRequest) -> pb.ReadPageReply:

@@ -14,11 +14,12 @@ import grpc
 from lightpage.errors import FrameError, InvalidInputError, LimitError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.rpc.replies import decode_reply, model_message, read_reply, result_message
+from runtime.rpc.replies import data_reply, decode_reply, model_message, read_reply, result_message
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator, Step
-from runtime.wire.messages import PIXEL_CODES, check_options, levels_of, pilots_of, pixel_type
+from runtime.service.user_data import read_data
+from runtime.wire.messages import PIXEL_CODES, check_options, pilots_of, pixel_type
 from runtime.wire.status import abort, status_of, without_folders
 
 _log = logging.getLogger(__name__)
@@ -57,6 +58,8 @@ class LightpageServicer(pb_grpc.LightpageServicer):
                 profile_toml=bundle.manifest.profile,
                 calibration_toml=bundle.manifest.calibration,
                 pilot_mask=bundle.pilot_mask.astype("uint8").tobytes(),
+                code_toml=bundle.manifest.code or "",
+                user_bytes_per_page=0 if bundle.code is None else model.decoder.page_codec.user_bytes,
                 pilot_phases=() if bundle.pilot_phases is None else bundle.pilot_phases.tolist(),
             )
 
@@ -70,7 +73,8 @@ class LightpageServicer(pb_grpc.LightpageServicer):
             with _stall_guard(context, receive_s):
                 header = _header(request_iterator)
             check_options(header.options)
-            caller, levels = _caller(context), levels_of(header.options)
+            caller, user_data = _caller(context), header.options.want_user_data
+            levels = self._plane.levels_of(header.options.levels, user_data)
             page_shape = self._plane.registry.current.decoder.bundle.profile.page_shape
             pilots = pilots_of(header.pilots, page_shape, levels) if header.HasField("pilots") else None
             shape = (header.rows_px, header.columns_px)
@@ -87,7 +91,9 @@ class LightpageServicer(pb_grpc.LightpageServicer):
                         receiver.add(part.chunk)
                 pair = receiver.pair()
                 received = time.perf_counter()
-                answer = self._plane.decode(pair, levels, caller, pilots, start=start, received=received)
+                answer = self._plane.decode(
+                    pair, levels, caller, pilots, user_data=user_data, start=start, received=received
+                )
             return decode_reply(answer, header.options)
 
     def ReadPage(self, request: pb.ReadPageRequest, context: grpc.ServicerContext) -> pb.ReadPageReply:
@@ -95,8 +101,19 @@ class LightpageServicer(pb_grpc.LightpageServicer):
         with self._call("ReadPage", context):
             check_options(request.options)
             page = request.page if request.HasField("page") else None
-            read = self._plane.read_page(page, request.options.levels or None, _caller(context))
+            options = request.options
+            read = self._plane.read_page(
+                page, options.levels or None, _caller(context), user_data=options.want_user_data
+            )
             return read_reply(read, request)
+
+    def ReadData(self, request: pb.ReadDataRequest, context: grpc.ServicerContext) -> Iterator[pb.ReadDataReply]:
+        """Read the bytes of a range of pages."""
+        with self._call("ReadData", context):
+            if request.pages < 1:
+                raise InvalidInputError("pages to read", request.pages, "at least 1")
+            for page in read_data(self._plane, request.first_page, request.pages, _caller(context)):
+                yield data_reply(page)
 
     def Recalibrate(
         self, request: pb.RecalibrateRequest, context: grpc.ServicerContext

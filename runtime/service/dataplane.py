@@ -10,8 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.codec.header import Header
+from lightpage.codec.page_codec import PageBytes
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.page.pilots import Pilots
+from lightpage.page.symbols import MAX_LEVELS
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.source import FrameSource, SourcePage, own_fault
 from runtime.decoding.decoder import Decoder
@@ -28,12 +31,13 @@ from runtime.service.store import ModelStore
 
 @dataclass(frozen=True)
 class Answer:
-    """A decoded page with the model that decoded it and the seconds that the service spent."""
+    """A decoded page with the model that decoded it, the seconds that it took, and user bytes if asked for."""
 
     page: DecodedPage
     model_version: str
     receive_s: float
     total_s: float
+    user_data: PageBytes | None = None
 
 
 @dataclass(frozen=True)
@@ -116,6 +120,14 @@ class DataPlane:
         with self.receives.held(caller):
             yield PairReceiver(shape, dtype, self.limits.pair_bytes)
 
+    def levels_of(self, asked: int, user_data: bool) -> int:
+        """The level count that a caller's 0 stands for: that of the model's code for user bytes, else 256.
+
+        Raises:
+            BundleError: user bytes are asked for, and the model has no code.
+        """
+        return asked or (self.registry.current.decoder.page_codec.code.levels if user_data else MAX_LEVELS)
+
     def decode(
         self,
         pair: FramePair,
@@ -123,6 +135,7 @@ class DataPlane:
         caller: Caller,
         pilots: Pilots | None = None,
         *,
+        user_data: bool = False,
         start: float | None = None,
         received: float | None = None,
     ) -> Answer:
@@ -135,8 +148,11 @@ class DataPlane:
             pilots: known symbols where they differ from the device's pattern.
             start: when the call began, in `time.perf_counter` seconds.
             received: when the pair was complete, likewise.
+            user_data: whether to read the page's bytes too.
 
         Raises:
+            BundleError: user bytes are asked for, and the model has no code.
+            InvalidInputError: they are, and `levels` are not the code's.
             SlotsTakenError: no slot until the caller's time is up.
             CallerLeft: the caller has gone.
             UnconfirmedPageError, FrameError, PageError: see `Tracker.decode`.
@@ -148,19 +164,41 @@ class DataPlane:
             caller.check()
             # Taken once: a swap in the meantime changes the next request, not this one.
             model = self.registry.current
-            page = self._decode(model, pair, levels, pilots, "frame pair", sure=pilots is None)
-        return Answer(page, model.version, received - start, time.perf_counter() - start)
+            sure = pilots is None
+            if user_data:
+                check_code_levels(model.decoder, levels)
+                pilots = pilots or model.decoder.written_pilots(levels)
+            page = self._decode(model, pair, levels, pilots, "frame pair", sure=sure)
+            found = self._user_data(model, page) if user_data else None
+        return Answer(page, model.version, received - start, time.perf_counter() - start, found)
 
-    def read_page(self, page: int | None, levels: int | None, caller: Caller) -> ReadAnswer:
-        """Read a page from the source and decode it; `levels` None stands for the source's own.
+    def read_page(
+        self,
+        page: int | None,
+        levels: int | None,
+        caller: Caller,
+        *,
+        user_data: bool = False,
+        expected: Header | None = None,
+    ) -> ReadAnswer:
+        """Read a page from the source and decode it; `levels` None stands for the source's own, or the code's.
+
+        Args:
+            page: which; the next one if None.
+            levels: M.
+            caller: who waits.
+            user_data: whether to read the page's bytes too.
+            expected: the page of its volume that should be there, where that is known.
 
         Raises:
+            BundleError, InvalidInputError: see `decode`.
             SourceError: no source, or one that is damaged or dark.
             PageError: no such page, or an impossible level count; else as `decode`.
         """
         start = time.perf_counter()
         source = self.source
-        levels = source.levels if levels is None else levels
+        if levels is None:
+            levels = self.levels_of(0, True) if user_data else source.levels
         # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
         with self.decodes.held(caller):
             caller.check()
@@ -169,16 +207,26 @@ class DataPlane:
                 found = source.read(page)
             received = time.perf_counter()
             mask = self._mask(found, model.decoder)
+            if user_data:
+                check_code_levels(model.decoder, levels)
             # Pilots are what was written, whatever level count the caller wants to see.
             if found.symbols is not None:
                 pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
             else:
-                pilots = model.decoder.pilots(source.levels, mask)
+                own = model.decoder
+                pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
             subject = f"page {found.page_index} of {source.name}"
             with own_fault(f"{subject}: "):
                 decoded = self._decode(model, found.pair, levels, pilots, subject)
-        answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start)
+            data = self._user_data(model, decoded, expected) if user_data else None
+        answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start, data)
         return ReadAnswer(answer, found, mask)
+
+    def _user_data(self, model: Model, page: DecodedPage, expected: Header | None = None) -> PageBytes:
+        """The bytes of a page that was decoded, counted."""
+        found = model.decoder.page_codec.decode(page.phase, page.concentration, expected)
+        self.metrics.user_data(found)
+        return found
 
     def adopt(self, decoder: Decoder, expected: Model | None = None) -> Model:
         """Remember a loaded decoder and put it in service: both or neither.
@@ -224,6 +272,18 @@ class DataPlane:
             raise lost from None
         self.metrics.page(page, model.version)
         return page
+
+
+def check_code_levels(decoder: Decoder, levels: int) -> None:
+    """Check that a page is decoded at the level count of its code.
+
+    Raises:
+        BundleError: the model has no code.
+        InvalidInputError: it has another level count.
+    """
+    expected = decoder.page_codec.code.levels
+    if levels != expected:
+        raise InvalidInputError("levels", levels, f"{expected}, as the code of {decoder.version} has, or 0")
 
 
 def _check_source(source: FrameSource, decoder: Decoder) -> None:

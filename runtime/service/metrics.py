@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
 
+from lightpage.codec.page_codec import PageBytes
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import unconfirmed_page
 from runtime.errors import LostPageError, UnconfirmedPageError
@@ -35,6 +36,10 @@ class ServiceMetrics:
         self.share = Gauge("lightpage_pilot_share", "Claimed information that the last pilots confirm.", registry=own)
         self.due = Gauge("lightpage_recalibration_due", "1 where they confirm too little of it.", registry=own)
         self.lost_pages = Counter("lightpage_pages_lost", "Pages not given out.", ["reason"], registry=own)
+        self.margin = Gauge("lightpage_margin_bits", "Of the last page beyond what its code needs.", registry=own)
+        self.data_pages = Counter("lightpage_data_pages", "Pages read for their bytes.", ["loss"], registry=own)
+        self.corrected = Counter("lightpage_corrected_symbols", "Mended by Reed-Solomon.", registry=own)
+        self.code_iterations = Gauge("lightpage_code_iterations", "Of the last page's blocks, mean.", registry=own)
         self.searches = Counter("lightpage_image_searches", "Pages searched for.", ["found"], registry=own)
         self.image = Gauge("lightpage_image_shift_px", "Of the last page since calibration.", ["axis"], registry=own)
         self.recalibrations = Counter("lightpage_recalibrations", "By their end.", ["result"], registry=own)
@@ -53,6 +58,13 @@ class ServiceMetrics:
         if page.image is not None:
             self.image.labels("x").set(page.image.shift_x_px)
             self.image.labels("y").set(page.image.shift_y_px)
+
+    def user_data(self, found: PageBytes) -> None:
+        """Count a page whose bytes were read, or not."""
+        self.data_pages.labels("none" if found.loss is None else found.loss.value).inc()
+        self.margin.set(found.margin_bits)
+        self.corrected.inc(found.corrected)
+        self.code_iterations.set(found.iterations)
 
     def lost(self, error: LostPageError, *, tells: bool = True) -> None:
         """Count a page that was not given out; where it `tells` of the device, that is a sign of drift too."""

@@ -7,9 +7,11 @@ from dataclasses import asdict, dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.codec.header import Header
+from lightpage.codec.page_codec import Loss, PageBytes
 from lightpage.errors import InvalidInputError, PageError
 from lightpage.page.pilots import Pilots
-from lightpage.page.symbols import MAX_LEVELS, check_levels, symbol_phases
+from lightpage.page.symbols import check_levels, symbol_phases
 from runtime.decoding.page import ImagePosition
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
@@ -17,6 +19,14 @@ PIXEL_TYPES = {pb.PIXEL_TYPE_UINT8: "uint8", pb.PIXEL_TYPE_UINT16: "uint16"}
 PIXEL_CODES = {name: code for code, name in PIXEL_TYPES.items()}
 
 _CONFIDENCE_FORMATS = (pb.CONFIDENCE_FORMAT_UNSPECIFIED, pb.CONFIDENCE_FORMAT_FLOAT32, pb.CONFIDENCE_FORMAT_UINT8)
+DATA_LOSSES: dict[Loss | None, pb.DataLoss] = {
+    None: pb.DATA_LOSS_UNSPECIFIED,
+    Loss.OPTICS: pb.DATA_LOSS_OPTICS,
+    Loss.HEADER: pb.DATA_LOSS_HEADER,
+    Loss.CODE: pb.DATA_LOSS_CODE,
+    Loss.BODY: pb.DATA_LOSS_BODY,
+    Loss.CHECKSUM: pb.DATA_LOSS_CHECKSUM,
+}
 FLOAT = np.dtype("<f4")
 """Of confidences, concentrations and phases."""
 
@@ -86,9 +96,23 @@ def check_options(options: pb.DecodeOptions) -> None:
         raise InvalidInputError("confidence_format", options.confidence_format, expected)
 
 
-def levels_of(options: pb.DecodeOptions) -> int:
-    """The level count asked for, 256 by default."""
-    return options.levels or MAX_LEVELS
+def user_data_of(message: pb.UserData) -> PageBytes:
+    """A message as what a page gave; a loss that this version does not know counts as one of the body."""
+    told = message.header
+    header = Header(told.code_id, told.volume, told.page, told.volume_bytes) if message.HasField("header") else None
+    loss = next((loss for loss, known in DATA_LOSSES.items() if known == message.loss), Loss.BODY)
+    return PageBytes(
+        header,
+        message.data if loss is None else None,
+        message.data_pages,
+        message.parity_pages,
+        loss,
+        message.iterations,
+        message.failed_blocks,
+        message.blocks,
+        message.corrected,
+        message.margin_bits,
+    )
 
 
 def image_message(image: ImagePosition) -> pb.ImagePosition:

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.codec.page_codec import PageBytes
 from lightpage.errors import LightpageError
 from runtime.decoding.page import ImagePosition
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.wire.messages import FLOAT, image_of
+from runtime.wire.messages import FLOAT, image_of, user_data_of
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ class RemotePage:
         page: number of the page in the source, or None where the caller sent the frames.
         written: what the source knows to have been written, uint8 [ny, nx], or None.
         pilot_mask: where the pilots are, bool [ny, nx]; given with `written`.
+        user_data: the page's bytes, or None where not asked for.
     """
 
     symbols: NDArray[np.uint8]
@@ -64,6 +66,7 @@ class RemotePage:
     confirmed_bits: float = 0.0
     recalibration_due: bool = False
     image: ImagePosition | None = None
+    user_data: PageBytes | None = None
 
 
 def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> RemotePage:
@@ -91,6 +94,7 @@ def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> 
         confirmed_bits=reply.confirmed_bits,
         recalibration_due=reply.recalibration_due,
         image=image_of(reply.image) if reply.HasField("image") else None,
+        user_data=user_data_of(reply.user_data) if reply.HasField("user_data") else None,
         model_version=reply.model_version,
         timings=RemoteTimings(
             reply.timings.receive_s, reply.timings.decode_s, reply.timings.inference_s, reply.timings.total_s

@@ -15,6 +15,7 @@ from lightpage.errors import (
     InvalidInputError,
     LightpageError,
     LimitError,
+    LostDataError,
     RecalibrationRefusedError,
 )
 from runtime import errors as service_errors
@@ -27,6 +28,7 @@ _CODES: tuple[tuple[type[BaseException], grpc.StatusCode], ...] = (
     (InvalidInputError, grpc.StatusCode.INVALID_ARGUMENT),
     (LimitError, grpc.StatusCode.RESOURCE_EXHAUSTED),
     (LostPageError, grpc.StatusCode.DATA_LOSS),
+    (LostDataError, grpc.StatusCode.DATA_LOSS),
     (SlotsTakenError, grpc.StatusCode.RESOURCE_EXHAUSTED),
     (BusyError, grpc.StatusCode.ABORTED),
     (SourceError, grpc.StatusCode.FAILED_PRECONDITION),
@@ -68,6 +70,16 @@ def without_folders(text: str) -> str:
     return _FOLDERS.sub("", text)
 
 
+def detail_of(error: LightpageError) -> pb.ErrorDetail:
+    """A foreseen error as its message, files named without their folders."""
+    subject, got, expected = (without_folders(text)[:1000] for text in (error.subject, error.got, error.expected))
+    detail = pb.ErrorDetail(kind=type(error).__name__, thing=subject, got=got, wanted=expected)
+    if isinstance(error, LostPageError):
+        detail.reason = _REASONS[error.reason]
+        detail.recalibration_due = error.recalibration_due
+    return detail
+
+
 def abort(context: grpc.ServicerContext, error: BaseException) -> None:
     """End the call with the status of `error`. Always raises, as `context.abort` does.
 
@@ -76,13 +88,9 @@ def abort(context: grpc.ServicerContext, error: BaseException) -> None:
     """
     code = status_of(error)
     if isinstance(error, LightpageError):
-        subject, got, expected = (without_folders(text)[:1000] for text in (error.subject, error.got, error.expected))
-        detail = pb.ErrorDetail(kind=type(error).__name__, thing=subject, got=got, wanted=expected)
-        if isinstance(error, LostPageError):
-            detail.reason = _REASONS[error.reason]
-            detail.recalibration_due = error.recalibration_due
+        detail = detail_of(error)
         context.set_trailing_metadata(((DETAIL_KEY, detail.SerializeToString()),))
-        context.abort(code, f"{subject}: got {got}, wanted {expected}"[:2000])
+        context.abort(code, f"{detail.thing}: got {detail.got}, wanted {detail.wanted}"[:2000])
     context.abort(code, f"{type(error).__name__} in the service; its log says more")
 
 

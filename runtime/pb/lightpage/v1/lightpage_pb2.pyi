@@ -20,6 +20,15 @@ class ConfidenceFormat(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     CONFIDENCE_FORMAT_FLOAT32: _ClassVar[ConfidenceFormat]
     CONFIDENCE_FORMAT_UINT8: _ClassVar[ConfidenceFormat]
 
+class DataLoss(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    DATA_LOSS_UNSPECIFIED: _ClassVar[DataLoss]
+    DATA_LOSS_OPTICS: _ClassVar[DataLoss]
+    DATA_LOSS_HEADER: _ClassVar[DataLoss]
+    DATA_LOSS_CODE: _ClassVar[DataLoss]
+    DATA_LOSS_BODY: _ClassVar[DataLoss]
+    DATA_LOSS_CHECKSUM: _ClassVar[DataLoss]
+
 class LossReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     LOSS_REASON_UNSPECIFIED: _ClassVar[LossReason]
@@ -32,6 +41,12 @@ PIXEL_TYPE_UINT16: PixelType
 CONFIDENCE_FORMAT_UNSPECIFIED: ConfidenceFormat
 CONFIDENCE_FORMAT_FLOAT32: ConfidenceFormat
 CONFIDENCE_FORMAT_UINT8: ConfidenceFormat
+DATA_LOSS_UNSPECIFIED: DataLoss
+DATA_LOSS_OPTICS: DataLoss
+DATA_LOSS_HEADER: DataLoss
+DATA_LOSS_CODE: DataLoss
+DATA_LOSS_BODY: DataLoss
+DATA_LOSS_CHECKSUM: DataLoss
 LOSS_REASON_UNSPECIFIED: LossReason
 LOSS_REASON_PILOTS_DISAGREE: LossReason
 LOSS_REASON_IMAGE_NOT_FOUND: LossReason
@@ -42,7 +57,7 @@ class DescribeRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class DescribeReply(_message.Message):
-    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml", "pilot_mask", "pilot_phases")
+    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml", "pilot_mask", "pilot_phases", "code_toml", "user_bytes_per_page")
     SERVICE_VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -54,6 +69,8 @@ class DescribeReply(_message.Message):
     CALIBRATION_TOML_FIELD_NUMBER: _ClassVar[int]
     PILOT_MASK_FIELD_NUMBER: _ClassVar[int]
     PILOT_PHASES_FIELD_NUMBER: _ClassVar[int]
+    CODE_TOML_FIELD_NUMBER: _ClassVar[int]
+    USER_BYTES_PER_PAGE_FIELD_NUMBER: _ClassVar[int]
     service_version: str
     model: Model
     camera: Camera
@@ -65,7 +82,9 @@ class DescribeReply(_message.Message):
     calibration_toml: str
     pilot_mask: bytes
     pilot_phases: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ..., pilot_mask: _Optional[bytes] = ..., pilot_phases: _Optional[_Iterable[float]] = ...) -> None: ...
+    code_toml: str
+    user_bytes_per_page: int
+    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ..., pilot_mask: _Optional[bytes] = ..., pilot_phases: _Optional[_Iterable[float]] = ..., code_toml: _Optional[str] = ..., user_bytes_per_page: _Optional[int] = ...) -> None: ...
 
 class Model(_message.Message):
     __slots__ = ("name", "version", "created", "current", "metrics")
@@ -121,16 +140,18 @@ class Limits(_message.Message):
     def __init__(self, message_bytes: _Optional[int] = ..., chunk_bytes: _Optional[int] = ..., pair_bytes: _Optional[int] = ..., concurrent_decodes: _Optional[int] = ...) -> None: ...
 
 class DecodeOptions(_message.Message):
-    __slots__ = ("levels", "confidence_format", "want_concentration", "want_phase")
+    __slots__ = ("levels", "confidence_format", "want_concentration", "want_phase", "want_user_data")
     LEVELS_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FORMAT_FIELD_NUMBER: _ClassVar[int]
     WANT_CONCENTRATION_FIELD_NUMBER: _ClassVar[int]
     WANT_PHASE_FIELD_NUMBER: _ClassVar[int]
+    WANT_USER_DATA_FIELD_NUMBER: _ClassVar[int]
     levels: int
     confidence_format: ConfidenceFormat
     want_concentration: bool
     want_phase: bool
-    def __init__(self, levels: _Optional[int] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., want_concentration: _Optional[bool] = ..., want_phase: _Optional[bool] = ...) -> None: ...
+    want_user_data: bool
+    def __init__(self, levels: _Optional[int] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., want_concentration: _Optional[bool] = ..., want_phase: _Optional[bool] = ..., want_user_data: _Optional[bool] = ...) -> None: ...
 
 class Pilots(_message.Message):
     __slots__ = ("mask", "values", "levels")
@@ -167,7 +188,7 @@ class DecodeFramesRequest(_message.Message):
     def __init__(self, header: _Optional[_Union[DecodeHeader, _Mapping]] = ..., chunk: _Optional[bytes] = ...) -> None: ...
 
 class DecodeReply(_message.Message):
-    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings", "pilot_trust", "claimed_bits", "confirmed_bits", "recalibration_due", "image")
+    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings", "pilot_trust", "claimed_bits", "confirmed_bits", "recalibration_due", "image", "user_data")
     ROWS_FIELD_NUMBER: _ClassVar[int]
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
     LEVELS_FIELD_NUMBER: _ClassVar[int]
@@ -185,6 +206,7 @@ class DecodeReply(_message.Message):
     CONFIRMED_BITS_FIELD_NUMBER: _ClassVar[int]
     RECALIBRATION_DUE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
+    USER_DATA_FIELD_NUMBER: _ClassVar[int]
     rows: int
     columns: int
     levels: int
@@ -202,7 +224,66 @@ class DecodeReply(_message.Message):
     confirmed_bits: float
     recalibration_due: bool
     image: ImagePosition
-    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ..., claimed_bits: _Optional[float] = ..., confirmed_bits: _Optional[float] = ..., recalibration_due: _Optional[bool] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ...) -> None: ...
+    user_data: UserData
+    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ..., claimed_bits: _Optional[float] = ..., confirmed_bits: _Optional[float] = ..., recalibration_due: _Optional[bool] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ...) -> None: ...
+
+class UserData(_message.Message):
+    __slots__ = ("data", "loss", "header", "data_pages", "parity_pages", "margin_bits", "corrected", "blocks", "failed_blocks", "iterations")
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    LOSS_FIELD_NUMBER: _ClassVar[int]
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    DATA_PAGES_FIELD_NUMBER: _ClassVar[int]
+    PARITY_PAGES_FIELD_NUMBER: _ClassVar[int]
+    MARGIN_BITS_FIELD_NUMBER: _ClassVar[int]
+    CORRECTED_FIELD_NUMBER: _ClassVar[int]
+    BLOCKS_FIELD_NUMBER: _ClassVar[int]
+    FAILED_BLOCKS_FIELD_NUMBER: _ClassVar[int]
+    ITERATIONS_FIELD_NUMBER: _ClassVar[int]
+    data: bytes
+    loss: DataLoss
+    header: PageHeader
+    data_pages: int
+    parity_pages: int
+    margin_bits: float
+    corrected: int
+    blocks: int
+    failed_blocks: int
+    iterations: float
+    def __init__(self, data: _Optional[bytes] = ..., loss: _Optional[_Union[DataLoss, str]] = ..., header: _Optional[_Union[PageHeader, _Mapping]] = ..., data_pages: _Optional[int] = ..., parity_pages: _Optional[int] = ..., margin_bits: _Optional[float] = ..., corrected: _Optional[int] = ..., blocks: _Optional[int] = ..., failed_blocks: _Optional[int] = ..., iterations: _Optional[float] = ...) -> None: ...
+
+class PageHeader(_message.Message):
+    __slots__ = ("volume", "page", "volume_bytes", "code_id")
+    VOLUME_FIELD_NUMBER: _ClassVar[int]
+    PAGE_FIELD_NUMBER: _ClassVar[int]
+    VOLUME_BYTES_FIELD_NUMBER: _ClassVar[int]
+    CODE_ID_FIELD_NUMBER: _ClassVar[int]
+    volume: int
+    page: int
+    volume_bytes: int
+    code_id: int
+    def __init__(self, volume: _Optional[int] = ..., page: _Optional[int] = ..., volume_bytes: _Optional[int] = ..., code_id: _Optional[int] = ...) -> None: ...
+
+class ReadDataRequest(_message.Message):
+    __slots__ = ("first_page", "pages")
+    FIRST_PAGE_FIELD_NUMBER: _ClassVar[int]
+    PAGES_FIELD_NUMBER: _ClassVar[int]
+    first_page: int
+    pages: int
+    def __init__(self, first_page: _Optional[int] = ..., pages: _Optional[int] = ...) -> None: ...
+
+class ReadDataReply(_message.Message):
+    __slots__ = ("page", "user_data", "restored", "error", "model_version")
+    PAGE_FIELD_NUMBER: _ClassVar[int]
+    USER_DATA_FIELD_NUMBER: _ClassVar[int]
+    RESTORED_FIELD_NUMBER: _ClassVar[int]
+    ERROR_FIELD_NUMBER: _ClassVar[int]
+    MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    page: int
+    user_data: UserData
+    restored: bool
+    error: ErrorDetail
+    model_version: str
+    def __init__(self, page: _Optional[int] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ..., restored: _Optional[bool] = ..., error: _Optional[_Union[ErrorDetail, _Mapping]] = ..., model_version: _Optional[str] = ...) -> None: ...
 
 class ImagePosition(_message.Message):
     __slots__ = ("shift_x_px", "shift_y_px", "tilt_x_rad", "tilt_y_rad", "searched", "found")

@@ -53,6 +53,11 @@ class LightpageStub:
                 request_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPageRequest.SerializeToString,
                 response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPageReply.FromString,
                 _registered_method=True)
+        self.ReadData = channel.unary_stream(
+                '/lightpage.v1.Lightpage/ReadData',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReadDataRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReadDataReply.FromString,
+                _registered_method=True)
         self.Recalibrate = channel.unary_stream(
                 '/lightpage.v1.Lightpage/Recalibrate',
                 request_serializer=lightpage_dot_v1_dot_lightpage__pb2.RecalibrateRequest.SerializeToString,
@@ -98,6 +103,15 @@ class LightpageServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ReadData(self, request, context):
+        """Read a range of pages from the service's own source and send their user bytes, a message a page. Where pages of a
+        group are lost and enough of it was read, their bytes follow at the end of the group, restored from parity. A lost page
+        ends nothing: its message says why.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def Recalibrate(self, request, context):
         """Re-fit the device's geometry from pages with known symbols and put the new model in service. Progress messages come
         first, one result last. FAILED_PRECONDITION when the new model would not be better: the old one stays. ABORTED while
@@ -138,6 +152,11 @@ def add_LightpageServicer_to_server(servicer, server):
                     servicer.ReadPage,
                     request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPageRequest.FromString,
                     response_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPageReply.SerializeToString,
+            ),
+            'ReadData': grpc.unary_stream_rpc_method_handler(
+                    servicer.ReadData,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReadDataRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReadDataReply.SerializeToString,
             ),
             'Recalibrate': grpc.unary_stream_rpc_method_handler(
                     servicer.Recalibrate,
@@ -239,6 +258,33 @@ class Lightpage:
             '/lightpage.v1.Lightpage/ReadPage',
             lightpage_dot_v1_dot_lightpage__pb2.ReadPageRequest.SerializeToString,
             lightpage_dot_v1_dot_lightpage__pb2.ReadPageReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ReadData(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/ReadData',
+            lightpage_dot_v1_dot_lightpage__pb2.ReadDataRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.ReadDataReply.FromString,
             options,
             channel_credentials,
             insecure,
