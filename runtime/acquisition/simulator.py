@@ -99,7 +99,7 @@ class SimulatorSource:
 
 
 def open_simulator(rest: str) -> SimulatorSource:
-    """The source `simulator:REST`, REST being `PROFILE?KEY=VALUE&...`.
+    """The source `simulator:REST`, REST being `PROFILE?KEY=VALUE&...` (levels, seed, device, symbols).
 
     Raises:
         InvalidInputError: an unknown profile, or settings that no device can have.
