@@ -12,19 +12,19 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
 from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.demo.demo import AIR_LEVELS, LEVELS, DemoResult, run_demo
+from runtime.demo.demo import AIR_LEVELS, DemoResult, run_demo
 
 
 @click.command()
 @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
 @click.option("--out", default="out/demo", show_default=True, type=OutputFolder(), help="Folder.")
-@click.option("--pages", default=3, show_default=True, type=click.IntRange(1, 100), help="Pages in each state.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of what is written.")
 @click.option("--json", "json_path", type=OutputFile(), help="Also write the figures to this file.")
-def demo(bundle: str, out: Path, pages: int, seed: int, json_path: Path | None) -> None:
-    """Decode pages of the simulated device through a service, let the device drift, recalibrate, decode again.
+def demo(bundle: str, out: Path, seed: int, json_path: Path | None) -> None:
+    """Store a picture on the simulated device and read it back, before a drift, after it and recalibrated.
 
-    Writes demo.json and demo.png (frames, confidence, AIR in each state) to the folder --out.
+    Writes to the folder --out: pages.h5 (what the modulator shows), demo.json, demo.png, and the picture as it was read
+    in each state (.pgm).
     """
     from runtime.demo.figure import write_figure  # matplotlib takes long to import
 
@@ -34,28 +34,39 @@ def demo(bundle: str, out: Path, pages: int, seed: int, json_path: Path | None) 
     except OSError as error:
         raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
     with percent_bar() as progress:
-        result = run_demo(bundle_path(bundle), pages, seed, progress)
+        result = run_demo(bundle_path(bundle), out, seed, progress)
     figures = result.to_json() | {"seconds": time.perf_counter() - start}
     write_json(out / "demo.json", figures)
     if json_path is not None:
         write_json(json_path, figures)
     write_figure(result, out / "demo.png")
     click.echo(describe(result))
-    click.echo(f"\nwritten to {out}: demo.json, demo.png ({figures['seconds']:.0f} s)")
+    click.echo(f"\nwritten to {out}: demo.json, demo.png, pages.h5, pictures ({figures['seconds']:.0f} s)")
 
 
 def describe(result: DemoResult) -> str:
     """The figures as a table for people."""
     lines = [
-        f"{'device':<16}{'model':<16}{'AIR, bit/symbol*':>17}{'confidence':>12}{'error rate':>12}{'decode, ms':>12}"
+        f"{'device':<16}{'model':<16}{'AIR, bit/symbol*':>17}{'margin':>9}{'unread':>8}{'restored':>10}{'lost':>6}"
+        f"{'picture':>10}{'decode, ms':>12}"
     ]
     lines += [
-        f"{phase.name:<16}{phase.model_version:<16}{phase.air_bits_per_symbol:>17.3f}{phase.confidence.mean():>12.3f}"
-        f"{phase.symbol_error_rate:>12.4f}{1e3 * phase.seconds:>12.0f}"
+        f"{phase.name:<16}{phase.model_version:<16}{phase.air_bits_per_symbol:>17.3f}"
+        f"{'' if phase.margin_bits is None else f'{phase.margin_bits:.3f}':>9}{phase.unread:>8}{phase.restored:>10}"
+        f"{phase.lost:>6}{'exact' if phase.exact else 'damaged':>10}{1e3 * phase.seconds:>12.0f}"
         for phase in result.phases
     ]
+    volume = result.volume
+    lines.append(
+        f"\na picture of {volume.file_bytes} bytes on {volume.pages} pages, {volume.parity_pages} of each group of "
+        f"{volume.group_pages} parity, one page spoilt; {volume.page_bytes} user bytes a page"
+    )
+    for step in result.drift:
+        margin = "" if step.margin_bits is None else f" margin {step.margin_bits:+.3f} bit a symbol,"
+        due = ", recalibration due" if step.recalibration_due else ""
+        lines.append(f"drift {step.share:.2f}:{margin} page {'lost' if step.lost else 'read'}{due}")
     found = result.recalibrated
     angle = "" if found.angle_deg is None else f", pipe angle {found.angle_deg:.3f} degree"
-    lines.append(f"\nrecalibrated with {found.pages_used} known pages in {found.seconds:.0f} s{angle}")
-    lines.append(f"* what a phase carries, counted in {AIR_LEVELS} levels; the pages hold {LEVELS}, as confidence does")
+    lines.append(f"recalibrated with {found.pages_used} known pages in {found.seconds:.0f} s{angle}")
+    lines.append(f"* what a phase carries, counted in {AIR_LEVELS} levels; the pages have {result.code.levels}")
     return "\n".join(lines)

@@ -1,25 +1,37 @@
-"""The main job on the simulated device: a service decodes, the device drifts, the service is recalibrated."""
+"""The main job on the simulated device: a picture goes through a service as bytes, while the device drifts.
+
+Its bytes are encoded on pages in two groups, and one page is spoilt. The service reads them all from the simulated
+device: as it was calibrated, after a drift that loses pages, and recalibrated.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import io
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.codec.code import Code
+from lightpage.codec.volume import Volume, encode_volume
+from lightpage.codec.volume_file import VolumeFile
 from lightpage.device.state import CameraPose, Device
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.information import achievable_rate
 from lightpage.progress import Progress
+from lightpage.recording.pages import Pages, PagesWriter
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.simulator import SimulatorSource
 from runtime.client.answers import Recalibrated
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
+from runtime.demo.picture import picture
+from runtime.errors import LostPageError
 from runtime.recalibration.refit import refit
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
@@ -29,12 +41,18 @@ from runtime.wire.pages import RemotePage
 
 Floats = NDArray[np.float64]
 
-LEVELS = 16
 AIR_LEVELS = 256
 """Level count of the AIR: fine enough that it does not bound what a phase carries."""
 
-PAGES_PER_SEED = 10_000
-"""Another seed writes other pages, on the same device."""
+GROUPS = 2
+PARITY_PAGES = 2
+SPOILT_PAGE = 3
+"""Page whose symbols are damaged, of those that are written."""
+SPOILT_SHARE = 0.4
+"""Of its symbols: far more than its code mends."""
+
+DRIFT_STEPS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
+"""Of the change of temperature of `drifted`; the first that loses a page ends the drift."""
 
 RECALIBRATION_PAGES = 2
 
@@ -46,10 +64,16 @@ class Phase:
     Attributes:
         name: the state.
         model_version: the last page's.
-        air: per data symbol, bits, mean over pages, [ny, nx]; not a number at pilots.
-        confidence: mean over pages, [ny, nx].
+        air: per data symbol, bits, mean over the pages that were decoded, [ny, nx]; not a number at pilots.
+        confidence: mean over them, [ny, nx].
         symbol_error_rate: of data symbols.
         seconds: of one decode in the service, median.
+        pages: that were read.
+        unread: of them, how many gave no bytes.
+        restored, lost: pages of the picture that parity gave back, and that are lost.
+        margin_bits: least margin of the pages that gave bytes, bits a symbol; None where none did.
+        picture: as it was read, lost bytes black, [rows, columns].
+        exact: whether it is the picture that was written.
     """
 
     name: str
@@ -58,6 +82,13 @@ class Phase:
     confidence: Floats
     symbol_error_rate: float
     seconds: float
+    pages: int = 0
+    unread: int = 0
+    restored: int = 0
+    lost: int = 0
+    margin_bits: float | None = None
+    picture: NDArray[np.uint8] | None = None
+    exact: bool = False
 
     @property
     def air_bits_per_symbol(self) -> float:
@@ -73,18 +104,43 @@ class Phase:
             "mean_confidence": float(self.confidence.mean()),
             "symbol_error_rate": self.symbol_error_rate,
             "seconds_per_page": self.seconds,
+            "pages": self.pages,
+            "pages_unread": self.unread,
+            "pages_restored": self.restored,
+            "pages_lost": self.lost,
+            "margin_bits_least": self.margin_bits,
+            "picture_exact": self.exact,
         }
 
 
 @dataclass(frozen=True)
+class DriftStep:
+    """What one page told while the device drifted.
+
+    Attributes:
+        share: of the drift of `drifted`.
+        margin_bits: of the page, bits a symbol; None where it was not decoded.
+        recalibration_due: whether its pilots show the drift.
+        lost: whether it gave no bytes.
+    """
+
+    share: float
+    margin_bits: float | None
+    recalibration_due: bool
+    lost: bool
+
+
+@dataclass(frozen=True)
 class DemoResult:
-    """All of the demo: three phases, the recalibration between the last two, and one frame pair with what it says."""
+    """All of the demo: three phases, the drift and the recalibration between them, and one frame pair with its page."""
 
     phases: tuple[Phase, ...]
+    drift: tuple[DriftStep, ...]
     recalibrated: Recalibrated
     frames: FramePair
     symbols: NDArray[np.uint8]
-    pages: int
+    code: Code
+    volume: Volume
     seed: int
 
     def to_json(self) -> dict[str, Any]:
@@ -92,10 +148,13 @@ class DemoResult:
         recalibrated = self.recalibrated
         return {
             "seed": self.seed,
-            "pages": self.pages,
-            "levels": LEVELS,
+            "pages": self.volume.pages,
+            "levels": self.code.levels,
             "air_levels": AIR_LEVELS,
+            "code": self.code.model_dump(),
+            "volume": self.volume.to_json(),
             "phases": [phase.to_json() for phase in self.phases],
+            "drift": [asdict(step) for step in self.drift],
             "recalibration": {
                 "model_version": recalibrated.model_version,
                 "previous_version": recalibrated.previous_version,
@@ -110,21 +169,21 @@ class DemoResult:
         }
 
 
-def drifted(device: Device) -> Device:
+def drifted(device: Device, share: float = 1.0) -> Device:
     """The device after a change of temperature: more than following the image's shift can make good."""
 
     def moved(pose: CameraPose) -> CameraPose:
         return pose.model_copy(
             update={
-                "scale_relative_error": pose.scale_relative_error + 5e-4,
-                "rotation_deg": pose.rotation_deg + 0.03,
+                "scale_relative_error": pose.scale_relative_error + 5e-4 * share,
+                "rotation_deg": pose.rotation_deg + 0.03 * share,
             }
         )
 
     geometry = device.geometry.model_copy(
         update={
-            "pipe_angle_deg": device.geometry.pipe_angle_deg + 0.03,
-            "focal_length_relative_error": device.geometry.focal_length_relative_error + 3e-4,
+            "pipe_angle_deg": device.geometry.pipe_angle_deg + 0.03 * share,
+            "focal_length_relative_error": device.geometry.focal_length_relative_error + 3e-4 * share,
         }
     )
     return device.model_copy(
@@ -136,52 +195,146 @@ def drifted(device: Device) -> Device:
     )
 
 
-def run_demo(bundle: Path, pages: int, seed: int, progress: Progress = lambda what, share: None) -> DemoResult:
-    """Decode, drift, decode, recalibrate, decode, all through a client of a service on this machine.
+def run_demo(bundle: Path, out: Path, seed: int, progress: Progress = lambda what, share: None) -> DemoResult:
+    """Write a picture and read it back in three states of the device, through a client of a service on this machine.
 
     Args:
-        bundle: of the bench device.
-        pages: pages decoded in each state, at least one.
-        seed: of what is written.
+        bundle: of the bench device, with a code.
+        out: folder that exists, for the pages and the pictures.
+        seed: of the volume's number and the damage: other pages are written.
         progress: told of every step, with the share of all that is done.
 
     Raises:
         LightpageError: an unusable bundle, or a recalibration that the service refuses.
     """
-    if pages < 1:
-        raise InvalidInputError("pages of the demo", pages, "at least 1")
     progress("load the bundle", 0.0)
     decoder = Decoder.load(bundle)
-    device = Device()
-    source = SimulatorSource(decoder.bundle.profile, device, LEVELS)
-    plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
-    first = PAGES_PER_SEED * (1 + seed)
-    known = first + 3 * pages
-    frames = source.read(known + RECALIBRATION_PAGES).pair
-    with (
-        LightpageServer(plane, Recalibrator(plane, refit), "127.0.0.1:0") as server,
-        LightpageClient(server.target) as client,
-    ):
+    volume = write_pages(decoder, out / "pages.h5", seed)
+    with ExitStack() as stack:
+        pages = stack.enter_context(Pages.open(out / "pages.h5"))
+        source = SimulatorSource(decoder.bundle.profile, Device(), written=pages)
+        plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
+        server = stack.enter_context(LightpageServer(plane, Recalibrator(plane, refit), "127.0.0.1:0"))
+        client = stack.enter_context(LightpageClient(server.target))
+        frames = source.read(0).pair
+        levels = decoder.page_codec.code.levels
+        symbols = client.decode(frames, levels).symbols
 
-        def decode(name: str, state: int, start: float, end: float) -> Phase:
-            found = []
-            for number in range(pages):
-                progress(name, start + (end - start) * number / pages)
-                page = first + state * pages + number
-                found.append(client.read_page(page, want_concentration=True, want_phase=True, want_written=True))
-            return summarise(name, found)
+        def read(name: str, start: float, end: float) -> Phase:
+            def told(share: float) -> None:
+                progress(name, start + (end - start) * share)
 
-        symbols = client.decode(frames, LEVELS).symbols
-        fresh = decode("as calibrated", 0, 0.1, 0.3)
-        source.set_device(drifted(device))
-        lost = decode("after drift", 1, 0.3, 0.5)
+            return read_picture(client, volume, out / f"{name.replace(' ', '-')}.pgm", name, told)
+
+        fresh = read("as calibrated", 0.05, 0.3)
+        steps = drift_until_lost(client, source, lambda: progress("drift", 0.3))
+        lost = read("after drift", 0.35, 0.6)
         recalibrated = client.recalibrate(
-            pages=range(known, known + RECALIBRATION_PAGES),
-            progress=lambda step, share: progress(f"recalibrate: {step}", 0.5 + 0.3 * share),
+            pages=range(RECALIBRATION_PAGES),
+            progress=lambda step, share: progress(f"recalibrate: {step}", 0.6 + 0.15 * share),
         )
-        again = decode("recalibrated", 2, 0.8, 1.0)
+        again = read("recalibrated", 0.75, 1.0)
     progress("done", 1.0)
-    return DemoResult((fresh, lost, again), recalibrated, frames, symbols, pages, seed)
+    code = decoder.page_codec.code
+    return DemoResult((fresh, lost, again), steps, recalibrated, frames, symbols, code, volume, seed)
+
+
+def write_pages(decoder: Decoder, path: Path, seed: int) -> Volume:
+    """Put the picture on pages, one of them spoilt, and write them to `path`; returns how it lies there.
+
+    Raises:
+        BundleError: the bundle has no code.
+    """
+    codec, content = decoder.page_codec, pgm(picture())
+    data = -(-len(content) // codec.user_bytes)
+    volume = Volume(1 + seed, len(content), codec.user_bytes, -(-data // GROUPS), PARITY_PAGES)
+    profile, levels = decoder.bundle.profile, codec.code.levels
+    rng = np.random.default_rng(seed)
+    count = 0
+    with PagesWriter(path, profile, levels, codec.code.model_dump() | volume.to_json()) as writer:
+        for symbols in encode_volume(codec, volume, io.BytesIO(content), decoder.bundle.written_pilots(levels)):
+            if count <= SPOILT_PAGE < count + len(symbols):
+                spoilt = symbols[SPOILT_PAGE - count]
+                damage = (rng.random(spoilt.shape) < SPOILT_SHARE) & ~codec.pilots
+                spoilt[damage] = rng.integers(0, levels, int(damage.sum()))
+            writer.append(symbols)
+            count += len(symbols)
+    return volume
+
+
+def pgm(grey: NDArray[np.uint8]) -> bytes:
+    """A grey picture [rows, columns] as a file in the portable graymap format."""
+    rows, columns = grey.shape
+    return f"P5 {columns} {rows} 255\n".encode() + grey.tobytes()
+
+
+def drift_until_lost(
+    client: LightpageClient, source: SimulatorSource, told: Callable[[], None]
+) -> tuple[DriftStep, ...]:
+    """Let the device drift in steps, reading one page after each, until that page is lost."""
+    steps: list[DriftStep] = []
+    for share in DRIFT_STEPS:
+        told()
+        source.set_device(drifted(Device(), share))
+        try:
+            page = client.read_page(0, user_data=True)
+        except LostPageError as error:
+            steps.append(DriftStep(share, None, error.recalibration_due, True))
+            break
+        found = page.user_data
+        assert found is not None  # it was asked for
+        steps.append(DriftStep(share, found.margin_bits, page.recalibration_due, found.data is None))
+        if found.data is None:
+            break
+    return tuple(steps)
+
+
+def read_picture(
+    client: LightpageClient, volume: Volume, path: Path, name: str, told: Callable[[float], None]
+) -> Phase:
+    """Read all pages of the picture and put it together again, in `path`; what is lost of it is black there."""
+    pages: list[RemotePage] = []
+    unread = 0
+    margins: list[float] = []
+    with VolumeFile(path, volume.page_bytes, volume.id) as file:
+        for number in range(volume.pages):
+            told(number / volume.pages)
+            try:
+                page = client.read_page(
+                    number, user_data=True, want_concentration=True, want_phase=True, want_written=True
+                )
+            except LostPageError:
+                unread += 1
+                continue
+            pages.append(page)
+            if page.user_data is None or page.user_data.data is None:
+                unread += 1
+                continue
+            file.add(page.user_data)
+            margins.append(page.user_data.margin_bits)
+        done = file.restore()
+        if file.volume is not None:
+            file.complete()
+    content, expected = path.read_bytes() if margins else b"", pgm(picture())
+    shape = picture().shape
+    grey = np.frombuffer(content[len(expected) - shape[0] * shape[1] :] or bytes(shape[0] * shape[1]), np.uint8)
+    return replace(
+        summarise(name, pages) if pages else _nothing(name, client),
+        pages=volume.pages,
+        unread=unread,
+        restored=len(done.restored),
+        lost=len(done.lost) if margins else volume.file_pages,
+        margin_bits=min(margins, default=None),
+        picture=grey.reshape(shape),
+        exact=content == expected,
+    )
+
+
+def _nothing(name: str, client: LightpageClient) -> Phase:
+    """A state in which no page was decoded."""
+    description = client.describe()
+    air = np.where(description.pilot_mask, np.nan, 0.0)
+    return Phase(name, description.model.version, air, np.zeros(description.page_shape), 1.0, float("nan"))
 
 
 def summarise(name: str, pages: Sequence[RemotePage]) -> Phase:

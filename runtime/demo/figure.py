@@ -1,4 +1,4 @@
-"""The picture of the demo: frames and their page, then maps of confidence and AIR in each state of the device."""
+"""The figure of the demo: frames and their page, then the picture that was read and the AIR in each state."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from runtime.demo.demo import LEVELS, DemoResult
+from runtime.demo.demo import DemoResult
 
 _LEAST_BITS, _MOST_BITS = 0.0, 8.0
 _PILOTS = "white"
@@ -21,19 +21,21 @@ def write_figure(result: DemoResult, path: Path) -> None:
     figure = Figure(figsize=(14, 10), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(3, 3)
+    levels = result.code.levels
     frames = (("in-phase frame", result.frames.in_phase), ("quadrature frame", result.frames.quadrature))
     for axis, (name, frame) in zip(axes[0], frames, strict=False):
         axis.imshow(frame, cmap="gray")
         axis.set_title(name)
     shown = axes[0, 2].imshow(
-        result.symbols, vmin=-0.5, vmax=LEVELS - 0.5, cmap=colormaps["twilight"].resampled(LEVELS)
+        result.symbols, vmin=-0.5, vmax=levels - 0.5, cmap=colormaps["twilight"].resampled(levels)
     )
     axes[0, 2].set_title("their page, decoded")
     figure.colorbar(shown, ax=axes[0, :], shrink=0.8, label="symbol")
     for axis, phase in zip(axes[1], result.phases, strict=True):
-        confidence = axis.imshow(phase.confidence, vmin=0, vmax=1, cmap="viridis")
-        axis.set_title(f"{phase.name}: confidence {phase.confidence.mean():.3f}")
-    figure.colorbar(confidence, ax=axes[1, :], shrink=0.8, label="confidence")
+        axis.imshow(phase.picture, vmin=0, vmax=255, cmap="gray")
+        told = "every byte right" if phase.exact else f"{phase.lost} of {result.volume.file_pages} pages lost"
+        unread = f"{phase.unread} of {phase.pages} pages unread, {phase.restored} restored"
+        axis.set_title(f"{phase.name}: {unread};\n{told}")
     for axis, phase in zip(axes[2], result.phases, strict=True):
         # an unlikely symbol costs many bits; the colour tells losses apart, not their depth
         colours = colormaps["magma"].with_extremes(bad=_PILOTS)
