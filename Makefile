@@ -53,21 +53,21 @@ format: $(STAMP)  ## let ruff put the code in order
 
 # What was trained is kept and only measured, which takes hours on two cores, most of them for the full-size page.
 COMPARE := $(BIN)/python -m analysis.comparison.decoders
-LOOKS := --arm wave --arm wave-refined --arm coherent --arm refined --arm oracle --arm oracle-refined
+PASSES := --method wave --method wave-refined --method coherent --method refined --method oracle --method oracle-refined
 bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: the table of what is kept, resumed when run again
-	$(COMPARE) --angle -0.6 --arm ray --arm mode --arm fast $(LOOKS) --out runs/bench-decoders/sheared
-	$(COMPARE) --angle 0 --arm mode $(LOOKS) --out runs/bench-decoders/square
-	$(COMPARE) --angle -0.6 --exposure 0.13 --steps 3000 --arm coherent --arm refined --arm oracle \
+	$(COMPARE) --angle -0.6 --method ray --method mode --method fast $(PASSES) --out runs/bench-decoders/sheared
+	$(COMPARE) --angle 0 --method mode $(PASSES) --out runs/bench-decoders/square
+	$(COMPARE) --angle -0.6 --exposure 0.13 --steps 3000 --method coherent --method refined --method oracle \
 	    --levels 4 --levels 8 --levels 16 --out runs/bench-decoders/dim
-	$(COMPARE) --angle -0.6 --symbol-size 2 --pages 130 --steps 4000 --published-steps 1125 --arm mode --arm coherent \
-	    --arm refined --arm oracle --out runs/bench-decoders/small-symbols
-	$(COMPARE) --angle -0.6 --exposure 0.13 --symbol-size 2 --pages 130 --steps 3000 --arm coherent --arm refined \
-	    --arm oracle --out runs/bench-decoders/dim-small-symbols
-	$(COMPARE) --profile paper --angle -0.6 --angle 0 --pages 20 --steps 4000 --arm coherent --arm refined --arm oracle \
+	$(COMPARE) --angle -0.6 --symbol-size 2 --pages 130 --steps 4000 --published-steps 1125 --method mode --method coherent \
+	    --method refined --method oracle --out runs/bench-decoders/small-symbols
+	$(COMPARE) --angle -0.6 --exposure 0.13 --symbol-size 2 --pages 130 --steps 3000 --method coherent --method refined \
+	    --method oracle --out runs/bench-decoders/dim-small-symbols
+	$(COMPARE) --profile paper --angle -0.6 --angle 0 --pages 20 --steps 4000 --method coherent --method refined --method oracle \
 	    --out runs/bench-decoders/full-size
-	$(COMPARE) --profile paper --angle -0.6 --symbol-size 2 --pages 12 --steps 4000 --arm coherent --arm refined \
-	    --arm oracle --out runs/bench-decoders/full-size-small-symbols
-	$(COMPARE) --ideal --angle 0 --angle -0.6 --arm mode --published-steps 1125 --out runs/bench-decoders/ideal
+	$(COMPARE) --profile paper --angle -0.6 --symbol-size 2 --pages 12 --steps 4000 --method coherent --method refined \
+	    --method oracle --out runs/bench-decoders/full-size-small-symbols
+	$(COMPARE) --ideal --angle 0 --angle -0.6 --method mode --published-steps 1125 --out runs/bench-decoders/ideal
 	$(BIN)/python -m analysis.speed.speed --decoder fast --decoder coherent --decoder wave --decoder refined \
 	    --decoder "ray 32/64" --decoder "ray 64/128"
 	$(BIN)/python -m analysis.speed.scaling

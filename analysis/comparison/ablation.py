@@ -2,8 +2,8 @@
 
     python -m analysis.comparison.ablation --angle -0.6 --out runs/ablation
 
-Everything else is as in the coherent arm of `analysis.comparison.decoders`, whose recording is shared if `--out` is the
-same. Interrupted, it goes on where it was; all lies in --out.
+Everything else is as in the method `coherent` of `analysis.comparison.decoders`; both share the recording if `--out` is
+the same. Interrupted, it goes on where it was; all lies in --out.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def main(
         for part in parts:
             outcomes.append(without(part, bench, choices))
             click.echo(f"{HEADER}\n{outcomes[-1].line()}", err=True)
-            write_json(out / "ablation.json", {"outcomes": [asdict(outcome) for outcome in outcomes]})
+            write_json(out / "ablation.json", {"outcomes": [outcome.as_json() for outcome in outcomes]})
     click.echo(HEADER)
     for outcome in outcomes:
         click.echo(outcome.line())

@@ -58,9 +58,9 @@ REFINED = "refined"
 WAVE_REFINED = "wave-refined"
 ORACLE_REFINED = "oracle-refined"
 FIRST_PASSES = {REFINED: "coherent", WAVE_REFINED: "wave", ORACLE_REFINED: ORACLE}
-"""Arms that make another pass, and the arm whose first pass they share."""
+"""Methods that make another pass, and the method whose first pass they share."""
 
-ARMS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, WAVE_REFINED, ORACLE, ORACLE_REFINED)
+METHODS = (*PUBLISHED, *LOCALIZERS, FAST, REFINED, WAVE_REFINED, ORACLE, ORACLE_REFINED)
 HELD_OUT_SHARE = 0.05
 LEVEL_PAGES = 4
 """Of each number of levels, and as many as are calibrated on: thirty thousand symbols on the bench device."""
@@ -68,7 +68,7 @@ LEVEL_PAGES = 4
 
 @dataclass(frozen=True)
 class Bench:
-    """What all arms share.
+    """What all methods share.
 
     Attributes:
         recording: open.
@@ -131,19 +131,19 @@ class Bench:
         """All that is not calibrated on, in order."""
         return [*self.training, *self.validation, *self.unseen]
 
-    def calibrated_device(self, arm: str = "") -> CalibratedDevice:
-        """The device as an arm knows it: fitted, or true."""
+    def calibrated_device(self, method: str = "") -> CalibratedDevice:
+        """The device as a method knows it: fitted, or true."""
         references = self.recording.references()
-        if arm == ORACLE:
+        if method == ORACLE:
             return perfectly_calibrated(self.profile, self.device, references)
         return CalibratedDevice.of(self.profile, self.fitted, references)
 
-    def extractor(self, arm: str) -> FeatureExtractor:
+    def extractor(self, method: str) -> FeatureExtractor:
         """Of the calibrated device; the true one for an oracle's further pass, the signal's power left in."""
-        localizer = "coherent" if arm in (ORACLE, FAST) else arm
-        return FeatureExtractor(self.calibrated_device(arm), localizer, PRESETS[FAST] if arm == FAST else None)
+        localizer = "coherent" if method in (ORACLE, FAST) else method
+        return FeatureExtractor(self.calibrated_device(method), localizer, PRESETS[FAST] if method == FAST else None)
 
-    def symbol_arm(self, name: str, size: str, choices: Hyperparameters) -> Outcome:
+    def symbol_method(self, name: str, size: str, choices: Hyperparameters) -> Outcome:
         """Features, then the network at symbol pitch."""
         if name == FAST:
             choices = replace(PRESETS[FAST], steps=choices.steps, seed=choices.seed)
@@ -171,11 +171,11 @@ class Bench:
         preparing = refined.seconds - sum(one.seconds for one in refined.trained)
         again = choices.of_refinement()
         drawn = again.drawn(self.profile.page_shape)
-        arm = f"{name} {choices.refinements}"
-        outcome = self.outcome(arm, size, again.steps, at, refined.last, *held_out, preparing, drawn)
+        method = f"{name} {choices.refinements}"
+        outcome = self.outcome(method, size, again.steps, at, refined.last, *held_out, preparing, drawn)
         passes = [first, *refined.trained]
         by_levels = self.at_levels(base, at, passes, outcome.kappa_scale, prediction)
-        return replace(outcome, looks=len(passes), by_levels=by_levels)
+        return replace(outcome, passes=len(passes), by_levels=by_levels)
 
     def at_levels(
         self,
@@ -193,11 +193,11 @@ class Bench:
                 self.profile, self.device, LEVEL_PAGES, self.seed + levels, self.out / at.name, levels
             ) as pages:
                 numbers = list(range(pages.pages))
-                looked = partial(self.features_of, name, pages, numbers)
-                fill(at / "look-0", self.key(name), len(numbers), looked, f"pages of {levels} levels")
+                make_first = partial(self.features_of, name, pages, numbers)
+                fill(at / "pass-0", self.key(name), len(numbers), make_first, f"pages of {levels} levels")
                 for number in range(1, len(passes)):
                     assert prediction is not None
-                    earlier = at / f"look-{number - 1}"
+                    earlier = at / f"pass-{number - 1}"
                     inputs = RefinementPages(pages, numbers, len(numbers), 0, earlier)
                     make = partial(
                         refined_pages,
@@ -208,13 +208,13 @@ class Bench:
                         passes[number - 1].module,
                     )
                     key = f"{self.key(name)} {passes[number - 1].validation_air}"
-                    fill(at / f"look-{number}", key, len(numbers), make, f"look {number} at them")
-                last = FeatureStore(at / f"look-{len(passes) - 1}")
+                    fill(at / f"pass-{number}", key, len(numbers), make, f"pass {number} over pages of {levels} levels")
+                last = FeatureStore(at / f"pass-{len(passes) - 1}")
                 found.append(level_figures(self.decoded(passes[-1].module, last, scale), pages, numbers, self.mask))
         return found
 
     def key(self, name: str) -> str:
-        """What the features of an arm depend on, beside the recording."""
+        """What the features of a method depend on, beside the recording."""
         if name == ORACLE:
             return ""
         return self.fitted.to_toml() + (PRESETS[FAST].first_pass if name == FAST else "")
@@ -222,7 +222,7 @@ class Bench:
     def features_of(
         self, name: str, recording: Recording, pages: Sequence[int], start: int, shift: tuple[float, float]
     ) -> Iterator[PageFeatures]:
-        """First passes of an arm at pages from a place in their order on, the image having moved by `shift` before."""
+        """First passes of a method at pages from one on, in their order; the image had moved by `shift` before."""
         if name == ORACLE:
             return Oracle(recording, self.profile, self.device).pages(pages[start:], shift)
         return self.extractor(name).pages(recording, pages[start:], shift)
@@ -249,7 +249,7 @@ class Bench:
         first, last, end = len(self.training), len(self.training) + len(self.validation), len(self.pages)
         return FeatureStore(features, range(first, last)), FeatureStore(features, range(last, end))
 
-    def published_arm(self, name: str, choices: PublishedChoices) -> Outcome:
+    def published_method(self, name: str, choices: PublishedChoices) -> Outcome:
         """States of the pages, then a published decoder on raw frames."""
         states, preparing = page_states(
             self.out / "states.json", self.fitted.to_toml(), self.recording, self.extractor("coherent"), self.pages
@@ -315,7 +315,7 @@ class Bench:
             validation_curve=validated,
             training_curve=trained.curves.get("train_air", []),
             run=str(folder.relative_to(self.out.parent)),
-            arm=name,
+            method=name,
             size=size,
             steps=steps,
             air=figures.air_bits_per_symbol,

@@ -1,15 +1,15 @@
 """Every decoder on the same light, against the oracle: same recording, same held-out pages.
 
     python -m analysis.comparison.decoders --angle -0.6 --out runs/decoders
-    python -m analysis.comparison.decoders --arm coherent --size 64x2x0 --size 96x2x1 --steps 1500 --out runs/decoders
+    python -m analysis.comparison.decoders --method coherent --size 64x2x0 --size 96x2x1 --steps 1500 --out runs/sizes
 
-Coherent, wave and oracle share network, steps and seeds; refined is coherent, and then looks again, as wave-refined is
-wave and oracle-refined the oracle; fast is coherent with less of everything. The oracle knows the simulated truth:
+Coherent, wave and oracle share network, steps and seeds. Refined is coherent and makes a further pass, as wave-refined
+is wave and oracle-refined the oracle. Fast is coherent with less of everything. The oracle knows the simulated truth:
 geometry, cameras, reference; the signal's own power is taken off its frames; then the wave adjoint and the same
 network. None, mode and ray are the published decoders, with their own network and training. Image shift and piston of
-every page, held-out ones too, are found from all of its symbols, for each arm alike, but a figure's piston from pilots.
-Interrupted, it goes on where it was; all lies in --out. What was trained on the same light before and kept (--keep) is
-only measured again.
+every page, held-out ones too, are found from all of its symbols, for each method alike; the piston of a figure is found
+from pilots. Interrupted, it goes on where it was; all lies in --out. What was trained on the same light before and kept
+(--keep) is only measured again.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -25,7 +25,7 @@ from typing import Any
 
 import click
 
-from analysis.comparison.bench import ARMS, ORACLE, Bench
+from analysis.comparison.bench import METHODS, ORACLE, Bench
 from analysis.comparison.decoders_figure import draw, title
 from analysis.comparison.levels import LEVEL_HEADER
 from analysis.comparison.light import light_name, recorded
@@ -94,7 +94,7 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
 @click.option(
     "--size", "sizes", type=Size(), multiple=True, default=(DEFAULT_SIZE,), show_default=True, help="Network."
 )
-@click.option("--refinements", type=click.IntRange(1, 4), default=1, show_default=True, help="Of the refined arm.")
+@click.option("--refinements", type=click.IntRange(1, 4), default=1, show_default=True, help="Of the refined method.")
 @click.option(
     "--published-steps",
     type=click.IntRange(10),
@@ -103,7 +103,9 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
 @click.option(
     "--published-channels", type=click.IntRange(4), multiple=True, default=(32,), show_default=True, help="Network."
 )
-@click.option("--arm", "names", type=click.Choice(ARMS), multiple=True, default=ARMS, show_default=True)
+@click.option(
+    "--method", "--arm", "names", type=click.Choice(METHODS), multiple=True, default=METHODS, show_default=True
+)
 @click.option(
     "--levels",
     type=click.IntRange(2, 255),
@@ -116,7 +118,7 @@ DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparam
     type=click.Path(file_okay=False, path_type=Path),
     default=TRAINED,
     show_default="those of this repository",
-    help="Folder of arms that are trained already.",
+    help="Folder of methods that are trained already.",
 )
 @click.option("--keep", "keeps", is_flag=True, help="Keep what is trained in that folder.")
 @click.option("--out", type=OutputFolder(), required=True, help="Folder for features, runs, figures.json.")
@@ -140,7 +142,7 @@ def main(
     keeps: bool,
     out: Path,
 ) -> None:
-    """Train every arm on the same pages, light by light, and print what it says of held-out ones."""
+    """Train every method on the same pages, light by light, and print what it says of held-out ones."""
     keep_freed_memory()
     nominal = load_profile(profile_name)
     click.get_current_context().with_resource(sole_writer(out))
@@ -165,11 +167,11 @@ def main(
                     authors = replace(published_choices(name, profile, len(bench.training)), seed=seed)
                     authors = authors if published_steps is None else replace(authors, steps=published_steps)
                     widths = [replace(authors, channels=(width, 2 * width)) for width in published_channels]
-                    runs += [partial(bench.published_arm, name, choices) for choices in widths]
+                    runs += [partial(bench.published_method, name, choices) for choices in widths]
                 else:
                     common = Hyperparameters(steps=steps, seed=seed, refinements=refinements)
                     own = sizes[:1] if name == FAST else sizes  # whose size is fixed
-                    runs += [partial(bench.symbol_arm, name, size, common) for size in own]
+                    runs += [partial(bench.symbol_method, name, size, common) for size in own]
             outcomes: list[Outcome] = []
             for run in runs:
                 outcomes = compared([*outcomes, run()])
@@ -181,7 +183,7 @@ def main(
                     "exposure": exposure,
                     "symbol_size_px": size_px,
                     "ideal": ideal,
-                    "outcomes": [asdict(outcome) for outcome in outcomes],
+                    "outcomes": [outcome.as_json() for outcome in outcomes],
                 }
                 write_json(out / "figures.json", {"pages": pages, "seed": seed, "lights": [*lights, light]})
                 draw([*lights, light], out)
@@ -191,24 +193,24 @@ def main(
         if not all(outcome.is_settled for outcome in outcomes):
             click.echo(FOOTNOTE)
         if levels:
-            lines = [figures.line(o.arm, o.size) for o in outcomes for figures in o.by_levels]
+            lines = [figures.line(o.method, o.size) for o in outcomes for figures in o.by_levels]
             click.echo("\n".join([LEVEL_HEADER, *lines]))
 
 
 def compared(outcomes: list[Outcome]) -> list[Outcome]:
     """The outcomes with what they reached over the oracle, and the others over the best of the published decoders.
 
-    That oracle has a network of the same size, if there was one, and looks as often, if one did.
+    That oracle has a network of the same size, if there was one, and makes as many passes, if one did.
     """
-    oracles = {(o.looks, o.size): o.air for o in outcomes if o.arm.startswith(ORACLE)}
-    once = [air for (looks, _), air in oracles.items() if looks == 1]
-    published = [outcome.air for outcome in outcomes if outcome.arm in PUBLISHED]
+    oracles = {(o.passes, o.size): o.air for o in outcomes if o.method.startswith(ORACLE)}
+    once = [air for (passes, _), air in oracles.items() if passes == 1]
+    published = [outcome.air for outcome in outcomes if outcome.method in PUBLISHED]
 
     def over(outcome: Outcome) -> Outcome:
-        alike = [oracles[looks, outcome.size] for looks in (outcome.looks, 1) if (looks, outcome.size) in oracles]
+        alike = [oracles[passes, outcome.size] for passes in (outcome.passes, 1) if (passes, outcome.size) in oracles]
         if alike or once:
             outcome = replace(outcome, over_oracle=outcome.air / (alike[0] if alike else max(once)))
-        if published and outcome.arm not in PUBLISHED:
+        if published and outcome.method not in PUBLISHED:
             outcome = replace(outcome, over_published=outcome.air / max(published))
         return outcome
 

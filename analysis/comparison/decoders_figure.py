@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from train.published.localizers import NAMES as PUBLISHED
 
 MAP = "air_map.npy"
-"""File of an arm's run: AIR of each symbol, mean over the held-out pages, [ny, nx]."""
+"""File of a method's run: AIR of each symbol, mean over the held-out pages, [ny, nx]."""
 _BRIGHT = 99.0
 """Percentile of the symbols' rates at which the colours of the maps end."""
 _DOTS = 110
@@ -49,7 +49,7 @@ def title(light: dict[str, Any]) -> str:
 
 
 def _bars(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
-    """AIR of each arm, and a mark where it claims to be."""
+    """AIR of each method, and a mark where it claims to be."""
     places = np.arange(len(outcomes))[::-1]
     axis.barh(places, [outcome["air"] for outcome in outcomes], color=[f"C{n % 10}" for n in range(len(outcomes))])
     axis.plot([outcome["own_mi"] for outcome in outcomes], places, "k|", markersize=14)
@@ -62,7 +62,7 @@ def _bars(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
 
 
 def _curves(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
-    """How each arm learnt: AIR of the pages trained on, thin, and of those held out, thick, by share of its steps."""
+    """How each method learnt: AIR by share of its steps, of training pages (thin) and of validation pages (thick)."""
     for number, outcome in enumerate(outcomes):
         for name, width in (("training_curve", 0.7), ("validation_curve", 1.8)):
             steps, rates = np.reshape(outcome[name], (-1, 2)).T
@@ -74,7 +74,7 @@ def _curves(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:
 
 
 def _maps(part: Any, outcomes: list[dict[str, Any]], out: Path) -> None:
-    """Where on the page each arm reads how much."""
+    """Where on the page each method reads how much."""
     maps = [np.load(out / outcome["run"] / MAP) for outcome in outcomes]
     top = max(0.1, *(float(np.nanpercentile(rates, _BRIGHT)) for rates in maps))
     rows = 1 if len(outcomes) < 3 else 2
@@ -90,6 +90,6 @@ def _maps(part: Any, outcomes: list[dict[str, Any]], out: Path) -> None:
 
 
 def _name(outcome: dict[str, Any]) -> str:
-    """An arm, without the number of its refinements if there is one; with whose it is."""
-    arm = str(outcome["arm"]).removesuffix(" 1")
-    return f"{arm} (published)" if arm in PUBLISHED else arm
+    """A method, without the number of its refinements if that is one; published ones are marked."""
+    method = str(outcome["arm"]).removesuffix(" 1")
+    return f"{method} (published)" if method in PUBLISHED else method

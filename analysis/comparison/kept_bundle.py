@@ -1,4 +1,4 @@
-"""A kept arm of the comparison as a bundle, to measure in the runtime what was trained for a certain light.
+"""A kept method of the comparison as a bundle, so that the runtime can be measured with what was trained for a light.
 
     python -m analysis.comparison.kept_bundle --kept analysis/weights/bench/-0.6deg-32e-4px --out bundle.zip
 
@@ -64,21 +64,21 @@ def light_of(kept: Path) -> tuple[Profile, Device, int]:
 
 
 def export_kept(kept: Path, work: Path, out: Path, localizer: str = COHERENT, refinements: int = 1) -> None:
-    """Write the bundle of an arm.
+    """Write the bundle of a method.
 
     Args:
         kept: folder of the light.
         work: folder for pages and run; made, and gone on with if it is there.
         out: new bundle.
-        localizer: whose arm.
+        localizer: of the method.
         refinements: passes behind the first, 0 or 1.
 
     Raises:
-        InvalidInputError: no such arm is kept.
+        InvalidInputError: no such method is kept.
     """
     profile, device, seed = light_of(kept)
-    arm = next((folder for folder in sorted((kept / localizer).glob("*")) if (folder / FITTED).exists()), None)
-    if arm is None:
+    trained = next((folder for folder in sorted((kept / localizer).glob("*")) if (folder / FITTED).exists()), None)
+    if trained is None:
         raise InvalidInputError(f"--kept {kept}", f"no trained {localizer}", "a localizer that is kept there")
     work.mkdir(parents=True, exist_ok=True)
     calibration = load_calibration(kept / CALIBRATION)
@@ -88,7 +88,7 @@ def export_kept(kept: Path, work: Path, out: Path, localizer: str = COHERENT, re
         job.claim(force=False)
         job.run(CALIBRATED + MATCHED_PAGES + JUDGED)
     with Recording.open(path) as recording:
-        decoder = _decoder(arm, profile, calibration, recording, localizer, refinements)
+        decoder = _decoder(trained, profile, calibration, recording, localizer, refinements)
         references, mask = recording.references(), pilot_mask(profile)
         judged = range(CALIBRATED + MATCHED_PAGES, recording.pages)
         run = Run(
@@ -98,7 +98,7 @@ def export_kept(kept: Path, work: Path, out: Path, localizer: str = COHERENT, re
             hyperparameters=decoder.choices,
             camera_bit_depth=recording.bit_depth,
             trained_pages=tuple(hash_frames(recording.frames(page)) for page in judged),
-            validation_air=_validation_air(arm, refinements),
+            validation_air=_validation_air(trained, refinements),
             kappa_scale=_kappa_scale(decoder, profile, calibration, recording, judged),
             seconds=0.0,
             provenance={"command": f"python -m analysis.comparison.kept_bundle --kept {kept.name}", "seed": seed},
@@ -115,19 +115,19 @@ def export_kept(kept: Path, work: Path, out: Path, localizer: str = COHERENT, re
 
 
 def _decoder(
-    arm: Path, profile: Profile, calibration: Calibration, recording: Recording, localizer: str, refinements: int
+    trained: Path, profile: Profile, calibration: Calibration, recording: Recording, localizer: str, refinements: int
 ) -> SymbolDecoder:
     """The trained decoder, put together as training does it."""
-    begun = json.loads((arm / BEGUN).read_text())
+    begun = json.loads((trained / BEGUN).read_text())
     options = {name: value for name, value in begun.items() if name != "format"} | {"refinements": refinements}
     choices = Hyperparameters(**options)
     decoder = SymbolDecoder(profile, calibration.vector, localizer, choices)
-    decoder.network.load_state_dict(_weights(arm))
+    decoder.network.load_state_dict(_weights(trained))
     if refinements:
         extractor = FeatureExtractor(CalibratedDevice.of(profile, calibration, recording.references()), localizer)
         pages = known_pages(recording, profile, range(CALIBRATED, CALIBRATED + MATCHED_PAGES))
         decoder.prediction = fit_prediction(extractor, explained(extractor, pages))
-        decoder.refiners[0].load_state_dict(_weights(arm / "refinement-1"))
+        decoder.refiners[0].load_state_dict(_weights(trained / "refinement-1"))
     return decoder.float().eval()
 
 
@@ -136,8 +136,8 @@ def _weights(folder: Path) -> dict[str, torch.Tensor]:
     return kept
 
 
-def _validation_air(arm: Path, refinements: int) -> float:
-    folder = arm / f"refinement-{refinements}" if refinements else arm
+def _validation_air(trained: Path, refinements: int) -> float:
+    folder = trained / f"refinement-{refinements}" if refinements else trained
     return float(json.loads((folder / FITTED).read_text())["validation_air"])
 
 
@@ -166,7 +166,7 @@ def _kappa_scale(
 @click.option("--work", default=Path("runs/kept-bundle"), show_default=True, type=OutputFolder())
 @click.option("--out", required=True, type=NewPath())
 def main(kept: Path, localizer: str, refinements: int, work: Path, out: Path) -> None:
-    """Export a kept arm of the comparison as a bundle."""
+    """Export a kept method of the comparison as a bundle."""
     export_kept(kept, work / kept.name, out, localizer, refinements)
     click.echo(out)
 

@@ -26,16 +26,16 @@ class LevelFigures:
     own_mi: float
     gmi: float | None
 
-    def line(self, arm: str, size: str) -> str:
+    def line(self, method: str, size: str) -> str:
         low, high = JUDGED
         outside = "" if low <= self.symbol_error_rate <= high else "  not judged"
         return (
-            f"{arm:<16} {size:<9} {self.levels:>6} {self.symbol_error_rate:>9.4f} {self.ece:>7.4f} {self.air:>7.3f} "
+            f"{method:<16} {size:<9} {self.levels:>6} {self.symbol_error_rate:>9.4f} {self.ece:>7.4f} {self.air:>7.3f} "
             f"{self.own_mi:>7.3f} {'' if self.gmi is None else f'{self.gmi:.3f}':>7}{outside}"
         )
 
 
-LEVEL_HEADER = f"{'arm':<16} {'size':<9} {'levels':>6} {'error':>9} {'ECE':>7} {'AIR':>7} {'own-MI':>7} {'GMI':>7}"
+LEVEL_HEADER = f"{'method':<16} {'size':<9} {'levels':>6} {'error':>9} {'ECE':>7} {'AIR':>7} {'own-MI':>7} {'GMI':>7}"
 
 
 def level_figures(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,20 +35,24 @@ def gained_at_the_end(curve: Curve, steps: int) -> float:
     return max(late) - max(early) if late and early else float("nan")
 
 
+_KEYS = {"method": "arm", "passes": "looks"}
+"""Attributes of an outcome whose keys in JSON have other names."""
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """What one arm reached with a network of one size.
+    """What one method reached with a network of one size.
 
     Rates in bits per data symbol, `size` as `--size` has it; `run` is its folder, `kappa_scale` the factor on its
-    concentrations that the validation pages ask for, `own_mi_unscaled` what it claims without, `looks` how often it
-    looks, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light meets the
+    concentrations that the validation pages ask for, `own_mi_unscaled` what it claims without, `passes` how many it
+    makes, `by_levels` what it is worth among fewer levels, `by_walls` the AIR of the symbols whose light meets the
     walls of `WALLS`, `pages_per_second` how fast it trained. The curves are AIR by step. The size is that of the
     first pass's network, steps, times and curves are those of the last pass, which goes on from the ones before.
     `analysis.comparison.decoders.compared` tells `over_oracle` and `over_published`.
     """
 
     run: str
-    arm: str
+    method: str
     size: str
     steps: int
     air: float
@@ -64,7 +69,7 @@ class Outcome:
     kappa_scale: float
     training_curve: Curve
     validation_curve: Curve
-    looks: int = 1
+    passes: int = 1
     over_oracle: float | None = None
     over_published: float | None = None
     by_levels: list[LevelFigures] = field(default_factory=list)
@@ -74,11 +79,18 @@ class Outcome:
         """Whether more steps would hardly have helped; False if that was not seen."""
         return self.gained_in_last_fifth < SETTLED_BITS
 
+    def as_json(self) -> dict[str, Any]:
+        """Its entry in `figures.json` and `ablation.json`.
+
+        The files' keys are kept as earlier versions wrote them: `arm` for the method, `looks` for its passes.
+        """
+        return {_KEYS.get(name, name): value for name, value in asdict(self).items()}
+
     def line(self) -> str:
         over = ["" if ratio is None else f"{ratio:.3f}" for ratio in (self.over_oracle, self.over_published)]
         walls = "".join(f"{self.by_walls[name]:>7.3f} " for name in WALLS)
         return (
-            f"{self.arm:<16} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} "
+            f"{self.method:<16} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} "
             f"{self.own_mi - self.air:>7.3f} {self.page_kB:>6.2f} {self.own_mi_kB:>6.2f} "
             f"{walls}{over[0]:>10} {over[1]:>10} "
             f"{self.gained_in_last_fifth:>8.3f}{' ' if self.is_settled else UNSETTLED} "
@@ -87,7 +99,7 @@ class Outcome:
 
 
 HEADER = (
-    f"{'arm':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} {'own-kB':>6} "
+    f"{'method':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} {'own-kB':>6} "
     + "".join(f"{name:>7} " for name in WALLS)
     + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8}  {'features':>9} {'training':>8} {'pages/s':>7}"
 )
@@ -95,8 +107,8 @@ HEADER = (
 one factor that the validation pages ask for; AIR where a symbol's light meets no wall of the pipe, a wall of pair x,
 of pair y, or of both; AIR over the oracle's, and over that of the best published decoder; of the last pass alone, as
 its steps: what validation AIR gained in the last fifth of them (`FOOTNOTE`), minutes of features and of training, and
-pages it trained on a second, validation counted as time: of a kept arm, on the machine that trained it. The network's
-size is the first pass's."""
+pages it trained on a second, validation counted as time: of a kept method, on the machine that trained it. The size is
+that of the first pass's network."""
 
 UNSETTLED = "*"
 FOOTNOTE = (

@@ -1,4 +1,4 @@
-"""Calibrations and trained arms that need not be made again: some take hours, and they are small.
+"""Calibrations and trained methods that need not be made again: some take hours, and they are small.
 
 They lie in a folder for each light, which says in its `begun.json` what the light is, and there in a folder for each
 run, which says with which options it was begun.

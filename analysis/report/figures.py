@@ -178,14 +178,14 @@ def concentration(data: ReportData) -> Picture:
     return _picture(figure, alt, caption)
 
 
-def training(looks: Sequence[Mapping[str, Curve]]) -> list[Picture]:
-    """Loss and AIR while the run was trained, and the pipe's angle where rays were; one look behind the other."""
+def training(passes: Sequence[Mapping[str, Curve]]) -> list[Picture]:
+    """Loss and AIR while the run was trained, and the pipe's angle where rays were; one pass behind the other."""
     pictures = []
-    if losses := _in_a_row(looks, "train_nll"):
+    if losses := _in_a_row(passes, "train_nll"):
         figure, axis = _one()
         for index, curve in enumerate(losses):
             axis.plot(*_xy(curve), color=BLUE, linewidth=0.8, label="training" if not index else None)
-        _mark_looks(axis, losses)
+        _mark_passes(axis, losses)
         axis.set(xlabel="step", ylabel="loss, nat/symbol")
         axis.legend(frameon=False)
         last = losses[-1][-1]
@@ -194,22 +194,22 @@ def training(looks: Sequence[Mapping[str, Curve]]) -> list[Picture]:
             _picture(figure, f"Loss over the steps, {number(last[1], 2)} nat/symbol at step {last[0]}.", caption)
         )
     rates = {"train_air": ("training batches", BLUE, "-"), "val_air": ("validation pages", ORANGE, "o-")}
-    if any(tag in curves for tag in rates for curves in looks):
+    if any(tag in curves for tag in rates for curves in passes):
         figure, axis = _one()
         for tag, (name, colour, style) in rates.items():
-            for index, curve in enumerate(_in_a_row(looks, tag)):
+            for index, curve in enumerate(_in_a_row(passes, tag)):
                 label = None if index else name
                 axis.plot(*_xy(curve), style, color=colour, linewidth=0.9, markersize=2.5, label=label)
-        _mark_looks(axis, _in_a_row(looks, "train_air"))
+        _mark_passes(axis, _in_a_row(passes, "train_air"))
         axis.set(xlabel="step", ylabel="AIR, bit/symbol")
         axis.legend(frameon=False, loc="lower right")
-        best = [max(value for _, value in curve) for curve in _in_a_row(looks, "val_air")]
+        best = [max(value for _, value in curve) for curve in _in_a_row(passes, "val_air")]
         caption = "AIR of training batches and of the validation pages"
         if best:
-            caption += f", at its best {', with one more look '.join(f'{air:.3f}' for air in best)} bit/symbol"
+            caption += f", at its best {', with one more pass '.join(f'{air:.3f}' for air in best)} bit/symbol"
         caption += "."
         pictures.append(_picture(figure, f"AIR over the steps. {caption}", caption))
-    if angles := _in_a_row(looks, "angle_deg"):
+    if angles := _in_a_row(passes, "angle_deg"):
         figure, axis = _one()
         axis.plot(*_xy(angles[0]), color=GREEN, linewidth=1.2)
         axis.set(xlabel="step", ylabel="pipe angle, degree")
@@ -219,21 +219,21 @@ def training(looks: Sequence[Mapping[str, Curve]]) -> list[Picture]:
     return pictures
 
 
-def _in_a_row(looks: Sequence[Mapping[str, Curve]], tag: str) -> list[Curve]:
-    """The curves of a tag, each look's steps counted on from those of the passes before it."""
+def _in_a_row(passes: Sequence[Mapping[str, Curve]], tag: str) -> list[Curve]:
+    """The curves of a tag, each pass's steps counted on from those of the passes before it."""
     found, before = list[Curve](), 0
-    for curves in looks:
+    for curves in passes:
         if curve := curves.get(tag):
             found.append([(before + step, value) for step, value in curve])
         before += max((step + 1 for other in curves.values() for step, _ in other), default=0)
     return found
 
 
-def _mark_looks(axis: Axes, curves: Sequence[Curve]) -> None:
-    """A line where each further look begins."""
+def _mark_passes(axis: Axes, curves: Sequence[Curve]) -> None:
+    """A line where each further pass begins."""
     for curve in curves[1:]:
         axis.axvline(curve[0][0], color="gray", linewidth=0.8, linestyle=":")
-        axis.annotate(" looks again", (curve[0][0], 1), xycoords=("data", "axes fraction"), va="top", fontsize=7)
+        axis.annotate(" further pass", (curve[0][0], 1), xycoords=("data", "axes fraction"), va="top", fontsize=7)
 
 
 def page(golden: Golden) -> list[Picture]:

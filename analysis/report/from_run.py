@@ -82,7 +82,7 @@ def report_of_run(folder: Path, recording_path: Path | None = None) -> ReportDat
         maps=accumulator.maps(),
         confidence_bins=accumulator.confidence_bins(),
         concentration_bins=accumulator.concentration_bins(),
-        curves=_curves(folder, run) or "There are no curves: the run did not keep them for every look.",
+        curves=_curves(folder, run) or "There are no curves: the run did not keep them for every pass.",
         golden=Golden(FramePair(golden["in_phase"], golden["quadrature"]), phase[0]),
     )
 
@@ -115,7 +115,7 @@ def _at_symbol_pitch(folder: Path, run: Run, kept: dict[str, NDArray[Any]]) -> _
     choices = run.hyperparameters
     assert not isinstance(choices, PublishedChoices)
     try:
-        store = FeatureStore(_looks(folder, run)[-1] / "features", range(first, first + validated))
+        store = FeatureStore(_passes(folder, run)[-1] / "features", range(first, first + validated))
         _ = store[0]
     except (OSError, ValueError, IndexError) as error:
         raise InvalidInputError(f"run {folder}: features", error, "the features that training left there") from None
@@ -126,16 +126,16 @@ def _at_symbol_pitch(folder: Path, run: Run, kept: dict[str, NDArray[Any]]) -> _
     return _Decodable(SymbolTraining(network, choices, kept["pilots"], MAX_LEVELS), store, size)
 
 
-def _looks(folder: Path, run: Run) -> list[Path]:
-    """Folders of all that was trained, one look behind the other."""
+def _passes(folder: Path, run: Run) -> list[Path]:
+    """Folders of all that was trained, one pass behind the other."""
     choices = run.hyperparameters
     again = 0 if isinstance(choices, PublishedChoices) else choices.refinements
     return [folder, *(folder / f"refinement-{number}" for number in range(1, again + 1))]
 
 
 def _curves(folder: Path, run: Run) -> list[dict[str, Curve]]:
-    """Those of each look; none unless they were kept for all."""
-    found = [curves_of(look) or fitted_curves(look) for look in _looks(folder, run)]
+    """Those of each pass; none unless they were kept for all."""
+    found = [curves_of(at) or fitted_curves(at) for at in _passes(folder, run)]
     return found if all(found) else []
 
 
@@ -204,7 +204,7 @@ def _facts(run: Run, size: int) -> list[tuple[str, str]]:
         if choices.refinements:
             again = choices.of_refinement()
             network += f"; {choices.refinements} more with {again.channels} channels, {again.blocks} block"
-            steps += f", {again.steps:,} for each further look,"
+            steps += f", {again.steps:,} for each further pass,"
     provenance = run.provenance
     return [
         ("Localizer", run.localizer),

@@ -63,21 +63,21 @@ class Results:
         self._miss(name)
         return None
 
-    def outcome(self, name: str, angle_deg: float, arm: str) -> Figures | None:
+    def outcome(self, name: str, angle_deg: float, method: str) -> Figures | None:
         """The outcome of a comparison's method at a pipe angle, with its exposure."""
         for light in (self.figures(name) or {"lights": []})["lights"]:
             for outcome in light["outcomes"]:
                 # the name of a method with several passes ends with their number
-                if light["angle_deg"] == angle_deg and outcome["arm"].removesuffix(" 1") == arm:
+                if light["angle_deg"] == angle_deg and outcome["arm"].removesuffix(" 1") == method:
                     return {"exposure": light["exposure"], **outcome}
-        self._miss(f"{name}, {angle_deg:g} degree, {arm}")
+        self._miss(f"{name}, {angle_deg:g} degree, {method}")
         return None
 
-    def outcomes(self, name: str, angle_deg: float, *arms: str) -> list[Figures] | None:
+    def outcomes(self, name: str, angle_deg: float, *methods: str) -> list[Figures] | None:
         """The outcomes of several methods, None if one is missing."""
-        found = [self.outcome(name, angle_deg, arm) for arm in arms]
+        found = [self.outcome(name, angle_deg, method) for method in methods]
         whole = [outcome for outcome in found if outcome is not None]
-        return whole if len(whole) == len(arms) else None
+        return whole if len(whole) == len(methods) else None
 
     def times(self, profile: str, decoder: str, other: str) -> float | None:
         """How many times another decoder's time one takes, in the speed benchmark."""

@@ -95,7 +95,7 @@ def test_the_gain_at_the_end_is_read_from_the_run(tmp_path: Path) -> None:
 def test_an_arm_that_still_learns_is_marked() -> None:
     outcome = Outcome(
         run="mode",
-        arm="mode",
+        method="mode",
         size="32/64",
         steps=100,
         air=3.0,
@@ -115,6 +115,8 @@ def test_an_arm_that_still_learns_is_marked() -> None:
     )
     assert outcome.is_settled
     assert len(outcome.line()) == len(HEADER)
+    assert list(outcome.as_json())[:3] == ["run", "arm", "size"]  # the file's keys are a contract
+    assert (outcome.as_json()["arm"], outcome.as_json()["looks"]) == ("mode", 1)
     for gained in (0.02, float("nan")):
         learning = replace(outcome, gained_in_last_fifth=gained)
         assert not learning.is_settled
@@ -122,7 +124,7 @@ def test_an_arm_that_still_learns_is_marked() -> None:
 
 
 @pytest.mark.long
-def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path) -> None:
+def test_the_command_compares_the_methods_and_takes_up_what_is_there(tmp_path: Path) -> None:
     profile = tmp_path / "small.toml"
     profile.write_text(PROFILE.to_toml())
     out = tmp_path / "out"
@@ -131,8 +133,9 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     calibration_of(Device()).save(light / "calibration.toml")
     arguments = f"--profile {profile} --pages 12 --steps 20 --size 8x1x0"
     arguments += "".join(
-        f" --arm {name}" for name in ("coherent", "refined", "oracle", "fast", "none", "oracle-refined", "wave-refined")
+        f" --method {name}" for name in ("coherent", "refined", "oracle", "fast", "none", "oracle-refined")
     )
+    arguments += " --arm wave-refined"  # the option's earlier name
     arguments += f" --published-channels 4 --published-steps 12 --levels 16 --trained {tmp_path / 'kept'} --keep"
     arguments += f" --out {out}"
     first = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
@@ -141,22 +144,22 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     (figures,) = json.loads((out / "figures.json").read_text())["lights"]
     coherent, refined, oracle, fast, none, again, by_waves = figures["outcomes"]
     assert (refined["arm"], refined["steps"]) == ("refined 1", 5)
-    by_levels = [[figures["levels"] for figures in arm["by_levels"]] for arm in figures["outcomes"]]
+    by_levels = [[figures["levels"] for figures in method["by_levels"]] for method in figures["outcomes"]]
     assert by_levels == [[16], [16], [16], [16], [], [16], [16]]
-    assert all(0 < arm["by_levels"][0]["symbol_error_rate"] <= 0.8 for arm in (coherent, refined, oracle))
-    assert all(len(arm["validation_curve"]) > 0 for arm in figures["outcomes"])
+    assert all(0 < method["by_levels"][0]["symbol_error_rate"] <= 0.8 for method in (coherent, refined, oracle))
+    assert all(len(method["validation_curve"]) > 0 for method in figures["outcomes"])
     # who is made less sure claims less than before, and who is made surer more
-    for arm in figures["outcomes"]:
-        assert np.sign(arm["own_mi_unscaled"] - arm["own_mi"]) == np.sign(1 - arm["kappa_scale"]) != 0
+    for method in figures["outcomes"]:
+        assert np.sign(method["own_mi_unscaled"] - method["own_mi"]) == np.sign(1 - method["kappa_scale"]) != 0
     # the mean over all symbols is that of the zones, weighted by their symbols
     data = ~pilot_mask(PROFILE)
     shares = {name: (zone & data).sum() / data.sum() for name, zone in zones_of(Device()).items()}
-    for arm in figures["outcomes"]:
-        assert arm["air"] == pytest.approx(sum(share * arm["by_walls"][name] for name, share in shares.items()))
+    for method in figures["outcomes"]:
+        assert method["air"] == pytest.approx(sum(share * method["by_walls"][name] for name, share in shares.items()))
     assert "no wall" in first.output
     assert len(coherent["training_curve"]) > 0
-    for arm in figures["outcomes"]:
-        assert arm["own_mi_kB"] == pytest.approx(arm["own_mi"] * data.sum() / 8000)
+    for method in figures["outcomes"]:
+        assert method["own_mi_kB"] == pytest.approx(method["own_mi"] * data.sum() / 8000)
     assert (out / "figure.png").stat().st_size > 10_000
     assert (coherent["arm"], oracle["arm"], oracle["over_oracle"]) == ("coherent", "oracle", 1)
     assert coherent["over_oracle"] == pytest.approx(coherent["air"] / oracle["air"])
@@ -173,7 +176,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
         2,
         f"{light.name}/wave/8x1x0-20/refinement-1",
     )
-    assert first.output.count("of theirs") == len(figures["outcomes"]) + 1  # as soon as an arm is there, and in the end
+    assert first.output.count("of theirs") == len(figures["outcomes"]) + 1  # whenever a method is there, and in the end
     assert figures["angle_error_deg"] == pytest.approx(0, abs=1e-9)
     told = Told()
     with reporting(told):
@@ -195,7 +198,7 @@ def test_the_command_compares_the_arms_and_takes_up_what_is_there(tmp_path: Path
     kept = WeightStore(light, tmp_path / "kept" / "small" / light.name, adds=True)
     assert "commit" in json.loads((kept.folder / "oracle" / "8x1x0-20" / FITTED).read_text())["made_by"]
     assert kept.is_of_this_light
-    # only arms of this light, this calibration and these options are taken up
+    # only trainings of this light, this calibration and these options are taken up
     run = light / "oracle" / "8x1x0-20"
     options = json.loads((run / "begun.json").read_text())
     options.pop("format")
@@ -228,7 +231,7 @@ def test_an_ideal_device_has_the_angle_and_the_noise_alone(tmp_path: Path) -> No
     light.mkdir(parents=True)
     ideal = ideal_device().with_settings(["geometry.pipe_angle_deg=-0.3", "sensor.full_well_e=32"])
     calibration_of(ideal).save(light / "calibration.toml")
-    arguments = f"--profile {profile} --ideal --angle -0.3 --pages 12 --arm none --published-channels 4"
+    arguments = f"--profile {profile} --ideal --angle -0.3 --pages 12 --method none --published-channels 4"
     arguments += f" --published-steps 10 --trained {tmp_path / 'kept'} --out {tmp_path / 'out'}"
     ran = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert ran.exit_code == 0, ran.output

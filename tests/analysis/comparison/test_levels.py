@@ -33,4 +33,4 @@ def test_calibrated_beliefs_have_the_error_rate_that_they_claim_and_bold_ones_do
     assert calibrated.symbol_error_rate == bold.symbol_error_rate == pytest.approx(wrong.mean(), abs=1e-9)
     assert 0.1 < calibrated.symbol_error_rate < 0.3
     assert calibrated.ece < 0.03 < bold.ece
-    assert "not judged" not in calibrated.line("arm", "size")
+    assert "not judged" not in calibrated.line("method", "size")

@@ -117,24 +117,24 @@ def test_a_run_at_symbol_pitch(coherent: Path, tmp_path: Path) -> None:
     assert "8 channels, 1 blocks" in text
 
 
-def test_the_steps_of_another_look_are_counted_on() -> None:
+def test_the_steps_of_another_pass_are_counted_on() -> None:
     passes = [{"train_nll": [(4, 1.0), (9, 0.5)]}, {"train_nll": [(4, 0.4)]}]
     (loss,) = training(passes)
     assert "0.40 nat/symbol at step 14" in loss.alt
 
 
-def test_a_run_that_looks_twice_is_told_as_a_whole(coherent: Path) -> None:
+def test_a_run_of_two_passes_is_told_as_a_whole(coherent: Path) -> None:
     described, data = load_run(coherent), report_of_run(coherent)
     (first, second), facts = data.curves, dict(data.facts)
     best = max(value for _, value in second["val_air"])
     assert best == pytest.approx(described.validation_air, abs=0.02)  # looked at in bfloat16 while it trains
     _, air = training([first, second])
-    assert f"with one more look {best:.3f} bit/symbol" in air.caption
+    assert f"with one more pass {best:.3f} bit/symbol" in air.caption
     weights = torch.load(coherent / "decoder.pt", weights_only=True)
     learnt = sum(value.numel() for name, value in weights.items() if name.startswith(("network.", "refiners.")))
     assert f"; {learnt:,} parameters in all" in facts["Network"]
     assert "; 1 more with 5 channels, 1 block;" in facts["Network"]
-    assert facts["Training"].startswith("12 steps of 4 pages, 3 for each further look, in ")
+    assert facts["Training"].startswith("12 steps of 4 pages, 3 for each further pass, in ")
 
 
 def test_a_run_by_rays_shows_the_angle_that_it_was_trained_to(

@@ -26,9 +26,9 @@ README = {
 """Methods by their names in the README's table."""
 
 
-def outcome(arm: str, air: float, gained: float = 0.001) -> dict[str, Any]:
+def outcome(method: str, air: float, gained: float = 0.001) -> dict[str, Any]:
     curves = {"training_curve": [[1, 0.5]], "validation_curve": [[1, 0.4]]}
-    return {"arm": arm, "air": air, "page_kB": air / 2, "steps": 1200, "gained_in_last_fifth": gained, **curves}
+    return {"arm": method, "air": air, "page_kB": air / 2, "steps": 1200, "gained_in_last_fifth": gained, **curves}
 
 
 def toy(*outcomes: dict[str, Any], angle_deg: float = -0.6) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def test_the_readme_says_what_the_kept_figures_say() -> None:
     readme = (ROOT / "README.md").read_text("utf-8")
     told = [line.replace("*", "").strip("| ").split(" | ") for line in readme.splitlines() if line.count(" | ") == 2]
     told = [row for row in told if row[0] in README]
-    found = [(name, Results(kept).outcome("sheared", -0.6, arm)) for name, arm in README.items()]
+    found = [(name, Results(kept).outcome("sheared", -0.6, method)) for name, method in README.items()]
     assert told == [[name, f"{of['air']:.2f}", f"{of['page_kB']:.2f}"] for name, of in found if of is not None]
     shipped = kept["evaluation"].figures["air_bits_per_symbol"]
     assert f"148 pages and 4,800 steps read {shipped:.1f} bits" in readme
