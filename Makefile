@@ -54,7 +54,7 @@ format: $(STAMP)  ## let ruff put the code in order
 # What was trained is kept and only measured, which takes hours on two cores, most of them for the full-size page.
 COMPARE := $(BIN)/python -m analysis.comparison.decoders
 PASSES := --method wave --method wave-refined --method coherent --method refined --method oracle --method oracle-refined
-bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: the table of what is kept, resumed when run again
+bench-decoders: $(STAMP)  ## decoders on the same data sets, against the oracles: the table of what is kept, resumed when run again
 	$(COMPARE) --angle -0.6 --method ray --method mode --method fast $(PASSES) --out runs/bench-decoders/sheared
 	$(COMPARE) --angle 0 --method mode $(PASSES) --out runs/bench-decoders/square
 	$(COMPARE) --angle -0.6 --exposure 0.13 --steps 3000 --method coherent --method refined --method oracle \
@@ -73,7 +73,7 @@ bench-decoders: $(STAMP)  ## decoders on the same light, against the oracles: th
 	$(BIN)/python -m analysis.speed.scaling
 
 # Exposures of 1 and 0.13: bright light, and about the dimmest in which two known pages still calibrate the device.
-train-decoders: $(STAMP)  ## every decoder in every light at quarter scale, trained anew: days on two cores, resumed when run again
+train-decoders: $(STAMP)  ## every decoder on every data set at quarter scale, trained anew: days on two cores, resumed when run again
 	$(COMPARE) --angle 0 --angle -0.6 --exposure 1 --exposure 0.13 \
 	    --symbol-size 4 --symbol-size 2 --pages 500 --levels 4 --levels 8 --levels 16 --trained runs/train-decoders/kept --keep \
 	    --out runs/train-decoders

@@ -1,1 +1,1 @@
-"""Decoders compared on the same light."""
+"""Decoders compared on the same data."""

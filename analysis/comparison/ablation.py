@@ -17,7 +17,7 @@ import click
 from torch import nn
 
 from analysis.comparison.bench import Bench
-from analysis.comparison.light import LEVELS, light_name, recorded
+from analysis.comparison.data_set import LEVELS, data_set_name, recorded
 from analysis.comparison.outcome import HEADER, Outcome
 from analysis.comparison.weight_store import TRAINED, WeightStore
 from lightpage.cli.main import run
@@ -119,7 +119,7 @@ def main(
     profile = load_profile(profile_name)
     click.get_current_context().with_resource(sole_writer(out))
     device = Device().with_settings([f"geometry.pipe_angle_deg={angle_deg}", f"sensor.full_well_e={full_well}"])
-    name = light_name(device, profile.page.symbol_size_px)
+    name = data_set_name(device, profile.page.symbol_size_px)
     choices = Hyperparameters(steps=steps, seed=seed)
     with recorded(profile, device, pages, seed, out / name) as recording:
         kept = WeightStore(out / name, TRAINED / Path(profile_name).stem / name)

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
+from analysis.comparison.data_set import CALIBRATED, LEVELS, calibrated, recorded
 from analysis.comparison.decoders_figure import MAP
 from analysis.comparison.levels import LevelFigures, level_figures
-from analysis.comparison.light import CALIBRATED, LEVELS, calibrated, recorded
 from analysis.comparison.oracle import Oracle
 from analysis.comparison.outcome import Outcome, gained_at_the_end, symbols_by_walls
 from analysis.comparison.weight_store import CALIBRATION, WeightStore
@@ -78,7 +78,7 @@ class Bench:
         training, validation, unseen: page numbers.
         levels: numbers of levels of further recordings, on which confidences are judged.
         seed: of the recording; theirs follow.
-        kept: of this light.
+        kept: of this data set.
     """
 
     recording: Recording
@@ -111,8 +111,8 @@ class Bench:
             recording=recording,
             profile=profile,
             device=device,
-            fitted=calibrated(profile, recording, kept.light / CALIBRATION),
-            out=kept.light,
+            fitted=calibrated(profile, recording, kept.data_set / CALIBRATION),
+            out=kept.data_set,
             training=range(CALIBRATED, last - 2 * held),
             validation=range(last - 2 * held, last - held),
             unseen=range(last - held, last),

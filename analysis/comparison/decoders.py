@@ -1,4 +1,4 @@
-"""Every decoder on the same light, against the oracle: same recording, same held-out pages.
+"""Every decoder on the same data set, against the oracle: same recording, same held-out pages.
 
     python -m analysis.comparison.decoders --angle -0.6 --out runs/decoders
     python -m analysis.comparison.decoders --method coherent --size 64x2x0 --size 96x2x1 --steps 1500 --out runs/sizes
@@ -8,8 +8,8 @@ is wave and oracle-refined the oracle. Fast is coherent with less of everything.
 geometry, cameras, reference; the signal's own power is taken off its frames; then the wave adjoint and the same
 network. None, mode and ray are the published decoders, with their own network and training. Image shift and piston of
 every page, held-out ones too, are found from all of its symbols, for each method alike; the piston of a figure is found
-from pilots. Interrupted, it goes on where it was; all lies in --out. What was trained on the same light before and kept
-(--keep) is only measured again.
+from pilots. Interrupted, it goes on where it was; all lies in --out. What was trained on the same data set before and
+kept (--keep) is only measured again.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from typing import Any
 import click
 
 from analysis.comparison.bench import METHODS, ORACLE, Bench
+from analysis.comparison.data_set import data_set_name, recorded
 from analysis.comparison.decoders_figure import draw, title
 from analysis.comparison.levels import LEVEL_HEADER
-from analysis.comparison.light import light_name, recorded
 from analysis.comparison.outcome import FOOTNOTE, HEADER, Outcome
 from analysis.comparison.weight_store import TRAINED, WeightStore
 from lightpage.cli.main import run
@@ -142,11 +142,11 @@ def main(
     keeps: bool,
     out: Path,
 ) -> None:
-    """Train every method on the same pages, light by light, and print what it says of held-out ones."""
+    """Train every method on the same pages, data set by data set, and print what it says of held-out ones."""
     keep_freed_memory()
     nominal = load_profile(profile_name)
     click.get_current_context().with_resource(sole_writer(out))
-    lights: list[dict[str, Any]] = []
+    measured: list[dict[str, Any]] = []
     symbol_sizes = symbol_sizes or (nominal.page.symbol_size_px,)
     for angle_deg, full_well, exposure, size_px in product(angles_deg, full_wells, exposures, symbol_sizes):
         profile = nominal.with_symbols_of(size_px)
@@ -157,7 +157,7 @@ def main(
         }
         usual = ideal_device() if ideal else Device()
         device = usual.with_settings([f"{key}={value}" for key, value in settings.items()])
-        folder = out / light_name(device, size_px, "-ideal" if ideal else "")
+        folder = out / data_set_name(device, size_px, "-ideal" if ideal else "")
         kept = trained / Path(profile_name).stem / folder.name
         with recorded(profile, device, pages, seed, folder) as recording:
             bench = Bench.of(recording, profile, device, levels, seed, WeightStore(folder, kept, keeps))
@@ -176,7 +176,7 @@ def main(
             for run in runs:
                 outcomes = compared([*outcomes, run()])
                 click.echo(f"{HEADER}\n{outcomes[-1].line()}", err=True)
-                light = {
+                data_set = {
                     "angle_deg": angle_deg,
                     "angle_error_deg": bench.fitted.angle_deg(profile) - angle_deg,
                     "full_well_e": full_well,
@@ -185,10 +185,11 @@ def main(
                     "ideal": ideal,
                     "outcomes": [outcome.as_json() for outcome in outcomes],
                 }
-                write_json(out / "figures.json", {"pages": pages, "seed": seed, "lights": [*lights, light]})
-                draw([*lights, light], out)
-        lights.append(light)
-        click.echo(f"\n{title(light)}")
+                # data sets are `lights` there, as in earlier versions
+                write_json(out / "figures.json", {"pages": pages, "seed": seed, "lights": [*measured, data_set]})
+                draw([*measured, data_set], out)
+        measured.append(data_set)
+        click.echo(f"\n{title(data_set)}")
         click.echo("\n".join([HEADER, *(outcome.line() for outcome in outcomes)]))
         if not all(outcome.is_settled for outcome in outcomes):
             click.echo(FOOTNOTE)

@@ -16,22 +16,22 @@ MAP = "air_map.npy"
 _BRIGHT = 99.0
 """Percentile of the symbols' rates at which the colours of the maps end."""
 _DOTS = 110
-_WIDTH_IN, _LIGHT_IN = 14.0, 5.2
+_WIDTH_IN, _DATA_SET_IN = 14.0, 5.2
 
 
-def draw(lights: list[dict[str, Any]], out: Path) -> None:
+def draw(data_sets: list[dict[str, Any]], out: Path) -> None:
     """Write `figure.png` into the folder of a comparison.
 
     Args:
-        lights: as `figures.json` holds them; each outcome's `run` is a folder below `out`, with its `MAP`.
+        data_sets: as `figures.json` holds them; each outcome's `run` is a folder below `out`, with its `MAP`.
         out: the comparison's folder.
     """
-    figure = Figure(figsize=(_WIDTH_IN, _LIGHT_IN * len(lights)), layout="constrained")
+    figure = Figure(figsize=(_WIDTH_IN, _DATA_SET_IN * len(data_sets)), layout="constrained")
     FigureCanvasAgg(figure)
-    for part, light in zip(figure.subfigures(len(lights), 1, squeeze=False)[:, 0], lights, strict=True):
-        outcomes = light["outcomes"]
+    for part, data_set in zip(figure.subfigures(len(data_sets), 1, squeeze=False)[:, 0], data_sets, strict=True):
+        outcomes = data_set["outcomes"]
         top = max(0.1, *(outcome["own_mi"] for outcome in outcomes))
-        part.suptitle(title(light))
+        part.suptitle(title(data_set))
         charts, maps = part.subfigures(1, 2, width_ratios=[2, 3])
         bars, curves = charts.subplots(2, 1)
         _bars(bars, outcomes, top)
@@ -40,12 +40,12 @@ def draw(lights: list[dict[str, Any]], out: Path) -> None:
     figure.savefig(out / "figure.png", dpi=_DOTS, metadata={"Software": None})
 
 
-def title(light: dict[str, Any]) -> str:
-    """What a light of a comparison is."""
-    size = light["symbol_size_px"]
-    noise = f"full well {light['full_well_e']:g} e-, exposure {light['exposure']:g}"
-    device = ", ideal device" if light["ideal"] else ""
-    return f"{light['angle_deg']:g} degree, {noise}, symbols of {size}x{size} pixels{device}"
+def title(data_set: dict[str, Any]) -> str:
+    """What a data set of a comparison is."""
+    size = data_set["symbol_size_px"]
+    noise = f"full well {data_set['full_well_e']:g} e-, exposure {data_set['exposure']:g}"
+    device = ", ideal device" if data_set["ideal"] else ""
+    return f"{data_set['angle_deg']:g} degree, {noise}, symbols of {size}x{size} pixels{device}"
 
 
 def _bars(axis: Any, outcomes: list[dict[str, Any]], top: float) -> None:

@@ -1,8 +1,9 @@
-"""A kept method of the comparison as a bundle, so that the runtime can be measured with what was trained for a light.
+"""A kept method of the comparison as a bundle, so that the runtime can be measured with what was trained.
 
     python -m analysis.comparison.kept_bundle --kept analysis/weights/bench/-0.6deg-32e-4px --out bundle.zip
 
-A few pages of the light are simulated anew: they say how strong the light is, and how well calibrated the claims are.
+A few pages of the data set are simulated anew: they say how strong the light is, and how well calibrated the
+concentrations are.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import click
 import numpy as np
 import torch
 
-from analysis.comparison.light import CALIBRATED
+from analysis.comparison.data_set import CALIBRATED
 from analysis.comparison.weight_store import CALIBRATION
 from export.command import export_run
 from export.graph import DecoderGraph, table_tensors
@@ -49,8 +50,8 @@ JUDGED = 3
 """Pages by which claims are calibrated: thousands of symbols each."""
 
 
-def light_of(kept: Path) -> tuple[Profile, Device, int]:
-    """Profile, true device and seed of a kept light.
+def data_set_of(kept: Path) -> tuple[Profile, Device, int]:
+    """Profile, true device and seed of a kept data set.
 
     Raises:
         InvalidInputError: nothing is kept there.
@@ -60,14 +61,14 @@ def light_of(kept: Path) -> tuple[Profile, Device, int]:
         profile = parse_profile(begun["--profile"], f"{kept / BEGUN}: profile")
         return profile, Device.model_validate(begun["device"]), int(begun["--seed"])
     except (OSError, ValueError, KeyError) as error:
-        raise InvalidInputError(f"--kept {kept}", error, f"the folder of a kept light with its {BEGUN}") from None
+        raise InvalidInputError(f"--kept {kept}", error, f"the folder of a kept data set with its {BEGUN}") from None
 
 
 def export_kept(kept: Path, work: Path, out: Path, localizer: str = COHERENT, refinements: int = 1) -> None:
     """Write the bundle of a method.
 
     Args:
-        kept: folder of the light.
+        kept: folder of the data set.
         work: folder for pages and run; made, and gone on with if it is there.
         out: new bundle.
         localizer: of the method.
@@ -76,7 +77,7 @@ def export_kept(kept: Path, work: Path, out: Path, localizer: str = COHERENT, re
     Raises:
         InvalidInputError: no such method is kept.
     """
-    profile, device, seed = light_of(kept)
+    profile, device, seed = data_set_of(kept)
     trained = next((folder for folder in sorted((kept / localizer).glob("*")) if (folder / FITTED).exists()), None)
     if trained is None:
         raise InvalidInputError(f"--kept {kept}", f"no trained {localizer}", "a localizer that is kept there")

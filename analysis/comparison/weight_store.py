@@ -1,7 +1,7 @@
 """Calibrations and trained methods that need not be made again: some take hours, and they are small.
 
-They lie in a folder for each light, which says in its `begun.json` what the light is, and there in a folder for each
-run, which says with which options it was begun.
+They lie in a folder for each data set, whose `begun.json` says what it is, and there in a folder for each run, whose
+`begun.json` says with which options it was begun.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ _LARGE = 1000
 
 @dataclass(frozen=True)
 class WeightStore:
-    """What is kept of a light.
+    """What is kept of a data set.
 
     Attributes:
-        light: folder of the light, with its recording.
+        data_set: folder of the data set, with its recording.
         folder: where it is kept, which need not be there.
         adds: whether what is trained now is to be kept too.
     """
 
-    light: Path
+    data_set: Path
     folder: Path
     adds: bool = False
 
     @property
-    def is_of_this_light(self) -> bool:
-        """Whether something is kept, and of just this light: device, pages, seed and the code's format."""
-        return (self.folder / BEGUN).exists() and _read(self.folder / BEGUN) == _read(self.light / BEGUN)
+    def is_of_this_data_set(self) -> bool:
+        """Whether something is kept, and of just this data set: device, pages, seed and the code's format."""
+        return (self.folder / BEGUN).exists() and _read(self.folder / BEGUN) == _read(self.data_set / BEGUN)
 
     def bring_calibration(self) -> None:
         """Copy the calibration to where it would be made again; one that is there stays.
 
         Raises:
-            InvalidInputError: things are to be kept, where something of another light is kept.
+            InvalidInputError: things are to be kept, where something of another data set is kept.
         """
-        if self.adds and (self.folder / BEGUN).exists() and not self.is_of_this_light:
+        if self.adds and (self.folder / BEGUN).exists() and not self.is_of_this_data_set:
             expected = "device, pages and seed of what is kept there, or another --trained"
-            raise InvalidInputError(f"--keep in {self.folder}", "another light", expected)
-        if self.is_of_this_light and not (self.light / CALIBRATION).exists():
-            _copy(self.folder / CALIBRATION, self.light / CALIBRATION)
+            raise InvalidInputError(f"--keep in {self.folder}", "another data set", expected)
+        if self.is_of_this_data_set and not (self.data_set / CALIBRATION).exists():
+            _copy(self.folder / CALIBRATION, self.data_set / CALIBRATION)
 
     def bring(self, run: Path, options: dict[str, Any]) -> bool:
         """Copy a trained run, and what was trained on it, to where it would be trained again.
@@ -62,18 +62,18 @@ class WeightStore:
         Nothing is taken where training has begun, or that was begun with other options or another calibration.
 
         Args:
-            run: its folder below the light's.
+            run: its folder below the data set's.
             options: with which it would be begun.
 
         Returns:
             Whether it was copied.
         """
-        kept = self.folder / run.relative_to(self.light)
+        kept = self.folder / run.relative_to(self.data_set)
         if (run / FITTED).exists() or (run / CHECKPOINTS).exists() or not (kept / FITTED).exists():
             return False
-        if not self.is_of_this_light or _read(kept / BEGUN) != {"format": FORMAT, **options}:
+        if not self.is_of_this_data_set or _read(kept / BEGUN) != {"format": FORMAT, **options}:
             return False
-        if (self.folder / CALIBRATION).read_text() != (self.light / CALIBRATION).read_text():
+        if (self.folder / CALIBRATION).read_text() != (self.data_set / CALIBRATION).read_text():
             return False
         # what says that a training is finished comes last
         for name in (BEGUN, FITTED_WEIGHTS, FITTED):
@@ -85,13 +85,13 @@ class WeightStore:
         """Copy a trained run, and what was trained on it, large tensors in half precision, if that was wanted.
 
         Raises:
-            InvalidInputError: another light, another calibration, or another training with the same options is kept.
+            InvalidInputError: another data set, another calibration, or another training with the same options is kept.
         """
         if not self.adds:
             return
-        _copy_or_check(self.light / BEGUN, self.folder / BEGUN)
-        _copy_or_check(self.light / CALIBRATION, self.folder / CALIBRATION)
-        kept = self.folder / run.relative_to(self.light)
+        _copy_or_check(self.data_set / BEGUN, self.folder / BEGUN)
+        _copy_or_check(self.data_set / CALIBRATION, self.folder / CALIBRATION)
+        kept = self.folder / run.relative_to(self.data_set)
         for path in sorted(run.rglob(FITTED), key=lambda path: len(path.parts)):
             to = kept / path.parent.relative_to(run)
             if not (to / FITTED).exists():

@@ -133,17 +133,17 @@ def slim(name: str, figures: Figures) -> Figures:
 def comparison(figures: Figures) -> Figures:
     """Of `analysis.comparison.decoders`, without its curves."""
     curves = {"training_curve", "validation_curve"}
-    lights = [
-        light | {"outcomes": [{key: of[key] for key in of if key not in curves} for of in light["outcomes"]]}
-        for light in figures["lights"]
+    data_sets = [
+        data_set | {"outcomes": [{key: of[key] for key in of if key not in curves} for of in data_set["outcomes"]]}
+        for data_set in figures["lights"]
     ]
-    return figures | {"lights": lights}
+    return figures | {"lights": data_sets}
 
 
 def methods(measurement: Measurement) -> set[str]:
     """Methods of a comparison with the angle that each was measured at; of another measurement none."""
-    lights = measurement.figures.get("lights", [])
-    return {f"{of['arm']} at {light['angle_deg']:g} degree" for light in lights for of in light["outcomes"]}
+    data_sets = measurement.figures.get("lights", [])
+    return {f"{of['arm']} at {data_set['angle_deg']:g} degree" for data_set in data_sets for of in data_set["outcomes"]}
 
 
 def evaluation(figures: Figures) -> Figures:

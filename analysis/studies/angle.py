@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from analysis.studies.study import Case, Result, Row, Settings, Study
-from analysis.studies.trained import Light, trained
+from analysis.studies.trained import DataSet, trained
 from lightpage.device.state import Device
 from lightpage.progress import Progress
 
@@ -31,13 +31,13 @@ def _cases(settings: Settings) -> list[Case]:
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    light = Light("light", settings.profile, Device())
+    data_set = DataSet("light", settings.profile, Device())
     if case["matched"]:
         curvature = settings.profile.light_curvature_rad
-        light = Light(
+        data_set = DataSet(
             "light-matched", settings.profile, Device().with_settings([f"reference.curvature_rad={curvature}"])
         )
-    return trained(settings, light, case["localizer"], work, progress)
+    return trained(settings, data_set, case["localizer"], work, progress)
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:

@@ -1,4 +1,4 @@
-"""Phases by a von Mises density against symbols by classes: the same decoder with either head, on the same light."""
+"""Phases by a von Mises density against symbols by classes: the same decoder with either head, on the same data set."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from analysis.studies.study import Case, Result, Row, Settings, Study
-from analysis.studies.trained import Light, trained
+from analysis.studies.trained import DataSet, trained
 from lightpage.device.state import ideal_device
 from lightpage.progress import Progress
 
@@ -28,9 +28,9 @@ def _cases(settings: Settings) -> list[Case]:
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
     # classes ask for a piston that is known, and a square pipe lets the mode localizer do all that it can
-    light = Light(f"light-{case['levels']}", settings.profile.with_ideal_lenses(), ideal_device(), case["levels"])
+    data_set = DataSet(f"light-{case['levels']}", settings.profile.with_ideal_lenses(), ideal_device(), case["levels"])
     classes = case["levels"] if case["head"] == "classes" else 0
-    return trained(settings, light, "mode", work, progress, knows_piston=True, classes=classes)
+    return trained(settings, data_set, "mode", work, progress, knows_piston=True, classes=classes)
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:

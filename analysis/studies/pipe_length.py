@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from analysis.studies.study import Case, Result, Row, Settings, Study
-from analysis.studies.trained import Light, trained
+from analysis.studies.trained import DataSet, trained
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import ideal_device
 from lightpage.progress import Progress
@@ -46,9 +46,9 @@ def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> 
     length = scaled_length_m(settings.profile, case["length_mm"])
     pipe = settings.profile.pipe.model_copy(update={"length_m": length, "angle_deg": 0.0})
     profile = settings.profile.with_ideal_lenses().model_copy(update={"pipe": pipe})
-    light = Light(f"light-{case['length_mm']:g}mm", profile, ideal_device())
+    data_set = DataSet(f"light-{case['length_mm']:g}mm", profile, ideal_device())
     # as with the authors, who trained the angle of their device alone: a simulated pipe is known to be square
-    return trained(settings, light, case["localizer"], work, progress, angle_rate=0.0)
+    return trained(settings, data_set, case["localizer"], work, progress, angle_rate=0.0)
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from analysis.studies.study import Case, Result, Row, Settings, Study
-from analysis.studies.trained import Light, trained
+from analysis.studies.trained import DataSet, trained
 from lightpage.device.state import Device
 from lightpage.progress import Progress
 
@@ -27,8 +27,8 @@ def _cases(settings: Settings) -> list[Case]:
 
 
 def _measure(settings: Settings, case: Case, work: Path, progress: Progress) -> Result:
-    light = Light(f"light-{case['size']}", settings.profile.with_symbols_of(case["size"]), Device())
-    return trained(settings, light, case["localizer"], work, progress)
+    data_set = DataSet(f"light-{case['size']}", settings.profile.with_symbols_of(case["size"]), Device())
+    return trained(settings, data_set, case["localizer"], work, progress)
 
 
 def _rows(cases: Sequence[Case], results: Sequence[Result]) -> list[Row]:

@@ -51,11 +51,11 @@ _HELD_SHARE = 0.05
 
 
 @dataclass(frozen=True)
-class Light:
+class DataSet:
     """A recording of a simulated device that several decoders are trained on.
 
     Attributes:
-        name: of its file, beside the folders of the cases.
+        name: of its file, beside the folders of the cases; it stays, so that an interrupted study finds it again.
         profile, device: nominal and true.
         levels: M of its pages.
     """
@@ -68,7 +68,7 @@ class Light:
 
 def trained(
     settings: Settings,
-    light: Light,
+    data_set: DataSet,
     localizer: str,
     work: Path,
     progress: Progress,
@@ -78,12 +78,12 @@ def trained(
 ) -> Result:
     """What a published decoder reaches on held-out pages of a simulated device, trained as its authors did.
 
-    Piston and shift of the pages are those that were simulated. Recordings are large: those of other lights are
-    dropped, so cases on one light should follow each other.
+    Piston and shift of the pages are those that were simulated. Recordings are large: those of other data sets are
+    dropped, so cases on one data set should follow each other.
 
     Args:
         settings: of the study.
-        light: what is recorded.
+        data_set: what is recorded.
         localizer: none, mode or ray.
         work: folder of the case.
         progress: told of the steps.
@@ -98,9 +98,9 @@ def trained(
         is judged, not a number where it has none. With classes, air_map,
         own_mi_map and ece are those of its beliefs in classes, and air_of_p is that of p.
     """
-    profile, device, levels = light.profile, light.device, light.levels
+    profile, device, levels = data_set.profile, data_set.device, data_set.levels
     pages = _QUICK_PAGES if settings.quick else PAGES
-    path = work.parent / f"{light.name}.h5"
+    path = work.parent / f"{data_set.name}.h5"
     progress("record", 0.0)
     if not path.exists():
         for other in work.parent.glob("*.h5"):

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from analysis.comparison.kept_bundle import export_kept, light_of
+from analysis.comparison.kept_bundle import data_set_of, export_kept
 from analysis.comparison.weight_store import TRAINED
 from analysis.tracking.figure import POINTS, draw
 from analysis.tracking.tables import (
@@ -390,7 +390,7 @@ def points(out: Path, names: tuple[str, ...]) -> Iterator[Point]:
     kept, bundle = TRAINED / "bench" / NOISY, out / "noisy.zip"
     if not bundle.exists():
         export_kept(kept, out / "noisy", bundle, refinements=0)
-    yield Point(DIM, Decoder.load(bundle), light_of(kept)[1])
+    yield Point(DIM, Decoder.load(bundle), data_set_of(kept)[1])
 
 
 @click.command()

@@ -21,7 +21,7 @@ from analysis.comparison.ablation import (
     main,
 )
 from analysis.comparison.bench import Bench
-from analysis.comparison.light import light_name, recorded
+from analysis.comparison.data_set import data_set_name, recorded
 from analysis.comparison.weight_store import WeightStore
 from lightpage.device.state import Device, Sensor
 from lightpage.progress import reporting
@@ -35,23 +35,23 @@ DEVICE = Device().with_settings(["geometry.pipe_angle_deg=-0.6", "sensor.full_we
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the calibration of the small device, which is too small to be found from nominal."""
     out = tmp_path_factory.mktemp("ablation")
-    light = out / light_name(DEVICE, PROFILE.page.symbol_size_px)
-    light.mkdir()
-    calibration_of(DEVICE).save(light / "calibration.toml")
+    data_set = out / data_set_name(DEVICE, PROFILE.page.symbol_size_px)
+    data_set.mkdir()
+    calibration_of(DEVICE).save(data_set / "calibration.toml")
     return out
 
 
 @pytest.fixture(scope="module")
 def bench(out: Path) -> Iterator[Bench]:
-    folder = out / light_name(DEVICE, PROFILE.page.symbol_size_px)
+    folder = out / data_set_name(DEVICE, PROFILE.page.symbol_size_px)
     with recorded(PROFILE, DEVICE, 12, 5000, folder) as recording:
         yield Bench.of(recording, PROFILE, DEVICE, (), 5000, WeightStore(folder, folder / "kept"))
 
 
-def test_lights_are_told_apart_by_name() -> None:
-    assert light_name(DEVICE, 4) == "-0.6deg-32e-4px"
+def test_data_sets_are_told_apart_by_name() -> None:
+    assert data_set_name(DEVICE, 4) == "-0.6deg-32e-4px"
     dim = DEVICE.model_copy(update={"sensor": Sensor(full_well_e=32, exposure_relative=0.13)})
-    assert light_name(dim, 2, "-ideal") == "-0.6deg-32e-2px-0.13x-ideal"
+    assert data_set_name(dim, 2, "-ideal") == "-0.6deg-32e-2px-0.13x-ideal"
 
 
 def test_parts_of_the_light_are_left_out(bench: Bench) -> None:

@@ -128,9 +128,9 @@ def test_the_command_compares_the_methods_and_takes_up_what_is_there(tmp_path: P
     profile = tmp_path / "small.toml"
     profile.write_text(PROFILE.to_toml())
     out = tmp_path / "out"
-    light = out / "-0.6deg-32e-4px"
-    light.mkdir(parents=True)
-    calibration_of(Device()).save(light / "calibration.toml")
+    data_set = out / "-0.6deg-32e-4px"
+    data_set.mkdir(parents=True)
+    calibration_of(Device()).save(data_set / "calibration.toml")
     arguments = f"--profile {profile} --pages 12 --steps 20 --size 8x1x0"
     arguments += "".join(
         f" --method {name}" for name in ("coherent", "refined", "oracle", "fast", "none", "oracle-refined")
@@ -174,7 +174,7 @@ def test_the_command_compares_the_methods_and_takes_up_what_is_there(tmp_path: P
     assert (by_waves["arm"], by_waves["looks"], by_waves["run"]) == (
         "wave-refined 1",
         2,
-        f"{light.name}/wave/8x1x0-20/refinement-1",
+        f"{data_set.name}/wave/8x1x0-20/refinement-1",
     )
     assert first.output.count("of theirs") == len(figures["outcomes"]) + 1  # whenever a method is there, and in the end
     assert figures["angle_error_deg"] == pytest.approx(0, abs=1e-9)
@@ -195,31 +195,31 @@ def test_the_command_compares_the_methods_and_takes_up_what_is_there(tmp_path: P
     for one, other in zip(outcomes, figures["outcomes"], strict=True):
         assert one["air"] == pytest.approx(other["air"], abs=0.01)  # large tensors are kept in half precision
         assert one["validation_curve"] == other["validation_curve"]
-    kept = WeightStore(light, tmp_path / "kept" / "small" / light.name, adds=True)
+    kept = WeightStore(data_set, tmp_path / "kept" / "small" / data_set.name, adds=True)
     assert "commit" in json.loads((kept.folder / "oracle" / "8x1x0-20" / FITTED).read_text())["made_by"]
-    assert kept.is_of_this_light
-    # only trainings of this light, this calibration and these options are taken up
-    run = light / "oracle" / "8x1x0-20"
+    assert kept.is_of_this_data_set
+    # only trainings of this data set, this calibration and these options are taken up
+    run = data_set / "oracle" / "8x1x0-20"
     options = json.loads((run / "begun.json").read_text())
     options.pop("format")
-    new = replace(kept, light=elsewhere / "new")
-    new.light.mkdir()
-    shutil.copyfile(light / "begun.json", new.light / "begun.json")
+    new = replace(kept, data_set=elsewhere / "new")
+    new.data_set.mkdir()
+    shutil.copyfile(data_set / "begun.json", new.data_set / "begun.json")
     new.bring_calibration()
-    assert not new.bring(new.light / run.relative_to(light), options | {"steps": 30})
-    (new.light / "calibration.toml").write_text("another")
-    assert not new.bring(new.light / run.relative_to(light), options)
-    shutil.copyfile(light / "calibration.toml", new.light / "calibration.toml")
-    assert new.bring(new.light / run.relative_to(light), options)
-    assert not new.bring(new.light / run.relative_to(light), options)  # it is there
-    # and nothing of another light is mixed with them
-    (new.light / "begun.json").write_text("{}")
-    shutil.rmtree(new.light / run.relative_to(light))
-    assert not new.bring(new.light / run.relative_to(light), options)
-    with pytest.raises(InvalidInputError, match="another light"):
+    assert not new.bring(new.data_set / run.relative_to(data_set), options | {"steps": 30})
+    (new.data_set / "calibration.toml").write_text("another")
+    assert not new.bring(new.data_set / run.relative_to(data_set), options)
+    shutil.copyfile(data_set / "calibration.toml", new.data_set / "calibration.toml")
+    assert new.bring(new.data_set / run.relative_to(data_set), options)
+    assert not new.bring(new.data_set / run.relative_to(data_set), options)  # it is there
+    # and nothing of another data set is mixed with them
+    (new.data_set / "begun.json").write_text("{}")
+    shutil.rmtree(new.data_set / run.relative_to(data_set))
+    assert not new.bring(new.data_set / run.relative_to(data_set), options)
+    with pytest.raises(InvalidInputError, match="another data set"):
         new.bring_calibration()
     with pytest.raises(InvalidInputError, match="another one"):
-        new.keep(new.light / run.relative_to(light))
+        new.keep(new.data_set / run.relative_to(data_set))
     with pytest.raises(click.BadParameter, match="96x2x0"):
         CliRunner().invoke(main, ["--size", "96", "--out", str(out)], standalone_mode=False, catch_exceptions=False)
 
@@ -227,16 +227,16 @@ def test_the_command_compares_the_methods_and_takes_up_what_is_there(tmp_path: P
 def test_an_ideal_device_has_the_angle_and_the_noise_alone(tmp_path: Path) -> None:
     profile = tmp_path / "small.toml"
     profile.write_text(PROFILE.to_toml())
-    light = tmp_path / "out" / "-0.3deg-32e-4px-ideal"
-    light.mkdir(parents=True)
+    data_set = tmp_path / "out" / "-0.3deg-32e-4px-ideal"
+    data_set.mkdir(parents=True)
     ideal = ideal_device().with_settings(["geometry.pipe_angle_deg=-0.3", "sensor.full_well_e=32"])
-    calibration_of(ideal).save(light / "calibration.toml")
+    calibration_of(ideal).save(data_set / "calibration.toml")
     arguments = f"--profile {profile} --ideal --angle -0.3 --pages 12 --method none --published-channels 4"
     arguments += f" --published-steps 10 --trained {tmp_path / 'kept'} --out {tmp_path / 'out'}"
     ran = CliRunner().invoke(main, arguments.split(), catch_exceptions=False)
     assert ran.exit_code == 0, ran.output
     assert "symbols of 4x4 pixels, ideal device" in ran.output
-    assert Device.model_validate(json.loads((light / "begun.json").read_text())["device"]) == ideal
+    assert Device.model_validate(json.loads((data_set / "begun.json").read_text())["device"]) == ideal
 
 
 def test_what_is_wrong_is_told_in_a_line(tmp_path: Path) -> None:

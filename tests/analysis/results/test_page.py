@@ -32,8 +32,8 @@ def outcome(method: str, air: float, gained: float = 0.001) -> dict[str, Any]:
 
 
 def toy(*outcomes: dict[str, Any], angle_deg: float = -0.6) -> dict[str, Any]:
-    light = {"angle_deg": angle_deg, "full_well_e": 32.0, "exposure": 0.5, "outcomes": list(outcomes)}
-    return {"pages": 60, "seed": 1, "lights": [light]}
+    data_set = {"angle_deg": angle_deg, "full_well_e": 32.0, "exposure": 0.5, "outcomes": list(outcomes)}
+    return {"pages": 60, "seed": 1, "lights": [data_set]}
 
 
 def written(path: Path, figures: object) -> Path:

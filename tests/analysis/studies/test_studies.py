@@ -34,7 +34,7 @@ from analysis.studies import (
 )
 from analysis.studies.command import study
 from analysis.studies.study import Settings, aligned, measured
-from analysis.studies.trained import Light, _beliefs, _of_classes, chosen
+from analysis.studies.trained import DataSet, _beliefs, _of_classes, chosen
 from lightpage.device.lenses import LENSES
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, ideal_device
@@ -302,12 +302,12 @@ def test_devices_are_enlarged_to_some_three_hundred_thousand_symbols(name: str, 
         scaling.enlarged(load_profile("paper"), 16)
 
 
-LIGHTS = {"angle": 2, "symbol-size": 2, "pipe-length": 2, "heads": 1}
+DATA_SETS = {"angle": 2, "symbol-size": 2, "pipe-length": 2, "heads": 1}
 """How many recordings each study that trains asks for, its few cases."""
 
 
 def test_all_that_train_are_known() -> None:
-    assert {name for name, study in STUDIES.items() if study.trains} == set(LIGHTS)
+    assert {name for name, study in STUDIES.items() if study.trains} == set(DATA_SETS)
 
 
 def test_the_first_step_above_a_threshold_is_told_or_none() -> None:
@@ -324,11 +324,11 @@ def test_the_device_for_studies_that_train_has_the_zones_of_the_full_one() -> No
 
 
 @pytest.mark.parametrize(
-    ("name", "lights"),
-    [pytest.param(*each, marks=[] if each[0] == "heads" else pytest.mark.long) for each in LIGHTS.items()],
+    ("name", "data_sets"),
+    [pytest.param(*each, marks=[] if each[0] == "heads" else pytest.mark.long) for each in DATA_SETS.items()],
 )
-def test_each_that_trains_makes_maps_of_every_case_and_each_light_once(
-    name: str, lights: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_each_that_trains_makes_maps_of_every_case_and_each_data_set_once(
+    name: str, data_sets: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "small.toml").write_text(SMALL.to_toml())
     out, made = tmp_path / "out", list[Path]()
@@ -340,7 +340,7 @@ def test_each_that_trains_makes_maps_of_every_case_and_each_light_once(
     monkeypatch.setattr(RecordingJob, "run", made_and_noted)
     run(name, "--quick", "--profile", str(tmp_path / "small.toml"), "--out", str(out))
     cases = STUDIES[name].cases(Settings(SMALL, quick=True))
-    assert len(made) == len(set(made)) == lights  # several decoders on the same one
+    assert len(made) == len(set(made)) == data_sets  # several decoders on the same one
     assert list(out.glob("results/*.h5")) == made[-1:]
     written = json.loads((out / "study.json").read_text())
     assert len(written["rows"]) == len(cases)
@@ -411,16 +411,16 @@ def test_a_smaller_device_has_a_shorter_pipe_with_as_many_walls() -> None:
 
 @pytest.mark.parametrize("study", [heads, pipe_length])
 def test_square_pipes_without_defects_have_ideal_lenses_too(study: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[Light, dict[str, object]]] = []
+    asked: list[tuple[DataSet, dict[str, object]]] = []
     monkeypatch.setattr(
-        study, "trained", lambda settings, light, localizer, *_, **changes: asked.append((light, changes))
+        study, "trained", lambda settings, data_set, localizer, *_, **changes: asked.append((data_set, changes))
     )
     settings = Settings(load_profile("paper"))
     for case in study.STUDY.cases(settings):
         study.STUDY.measure(settings, case, Path(), lambda what, share: None)
-    assert {light.profile.ideal_lenses for light, _ in asked} == {True}
-    assert all(light.device == ideal_device() for light, _ in asked)
-    assert {published_choices("ray", light.profile, 450).lenses for light, _ in asked} == {PARAXIAL}
+    assert {data_set.profile.ideal_lenses for data_set, _ in asked} == {True}
+    assert all(data_set.device == ideal_device() for data_set, _ in asked)
+    assert {published_choices("ray", data_set.profile, 450).lenses for data_set, _ in asked} == {PARAXIAL}
     if study is heads:  # classes know the piston, so the other head must
         assert {changes["knows_piston"] for _, changes in asked} == {True}
 

@@ -1,4 +1,4 @@
-"""The data sets of a comparison: a device, its recording and its calibration."""
+"""The data sets of a comparison: a device with its noise, exposure and symbols, its recording and its calibration."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def calibrated(profile: Profile, recording: Recording, path: Path) -> Calibratio
     return load_calibration(path)
 
 
-def light_name(device: Device, symbol_size_px: int, apart: str = "") -> str:
-    """Name of the folder of a light; `apart` says what else sets it apart."""
+def data_set_name(device: Device, symbol_size_px: int, apart: str = "") -> str:
+    """Name of the folder of a data set; `apart` says what else sets it apart."""
     geometry, sensor = device.geometry, device.sensor
     dimmed = "" if sensor.exposure_relative == Sensor().exposure_relative else f"-{sensor.exposure_relative:g}x"
     return f"{geometry.pipe_angle_deg:g}deg-{sensor.full_well_e:g}e-{symbol_size_px}px{dimmed}{apart}"
@@ -45,7 +45,7 @@ def light_name(device: Device, symbol_size_px: int, apart: str = "") -> str:
 def recorded(
     profile: Profile, device: Device, pages: int, seed: int, folder: Path, levels: int = LEVELS
 ) -> Iterator[Recording]:
-    """The recording of a light, of so many pages and some to calibrate on before them; made if it is not there."""
+    """The recording of a data set, of so many pages and some to calibrate on before them; made if it is not there."""
     folder.mkdir(parents=True, exist_ok=True)
     begin(folder, {"--profile": profile.to_toml(), "device": device.model_dump(), "--pages": pages, "--seed": seed})
     path = folder / "recording.h5"
