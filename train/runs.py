@@ -41,6 +41,9 @@ FORMAT = 8
 together with those of this one, or when the simulator's light changes (as the simulator's `LIGHT` is then), or which
 pages the comparison trains on."""
 
+_RENAMED = {"levels": "depth", "--levels": "--depth"}
+"""Choices that earlier versions kept under other names: the depth of the network was called its levels."""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -143,6 +146,7 @@ def check_begun(folder: Path, options: dict[str, Any]) -> bool:
         kept = json.loads((folder / BEGUN).read_text())
         if not isinstance(kept, dict):
             raise ValueError("no table of options")
+        kept = renamed(kept)
     except FileNotFoundError:
         if (folder / CHECKPOINTS).exists() or (folder / FITTED).exists():
             expected = f"a run that says in {BEGUN} what it was begun with, or another --out"
@@ -162,6 +166,11 @@ def check_begun(folder: Path, options: dict[str, Any]) -> bool:
             expected = f"{then!r}, with which it was begun, or another --out"
             raise InvalidInputError(f"run {folder}: {name}", now, expected)
     return True
+
+
+def renamed(choices: Mapping[str, Any]) -> dict[str, Any]:
+    """Choices that a run keeps, of this version or an earlier one, under the names of this version."""
+    return {_RENAMED.get(name, name): value for name, value in choices.items()}
 
 
 def _check_format(folder: Path, found: object) -> None:
@@ -198,7 +207,7 @@ def load_run(folder: Path) -> Run:
         if data["localizer"] in PUBLISHED:
             data["hyperparameters"] = PublishedChoices(**choices | {"channels": tuple(choices["channels"])})
         else:
-            data["hyperparameters"] = Hyperparameters(**choices)
+            data["hyperparameters"] = Hyperparameters(**renamed(choices))
         for name in ("trained_pages", "pages"):
             data[name] = tuple(data[name])
         run = Run(**data)

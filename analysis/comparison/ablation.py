@@ -51,8 +51,8 @@ PARTS = {
 class Unconditioned(SymbolUNet):
     """A network whose filters are the same everywhere: their modulation stays at its first value, none."""
 
-    def __init__(self, light_channels: int, channels: int = 96, blocks: int = 2, levels: int = 0) -> None:
-        super().__init__(light_channels, channels, blocks, levels)
+    def __init__(self, light_channels: int, channels: int = 96, blocks: int = 2, depth: int = 0) -> None:
+        super().__init__(light_channels, channels, blocks, depth)
         self.where.requires_grad_(False)
 
 
@@ -91,7 +91,7 @@ def without(part: str, bench: Bench, choices: Hyperparameters) -> Outcome:
     kind = Unconditioned if part == POSITIONS else SymbolUNet
     fitted = fit_network(folder, choices, bench.mask, LEVELS, training, validation, kind=kind, devices=1)
     drawn = choices.drawn(bench.profile.page_shape)
-    size = f"{choices.channels}x{choices.blocks}x{choices.levels}"
+    size = f"{choices.channels}x{choices.blocks}x{choices.depth}"
     return bench.outcome(part, size, choices.steps, folder, fitted, validation, unseen, preparing, drawn)
 
 

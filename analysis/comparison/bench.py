@@ -147,10 +147,10 @@ class Bench:
         """Features, then the network at symbol pitch."""
         if name == FAST:
             choices = replace(PRESETS[FAST], steps=choices.steps, seed=choices.seed)
-            size = f"{choices.channels}x{choices.blocks}x{choices.levels}"
+            size = f"{choices.channels}x{choices.blocks}x{choices.depth}"
         else:
-            channels, blocks, levels = map(int, size.split("x"))
-            choices = replace(choices, channels=channels, blocks=blocks, levels=levels)
+            channels, blocks, depth = map(int, size.split("x"))
+            choices = replace(choices, channels=channels, blocks=blocks, depth=depth)
         base = FIRST_PASSES.get(name, name)
         folder, features, first, preparing = self.first_pass(base, size, choices)
         if name not in FIRST_PASSES:

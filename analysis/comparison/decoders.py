@@ -45,17 +45,17 @@ from train.runs import sole_writer
 
 
 class Size(click.ParamType[str]):
-    """Channels, blocks and levels of a network, e.g. ``96x2x0``."""
+    """Channels, blocks and depth of a network, e.g. ``96x2x0``."""
 
-    name = "channels x blocks x levels"
+    name = "channels x blocks x depth"
 
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
         if not re.fullmatch(r"[1-9]\d{0,3}x[1-9]\d?x[0-4]", value):
-            self.fail(f"{value!r}: wanted CHANNELSxBLOCKSxLEVELS, as {DEFAULT_SIZE}", param, ctx)
+            self.fail(f"{value!r}: wanted CHANNELSxBLOCKSxDEPTH, as {DEFAULT_SIZE}", param, ctx)
         return value
 
 
-DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparameters.levels}"
+DEFAULT_SIZE = f"{Hyperparameters.channels}x{Hyperparameters.blocks}x{Hyperparameters.depth}"
 
 
 @click.command()

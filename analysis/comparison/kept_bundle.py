@@ -41,7 +41,7 @@ from train.fitting.validation import without_piston
 from train.models.decoder import COHERENT, SymbolDecoder
 from train.models.hyperparameters import Hyperparameters
 from train.models.twin import RayTwin, TorchTwin
-from train.runs import BEGUN, GOLDEN, REFERENCES, Run, save_arrays, save_weights
+from train.runs import BEGUN, GOLDEN, REFERENCES, Run, renamed, save_arrays, save_weights
 from train.trainers.refinement import fit_prediction
 from train.trainers.symbols import MATCHED_PAGES
 
@@ -119,7 +119,7 @@ def _decoder(
     trained: Path, profile: Profile, calibration: Calibration, recording: Recording, localizer: str, refinements: int
 ) -> SymbolDecoder:
     """The trained decoder, put together as training does it."""
-    begun = json.loads((trained / BEGUN).read_text())
+    begun = renamed(json.loads((trained / BEGUN).read_text()))
     options = {name: value for name, value in begun.items() if name != "format"} | {"refinements": refinements}
     choices = Hyperparameters(**options)
     decoder = SymbolDecoder(profile, calibration.vector, localizer, choices)

@@ -17,7 +17,7 @@ import torch
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_file
 from train.fitting.fitted import CHECKPOINTS, FITTED, FITTED_WEIGHTS
-from train.runs import BEGUN, FORMAT
+from train.runs import BEGUN, FORMAT, renamed
 
 TRAINED = Path(__file__).parents[1] / "weights"
 CALIBRATION = "calibration.toml"
@@ -71,7 +71,7 @@ class WeightStore:
         kept = self.folder / run.relative_to(self.data_set)
         if (run / FITTED).exists() or (run / CHECKPOINTS).exists() or not (kept / FITTED).exists():
             return False
-        if not self.is_of_this_data_set or _read(kept / BEGUN) != {"format": FORMAT, **options}:
+        if not self.is_of_this_data_set or renamed(_read(kept / BEGUN)) != {"format": FORMAT, **options}:
             return False
         if (self.folder / CALIBRATION).read_text() != (self.data_set / CALIBRATION).read_text():
             return False

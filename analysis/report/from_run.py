@@ -200,7 +200,7 @@ def _facts(run: Run, size: int) -> list[tuple[str, str]]:
     if isinstance(choices, PublishedChoices):
         network = "published U-Net of {} and {} channels".format(*choices.channels)
     else:
-        network = f"{choices.channels} channels, {choices.blocks} blocks, {choices.levels} levels below symbol pitch"
+        network = f"{choices.channels} channels, {choices.blocks} blocks, depth {choices.depth}"
         if choices.refinements:
             again = choices.of_refinement()
             network += f"; {choices.refinements} more with {again.channels} channels, {again.blocks} block"

@@ -81,7 +81,7 @@ def _coherent(profile: Profile) -> tuple[Callable[[], object], int]:
     tensors = {name: torch.from_numpy(value) for name, value in table.items()}
     recovery, localizer = FieldRecovery(profile).eval(), CoherentLocalizer(profile).eval()
     choices = Hyperparameters()
-    network = SymbolUNet(localizer.light_channels, choices.channels, choices.blocks, choices.levels).eval()
+    network = SymbolUNet(localizer.light_channels, choices.channels, choices.blocks, choices.depth).eval()
     reference = torch.full(profile.frame_shape, 100.0)
     generator = torch.Generator().manual_seed(0)
     frames = [reference + 20 * torch.randn(profile.frame_shape, generator=generator) for _ in range(2)]

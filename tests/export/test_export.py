@@ -253,6 +253,13 @@ def test_parity_is_judged_against_the_norm_and_never_passes_nan() -> None:
             check_parity(p, wrong, "x")
 
 
+def test_a_run_of_earlier_names_is_read(run_folder: Path, tmp_path: Path) -> None:
+    described = json.loads((run_folder / "run.json").read_text())
+    described["hyperparameters"]["levels"] = described["hyperparameters"].pop("depth")
+    (tmp_path / "run.json").write_text(json.dumps(described))
+    assert load_run(tmp_path) == load_run(run_folder)
+
+
 def test_an_unfinished_run_is_named(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"run\.json"):
         load_run(tmp_path)

@@ -40,6 +40,7 @@ class Choice:
         published: what holds without it for the published decoders, where they have it.
         localizers: that have it.
         of_preset: whether it is set by `--preset`; `--help` does not list it then, but it may be given too.
+        earlier: flag of earlier versions, which may be given too.
     """
 
     flag: str
@@ -49,6 +50,12 @@ class Choice:
     published: object = None
     localizers: tuple[str, ...] = _ALL
     of_preset: bool = False
+    earlier: str | None = None
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """All that it may be given by."""
+        return (self.flag,) if self.earlier is None else (self.flag, self.earlier)
 
     @property
     def name(self) -> str:
@@ -99,16 +106,17 @@ CHOICES = (
     Choice(
         "--blocks",
         click.IntRange(min=1),
-        "Residual blocks of the network, at each of its levels.",
+        "Residual blocks of the network, at each of its resolutions.",
         localizers=LOCALIZERS,
         of_preset=True,
     ),
     Choice(
-        "--levels",
+        "--depth",
         click.IntRange(min=0, max=4),
-        "Levels of the network below symbol pitch; 0 is the flat one.",
+        "How often the network halves its resolution below symbol pitch; 0 is the flat one.",
         localizers=LOCALIZERS,
         of_preset=True,
+        earlier="--levels",
     ),
     Choice(
         "--refinements",
@@ -195,7 +203,9 @@ C = TypeVar("C", bound=Callable[..., Any])
 def with_choices(command: C) -> C:
     """Give a command the options of `CHOICES`; what is not given comes as None."""
     for choice in reversed(CHOICES):
-        command = click.option(choice.flag, type=choice.type, help=choice.help, hidden=choice.of_preset)(command)
+        command = click.option(*choice.flags, choice.name, type=choice.type, help=choice.help, hidden=choice.of_preset)(
+            command
+        )
     return command
 
 

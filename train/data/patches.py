@@ -28,7 +28,7 @@ def training_pages(stores: Sequence[FeatureStore], mask: NDArray[np.bool_], choi
     Raises:
         InvalidInputError: patches in which the network would not see the neighbours of a single symbol.
     """
-    return Patches(stores, mask, choices.patch, reach(choices.blocks, choices.levels), 2**choices.levels)
+    return Patches(stores, mask, choices.patch, reach(choices.blocks, choices.depth), 2**choices.depth)
 
 
 class Patches(Dataset[Page]):
@@ -41,7 +41,7 @@ class Patches(Dataset[Page]):
         stores, mask: as for `training_pages`.
         side: symbols along an edge.
         rim: symbols along a patch's edge that are shown and not asked for: the network misses their neighbours.
-        step: places lie on multiples of it, as the network's lower levels do.
+        step: places lie on multiples of it, as the network's coarser grids do.
 
     Raises:
         InvalidInputError: patches that are all rim.

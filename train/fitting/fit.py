@@ -65,7 +65,7 @@ def fit_network(
     """
     seed_stretch(run, hyperparameters.seed)
     light_channels = training[0][0].shape[0]
-    network = kind(light_channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.levels)
+    network = kind(light_channels, hyperparameters.channels, hyperparameters.blocks, hyperparameters.depth)
     if start is not None:
         network.load_state_dict(start.state_dict())
     module = SymbolTraining(network, hyperparameters, pilot_mask, levels)

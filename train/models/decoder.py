@@ -38,12 +38,12 @@ class SymbolDecoder(nn.Module):
             choices.coherent_localizer(profile) if localizer == COHERENT else WaveLocalizer(profile, parameters, grid)
         )
         self.localizer: CoherentLocalizer | WaveLocalizer = chosen
-        self.network = SymbolUNet(chosen.light_channels, choices.channels, choices.blocks, choices.levels)
+        self.network = SymbolUNet(chosen.light_channels, choices.channels, choices.blocks, choices.depth)
         small = choices.of_refinement()
         self.prediction = Prediction(profile, parameters, grid) if choices.refinements else None
         unexplained = self.prediction.light_channels if self.prediction else 0
         self.refiners = nn.ModuleList(
-            Refiner(unexplained, small.channels, small.blocks, small.levels) for _ in range(choices.refinements)
+            Refiner(unexplained, small.channels, small.blocks, small.depth) for _ in range(choices.refinements)
         )
         self._geometry = _BY_RAYS if localizer == COHERENT else _BY_WAVES
         waves = _BY_WAVES if localizer == WAVE or choices.refinements else ()

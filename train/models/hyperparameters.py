@@ -22,7 +22,7 @@ class Hyperparameters:
     """Everything that a training run chooses.
 
     Attributes:
-        channels, blocks, levels: size of the network, see `SymbolUNet`.
+        channels, blocks, depth: size of the network, see `SymbolUNet`.
         refinements: further passes of the decoder, see `train.trainers.refinement`.
         field_rounds, binning: of the field's recovery, see `train.models.field.FieldRecovery`.
         field_step: pitch of the common grid, camera pixels.
@@ -38,7 +38,7 @@ class Hyperparameters:
 
     channels: int = 96
     blocks: int = 2
-    levels: int = 0
+    depth: int = 0
     refinements: int = 0
     field_rounds: int = ROUNDS
     binning: int = 1
@@ -84,4 +84,4 @@ class Hyperparameters:
     def of_refinement(self) -> Hyperparameters:
         """The choices for a refinement's network, which starts from a good belief and sees little light."""
         steps = max(_FEWEST_STEPS, round(_REFINEMENT_STEPS * self.steps))
-        return replace(self, channels=max(1, self.channels * 2 // 3), blocks=1, levels=0, refinements=0, steps=steps)
+        return replace(self, channels=max(1, self.channels * 2 // 3), blocks=1, depth=0, refinements=0, steps=steps)

@@ -1,4 +1,4 @@
-"""The decoder network: a U-Net whose highest level is the symbol, not the camera sample."""
+"""The decoder network: a U-Net whose finest pitch is that of symbols, not of camera samples."""
 
 from __future__ import annotations
 
@@ -88,11 +88,11 @@ class Residual(nn.Module):
         return torch.as_tensor(x + inner)
 
 
-def reach(blocks: int, levels: int) -> int:
+def reach(blocks: int, depth: int) -> int:
     """Rings of neighbours that a `SymbolUNet` of that size sees of a symbol, at most."""
     convolutions = 2 * blocks
-    inner = sum((2 * convolutions + 1) << level for level in range(levels))
-    return 1 + inner + (convolutions << levels)
+    inner = sum((2 * convolutions + 1) << step for step in range(depth))
+    return 1 + inner + (convolutions << depth)
 
 
 def belief(outputs: Tensor, before: Tensor | float = 0.0) -> Tensor:
@@ -116,12 +116,12 @@ class SymbolUNet(nn.Module):
 
     Args:
         light_channels: real and imaginary parts of a symbol's samples.
-        channels: channels at symbol pitch, doubled with each level.
-        blocks: residual blocks before and after each level's descent.
-        levels: levels below symbol pitch; 0 is the flat network.
+        channels: channels at symbol pitch, doubled with each halving of the resolution.
+        blocks: residual blocks at each resolution, on the way down and on the way up.
+        depth: how often the resolution is halved below symbol pitch; 0 is the flat network.
     """
 
-    def __init__(self, light_channels: int, channels: int = 96, blocks: int = 2, levels: int = 0) -> None:
+    def __init__(self, light_channels: int, channels: int = 96, blocks: int = 2, depth: int = 0) -> None:
         super().__init__()
         self.stem = nn.Conv2d(light_channels, channels, 3, padding=1)
         self.where = PositionModulation(channels)
@@ -130,7 +130,7 @@ class SymbolUNet(nn.Module):
         self.inward = nn.ModuleList()
         self.outward = nn.ModuleList()
         width = channels
-        for _ in range(levels):
+        for _ in range(depth):
             self.inward.append(nn.Sequential(*(Residual(width) for _ in range(blocks))))
             self.down.append(nn.Conv2d(width, 2 * width, 2, stride=2))
             self.up.append(nn.Conv2d(2 * width, width, 1))
@@ -176,12 +176,12 @@ class Refiner(nn.Module):
     does. Who to trust is learnt.
 
     Args:
-        light_channels, channels, blocks, levels: as for `SymbolUNet`.
+        light_channels, channels, blocks, depth: as for `SymbolUNet`.
     """
 
-    def __init__(self, light_channels: int, channels: int = 96, blocks: int = 2, levels: int = 0) -> None:
+    def __init__(self, light_channels: int, channels: int = 96, blocks: int = 2, depth: int = 0) -> None:
         super().__init__()
-        self.unet = SymbolUNet(light_channels + 3, channels, blocks, levels)
+        self.unet = SymbolUNet(light_channels + 3, channels, blocks, depth)
         self.trust = nn.Parameter(torch.ones(()))
 
     def forward(self, light: Tensor, positions: Tensor, earlier: Tensor) -> Tensor:

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from lightpage.errors import InvalidInputError
 
 KERNEL = 5
-LEVELS = 3
-"""Times that the U halves its resolution."""
+DEPTH = 3
+"""How often the U halves its resolution."""
 HEAD_STRIDES = {4: (1, 1, 2, 1, 2), 8: (1, 1, 2, 2, 2), 16: (1, 2, 2, 2, 2)}
 """Strides of the convolutions behind the U, by samples per symbol and axis."""
 INPUTS = 4
@@ -43,17 +43,17 @@ class PublishedUNet(nn.Module):
             raise InvalidInputError("samples per symbol", samples, f"one of {', '.join(map(str, HEAD_STRIDES))}")
         high, low = channels
         self.first = _convolution(INPUTS, high)
-        self.down = nn.ModuleList(_convolution(high if level == 0 else low, low, 2) for level in range(LEVELS))
+        self.down = nn.ModuleList(_convolution(high if level == 0 else low, low, 2) for level in range(DEPTH))
         self.up = nn.ModuleList(
             nn.ConvTranspose2d(
-                low if level == LEVELS - 1 else 2 * low,
+                low if level == DEPTH - 1 else 2 * low,
                 high if level == 0 else low,
                 KERNEL,
                 stride=2,
                 padding=KERNEL // 2,
                 output_padding=1,
             )
-            for level in reversed(range(LEVELS))
+            for level in reversed(range(DEPTH))
         )
         width, reduced, head = 2 * high, False, []
         for stride in HEAD_STRIDES[samples]:

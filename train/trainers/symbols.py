@@ -163,7 +163,7 @@ class SymbolTrainer:
         expected = (self.localizer, profile.page_shape, *_size(self.choices, profile))
         if size != expected:
             raise InvalidInputError(
-                f"--start {self.start}: localizer, page, channels, blocks, levels, samples", size, f"{expected}"
+                f"--start {self.start}: localizer, page, channels, blocks, depth, samples", size, f"{expected}"
             )
         return load_decoder(self.start, run)
 
@@ -196,4 +196,4 @@ class SymbolTrainer:
 
 def _size(choices: object, profile: Profile) -> tuple[object, ...]:
     samples = getattr(choices, "samples", 0) or symbol_samples(profile)
-    return (*(getattr(choices, name, None) for name in ("channels", "blocks", "levels")), samples)
+    return (*(getattr(choices, name, None) for name in ("channels", "blocks", "depth")), samples)

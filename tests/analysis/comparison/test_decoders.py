@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import click
@@ -19,7 +19,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from analysis.comparison.decoders import main
 from analysis.comparison.oracle import Oracle
 from analysis.comparison.outcome import HEADER, WALLS, Outcome, gained_at_the_end, symbols_by_walls
-from analysis.comparison.weight_store import WeightStore
+from analysis.comparison.weight_store import CALIBRATION, TRAINED, WeightStore
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES
@@ -35,6 +35,8 @@ from tests.told import Told
 from train.data.features import FeatureExtractor, PageFeatures
 from train.fitting.curves import curves_of
 from train.fitting.fitted import FITTED
+from train.models.presets import FAST, PRESETS
+from train.runs import BEGUN, check_begun
 
 PROFILE = small_profile()
 
@@ -222,6 +224,18 @@ def test_the_command_compares_the_methods_and_takes_up_what_is_there(tmp_path: P
         new.keep(new.data_set / run.relative_to(data_set))
     with pytest.raises(click.BadParameter, match="96x2x0"):
         CliRunner().invoke(main, ["--size", "96", "--out", str(out)], standalone_mode=False, catch_exceptions=False)
+
+
+def test_what_was_kept_under_earlier_names_is_taken_up(tmp_path: Path) -> None:
+    kept = TRAINED / "bench" / "-0.6deg-32e-4px"
+    for name in (BEGUN, CALIBRATION):
+        shutil.copyfile(kept / name, tmp_path / name)
+    run = tmp_path / "fast" / "48x2x0-6000"
+    options = asdict(replace(PRESETS[FAST], steps=6000, seed=5000))
+    assert "levels" in json.loads((kept / run.relative_to(tmp_path) / BEGUN).read_text())
+    assert not WeightStore(tmp_path, kept).bring(run, options | {"depth": 1})
+    assert WeightStore(tmp_path, kept).bring(run, options)
+    assert check_begun(run, options)
 
 
 def test_an_ideal_device_has_the_angle_and_the_noise_alone(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ from train.fitting.curves import curves_of
 from train.fitting.provenance import provenance, provenance_of
 from train.models.hyperparameters import Hyperparameters
 from train.models.presets import PRESETS
-from train.runs import FORMAT, begin, sole_writer
+from train.runs import FORMAT, begin, check_begun, sole_writer
 from train.trainers.symbols import SymbolTrainer
 
 SECONDS = 120
@@ -76,7 +76,7 @@ def test_recorded_and_synthetic_pages_are_trained_on_and_the_last_are_left(devic
     run([*again, "--out", str(tmp_path / "again")])
     air = json.loads((tmp_path / "again" / "run.json").read_text())["validation_air"]
     assert air == pytest.approx(described["validation_air"], abs=1e-3)
-    with pytest.raises(InvalidInputError, match=r"channels, blocks, levels.*16"):
+    with pytest.raises(InvalidInputError, match=r"channels, blocks, depth.*16"):
         run([*again, "--channels", "16", "--out", str(tmp_path / "other")])
 
 
@@ -386,6 +386,17 @@ def test_a_run_does_not_go_on_with_other_options(tmp_path: Path) -> None:
         begin(tmp_path, options | {"--channels": 16})
     with pytest.raises(InvalidInputError, match=r"begun without --rate, wanted the version that began the run"):
         begin(tmp_path, options | {"--channels": [8, 16], "--rate": 0.1})
+
+
+def test_the_depth_of_the_network_is_known_by_its_earlier_name(tmp_path: Path) -> None:
+    (tmp_path / "begun.json").write_text(json.dumps({"format": FORMAT, "--channels": 8, "--levels": 1}))
+    assert check_begun(tmp_path, {"--channels": 8, "--depth": 1})
+    with pytest.raises(InvalidInputError, match="--depth: got 0, wanted 1, with which it was begun"):
+        check_begun(tmp_path, {"--channels": 8, "--depth": 0})
+    required = ["--profile", "bench", "--recording", "R.h5", "--out", str(tmp_path)]
+    for flag in ("--depth", "--levels"):
+        with train.make_context("train", [*required, flag, "2"]) as context:
+            assert context.params["depth"] == 2
 
 
 def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:

@@ -75,20 +75,20 @@ def test_patches_in_which_the_network_sees_no_symbol_whole_are_refused(store: Fe
         training_pages([store], mask, Hyperparameters(blocks=2, patch=10))
     rim = reach(1, 1)
     with pytest.raises(InvalidInputError, match=f"wanted at least {2 * rim + 2}"):  # cut to whole steps of two
-        training_pages([store], mask, Hyperparameters(blocks=1, levels=1, patch=2 * rim + 1))
-    smallest = training_pages([store], mask, Hyperparameters(blocks=1, levels=1, patch=2 * rim + 2))
+        training_pages([store], mask, Hyperparameters(blocks=1, depth=1, patch=2 * rim + 1))
+    smallest = training_pages([store], mask, Hyperparameters(blocks=1, depth=1, patch=2 * rim + 2))
     assert all(torch.isfinite(smallest[index][-1]).any() for index in range(len(smallest)))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("blocks", "levels"), [(1, 0), (2, 0), (1, 1)])
+@pytest.mark.parametrize(("blocks", "depth"), [(1, 0), (2, 0), (1, 1)])
 def test_a_network_says_of_a_patch_what_it_says_of_the_page(
-    store: FeatureStore, mask: np.ndarray, blocks: int, levels: int
+    store: FeatureStore, mask: np.ndarray, blocks: int, depth: int
 ) -> None:
     torch.manual_seed(0)
-    network = SymbolUNet(8, channels=8, blocks=blocks, levels=levels)
+    network = SymbolUNet(8, channels=8, blocks=blocks, depth=depth)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
-    patches = training_pages([store], mask, Hyperparameters(blocks=blocks, levels=levels, patch=SIDE))
+    patches = training_pages([store], mask, Hyperparameters(blocks=blocks, depth=depth, patch=SIDE))
     assert len(patches) == 3 * 2 * 2  # type: ignore[arg-type]
     asked_at = set()
     for index in [*range(len(patches))] * 4:  # type: ignore[arg-type]

@@ -10,9 +10,9 @@ import torch
 from train.models.network import PositionModulation, Refiner, SymbolUNet, belief
 
 
-@pytest.mark.parametrize("levels", [0, 1, 2])
-def test_it_keeps_the_page_whatever_its_size(levels: int) -> None:
-    network = SymbolUNet(7, channels=8, blocks=1, levels=levels)
+@pytest.mark.parametrize("depth", [0, 1, 2])
+def test_it_keeps_the_page_whatever_its_size(depth: int) -> None:
+    network = SymbolUNet(7, channels=8, blocks=1, depth=depth)
     assert network(torch.zeros(2, 7, 11, 13), torch.zeros(2, 2, 11, 13)).shape == (2, 2, 11, 13)
 
 

@@ -164,7 +164,7 @@ def test_the_command_trains_each_and_says_what_it_did(localizer: str, small_devi
 
 def test_options_of_the_other_network_are_refused(small_device: list[str], tmp_path: Path) -> None:
     published = [*small_device, "--localizer", "ray", "--out", str(tmp_path / "run")]
-    for option in (["--blocks", "2"], ["--levels", "1"], ["--synthetic-pages", "4"], ["--start", str(tmp_path)]):
+    for option in (["--blocks", "2"], ["--depth", "1"], ["--synthetic-pages", "4"], ["--start", str(tmp_path)]):
         with pytest.raises(InvalidInputError, match=f"{option[0]}: got .*--localizer ray"):
             run([*published, *option])
     with pytest.raises(InvalidInputError, match=r"--lenses: got .*--localizer wave"):
