@@ -36,7 +36,7 @@ _REPEATS = 3
 METHODS = ("matrix", "modes", "coherent")
 _EXPECTED = {"matrix": 2.0, "modes": 1.5, "coherent": 1.0}
 """Powers of the number of symbols."""
-_TIMED = {"matrix": "its product alone", "modes": "its localizer alone", "coherent": "frames to beliefs"}
+_TIMED = {"matrix": "its product alone", "modes": "its localizer alone", "coherent": "frames to estimates"}
 
 
 def enlarged(profile: Profile, factor: int) -> Profile:

@@ -96,7 +96,7 @@ def trained(
         error_map (mean magnitude of the phase error, radians), [ny, nx], NaN at pilots; training_curve and
         validation_curve (AIR) and angles (pipe angle, degrees), [points, 2], step first; angle_deg of the decoder that
         is judged, not a number where it has none. With classes, air_map,
-        own_mi_map and ece are those of its beliefs in classes, and air_of_p is that of p.
+        own_mi_map and ece are those of its posteriors over classes, and air_of_p is that of p.
     """
     profile, device, levels = data_set.profile, data_set.device, data_set.levels
     pages = _QUICK_PAGES if settings.quick else PAGES
@@ -124,9 +124,9 @@ def trained(
             fitted = train_published(
                 work, localizer, choices, profile, quadrature_phase, mask, training, validation, callbacks=[tell]
             )
-        p, phases = _beliefs(fitted.module, validation, mask, knows_piston)
+        p, phases = _estimates(fitted.module, validation, mask, knows_piston)
         scale = calibrating_factor(p.reshape(2, -1), phases.ravel())
-        p, phases = _beliefs(fitted.module, unseen, mask, knows_piston)
+        p, phases = _estimates(fitted.module, unseen, mask, knows_piston)
         figures = _of_p(scale * p, phases, mask, levels)
         if choices.classes:
             of_classes = _of_classes(fitted.module, validation, unseen, mask)
@@ -175,7 +175,7 @@ def _mean(values: NDArray[np.float32]) -> float:
     return float(np.nanmean(values))
 
 
-def _beliefs(
+def _estimates(
     module: PublishedTraining, pages: FramePages, mask: NDArray[np.bool_], knows_piston: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """p [2, pages, N] of the data symbols, the piston taken off, and their true phases [pages, N].
@@ -197,7 +197,7 @@ def _beliefs(
 
 
 def _of_p(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.bool_], levels: int) -> dict[str, Any]:
-    """What von Mises beliefs [2, pages, N] carry, claim and miss, as means over the pages by symbol; their ECE."""
+    """What von Mises estimates [2, pages, N] carry, claim and miss, as means over the pages by symbol; their ECE."""
     mu, kappa = np.arctan2(p[1], p[0]), np.hypot(p[0], p[1])
     symbols = decide(phases, levels)
     maps = symbol_maps(mu, kappa, symbols, levels, ~mask)
@@ -208,25 +208,25 @@ def _of_p(p: NDArray[np.float32], phases: NDArray[np.float32], mask: NDArray[np.
 def _of_classes(
     module: PublishedTraining, validation: FramePages, unseen: FramePages, mask: NDArray[np.bool_]
 ) -> dict[str, Any]:
-    """The same of beliefs in classes, without errors of the phase; the validation pages choose their temperature."""
+    """The same of posteriors over classes, without phase errors; the validation pages choose their temperature."""
     classes, data = module.choices.classes, torch.from_numpy(~mask)
     known = list(_scored(module, validation, data))
 
     scale = most_likely_factor(
         lambda factor: float(sum(functional.cross_entropy(factor * scores.T, symbols) for scores, symbols in known))
     )
-    rates, claims, beliefs, right = [], [], [], []
+    rates, claims, confidences, right = [], [], [], []
     for page, truth in _scored(module, unseen, data):
         log = torch.log_softmax(page.double() * scale, dim=0)
         rates.append(rate_of_classes(-log.gather(0, truth[None])[0], classes).numpy())
         claims.append(rate_of_classes(-(log.exp() * log).sum(0), classes).numpy())
         confidence, decided = log.exp().max(0)
-        beliefs.append(confidence.numpy())
+        confidences.append(confidence.numpy())
         right.append((decided == truth).numpy())
     return {
         "air_map": _over_pages(rates, mask),
         "own_mi_map": _over_pages(claims, mask),
-        "ece": expected_calibration_error(np.concatenate(beliefs), np.concatenate(right)),
+        "ece": expected_calibration_error(np.concatenate(confidences), np.concatenate(right)),
     }
 
 

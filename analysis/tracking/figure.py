@@ -1,4 +1,4 @@
-"""Picture of how the image is found, followed and believed."""
+"""Picture of how the image is found, followed and confirmed."""
 
 from __future__ import annotations
 

@@ -404,7 +404,7 @@ def points(out: Path, names: tuple[str, ...]) -> Iterator[Point]:
 def main(
     seeds: int, pages: int, wrong: int, names: tuple[str, ...], bundle: Path | None, recording: Path | None, out: Path
 ) -> None:
-    """Measure how the image is found, followed and believed."""
+    """Measure how the image is found, followed and confirmed."""
     out.mkdir(parents=True, exist_ok=True)
     kept = WeightStore(out, {"seeds": seeds, "pages": pages, "wrong": wrong})
     for point in points(out, names):

@@ -1,7 +1,7 @@
 """How much a decoded page carries and how well calibrated its confidence is: decisions and rates.
 
-A decoder believes of every symbol that its phase follows a von Mises density with mean phase `mu` (radians) and
-concentration `kappa`. All figures are computed in float64. `levels` is M: symbol s stands for the phase 2 pi s / M.
+A decoder's estimate of a symbol is a von Mises density of its phase, with mean phase `mu` (radians) and concentration
+`kappa`. All figures are computed in float64. `levels` is M: symbol s stands for the phase 2 pi s / M.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CHUNK = 8192
 
 
 def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int) -> Floats:
-    """Bits that a belief claims to know of a symbol: log2 M less the entropy of its posterior; shape as `mu`.
+    """Bits that an estimate claims to know of a symbol: log2 M less the entropy of its posterior; shape as `mu`.
 
     Where kappa is far below M^2 this is kappa I1(kappa) / (I0(kappa) ln 2) - log2 I0(kappa), which is all that there is
     to know of a phase that may take any value; among few levels it is less. It is the model's own claim and bounds
@@ -38,7 +38,7 @@ def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], level
     Raises:
         PageError: shapes differ, a phase that is not finite, a concentration that is negative or not a number.
     """
-    m, phase, k = _checked_belief(mu, kappa, levels)
+    m, phase, k = _checked_estimate(mu, kappa, levels)
     log_partition, away = _partition(phase, k, m)
     return np.asarray(np.log2(m) - (log_partition + k * away) / np.log(2))
 
@@ -167,7 +167,7 @@ def checked(
     Raises:
         PageError: see `log_posterior`.
     """
-    levels, phase, k = _checked_belief(mu, kappa, levels)
+    levels, phase, k = _checked_estimate(mu, kappa, levels)
     s = np.atleast_1d(np.asarray(symbols))
     if phase.shape != s.shape:
         raise PageError("phase, symbols", (phase.shape, s.shape), "two equal shapes")
@@ -176,7 +176,7 @@ def checked(
     return levels, phase, k, s.astype(np.int64)
 
 
-def _checked_belief(mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int) -> tuple[int, Floats, Floats]:
+def _checked_estimate(mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int) -> tuple[int, Floats, Floats]:
     check_levels(levels)
     phase, k = np.atleast_1d(np.asarray(mu, np.float64)), _concentration(kappa)
     if phase.shape != k.shape:

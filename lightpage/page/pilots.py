@@ -1,4 +1,4 @@
-"""What pilots show: the piston, which frames alone do not, and how far a decoder's claims may be believed."""
+"""What pilots show: the piston, which frames alone do not, and how far a decoder's claims may be trusted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lightpage.errors import PageError
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.von_mises import mean_resultant
 
-_BELIEF = 20.0
+_CREDIT = 20.0
 """Pilots that count for the decoder before any is seen: noise of 54 pilots then costs under 0.01 bit a symbol."""
 
 _OUTLIERS = 0.01
@@ -173,7 +173,7 @@ def estimate_trust(p: NDArray[np.floating], pilots: Pilots, angle_rad: float) ->
 
     Twice kappa (1 - cos error), summed over n pilots whose piston they gave themselves, is about n - 1 where the claims
     are true. A device that has drifted shows more; the pilots are then most likely under claims that are smaller by as
-    much. The decoder starts with the credit of `_BELIEF` pilots, and gets no more than it claims.
+    much. The decoder starts with the credit of `_CREDIT` pilots, and gets no more than it claims.
 
     Args:
         p: (px, py), [2, ny, nx].
@@ -184,7 +184,7 @@ def estimate_trust(p: NDArray[np.floating], pilots: Pilots, angle_rad: float) ->
         PageError: the page has another shape than the pilots.
     """
     missed = _missed(_errors(p, pilots), angle_rad)
-    return min(1.0, (_BELIEF + len(missed) - 1) / (_BELIEF + float(missed.sum())))
+    return min(1.0, (_CREDIT + len(missed) - 1) / (_CREDIT + float(missed.sum())))
 
 
 def check_claims(
@@ -226,7 +226,7 @@ def without_outliers(p: NDArray[np.floating], pilots: Pilots) -> Pilots:
     """The pilots less those few that contradict all others, as a dead place of the modulator does.
 
     A pilot is left out where its error is more likely one of any size, `_OUTLIERS` of all pilots having such, than what
-    the concentration claimed there allows after the others have told how far claims may be believed.
+    the concentration claimed there allows after the others have told how far claims may be trusted.
 
     Args:
         p: (px, py), [2, ny, nx].
@@ -285,7 +285,7 @@ def read_pilots(p: NDArray[np.floating], pilots: Pilots, gained_nats: float = 0.
 
 
 def _errors(p: NDArray[np.floating], pilots: Pilots) -> NDArray[np.complex128]:
-    """Beliefs at the pilots, kappa exp(i error), complex [pilots], piston and all."""
+    """Estimates at the pilots, kappa exp(i error), complex [pilots], piston and all."""
     if p.shape[1:] != pilots.mask.shape:
         raise PageError("pilot positions", f"shape {pilots.mask.shape}", f"shape {p.shape[1:]}, as the page has")
     at_pilots = p[0][pilots.mask].astype(np.float64) + 1j * p[1][pilots.mask]

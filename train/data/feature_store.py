@@ -20,8 +20,10 @@ from train.data.pages import Page
 from train.processes import is_first_process
 
 _STATE = "state.json"
-_SHOWN = ("light", "positions", "belief", "phases")
-"""Arrays of `PageFeatures`, in the order in which a page's item has them."""
+_FILES = {"light": "light", "positions": "positions", "estimate": "belief", "phases": "phases"}
+"""Files of the arrays of `PageFeatures`, in the order in which a page's item has them.
+
+The file of estimates keeps its earlier name, so that what an earlier version has made is gone on with."""
 _PAGE_STATE = "page_states"
 _PATIENCE_S, _LOOK_S = 1800.0, 0.2
 """How long a process waits for the next page of another, and how often it looks."""
@@ -33,8 +35,8 @@ Maker = Callable[[int, tuple[float, float]], Iterator[PageFeatures]]
 class FeatureStore(Dataset[Page]):
     """Pages of features in a folder, as arrays that are mapped and not loaded.
 
-    An item is a page's light [2 C, ny, nx] float16, positions [2, ny, nx], what an earlier pass believed [2, ny, nx]
-    if there was one, and true phases [ny, nx].
+    An item is a page's light [2 C, ny, nx] float16, positions [2, ny, nx], the estimate p of an earlier pass
+    [2, ny, nx] if there was one, and true phases [ny, nx].
 
     Args:
         folder: with arrays that `fill` has completed.
@@ -42,7 +44,7 @@ class FeatureStore(Dataset[Page]):
     """
 
     def __init__(self, folder: Path, pages: range | None = None) -> None:
-        names = [name for name in _SHOWN if (folder / f"{name}.npy").exists()]
+        names = [name for name in _FILES.values() if (folder / f"{name}.npy").exists()]
         self._arrays = [np.load(folder / f"{name}.npy", mmap_mode="r") for name in names]
         self._states = np.load(folder / f"{_PAGE_STATE}.npy", mmap_mode="r")
         self._pages = range(len(self._states)) if pages is None else pages
@@ -101,7 +103,7 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
     with torch.inference_mode():
         pages = track(make(done, shift), what, total=count, done=done)
         for number, page in zip(range(done, count), pages, strict=False):
-            values = {name: getattr(page, name) for name in _SHOWN}
+            values = {file: getattr(page, name) for name, file in _FILES.items()}
             values[_PAGE_STATE] = np.array([*page.state.shift_px, page.state.piston_rad])
             for name, value in values.items():
                 if value is None:

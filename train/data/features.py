@@ -56,14 +56,14 @@ class PageFeatures:
         positions: exit centroids [2, ny, nx], float32, over the pipe's width.
         phases: true phases [ny, nx], float32, radians.
         state: image shift and piston of the page that were taken off.
-        belief: p [2, ny, nx], float32, that an earlier pass came to and this one starts from; None for the first pass.
+        estimate: p [2, ny, nx], float32, of an earlier pass, from which this one starts; None for the first pass.
     """
 
     light: NDArray[np.float16]
     positions: NDArray[np.float32]
     phases: NDArray[np.float32]
     state: PageState
-    belief: NDArray[np.float32] | None = None
+    estimate: NDArray[np.float32] | None = None
 
 
 class FeatureExtractor:

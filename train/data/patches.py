@@ -70,9 +70,9 @@ class Patches(Dataset[Page]):
         store, page = self._places[index // self._each]
         starts = [self._start(count, side) for count, side in zip(self._shape, self._sides, strict=True)]
         rows, columns = (slice(start, start + side) for start, side in zip(starts, self._sides, strict=True))
-        light, positions, *belief, phases = store.part(page, rows, columns)
+        light, positions, *estimate, phases = store.part(page, rows, columns)
         where = with_page_coordinates(positions, self._shape, (rows, columns))
-        return light, where, *belief, torch.where(self._asked(rows, columns), phases, torch.nan)
+        return light, where, *estimate, torch.where(self._asked(rows, columns), phases, torch.nan)
 
     def _start(self, count: int, side: int) -> int:
         """Where a patch begins on an axis: drawn from beyond the page too, so that its edge is asked for as often."""

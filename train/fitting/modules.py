@@ -77,7 +77,7 @@ class DecoderTraining(L.LightningModule, Generic[N]):
 class SymbolTraining(DecoderTraining[SymbolNetwork]):
     """A network at symbol pitch, with exact rotation augmentation.
 
-    Its pages are light [N, 2 C, ny, nx], exit centroids [N, 2, ny, nx], for a `Refiner` what is believed so far
+    Its pages are light [N, 2 C, ny, nx], exit centroids [N, 2, ny, nx], for a `Refiner` the estimate so far
     [N, 2, ny, nx], and true phases [N, ny, nx].
 
     Args:
@@ -92,15 +92,15 @@ class SymbolTraining(DecoderTraining[SymbolNetwork]):
         self.choices = hyperparameters
 
     def forward(self, *page: Tensor) -> Tensor:
-        """Light, exit centroids and what is believed so far to p [N, 2, ny, nx]."""
+        """Light, exit centroids and the estimate so far to p [N, 2, ny, nx]."""
         light, *others = page
         return torch.as_tensor(self.network(light.float(), *others))
 
     def training_step(self, batch: Page, index: int) -> Tensor:
         """Loss of pages whose field and symbols were turned by one random angle each: piston is no information."""
-        light, positions, *belief, phases = batch
+        light, positions, *estimate, phases = batch
         rotation = 2 * math.pi * torch.rand(len(light), 1, 1, device=light.device)
-        shown = [_turned(part, rotation) for part in (light.float(), *belief)]
+        shown = [_turned(part, rotation) for part in (light.float(), *estimate)]
         return self.loss(self(shown[0], positions, *shown[1:]), phases + rotation)
 
     def configure_optimizers(self) -> Any:

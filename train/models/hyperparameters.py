@@ -82,6 +82,6 @@ class Hyperparameters:
         return self.steps * self.batch * share
 
     def of_refinement(self) -> Hyperparameters:
-        """The choices for a refinement's network, which starts from a good belief and sees little light."""
+        """The choices for a refinement's network, which starts from a good estimate and sees little light."""
         steps = max(_FEWEST_STEPS, round(_REFINEMENT_STEPS * self.steps))
         return replace(self, channels=max(1, self.channels * 2 // 3), blocks=1, depth=0, refinements=0, steps=steps)

@@ -95,7 +95,7 @@ def reach(blocks: int, depth: int) -> int:
     return 1 + inner + (convolutions << depth)
 
 
-def belief(outputs: Tensor, before: Tensor | float = 0.0) -> Tensor:
+def estimate(outputs: Tensor, before: Tensor | float = 0.0) -> Tensor:
     """p of a network's outputs [N, 3, ny, nx]: the first two add to it, the third multiplies it.
 
     From a page's dark edge to its middle concentration grows a hundredfold: a factor says so more easily than a sum.
@@ -151,10 +151,10 @@ class SymbolUNet(nn.Module):
         Returns:
             p = (px, py), [N, 2, ny, nx].
         """
-        return belief(self.outputs(light, positions))
+        return estimate(self.outputs(light, positions))
 
     def outputs(self, light: Tensor, positions: Tensor) -> Tensor:
-        """What `belief` makes p of, [N, 3, ny, nx]; light and exit centroids as for p itself."""
+        """What `estimate` makes p of, [N, 3, ny, nx]; light and exit centroids as for p itself."""
         x = self.where(self.stem(light), positions)
         kept = []
         for inward, down in zip(self.inward, self.down, strict=True):
@@ -170,9 +170,9 @@ class SymbolUNet(nn.Module):
 
 
 class Refiner(nn.Module):
-    """What an earlier pass believed, and the light that this leaves unexplained, to a better belief.
+    """The estimate of an earlier pass, and the light that it leaves unexplained, to a better estimate.
 
-    Unexplained light adds to the natural parameter p of a von Mises belief, as any further measurement of the phase
+    Unexplained light adds to the natural parameter p of a von Mises density, as any further measurement of the phase
     does. Who to trust is learnt.
 
     Args:
@@ -188,4 +188,4 @@ class Refiner(nn.Module):
         """Unexplained light, exit centroids and the earlier p, [N, 2, ny, nx], to p: see `SymbolUNet`."""
         kappa = torch.sqrt(earlier.square().sum(1, keepdim=True) + 1e-12)
         known = torch.cat([light, earlier / kappa, torch.log(kappa) - _TYPICAL_LOG_KAPPA], dim=1)
-        return belief(self.unet.outputs(known, positions), self.trust * earlier)
+        return estimate(self.unet.outputs(known, positions), self.trust * earlier)

@@ -44,7 +44,7 @@ class Prediction(nn.Module):
         return 2 * self.waves.samples**2
 
     def field(self, at: WaveMatrices, p: Tensor) -> Tensor:
-        """Expected field on the common grid, [2, Gy, Gx], of a believed page p [2, ny, nx]; its scale is open."""
+        """Expected field on the common grid, [2, Gy, Gx], of an estimated page p [2, ny, nx]; its scale is open."""
         samples = self.waves.samples
         written = expected_phasors(p).repeat_interleave(samples, dim=1).repeat_interleave(samples, dim=2)
         illumination = torch.tensordot(self.illumination, torch.stack(self._terms()), 1)
@@ -56,7 +56,7 @@ class Prediction(nn.Module):
     def forward(
         self, recovery: FieldRecovery, measured: Measured, field: Tensor, p: Tensor, parameters: Tensor | None = None
     ) -> Tensor:
-        """Light that a believed page leaves unexplained.
+        """Light that an estimated page leaves unexplained.
 
         Args:
             recovery: of the same device.
@@ -77,7 +77,7 @@ class Prediction(nn.Module):
 
 
 def expected_phasors(p: Tensor) -> Tensor:
-    """Mean of exp(i phase) under von Mises beliefs, [2, ...] to [2, ...].
+    """Mean of exp(i phase) under von Mises densities, [2, ...] to [2, ...].
 
     Its length, a ratio of Bessel functions, lies within 5% of kappa / (1/2 + sqrt(kappa^2 + 9/4)), one of the bounds of
     Amos (Math. Comp. 28, 1974).

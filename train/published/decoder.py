@@ -101,16 +101,16 @@ class PublishedDecoder(nn.Module):
 
 
 def p_of_classes(logits: Tensor) -> Tensor:
-    """The von Mises belief with the mean direction of a belief in M classes, [N, M, ny, nx] to p [N, 2, ny, nx].
+    """The von Mises density with the mean direction of a posterior over M classes, [N, M, ny, nx] to p [N, 2, ny, nx].
 
     Its concentration is that of the mean resultant's length R, R (2 - R^2) / (1 - R^2) to a few percent (Banerjee et
     al., 2005).
     """
     levels = logits.shape[1]
     angles = torch.arange(levels, device=logits.device) * (2 * math.pi / levels)
-    with torch.autocast(logits.device.type, enabled=False):  # of a sure belief 1 - R^2 would be rounding
-        belief = torch.softmax(logits.float(), dim=1)
-        parts = [torch.einsum("nmyx,m->nyx", belief, wave(angles)) for wave in (torch.cos, torch.sin)]
+    with torch.autocast(logits.device.type, enabled=False):  # of a sure posterior 1 - R^2 would be rounding
+        posterior = torch.softmax(logits.float(), dim=1)
+        parts = [torch.einsum("nmyx,m->nyx", posterior, wave(angles)) for wave in (torch.cos, torch.sin)]
         mean = torch.stack(parts, dim=1)
         squared = mean.square().sum(1, keepdim=True)
         return torch.as_tensor(mean * (2 - squared) / (1 - squared).clamp(min=1e-5))

@@ -151,7 +151,7 @@ class PublishedTraining(DecoderTraining[PublishedDecoder]):
         return loss
 
     def rate(self, batch: Page) -> float:
-        """AIR of held-out pages, bits per data symbol: of beliefs in classes, which know the piston, if it has them."""
+        """AIR of held-out pages, bits per data symbol: of posteriors over classes, piston known, if it has them."""
         if not self.choices.classes:
             return super().rate(batch)
         frames, state, phases = batch

@@ -31,7 +31,7 @@ from train.models.parts import stacked, turned
 from train.models.prediction import Prediction
 
 _FLOORS = (0.05, 20.0)
-"""Least and largest `Measured.pull` floor that is believed."""
+"""Least and largest `Measured.pull` floor that is accepted."""
 
 
 def fit_prediction(extractor: FeatureExtractor, known: Sequence[Explained]) -> Prediction:
@@ -163,12 +163,12 @@ def refined_pages(
         *shown, phases = earlier[number]
         state = earlier.state(number)
         measured, field = extractor.measure(inputs.recording.frames(inputs.pages[number]), state.shift_px)
-        belief = module(*(part[None] for part in shown))[0]
-        light = prediction(extractor.recovery, measured, field, turned(belief, state.piston_rad))
+        estimate = module(*(part[None] for part in shown))[0]
+        light = prediction(extractor.recovery, measured, field, turned(estimate, state.piston_rad))
         yield PageFeatures(
             turned(light, -state.piston_rad).numpy().astype(np.float16),
             shown[1].numpy(),
             phases.numpy(),
             state,
-            belief.numpy(),
+            estimate.numpy(),
         )

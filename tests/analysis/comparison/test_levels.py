@@ -1,4 +1,4 @@
-"""Confidences among few levels, of beliefs whose error rate is known."""
+"""Confidences among few levels, of estimates whose error rate is known."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lightpage.simulator.recording_job import RecordingJob
 from tests.lightpage.small import small_profile
 
 
-def test_calibrated_beliefs_have_the_error_rate_that_they_claim_and_bold_ones_do_not(tmp_path: Path) -> None:
+def test_calibrated_estimates_have_the_error_rate_that_they_claim_and_bold_ones_do_not(tmp_path: Path) -> None:
     profile, rng = small_profile(), np.random.default_rng(0)
     mask, pages = pilot_mask(profile), [0, 1]
     job = RecordingJob(profile, Device(), 4, 3, truth=False, out=tmp_path / "R.h5")
@@ -25,7 +25,7 @@ def test_calibrated_beliefs_have_the_error_rate_that_they_claim_and_bold_ones_do
     with Recording.open(tmp_path / "R.h5") as recording:
         written = [recording.symbols(page) for page in pages]
         phases = np.concatenate([symbol_phases(page, 4)[~mask] for page in written if page is not None])
-        # a symbol is as likely to be the true one as its belief says, where the belief is drawn about the true phase
+        # where estimates are drawn about the true phases, a symbol is as likely to be the true one as its estimate says
         seen = phases + rng.vonmises(0, kappa, phases.shape)
         p = kappa * np.stack([np.cos(seen), np.sin(seen)]).astype(np.float32)
         calibrated, bold = (level_figures(scale * p, recording, pages, mask) for scale in (1, 3))

@@ -34,7 +34,7 @@ from analysis.studies import (
 )
 from analysis.studies.command import study
 from analysis.studies.study import Settings, aligned, measured
-from analysis.studies.trained import DataSet, _beliefs, _of_classes, chosen
+from analysis.studies.trained import DataSet, _estimates, _of_classes, chosen
 from lightpage.device.lenses import LENSES
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, ideal_device
@@ -356,7 +356,7 @@ def test_each_that_trains_makes_maps_of_every_case_and_each_data_set_once(
                 assert bool(maps["angles"][:, 1].any()) == (name != "pipe-length")  # whose pipes are known to be square
 
 
-def test_beliefs_in_classes_are_made_calibrated_before_they_are_judged() -> None:
+def test_posteriors_over_classes_are_made_calibrated_before_they_are_judged() -> None:
     classes, spread, shape = 4, 0.6, (40, 50)
     generator, mask = torch.Generator().manual_seed(0), np.zeros(shape, dtype=bool)
     mask[::10, ::10] = True
@@ -439,7 +439,7 @@ def test_a_known_piston_is_taken_off_as_it_is_and_not_as_pilots_show_it(monkeypa
     left_over = (0.7 - 2 * step, -2.0 + 5 * step)
     for knows_piston, classes, left in ((True, 0, (0.0, 0.0)), (False, 0, (-0.4, -0.4)), (True, 16, left_over)):
         module = SimpleNamespace(choices=SimpleNamespace(classes=classes))
-        found, truth = _beliefs(module, SimpleNamespace(states=states), mask, knows_piston)  # type: ignore[arg-type]
+        found, truth = _estimates(module, SimpleNamespace(states=states), mask, knows_piston)  # type: ignore[arg-type]
         off = np.angle((found[0] + 1j * found[1]) * np.exp(-1j * truth))
         np.testing.assert_allclose(off, np.broadcast_to(np.array(left)[:, None], off.shape), atol=1e-4)
 

@@ -65,7 +65,7 @@ def test_decision_is_the_nearest_level_whatever_the_winding(levels: int) -> None
 
 
 @pytest.mark.parametrize("levels", [3, 4, 8, 16, 256])
-def test_air_of_calibrated_beliefs_equals_own_information(levels: int) -> None:
+def test_air_of_calibrated_estimates_equals_own_information(levels: int) -> None:
     kappa = np.random.default_rng(0).lognormal(np.log(10), 1, 200_000)
     symbols, mu = drawn_page(levels, kappa, 1)
     air = information.achievable_rate(mu, kappa, symbols, levels).mean()
@@ -80,7 +80,7 @@ def test_air_at_256_levels_agrees_with_the_continuous_form() -> None:
     np.testing.assert_allclose(information.achievable_rate(mu, kappa, symbols, 256), continuous, atol=1e-9)
 
 
-def test_overconfident_beliefs_claim_more_than_they_achieve() -> None:
+def test_overconfident_estimates_claim_more_than_they_achieve() -> None:
     kappa = np.full(50_000, 8.0)
     symbols, mu = drawn_page(16, kappa, 3)
     calibrated = measures.measure(mu, kappa, symbols, 16)

@@ -1,4 +1,4 @@
-"""The pilots give the piston, how far a decoder may be believed, and whether a page may be given out."""
+"""The pilots give the piston, how far a decoder may be trusted, and whether a page may be given out."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class TestTrust:
         p, pilots = self.noisy(4000, 40, 0)
         assert estimate_trust(p, pilots, estimate_piston(p, pilots).angle_rad) == 1
 
-    def test_wrong_pilots_leave_no_belief(self) -> None:
+    def test_wrong_pilots_leave_no_trust(self) -> None:
         p, pilots = self.noisy(400, 400, 0)
         wrong = Pilots(pilots.mask, np.roll(pilots.phases, 1))
         assert estimate_trust(p, wrong, estimate_piston(p, wrong).angle_rad) < 0.01

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,16 @@ def test_it_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
         assert light.shape == (24, 5, 6)
         for part in (light, positions, phases):
             assert torch.all(part == number)
+
+
+def test_estimates_of_an_earlier_pass_are_read_where_earlier_versions_kept_them(tmp_path: Path) -> None:
+    def make(first: int, shift: tuple[float, float]) -> Iterator[PageFeatures]:
+        return (replace(page, estimate=-page.positions) for page in Pages()(first, shift))
+
+    fill(tmp_path, "device", 2, make, "pages")
+    assert {path.stem for path in tmp_path.glob("*.npy")} == {"light", "positions", "belief", "phases", "page_states"}
+    _, positions, estimate, _ = FeatureStore(tmp_path)[1]
+    torch.testing.assert_close(estimate, -positions, rtol=0, atol=0)
 
 
 def test_what_is_complete_is_not_made_again(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from train.models.network import PositionModulation, Refiner, SymbolUNet, belief
+from train.models.network import PositionModulation, Refiner, SymbolUNet, estimate
 
 
 @pytest.mark.parametrize("depth", [0, 1, 2])
@@ -41,15 +41,15 @@ def test_the_filter_depends_on_where_a_beam_leaves_the_pipe() -> None:
     assert not torch.allclose(modulation(x, positions), x)
 
 
-def test_untrained_it_claims_nothing_and_a_further_look_leaves_what_was_believed() -> None:
+def test_untrained_it_claims_nothing_and_a_further_pass_leaves_the_estimate() -> None:
     light, positions, earlier = torch.randn(2, 3, 5, 6), torch.rand(2, 2, 5, 6), torch.randn(2, 2, 5, 6)
     assert not SymbolUNet(3, channels=8, blocks=1)(light, positions).any()
     torch.testing.assert_close(Refiner(3, channels=8, blocks=1)(light, positions, earlier), earlier)
 
 
-def test_outputs_add_to_a_belief_and_scale_it() -> None:
+def test_outputs_add_to_an_estimate_and_scale_it() -> None:
     before = torch.tensor([3.0, 4.0]).reshape(1, 2, 1, 1)
-    more = belief(torch.tensor([0.03, 0.04, 0.0]).reshape(1, 3, 1, 1), before)
+    more = estimate(torch.tensor([0.03, 0.04, 0.0]).reshape(1, 3, 1, 1), before)
     torch.testing.assert_close(more / before, torch.full_like(before, 2.0))
-    scaled = belief(torch.tensor([0.0, 0.0, 0.2]).reshape(1, 3, 1, 1), before)
+    scaled = estimate(torch.tensor([0.0, 0.0, 0.2]).reshape(1, 3, 1, 1), before)
     torch.testing.assert_close(scaled / before, torch.full_like(before, math.exp(2)))

@@ -1,4 +1,4 @@
-"""Beliefs in classes as von Mises beliefs, and that they are learned."""
+"""Posteriors over classes as von Mises densities, and that they are learned."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LEVELS = 64
 
 
 @pytest.mark.parametrize("kappa", [0.3, 3.0, 30.0])
-def test_a_von_mises_belief_in_classes_comes_back(kappa: float) -> None:
+def test_a_von_mises_posterior_over_classes_comes_back(kappa: float) -> None:
     angles = torch.arange(LEVELS) * (2 * math.pi / LEVELS)
     direction = 1.3
     logits = (kappa * torch.cos(angles - direction))[None, :, None, None]
@@ -26,14 +26,14 @@ def test_a_von_mises_belief_in_classes_comes_back(kappa: float) -> None:
     assert math.hypot(px, py) == pytest.approx(kappa, rel=0.06)
 
 
-def test_a_sure_belief_is_no_surer_in_the_arithmetic_of_training() -> None:
+def test_a_sure_posterior_is_no_surer_in_the_arithmetic_of_training() -> None:
     angles = torch.arange(LEVELS) * (2 * math.pi / LEVELS)
     logits = (150 * torch.cos(angles - 1.3))[None, :, None, None]
     with torch.autocast("cpu", torch.bfloat16):
         assert float(p_of_classes(logits).norm()) == pytest.approx(150, rel=0.02)
 
 
-def test_no_belief_is_no_p_and_a_sure_one_is_finite() -> None:
+def test_no_knowledge_is_no_p_and_a_sure_one_is_finite() -> None:
     none = p_of_classes(torch.zeros(1, LEVELS, 1, 1))
     assert float(none.abs().max()) < 1e-5
     sure = torch.zeros(1, LEVELS, 1, 1)

@@ -1,4 +1,4 @@
-"""A further pass: what a believed page leaves unexplained says where, and which way, the belief is wrong."""
+"""A further pass: what an estimated page leaves unexplained says where, and which way, the estimate is wrong."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ def dim() -> Known:
     return known_page(sensor=Sensor(full_well_e=100), drift=Drift(piston_rad=0.5, shift_px=0.2))
 
 
-def unexplained(known: Known, believed: np.ndarray) -> np.ndarray:
-    """Light [ny, nx] that sure beliefs in phases leave, against them."""
+def unexplained(known: Known, estimated: np.ndarray) -> np.ndarray:
+    """Light [ny, nx] that sure estimates of phases leave, against them."""
     state = known.extractor.state(known.extractor.field(known.pair), known.phases, np.zeros(2))
     measured, field = known.extractor.measure(known.pair, state.shift_px)
-    p = SURE * torch.from_numpy(np.stack([np.cos(believed), np.sin(believed)]).astype(np.float32))
+    p = SURE * torch.from_numpy(np.stack([np.cos(estimated), np.sin(estimated)]).astype(np.float32))
     light = known.prediction(known.extractor.recovery, measured, field, turned(p, state.piston_rad))
     seen = turned(light, -state.piston_rad).numpy()[:, 0].mean(1)
-    return (seen[0] + 1j * seen[1]) * np.exp(-1j * believed)
+    return (seen[0] + 1j * seen[1]) * np.exp(-1j * estimated)
 
 
 def test_expected_phasors_are_as_long_as_their_bessel_functions_say() -> None:
