@@ -47,7 +47,7 @@ from train.trainers.symbols import MATCHED_PAGES
 
 LEVELS = 256
 JUDGED = 3
-"""Pages by which claims are calibrated: thousands of symbols each."""
+"""Pages by which concentrations are calibrated: thousands of symbols each."""
 
 
 def data_set_of(kept: Path) -> tuple[Profile, Device, int]:

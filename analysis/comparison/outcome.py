@@ -91,7 +91,7 @@ class Outcome:
         walls = "".join(f"{self.by_walls[name]:>7.3f} " for name in WALLS)
         return (
             f"{self.method:<16} {self.size:<9} {self.steps:>6} {self.air:>8.3f} {self.own_mi:>7.3f} "
-            f"{self.own_mi - self.air:>7.3f} {self.page_kB:>6.2f} {self.own_mi_kB:>6.2f} "
+            f"{self.own_mi - self.air:>10.3f} {self.page_kB:>6.2f} {self.own_mi_kB:>6.2f} "
             f"{walls}{over[0]:>10} {over[1]:>10} "
             f"{self.gained_in_last_fifth:>8.3f}{' ' if self.is_settled else UNSETTLED} "
             f"{self.preparing_seconds / 60:>9.1f} {self.training_seconds / 60:>8.1f} {self.pages_per_second:>7.2f}"
@@ -99,11 +99,11 @@ class Outcome:
 
 
 HEADER = (
-    f"{'method':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'claims':>7} {'kB':>6} {'own-kB':>6} "
+    f"{'method':<16} {'size':<9} {'steps':>6} {'AIR':>8} {'own-MI':>7} {'over-claim':>10} {'kB':>6} {'own-kB':>6} "
     + "".join(f"{name:>7} " for name in WALLS)
     + f"{'of oracle':>10} {'of theirs':>10} {'gained':>8}  {'features':>9} {'training':>8} {'pages/s':>7}"
 )
-"""Held-out pages, bits a symbol and kB a page; own-MI and what it claims beyond the AIR, concentrations multiplied by
+"""Held-out pages, bits a symbol and kB a page; own-MI and the over-claim, own-MI less AIR, concentrations multiplied by
 one factor that the validation pages ask for; AIR where a symbol's light meets no wall of the pipe, a wall of pair x,
 of pair y, or of both; AIR over the oracle's, and over that of the best published decoder; of the last pass alone, as
 its steps: what validation AIR gained in the last fifth of them (`FOOTNOTE`), minutes of features and of training, and

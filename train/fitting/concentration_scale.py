@@ -19,7 +19,7 @@ from train.fitting.modules import DecoderTraining
 from train.fitting.validation import without_piston
 
 _SCALE_BOUNDS = (-3.0, 3.0)
-"""Bounds of the logarithm of a factor that calibrates a decoder's claims: hardly trained ones were off by five."""
+"""Bounds of the logarithm of a factor that calibrates concentrations: hardly trained decoders were off by five."""
 
 _AT_A_BOUND = 1e-3
 
@@ -61,6 +61,6 @@ def most_likely_factor(nll: Callable[[float], float]) -> float:
     found = optimize.minimize_scalar(lambda log: nll(math.exp(log)), bounds=_SCALE_BOUNDS, method="bounded")
     log_factor = float(found.x)
     if min(log_factor - _SCALE_BOUNDS[0], _SCALE_BOUNDS[1] - log_factor) < _AT_A_BOUND:
-        what = f"claims would be calibrated still better beyond the factor {math.exp(log_factor):.3g}"
+        what = f"concentrations would be calibrated still better beyond the factor {math.exp(log_factor):.3g}"
         warn(f"{what}, where the search ends: is the decoder trained?")
     return math.exp(log_factor)

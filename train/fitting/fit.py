@@ -33,8 +33,8 @@ from train.processes import process_number
 
 _LAST = "last.ckpt"
 
-LOOKS = 60
-"""How often a run looks at its validation pages."""
+VALIDATIONS = 60
+"""How often a run is judged by its validation pages."""
 
 _SEEDS_APART = 1_000_003
 """Of two processes of one run: further than any run has steps."""
@@ -69,7 +69,7 @@ def fit_network(
     if start is not None:
         network.load_state_dict(start.state_dict())
     module = SymbolTraining(network, hyperparameters, pilot_mask, levels)
-    draws = hyperparameters.batch * max(1, hyperparameters.steps // LOOKS)
+    draws = hyperparameters.batch * max(1, hyperparameters.steps // VALIDATIONS)
     sampler = RandomSampler(training, replacement=True, num_samples=draws)  # type: ignore[arg-type]  # it has a length
     averaged = EMAWeightAveraging(use_buffers=False, decay=1 - 1 / max(1.0, AVERAGED_SHARE * hyperparameters.steps))
     return fit(
@@ -102,7 +102,7 @@ def fit(
     callbacks: Sequence[Callback] = (),
     devices: int | str = "auto",
 ) -> Fitted[M]:
-    """Train, or go on with, the module of a run, looking at its validation pages after every pass of `training`.
+    """Train, or go on with, the module of a run, judging it by its validation pages after every pass of `training`.
 
     What a finished training made is kept in the folder and returned when it is asked for again. On several devices
     Lightning runs the program once for each; all of them return the same.
@@ -154,7 +154,7 @@ def fit(
             )
     except SystemExit:  # Lightning's answer to Ctrl-C, once it has closed its files
         raise KeyboardInterrupt from None
-    # the last steps are the quietest, and no look need have followed them
+    # the last steps are the quietest, and no validation need have followed them
     rates = {}
     for path in {last, folder / Path(best.best_model_path or last).name}:  # the run may have been moved meanwhile
         module.load_state_dict(_checkpoint(path)["state_dict"])

@@ -93,11 +93,11 @@ def test_a_run_begins_with_the_refinements_of_another_too(small_device: list[str
         torch.testing.assert_close(after[name], before[name], rtol=0, atol=1e-5)
 
 
-def test_options_of_the_first_look_are_kept_and_those_that_do_nothing_refused(
+def test_options_of_the_first_pass_are_kept_and_those_that_do_nothing_refused(
     small_device: list[str], tmp_path: Path
 ) -> None:
     small = [*small_device, "--channels", "8", "--blocks", "1", "--steps", "12", "--synthetic-pages", "0"]
-    hurried = [
+    fast = [
         "--binning",
         "2",
         "--field-step",
@@ -111,7 +111,7 @@ def test_options_of_the_first_look_are_kept_and_those_that_do_nothing_refused(
         "--patch",
         "20",
     ]
-    run([*small, *hurried, "--out", str(tmp_path / "run")])
+    run([*small, *fast, "--out", str(tmp_path / "run")])
     kept = json.loads((tmp_path / "run" / "run.json").read_text())["hyperparameters"]
     assert {
         name: kept[name] for name in ("binning", "field_step", "samples", "interpolation", "field_rounds", "patch")
