@@ -24,6 +24,9 @@ from lightpage.errors import InvalidInputError
 FEWEST_PAGES = 3
 """Fewer say nothing of how pages differ."""
 
+HEADROOM = 0.01
+"""Share of what a symbol carries that is kept for drift, so that it is noticed before pages are lost."""
+
 _QUANTILE = 3.09
 """Standard deviations below the mean of the page that one of a thousand falls short of."""
 _CONFIDENCE = 1.645
@@ -90,13 +93,16 @@ HEADER = f"{'levels':>6} {'carried':>9} {'deviation':>9} {'needed':>9} {'rate':>
 numbers of a page, corrections of a Reed-Solomon word, user bytes of a page."""
 
 
-def choose(draw: Draw, air_bits: float, pilots: NDArray[np.bool_], seed: int = 0) -> tuple[Choice, list[Choice]]:
+def choose(
+    draw: Draw, air_bits: float, pilots: NDArray[np.bool_], headroom: float = HEADROOM, seed: int = 0
+) -> tuple[Choice, list[Choice]]:
     """The code that carries most, and the best of each level count.
 
     Args:
         draw: draws the known pages.
         air_bits: what a symbol carries, bits: level counts near it are tried.
         pilots: bool [ny, nx].
+        headroom: share of what a symbol carries that is kept for drift.
         seed: of what is drawn.
 
     Raises:
@@ -104,7 +110,7 @@ def choose(draw: Draw, air_bits: float, pilots: NDArray[np.bool_], seed: int = 0
     """
     tried: list[Choice] = []
     for bits in range(max(1, int(air_bits) - 1), min(8, int(np.ceil(air_bits)) + 1) + 1):
-        choice = _best_of(draw, 1 << bits, pilots, np.random.default_rng([seed, bits]))
+        choice = _best_of(draw, 1 << bits, pilots, headroom * air_bits, np.random.default_rng([seed, bits]))
         if choice is not None:
             tried.append(choice)
     if not tried:
@@ -114,8 +120,10 @@ def choose(draw: Draw, air_bits: float, pilots: NDArray[np.bool_], seed: int = 0
     return max(tried, key=lambda choice: choice.user_bytes), tried
 
 
-def _best_of(draw: Draw, levels: int, pilots: NDArray[np.bool_], rng: np.random.Generator) -> Choice | None:
-    """The best code of a level count, None where none carries the pages."""
+def _best_of(
+    draw: Draw, levels: int, pilots: NDArray[np.bool_], kept_bits: float, rng: np.random.Generator
+) -> Choice | None:
+    """The best code of a level count that leaves `kept_bits` of a symbol, None where none carries the pages."""
     coded = min(MOST_CODED_BITS, level_bits(levels))
     pages = draw(levels, rng)
     if len(pages) < FEWEST_PAGES:
@@ -127,7 +135,7 @@ def _best_of(draw: Draw, levels: int, pilots: NDArray[np.bool_], rng: np.random.
         return None
     count, deviation = len(pages), float(information.std(ddof=1))
     spread = _QUANTILE + _CONFIDENCE * np.sqrt(1 / count + _QUANTILE**2 / (2 * count))
-    weakest = float(information.mean()) - spread * deviation
+    weakest = float(information.mean()) - spread * deviation - kept_bits / coded
     gap = 0.03
     code: Code | None = None
     for _ in range(3):  # the gap to the code's limit changes little with the rate

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.choose import Choice, DrawnPage, choose
+from lightpage.codec.choose import HEADROOM, Choice, DrawnPage, choose
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.pilots import Pilots, remove_piston
@@ -37,13 +37,16 @@ def air_bits(page: DecodedPage, symbols: NDArray[np.uint8], data: NDArray[np.boo
     return float(rates.mean())
 
 
-def choose_code(decoder: Decoder, recording: Recording, tracker: Tracker) -> tuple[Choice, list[Choice]]:
+def choose_code(
+    decoder: Decoder, recording: Recording, tracker: Tracker, headroom: float = HEADROOM
+) -> tuple[Choice, list[Choice]]:
     """Choose a code by the pages of a recording that the bundle has not seen.
 
     Args:
         decoder: of the device.
         recording: with known symbols.
         tracker: follows the device from page to page.
+        headroom: see `lightpage.codec.choose.choose`.
 
     Raises:
         RecordingError: another device's recording, or one without symbols.
@@ -83,4 +86,4 @@ def choose_code(decoder: Decoder, recording: Recording, tracker: Tracker) -> tup
             pages.append(DrawnPage(phase[data], kappa[data].astype(np.float64), symbols[data]))
         return pages
 
-    return choose(draw, float(np.mean(rates)) if rates else 1.0, mask)
+    return choose(draw, float(np.mean(rates)) if rates else 1.0, mask, headroom)

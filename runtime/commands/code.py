@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lightpage.cli.paths import NewPath, OutputFile
-from lightpage.codec.choose import HEADER
+from lightpage.codec.choose import HEADER, HEADROOM
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
 from lightpage.recording.reader import Recording
@@ -25,6 +25,13 @@ from runtime.decoding.image_tracker import tracker_for
 @click.option("--out", type=OutputFile(), help="Write the code to this TOML file.")
 @click.option("--out-bundle", type=NewPath(), help="Write the bundle with this code in it: a folder, or a .zip.")
 @click.option("--version", help="Of that bundle.")
+@click.option(
+    "--headroom",
+    type=click.FloatRange(0, 0.5),
+    default=HEADROOM,
+    show_default=True,
+    help="Share of what a symbol carries that is kept for drift.",
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the choices to this file.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 def code(
@@ -33,6 +40,7 @@ def code(
     out: Path | None,
     out_bundle: Path | None,
     version: str | None,
+    headroom: float,
     json_path: Path | None,
     threads: int | None,
 ) -> None:
@@ -46,7 +54,7 @@ def code(
         raise InvalidInputError("options", "one of --out-bundle and --version", "both or neither")
     decoder = Decoder.load(bundle_path(bundle), threads)
     with Recording.open(recording) as pages:
-        best, tried = choose_code(decoder, pages, tracker_for(decoder))
+        best, tried = choose_code(decoder, pages, tracker_for(decoder), headroom)
     if out is not None:
         best.code.save(out)
     if out_bundle is not None:

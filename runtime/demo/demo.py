@@ -46,7 +46,7 @@ AIR_LEVELS = 256
 
 GROUPS = 2
 PARITY_PAGES = 2
-SPOILT_PAGE = 3
+SPOILT_PAGE = 1
 """Page whose symbols are damaged, of those that are written."""
 SPOILT_SHARE = 0.4
 """Of its symbols: far more than its code mends."""
