@@ -373,8 +373,9 @@ class ForeignDevice:
         pilots: NDArray[np.bool_] | None = None,
         with_symbols: bool = True,
         jumps_px: Mapping[int, tuple[float, float]] | None = None,
+        symbols: NDArray[np.uint8] | None = None,
     ) -> NDArray[np.uint8]:
-        """Record pages of random symbols, without a profile; returns the symbols [page, ny, nx].
+        """Record pages, without a profile; returns the symbols [page, ny, nx].
 
         Args:
             path: HDF5 file, overwritten.
@@ -384,9 +385,11 @@ class ForeignDevice:
             pilots: boolean [ny, nx], written as it is.
             with_symbols: whether the file tells the symbols.
             jumps_px: see `walk`.
+            symbols: what the modulator shows, uint8 [pages, ny, nx]; drawn if left out.
         """
         rng = np.random.default_rng([seed, 2])
-        symbols = rng.integers(0, levels, size=(pages, *PAGE_SHAPE), dtype=np.uint8)
+        drawn = rng.integers(0, levels, size=(pages, *PAGE_SHAPE), dtype=np.uint8)
+        symbols = drawn if symbols is None else symbols
         drifts = self.walk(pages, rng, jumps_px)
         with h5py.File(str(path), "w") as file:
             file.attrs["format"] = "lightpage-recording"

@@ -27,12 +27,14 @@ from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import BundleError
 from lightpage.files import write_json
-from lightpage.progress import Progress
-from lightpage.recording.reader import FramePair
+from lightpage.progress import Progress, note
+from lightpage.recording.reader import FramePair, Recording
+from runtime.bulk.coded_pages import choose_code
 from runtime.bundle.bundle import Bundle, npz, write_bundle
 from runtime.bundle.manifest import DECODER, FIELD, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version, sha256
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
+from runtime.decoding.image_tracker import tracker_for
 from runtime.execution.session import open_session
 from train.models.twin import RayTwin, TorchTwin
 from train.published.trainer import published_decoder
@@ -52,14 +54,24 @@ _LEAST_CONTRAST = 2.0
 @click.option("--out", required=True, type=NewPath(), help="New bundle: a folder, or a .zip.")
 @click.option("--name", default=None, help="Name of the bundle; the profile's if left out.")
 @click.option("--version", "version", default=None, help="Of the bundle; its name, the time and a hash if left out.")
+@click.option("--recording", type=click.Path(path_type=Path), help="Choose the code of user bytes by its unseen pages.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-def export(run: Path, out: Path, name: str | None, version: str | None, json_path: Path | None) -> None:
-    """Export a training run, proving the bundle against torch with the runtime's own decoder."""
+def export(
+    run: Path, out: Path, name: str | None, version: str | None, recording: Path | None, json_path: Path | None
+) -> None:
+    """Export a training run, proving the bundle against torch with the runtime's own decoder.
+
+    With --recording the bundle also holds how user bytes are protected on the device's pages, as `lightpage code` would
+    choose it by the pages of the recording that the run was not trained on.
+    """
     with percent_bar() as progress:
-        bundle, error = export_run(run, out, name, version, progress)
+        bundle, error = export_run(run, out, name, version, progress, recording)
+    if bundle.code is None:
+        note("the bundle has no code for user bytes: export with --recording, or see `lightpage code`")
     size = sum(len(data) for data in bundle.files.values())
     if json_path is not None:
         figures = {"bundle": str(out), "version": bundle.version, "parity_error": error, "unpacked_bytes": size}
+        figures["code"] = None if bundle.code is None else bundle.code.model_dump()
         write_json(json_path, figures)
     click.echo(f"{out}: version {bundle.version}, p within {error:.1e} of torch, {size / 1e6:.1f} MB unpacked")
 
@@ -70,14 +82,23 @@ def export_run(
     name: str | None = None,
     version: str | None = None,
     progress: Progress = lambda step, share: None,
+    recording: Path | None = None,
 ) -> tuple[Bundle, float]:
     """Write the bundle of a run.
+
+    Args:
+        folder: of the run.
+        out: new bundle.
+        name, version: of it.
+        progress: told of every step.
+        recording: with pages that the run has not seen, to choose the code of user bytes by; no code without.
 
     Returns:
         The bundle as opened again, and the relative error of p against torch on the golden page.
 
     Raises:
         InvalidInputError: the run is unfinished.
+        RecordingError: the recording is of another device.
         BundleError: `version` is none, or the exported decoder does not say what torch says; nothing stays at `out`.
     """
     if version is not None:
@@ -130,7 +151,12 @@ def export_run(
     _remove(partial)
     try:
         write_bundle(partial, manifest, files)
-        Decoder.load(partial)
+        proven = Decoder.load(partial)
+        if recording is not None:
+            progress("choose the code of user bytes", 0.9)
+            with Recording.open(recording) as pages:
+                best, _ = choose_code(proven, pages, tracker_for(proven))
+            manifest = manifest.model_copy(update={"code": best.code.to_toml()})
     finally:
         _remove(partial)
     write_bundle(out, manifest, files)

@@ -57,6 +57,26 @@ def refuse_another_device(bundle: Path, seed: int, folder: Path) -> None:
     assert "1 of 1 pages that were refused" in told, told
 
 
+def carry_a_file(device: ForeignDevice, bundle: Path, seed: int, folder: Path) -> None:
+    """A file goes through the device and comes back bit by bit, read from frames and pilots alone."""
+    known, code, written = folder / "known.h5", folder / "code.toml", folder / "pages.h5"
+    sent, read, figures = folder / "sent.bin", folder / "read.bin", folder / "recovered.json"
+    device.write(known, pages=4, levels=256, seed=seed + 2)
+    lightpage("code", "--bundle", str(bundle), "--recording", str(known), "--out", str(code))
+    sent.write_bytes(np.random.default_rng(seed).bytes(1500))
+    lightpage("encode", str(sent), "--bundle", str(bundle), "--code", str(code), "--data-pages", "2",
+              "--parity-pages", "1", "--out", str(written))  # fmt: skip
+    with h5py.File(written) as file:
+        symbols, levels = file["symbols"][()], int(file.attrs["levels"])
+    shown = folder / "shown.h5"
+    device.write(shown, len(symbols), levels, seed + 3, with_symbols=False, symbols=symbols)
+    lightpage("recover", "--bundle", str(bundle), "--code", str(code), "--recording", str(shown), "--out", str(read),
+              "--json", str(figures))  # fmt: skip
+    told = json.loads(figures.read_text())
+    print(f"{told['user_bytes_per_page']} user bytes a page, margin at least {told['margin_bits_least']:.2f} bits")
+    assert read.read_bytes() == sent.read_bytes(), f"seed {seed}"
+
+
 @pytest.mark.timeout(60 * MINUTES)
 @pytest.mark.parametrize("training", ["short", pytest.param("long", marks=pytest.mark.long)])
 def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decoded(
@@ -93,3 +113,4 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
 
     read_after_jumps(device, bundle, evaluation["air_bits_per_symbol"], seed, tmp_path)
     refuse_another_device(bundle, seed, tmp_path)
+    carry_a_file(device, bundle, seed, tmp_path)
