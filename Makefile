@@ -14,7 +14,7 @@ IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo test test-long bench bench-speed bench-service bench-image-search bench-decoders train-decoders results image check-image proto lint format clean
+.PHONY: help setup demo test test-long bench bench-speed bench-service bench-codec bench-image-search bench-decoders train-decoders results image check-image proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -87,6 +87,11 @@ bench-service: $(STAMP)  ## time a page through the running service
 
 bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 	$(BIN)/lightpage bench
+
+bench-codec: $(STAMP)  ## user bytes on recorded pages, wrong bytes ever given out, time of the code: about three hours
+	$(BIN)/python -m analysis.codec.ledger --out runs/bench-codec
+	$(ONE_THREAD) $(BIN)/python -m analysis.codec.safety --json runs/bench-codec/safety.json
+	$(ONE_THREAD) $(BIN)/python -m analysis.codec.speed --json runs/bench-codec/speed.json
 
 bench-image-search: $(STAMP)  ## how the image is found, followed and confirmed: tables and a picture, in more than an hour
 	$(BIN)/python -m analysis.tracking.image_search --out runs/bench-image-search

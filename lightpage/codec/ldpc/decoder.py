@@ -24,7 +24,7 @@ _KNOWN = np.float32(1e4)
 _SIGN = np.uint32(0x80000000)
 _BLOCKS_AT_ONCE = 16
 """More leave the cache and are slower a block."""
-MOST_ITERATIONS = 40
+MOST_ITERATIONS = 25
 
 
 @dataclass(frozen=True)

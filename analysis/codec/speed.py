@@ -1,0 +1,214 @@
+"""Time of the page code on one core: decoders of LDPC blocks side by side, whole pages, and a file to pages.
+
+    python -m analysis.codec.speed --json runs/bench-codec/speed.json
+
+Decoders take turns on the same blocks. The installed size says what each would bring into the image.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.codec.numba_decoder import NumbaDecoder
+from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
+from lightpage.codec.code import Code
+from lightpage.codec.header import Header
+from lightpage.codec.ldpc.code import LdpcCode
+from lightpage.codec.ldpc.decoder import MOST_ITERATIONS, decode
+from lightpage.codec.mapping import bit_information
+from lightpage.codec.page_codec import PageCodec
+from lightpage.codec.volume import Volume, encode_volume
+from lightpage.device.profile import Profile, load_profile
+from lightpage.files import write_json
+from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
+from lightpage.recording.pages import PagesWriter
+
+Blocks = NDArray[np.float32]
+CODES = {"0.66": (6270, 9500), "0.50": (4750, 9500)}
+"""Information and sent bits: about a bench page in bright and in dim light."""
+_GAP = 0.075
+"""Information beyond the rate at which blocks are drawn: a page with some margin."""
+_MARGIN_BITS = 0.1
+"""Of the pages that are timed, bits a symbol."""
+PAGES: dict[str, tuple[str, int, Code]] = {
+    "bench 4x4": ("bench", 4, Code(levels=128, coded_bits=2, rate_per_mille=660, needed_information=0.72)),
+    "full size 4x4": ("paper", 4, Code(levels=64, coded_bits=2, rate_per_mille=480, needed_information=0.54)),
+    "full size 2x2": ("paper", 2, Code(levels=32, coded_bits=2, rate_per_mille=500, needed_information=0.56)),
+}
+
+
+def drawn(code: LdpcCode, count: int, rng: np.random.Generator) -> tuple[NDArray[np.uint8], Blocks]:
+    """Blocks and their LLRs in Gaussian noise, at a gap of `_GAP` above the code's rate."""
+    bits = rng.integers(0, 2, (count, code.information_bits), dtype=np.uint8)
+    sent = code.encode(bits)
+    low, high = 0.1, 3.0
+    noise = rng.standard_normal(sent.shape)
+    for _ in range(20):
+        sigma = (low + high) / 2
+        llrs = 2 * (1 - 2.0 * sent + sigma * noise) / sigma**2
+        low, high = (sigma, high) if bit_information(llrs, sent) > code.rate + _GAP else (low, sigma)
+    return bits, llrs.astype(np.float32)
+
+
+def by_library(code: LdpcCode) -> Callable[[Blocks], NDArray[np.uint8]]:
+    """Minimum-sum of the package `ldpc`."""
+    from ldpc.bp_decoder import BpDecoder
+    from scipy.sparse import csr_matrix
+
+    checks = [np.arange(code.lifting) + row * code.lifting for row in range(len(code.checks))]
+    rows = np.concatenate([np.tile(own, len(bits)) for own, bits in zip(checks, code.checks, strict=True)])
+    columns = np.concatenate([check.ravel() for check in code.checks])
+    matrix = csr_matrix((np.ones(len(rows), np.uint8), (rows, columns)))
+    coder = BpDecoder(
+        matrix, error_rate=0.1, max_iter=MOST_ITERATIONS, bp_method="minimum_sum", ms_scaling_factor=0.75,
+        schedule="serial",
+    )  # fmt: skip
+
+    def one(llrs: Blocks) -> NDArray[np.uint8]:
+        word = np.zeros(code.word_bits)
+        word[code.fillers] = 40
+        word[code.sent] = np.clip(llrs, -40, 40)
+        coder.update_channel_probs(1 / (1 + np.exp(np.abs(word))))
+        flips = coder.decode(np.asarray(matrix @ (word < 0) % 2, np.uint8))
+        return np.asarray(((word < 0) ^ flips.astype(bool))[: code.information_bits], np.uint8)
+
+    return lambda blocks: np.stack([one(block) for block in blocks])
+
+
+def decoders(code: LdpcCode) -> dict[str, Callable[[Blocks], NDArray[np.uint8]]]:
+    """Decoders of blocks by name."""
+    numba = NumbaDecoder(code)
+    return {
+        "numpy, one block": lambda blocks: np.concatenate([decode(code, b[None]).information for b in blocks]),
+        "numpy, 16 blocks": lambda blocks: decode(code, blocks).information,
+        "numba": lambda blocks: np.stack([numba.decode(block)[0] for block in blocks]),
+        "ldpc (C++)": by_library(code),
+    }
+
+
+BROUGHT = {"numpy": (), "numba": ("numba", "llvmlite"), "ldpc": ("ldpc", "stim", "sinter", "pymatching", "networkx")}
+"""Distributions that a decoder would bring into the image, which has numpy already."""
+
+
+def megabytes(names: tuple[str, ...]) -> float:
+    """Installed size of distributions."""
+    total = 0
+    for name in names:
+        try:
+            files = distribution(name).files or []
+        except PackageNotFoundError:
+            continue
+        total += sum(path.stat().st_size for file in files if (path := Path(str(file.locate()))).is_file())
+    return total / 1e6
+
+
+def time_decoders(count: int, rounds: int) -> list[dict[str, Any]]:
+    """Milliseconds a block of each decoder, the best of some rounds, and whether all came out right."""
+    found = []
+    for name, (information, sent) in CODES.items():
+        code = LdpcCode(information, sent)
+        bits, llrs = drawn(code, count, np.random.default_rng(0))
+        ways = decoders(code)
+        best = dict.fromkeys(ways, float("inf"))
+        right = {}
+        for way in ways.values():
+            way(llrs[:2])  # compiled, and in the cache
+        for _ in range(rounds):
+            for way_name, way in ways.items():
+                start = time.perf_counter()
+                decoded = way(llrs)
+                best[way_name] = min(best[way_name], (time.perf_counter() - start) / count)
+                right[way_name] = int(np.count_nonzero((decoded == bits).all(axis=1)))
+        for way_name, seconds in best.items():
+            size = megabytes(BROUGHT[way_name.partition(",")[0].partition(" ")[0]])
+            found.append(
+                {
+                    "rate": name,
+                    "decoder": way_name,
+                    "ms": 1e3 * seconds,
+                    "megabits_per_second": information / seconds / 1e6,
+                    "right": right[way_name],
+                    "blocks": count,
+                    "brought_MB": size,
+                }
+            )
+    return found
+
+
+def time_page(profile: Profile, code: Code, rounds: int) -> dict[str, float]:
+    """Milliseconds of a page's code, by its parts, on one core."""
+    mask = pilot_mask(profile)
+    codec, rng = PageCodec(code, mask), np.random.default_rng(0)
+    data = rng.integers(0, 256, (1, codec.user_bytes), dtype=np.uint8)
+    symbols = codec.encode([Header(code.id, 1, 0, 1)], data, (1, 0), pilot_symbols(profile, code.levels)[mask])[0]
+    best, iterations = float("inf"), 0.0
+    step = 2 * np.pi / code.levels
+    for share in np.linspace(0.45, 0.2, 26):
+        noise = share * step
+        phase = symbol_phases(symbols, code.levels) + noise * rng.standard_normal(symbols.shape)
+        kappa = np.full(symbols.shape, noise**-2)
+        if codec.decode(phase, kappa).margin_bits > _MARGIN_BITS:
+            break
+    for _ in range(rounds):
+        start = time.perf_counter()
+        found = codec.decode(phase, kappa)
+        best, iterations = min(best, time.perf_counter() - start), found.iterations
+    return {"ms": 1e3 * best, "user_bytes": codec.user_bytes, "blocks": codec.blocks, "iterations": iterations}
+
+
+def time_encoding(profile: Profile, code: Code, size: int) -> float:
+    """Megabytes a second from a file to pages in HDF5, in groups of 60 + 4."""
+    mask = pilot_mask(profile)
+    codec, content = PageCodec(code, mask), np.random.default_rng(0).bytes(size)
+    volume = Volume(1, size, codec.user_bytes, 60, 4)
+    pilots = pilot_symbols(profile, code.levels)[mask]
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        with PagesWriter(Path(folder) / "pages.h5", profile, code.levels, {}) as writer:
+            for pages in encode_volume(codec, volume, io.BytesIO(content), pilots):
+                writer.append(pages)
+        return size / (time.perf_counter() - start) / 1e6
+
+
+@click.command()
+@click.option("--blocks", default=48, show_default=True, type=click.IntRange(16))
+@click.option("--rounds", default=5, show_default=True, type=click.IntRange(1))
+@click.option("--json", "json_path", type=OutputFile(), help="Write the times to this file.")
+def main(blocks: int, rounds: int, json_path: Path | None) -> None:
+    """Print the times."""
+    found = time_decoders(blocks, rounds)
+    click.echo(f"{'rate':<6} {'decoder':<18} {'ms/block':>9} {'Mb/s':>7} {'right':>8} {'MB more':>8}")
+    for each in found:
+        click.echo(
+            f"{each['rate']:<6} {each['decoder']:<18} {each['ms']:>9.2f} {each['megabits_per_second']:>7.2f} "
+            f"{each['right']:>4}/{each['blocks']:<3} {each['brought_MB']:>8.0f}"
+        )
+    pages = {}
+    click.echo(f"\n{'page':<14} {'bytes':>8} {'blocks':>7} {'iterations':>11} {'decode ms':>10} {'encode MB/s':>12}")
+    for name, (profile_name, size, code) in PAGES.items():
+        profile = load_profile(profile_name).with_symbols_of(size)
+        times = time_page(profile, code, rounds)
+        times["encode_MB_per_second"] = time_encoding(profile, code, 2_000_000)
+        pages[name] = times
+        click.echo(
+            f"{name:<14} {times['user_bytes']:>8.0f} {times['blocks']:>7.0f} {times['iterations']:>11.1f} "
+            f"{times['ms']:>10.1f} {times['encode_MB_per_second']:>12.2f}"
+        )
+    if json_path is not None:
+        write_json(json_path, {"decoders": found, "pages": pages})
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, name="python -m analysis.codec.speed"))
