@@ -58,7 +58,7 @@ class PageBytes:
         blocks: all of them.
         corrected: Reed-Solomon symbols that were mended.
         margin_bits: information of a symbol's coded bits beyond what the code needs, bits; negative where the page
-            should be lost. Of a lost page, by what its confidences claim.
+            should be lost. Of a lost page, by what its confidences claim, and at most 0.
     """
 
     header: Header | None
@@ -212,7 +212,8 @@ class PageCodec:
         self, header: Header | None, loss: Loss, blocks: NDArray[np.float32], failed: int, iterations: float
     ) -> PageBytes:
         margin = self.code.coded_bits * (bit_information(blocks) - self.code.needed_information)
-        return PageBytes(header, None, 0, 0, loss, iterations, failed, self.blocks, 0, margin)
+        # what is wrong and claims to be certain is no margin
+        return PageBytes(header, None, 0, 0, loss, iterations, failed, self.blocks, 0, min(margin, 0.0))
 
     def _checked(self, bits: Bits, header: Header) -> tuple[NDArray[np.uint8] | None, int]:
         """The body in the bits of a page where its checksum holds, mended if need be; and how much was mended."""

@@ -65,14 +65,16 @@ def read_data(plane: DataPlane, first: int, count: int, caller: Caller) -> Itera
 
     Raises:
         BundleError: the model has no code.
-        SourceError: no source, or one that is damaged.
+        SourceError: there is no source.
         PageError: no such page.
     """
+    plane.levels_of(0, user_data=True)
+    _ = plane.source
     group, last, expected = _Group(), None, None
     for index in range(first, first + count):
         try:
             answer = plane.read_page(index, None, caller, user_data=True, expected=expected).answer
-        except LostPageError as error:
+        except (LostPageError, SourceError) as error:
             expected = _following(group.volume, expected)
             yield DataPage(index, None, error)
             continue

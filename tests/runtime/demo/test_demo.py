@@ -14,7 +14,8 @@ from lightpage.errors import BundleError, CalibrationError, InvalidInputError
 from lightpage.page.symbols import pilot_mask, symbol_phases
 from runtime.commands.demo import demo
 from runtime.decoding.decoder import Decoder
-from runtime.demo.demo import drifted, run_demo, summarise
+from runtime.demo.demo import drifted, pgm, run_demo, summarise
+from runtime.demo.picture import picture
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.refit import refit
 from runtime.wire.pages import RemotePage, RemoteTimings
@@ -70,19 +71,41 @@ def test_a_bundle_without_field_or_calibration_cannot_be_refitted(decoder: Decod
         decoder.field_solver(pair, pair, np.zeros((2, 2, 10), np.float32), np.ones(2, np.float32))
 
 
-def test_no_pages_are_no_demo(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="at least 1"):
-        run_demo(tmp_path / "b.zip", 0, 0)
+def test_a_bundle_without_a_code_is_no_demo(toy_zip: Path, tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="code: got none"):
+        run_demo(toy_zip, tmp_path, 0)
 
 
-def test_drift_is_lost_and_won_back_with_the_shipped_bundle(tmp_path: Path) -> None:
-    result = CliRunner().invoke(demo, ["--out", str(tmp_path), "--pages", "3"], standalone_mode=False)
+def test_a_picture_is_lost_by_drift_and_won_back_with_the_shipped_bundle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = picture()[:60]
+    monkeypatch.setattr("runtime.demo.demo.picture", lambda: small)  # 8 pages instead of 20
+    result = CliRunner().invoke(demo, ["--out", str(tmp_path)], standalone_mode=False, catch_exceptions=False)
     assert result.exception is None
     figures = json.loads((tmp_path / "demo.json").read_text())
     fresh, lost, again = figures["phases"]
+    assert figures["pages"] == 4 + 2 * 2
     assert figures["recalibration"]["pages_used"] <= 2
-    assert lost["air_bits_per_symbol"] < 0.8 * fresh["air_bits_per_symbol"]
-    assert lost["mean_confidence"] < fresh["mean_confidence"]
+    for phase in (fresh, again):
+        assert (phase["pages_unread"], phase["pages_restored"], phase["pages_lost"]) == (1, 1, 0)
+        assert phase["picture_exact"]
+        assert phase["margin_bits_least"] > 0
+    assert lost["pages_lost"] > 0
+    assert not lost["picture_exact"]
+    assert figures["drift"][-1]["lost"]
     assert again["air_bits_per_symbol"] >= 0.98 * fresh["air_bits_per_symbol"]
     assert again["model_version"] != fresh["model_version"] == lost["model_version"]
     assert (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")
+    read = (tmp_path / "recalibrated.pgm").read_bytes()
+    assert read == (tmp_path / "as-calibrated.pgm").read_bytes() == pgm(small)
+    assert (tmp_path / "after-drift.pgm").read_bytes() != read
+
+
+@pytest.mark.long
+def test_the_whole_demo(tmp_path: Path) -> None:
+    result = CliRunner().invoke(demo, ["--out", str(tmp_path)], standalone_mode=False, catch_exceptions=False)
+    assert result.exception is None
+    figures = json.loads((tmp_path / "demo.json").read_text())
+    assert figures["pages"] >= 20
+    assert [phase["picture_exact"] for phase in figures["phases"]] == [True, False, True]

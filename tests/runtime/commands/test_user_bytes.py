@@ -1,0 +1,278 @@
+"""A file to pages and back by the commands, and every way in which that can go wrong."""
+
+from __future__ import annotations
+
+import errno
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from lightpage.cli.main import lightpage, run
+from lightpage.cli.simulate import simulate
+from lightpage.errors import InvalidInputError, LostDataError, RecordingError
+from lightpage.page.symbols import pilot_mask
+from runtime.commands.code import code as code_command
+from runtime.commands.encode import encode
+from runtime.commands.recover import recover
+from tests.runtime import coded, toy
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Path:
+    return coded.bundle(tmp_path / "toy.zip")
+
+
+@pytest.fixture
+def pages(bundle: Path, tmp_path: Path) -> np.ndarray:
+    return coded.pages(bundle, tmp_path)
+
+
+def recovered(bundle: Path, recording: Path, *more: str) -> tuple[Result, dict]:
+    """Recover to read.bin beside the recording; the outcome, and the figures where there are any."""
+    folder = recording.parent
+    asked = ["--bundle", str(bundle), "--recording", str(recording), "--out", str(folder / "read.bin")]
+    asked += ["--json", str(folder / "J.json"), "--no-tracking", *more]
+    result = CliRunner().invoke(recover, asked, standalone_mode=False)
+    figures = json.loads((folder / "J.json").read_text()) if (folder / "J.json").exists() else {}
+    return result, figures
+
+
+def test_a_file_comes_back_and_the_figures_say_what_it_cost(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+    assert len(pages) == 9 + 3 * 2  # 9 data pages in groups of three, two parity pages each
+    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages))
+    assert result.exception is None
+    assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
+    assert {key: figures[key] for key in ("pages", "pages_unread", "pages_lost", "user_bytes")} == {
+        "pages": 15,
+        "pages_unread": 0,
+        "pages_lost": 0,
+        "user_bytes": 1000,
+    }
+    data = 384 - np.count_nonzero(pilot_mask(toy.PROFILE))
+    assert figures["share_of_air"] == pytest.approx(figures["user_bytes_per_page"] / figures["air_bytes_per_page"])
+    assert figures["air_bytes_per_page"] == pytest.approx(figures["air_bits_per_symbol"] * data / 8, rel=0.01)
+    assert figures["q"] == pytest.approx(8 * figures["user_bytes_per_page"] / 384 / 5)
+    assert 0 < figures["page_failure_rate_bound_95"] < 0.25
+    assert figures["margin_bits_least"] > 0
+    assert figures["seconds_per_page"] > figures["code_seconds_per_page"] > 0
+
+
+def test_symbols_are_not_needed(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages, known=False))
+    assert result.exception is None
+    assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
+    assert figures["share_of_air"] is None
+
+
+def test_lost_pages_are_restored_and_named(
+    bundle: Path, pages: np.ndarray, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    spoilt = {1: coded.dark, 2: coded.half_lost, 13: coded.half_lost}
+    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages, spoilt))
+    assert result.exception is None
+    assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
+    assert (figures["pages_unread"], figures["restored"], figures["lost"]) == (3, [1, 2], [])
+    assert "recorded page 1 (page 1 of volume 9) gave no bytes" in caplog.text
+    assert [page["number"] for page in figures["page_results"] if page["loss"]] == [1, 2, 13]
+
+
+def test_too_many_lost_pages_are_named_and_leave_no_file(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+    recording = coded.recording(tmp_path / "R.h5", pages, {1: coded.dark, 2: coded.half_lost, 3: coded.dark})
+    result, figures = recovered(bundle, recording)
+    assert isinstance(result.exception, LostDataError)
+    assert "data pages 1-2 of volume 9 lost, not written" in str(result.exception)
+    for page in (1, 2, 3):
+        assert f"recorded page {page} (page {page} of volume 9)" in str(result.exception)
+    assert figures["lost"] == [1, 2]
+    assert not (tmp_path / "read.bin").exists()
+    assert not list(tmp_path.glob("*.partial"))
+    asked = f"recover --bundle {bundle} --recording {recording} --out {tmp_path / 'holes.bin'} --holes --no-tracking"
+    assert run(lightpage, asked.split()) == 3
+    size = figures["user_bytes_per_page"]
+    read = (tmp_path / "holes.bin").read_bytes()
+    assert read == coded.CONTENT[:size] + bytes(2 * size) + coded.CONTENT[3 * size :]
+
+
+@pytest.mark.parametrize("order", [lambda n: range(n)[::-1], lambda n: [*range(n), 3, 3, 5], lambda n: range(2, n)])
+def test_pages_in_any_order_twice_or_missing(bundle: Path, pages: np.ndarray, tmp_path: Path, order: object) -> None:
+    some = list(order(len(pages)))  # type: ignore[operator]
+    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages[some]))
+    assert result.exception is None
+    assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
+    assert figures["pages_repeated"] == len(some) - len(set(some))
+    assert figures["missing"] == sorted({0, 1} - set(some))
+
+
+@pytest.mark.parametrize("content", [b"", b"x", bytes(3 * 125)])
+def test_files_of_any_length(bundle: Path, tmp_path: Path, content: bytes) -> None:
+    pages = coded.pages(bundle, tmp_path, content)
+    result, _ = recovered(bundle, coded.recording(tmp_path / "R.h5", pages))
+    assert result.exception is None
+    assert (tmp_path / "read.bin").read_bytes() == content
+
+
+def test_a_page_alone_can_be_read_and_the_rest_is_named(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages[4:5]), "--holes")
+    assert isinstance(result.exception, LostDataError)
+    size = figures["user_bytes_per_page"]
+    # group 1 begins behind the two parity pages of group 0: recorded page 4 is parity
+    assert figures["lost"] == [0, 1, 2, 5, 6, 7, 10, 11, 12]
+    result, figures = recovered(bundle, coded.recording(tmp_path / "S.h5", pages[5:6]), "--holes")
+    assert (tmp_path / "read.bin").read_bytes()[3 * size : 4 * size] == coded.CONTENT[3 * size : 4 * size]
+
+
+class TestBadInput:
+    def test_another_code(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+        other = tmp_path / "other.toml"
+        coded.CODE.model_copy(update={"rate_per_mille": 600}).save(other)
+        result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages), "--code", str(other))
+        assert isinstance(result.exception, LostDataError)
+        assert "its header names another code" in str(result.exception)
+        assert {page["loss"] for page in figures["page_results"]} == {"code"}
+
+    def test_two_volumes(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+        (tmp_path / "other").mkdir()
+        other = coded.pages(bundle, tmp_path / "other", b"other", "--volume", "3", "--data-pages", "1")
+        recording = coded.recording(tmp_path / "R.h5", [*pages, *other])
+        result, _ = recovered(bundle, recording)
+        assert isinstance(result.exception, InvalidInputError)
+        assert "got pages of volumes 3, 9, wanted one of them: --volume" in str(result.exception)
+        assert not (tmp_path / "read.bin").exists()
+        result, _ = recovered(bundle, recording, "--volume", "3")
+        assert (tmp_path / "read.bin").read_bytes() == b"other"
+        result, _ = recovered(bundle, recording, "--volume", "4")
+        assert isinstance(result.exception, LostDataError)
+
+    def test_two_files_under_one_volume_id(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+        (tmp_path / "other").mkdir()
+        other = coded.pages(bundle, tmp_path / "other", coded.CONTENT[::-1])
+        result, _ = recovered(bundle, coded.recording(tmp_path / "R.h5", [*pages, *other]))
+        assert "volume 9: page 0: got two pages of this number with different bytes" in str(result.exception)
+        shorter = coded.pages(bundle, tmp_path / "other", coded.CONTENT[:500])
+        result, _ = recovered(bundle, coded.recording(tmp_path / "S.h5", [*pages, *shorter]))
+        assert "500 bytes in groups of 3 + 2 pages, wanted 1000 bytes" in str(result.exception)
+
+    def test_another_level_count(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+        result, _ = recovered(bundle, coded.recording(tmp_path / "R.h5", pages, levels=64))
+        assert isinstance(result.exception, RecordingError)
+        assert "levels: got 64, wanted 32, as the code has" in str(result.exception)
+
+    def test_a_recording_that_says_how_it_is_coded_needs_no_other_source(
+        self, pages: np.ndarray, tmp_path: Path
+    ) -> None:
+        plain = coded.bundle(tmp_path / "plain.zip", None)
+        with h5py.File(tmp_path / "pages.h5") as file:
+            told = file.attrs["code"]
+        result, _ = recovered(plain, coded.recording(tmp_path / "R.h5", pages, code=told))
+        assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
+        result, _ = recovered(plain, coded.recording(tmp_path / "S.h5", pages))
+        assert "no code in either, wanted --code" in str(result.exception)
+        for wrong in ("[]", '{"levels": 31}', "{"):
+            result, _ = recovered(plain, coded.recording(tmp_path / f"{len(wrong)}.h5", pages, code=wrong))
+            assert isinstance(result.exception, RecordingError)
+            assert "attribute 'code'" in str(result.exception)
+
+    def test_pages_of_noise_and_pilots_of_another_device(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+        noise = np.random.default_rng(0).integers(0, 32, pages.shape, dtype=np.uint8)
+        result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", noise))
+        assert isinstance(result.exception, LostDataError)
+        assert {page["loss"] for page in figures["page_results"]} == {"optics"}
+        other = tmp_path / "own.zip"
+        toy.write_own_pilots_bundle(other)
+        coded.CODE.save(tmp_path / "code.toml")
+        recording = coded.recording(tmp_path / "S.h5", pages)
+        result, figures = recovered(other, recording, "--code", str(tmp_path / "code.toml"))
+        assert isinstance(result.exception, LostDataError)
+        assert not (tmp_path / "read.bin").exists()
+
+    def test_a_full_disk_leaves_no_file(
+        self, bundle: Path, pages: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        recording = coded.recording(tmp_path / "R.h5", pages)
+
+        def full(*_: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr("lightpage.codec.volume_file.move_into_place", full)
+        result, _ = recovered(bundle, recording)
+        assert isinstance(result.exception, InvalidInputError)
+        assert "got No space left on device" in str(result.exception)
+        monkeypatch.setattr("lightpage.recording.pages.move_into_place", full)
+        with pytest.raises(RecordingError, match="No space left"):
+            coded.pages(bundle, tmp_path / ".", b"again", "--data-pages", "1")
+        assert not (tmp_path / "read.bin").exists()
+        assert not list(tmp_path.glob("*.partial"))
+
+    @pytest.mark.parametrize(
+        ("options", "told"),
+        [
+            ("--bundle B", "no code, wanted --code"),
+            ("--bundle B --profile bench", "both --bundle and --profile"),
+            ("", "neither --bundle nor --profile"),
+            ("--profile bench", "--profile without --code"),
+            ("--bundle B --code C --data-pages 0", "0 data and 4 parity pages"),
+            ("--bundle B --code C --data-pages 254 --parity-pages 2", "254 data and 2 parity pages"),
+            ("--bundle B --code C --volume 4294967296", "volume id: got 4294967296"),
+            ("--bundle B --code gone.toml", "code gone.toml: got No such file or directory"),
+        ],
+    )
+    def test_encode_refuses(self, tmp_path: Path, options: str, told: str) -> None:
+        plain = coded.bundle(tmp_path / "plain.zip", None)
+        coded.CODE.save(tmp_path / "C.toml")
+        (tmp_path / "f").write_bytes(b"abc")
+        words = [{"B": str(plain), "C": str(tmp_path / "C.toml")}.get(word, word) for word in options.split()]
+        asked = [str(tmp_path / "f"), *words, "--out", str(tmp_path / "pages.h5")]
+        result = CliRunner().invoke(encode, asked, standalone_mode=False)
+        assert isinstance(result.exception, InvalidInputError)
+        assert told in str(result.exception)
+        assert not (tmp_path / "pages.h5").exists()
+
+    def test_a_file_larger_than_a_volume(self, bundle: Path, tmp_path: Path) -> None:
+        with (tmp_path / "large").open("wb") as file:
+            file.truncate(1 << 41)  # holds no data
+        asked = [str(tmp_path / "large"), "--bundle", str(bundle), "--out", str(tmp_path / "pages.h5")]
+        result = CliRunner().invoke(encode, asked, standalone_mode=False)
+        assert f"file: got {1 << 41} bytes, wanted at most {(1 << 40) - 1} in a volume" in str(result.exception)
+
+    def test_truncated_pages(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+        whole = (tmp_path / "pages.h5").read_bytes()
+        (tmp_path / "cut.h5").write_bytes(whole[: len(whole) // 2])
+        asked = ["--profile", "bench", "--symbols", str(tmp_path / "cut.h5"), "--out", str(tmp_path / "R.h5")]
+        result = CliRunner().invoke(simulate, asked, standalone_mode=False)
+        assert isinstance(result.exception, RecordingError)
+        result = CliRunner().invoke(
+            simulate, [*asked[:3], str(tmp_path / "pages.h5"), *asked[4:]], standalone_mode=False
+        )
+        assert "got pages of (16, 24) symbols, wanted (56, 87)" in str(result.exception)
+
+
+def test_code_is_chosen_by_known_pages_and_kept_in_a_bundle(tmp_path: Path) -> None:
+    plain = coded.bundle(tmp_path / "plain.zip", None)
+    toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 256, 6)
+    asked = ["--bundle", str(plain), "--recording", str(tmp_path / "R.h5"), "--out", str(tmp_path / "C.toml")]
+    asked += ["--out-bundle", str(tmp_path / "with.zip"), "--version", "toy-2", "--json", str(tmp_path / "J.json")]
+    CliRunner().invoke(code_command, asked, standalone_mode=False, catch_exceptions=False)
+    figures = json.loads((tmp_path / "J.json").read_text())
+    best = max(figures["tried"], key=lambda each: each["user_bytes"])
+    assert figures["code"] == best["code"]
+    # sigma = 12 / 4 / 70 of a radian: 5.1 bits a symbol, of which a page of 364 symbols keeps most
+    assert 0.6 < 8 * figures["user_bytes_per_page"] / 364 / 5.1 < 0.95
+    pages = coded.pages(tmp_path / "with.zip", tmp_path)
+    assert pages.max() < figures["code"]["levels"]
+
+
+@pytest.mark.parametrize(("pages", "told"), [(2, "got 2, wanted at least 3"), (0, "no symbols")])
+def test_code_needs_known_pages(tmp_path: Path, pages: int, told: str) -> None:
+    plain = coded.bundle(tmp_path / "plain.zip", None)
+    toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 256, pages or 1)
+    if not pages:
+        with h5py.File(tmp_path / "R.h5", "r+") as file:
+            del file["symbols"]
+    asked = ["--bundle", str(plain), "--recording", str(tmp_path / "R.h5"), "--out", str(tmp_path / "C.toml")]
+    result = CliRunner().invoke(code_command, asked, standalone_mode=False)
+    assert told in str(result.exception)
+    assert not (tmp_path / "C.toml").exists()

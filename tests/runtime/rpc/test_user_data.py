@@ -1,0 +1,105 @@
+"""User bytes over gRPC: with a page, as a range of pages, and restored where pages are lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lightpage.codec.page_codec import Loss
+from lightpage.errors import BundleError, InvalidInputError, PageError
+from runtime.client.client import LightpageClient
+from runtime.decoding.decoder import Decoder
+from runtime.rpc.server import LightpageServer
+from runtime.service.dataplane import DataPlane
+from runtime.service.recalibrator import Recalibrator
+from runtime.service.registry import ModelRegistry
+from tests.runtime import coded, toy
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[object]:
+    """Starts a service whose source shows pages, some of them spoilt; returns its client and plane."""
+    with ExitStack() as stack:
+
+        def begin(
+            spoilt: dict[int, coded.Spoil] | None = None, with_code: bool = True
+        ) -> tuple[LightpageClient, DataPlane, np.ndarray]:
+            bundle = coded.bundle(tmp_path / "toy.zip")
+            pages = coded.pages(bundle, tmp_path)
+            own = bundle if with_code else coded.bundle(tmp_path / "plain.zip", None)
+            source = coded.ShownPages(pages, spoilt)
+            plane = DataPlane(ModelRegistry(Decoder.load(own, 1)), source)
+            server = stack.enter_context(LightpageServer(plane, Recalibrator(plane, toy.fit_references)))
+            client = stack.enter_context(LightpageClient(server.target, timeout_s=20))
+            return client, plane, pages
+
+        yield begin
+
+
+def test_a_page_carries_its_bytes_when_asked(serve) -> None:  # type: ignore[no-untyped-def]
+    client, plane, pages = serve()
+    told = client.describe()
+    assert told.user_bytes_per_page == plane.registry.current.decoder.page_codec.user_bytes
+    assert "rate_per_mille = 500" in told.code_toml
+    pair = toy.ToyDevice(noise=8.0).page(pages[1], 32, 0.3)
+    size = told.user_bytes_per_page
+    for page in (client.decode(pair, 0, user_data=True), client.read_page(1, user_data=True)):
+        found = page.user_data
+        assert found is not None
+        assert found.data == coded.CONTENT[size : 2 * size]
+        assert found.header is not None
+        assert (found.header.volume, found.header.page, found.header.volume_bytes) == (9, 1, 1000)
+        assert (found.loss, found.data_pages, found.parity_pages, page.levels) == (None, 3, 2, 32)
+        assert found.margin_bits > 0
+    assert client.decode(pair, 32).user_data is None
+    assert plane.metrics.registry.get_sample_value("lightpage_data_pages_total", {"loss": "none"}) == 2
+    assert plane.metrics.registry.get_sample_value("lightpage_margin_bits") > 0
+
+
+def test_a_damaged_page_has_symbols_and_no_bytes(serve) -> None:  # type: ignore[no-untyped-def]
+    client, plane, _ = serve({2: coded.half_lost})
+    found = client.read_page(2, user_data=True).user_data
+    assert found is not None
+    assert (found.data, found.loss) == (None, Loss.BODY)
+    assert found.margin_bits <= 0
+    assert plane.metrics.registry.get_sample_value("lightpage_data_pages_total", {"loss": "body"}) == 1
+
+
+def test_levels_must_be_the_codes(serve) -> None:  # type: ignore[no-untyped-def]
+    client, _, _ = serve()
+    with pytest.raises(InvalidInputError, match="levels: got 16, wanted 32, as the code of toy-1 has, or 0"):
+        client.read_page(0, 16, user_data=True)
+
+
+def test_a_model_without_a_code_says_so(serve) -> None:  # type: ignore[no-untyped-def]
+    client, _, _ = serve(with_code=False)
+    assert (client.describe().code_toml, client.describe().user_bytes_per_page) == ("", 0)
+    for call in (lambda: client.read_page(0, user_data=True), lambda: list(client.read_data(0, 2))):
+        with pytest.raises(BundleError, match="code: got none"):
+            call()
+
+
+def test_a_range_is_streamed_and_lost_pages_are_restored(serve) -> None:  # type: ignore[no-untyped-def]
+    client, _, pages = serve({0: coded.dark, 1: coded.half_lost, 6: coded.half_lost, 7: coded.dark, 8: coded.dark})
+    size = client.describe().user_bytes_per_page
+    found = list(client.read_data(0, len(pages)))
+    assert [each.page for each in found if each.page is not None] == list(range(len(pages)))
+    assert found[0].user_data.loss == Loss.OPTICS
+    assert "frames that contradict each other" in found[0].error
+    restored = {each.user_data.header.page: each.user_data.data for each in found if each.page is None}
+    assert restored == {0: coded.CONTENT[:size], 1: coded.CONTENT[size : 2 * size]}  # of group 1 too many are lost
+    # restored pages follow at the end of their group, before the next group's first page
+    assert [each.page for each in found].index(None) == 5
+    read = {each.user_data.header.page: each.user_data.data for each in found if each.user_data.data is not None}
+    assert read[2] == coded.CONTENT[2 * size : 3 * size]
+
+
+def test_ranges_that_are_none(serve) -> None:  # type: ignore[no-untyped-def]
+    client, _, _ = serve()
+    with pytest.raises(InvalidInputError, match="pages to read: got 0, wanted at least 1"):
+        list(client.read_data(0, 0))
+    assert issubclass(PageError, InvalidInputError)
