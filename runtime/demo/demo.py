@@ -51,7 +51,7 @@ SPOILT_PAGE = 1
 SPOILT_SHARE = 0.4
 """Of its symbols: far more than its code mends."""
 
-DRIFT_STEPS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
+DRIFT_STEPS = (0.04, 0.06, 0.08, 0.1, 0.15, 0.3, 1.0)
 """Of the change of temperature of `drifted`; the first that loses a page ends the drift."""
 
 RECALIBRATION_PAGES = 2
@@ -315,9 +315,11 @@ def read_picture(
         done = file.restore()
         if file.volume is not None:
             file.complete()
-    content, expected = path.read_bytes() if margins else b"", pgm(picture())
-    shape = picture().shape
-    grey = np.frombuffer(content[len(expected) - shape[0] * shape[1] :] or bytes(shape[0] * shape[1]), np.uint8)
+    black = np.zeros_like(picture())
+    if not margins:
+        path.write_bytes(pgm(black))
+    content, expected = path.read_bytes(), pgm(picture())
+    grey = np.frombuffer(content[len(expected) - black.size :], np.uint8)
     return replace(
         summarise(name, pages) if pages else _nothing(name, client),
         pages=volume.pages,
@@ -325,7 +327,7 @@ def read_picture(
         restored=len(done.restored),
         lost=len(done.lost) if margins else volume.file_pages,
         margin_bits=min(margins, default=None),
-        picture=grey.reshape(shape),
+        picture=grey.reshape(black.shape),
         exact=content == expected,
     )
 

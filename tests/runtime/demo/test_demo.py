@@ -81,6 +81,7 @@ def test_a_picture_is_lost_by_drift_and_won_back_with_the_shipped_bundle(
 ) -> None:
     small = picture()[:60]
     monkeypatch.setattr("runtime.demo.demo.picture", lambda: small)  # 8 pages instead of 20
+    monkeypatch.setattr("runtime.demo.demo.DRIFT_STEPS", (0.3,))
     result = CliRunner().invoke(demo, ["--out", str(tmp_path)], standalone_mode=False, catch_exceptions=False)
     assert result.exception is None
     figures = json.loads((tmp_path / "demo.json").read_text())
