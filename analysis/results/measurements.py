@@ -27,7 +27,7 @@ COMPARISONS = (
     "ideal",
 )
 """Folders of `make bench-decoders`."""
-EVALUATION, DEMO, IMAGE_SEARCH = "evaluation", "demo", "image-search"
+EVALUATION, DEMO, IMAGE_SEARCH, LEDGER = "evaluation", "demo", "image-search", "ledger"
 SPEED = "speed-"
 """Before the name of a profile."""
 
@@ -171,6 +171,11 @@ def image_search(figures: Figures) -> Figures:
     }
 
 
+def ledger(figures: Figures) -> Figures:
+    """Of `analysis.codec.ledger`, without the list of every page's margin."""
+    return {name: {key: of[key] for key in of if key != "margins"} for name, of in figures.items() if of["pages"]}
+
+
 def speed(figures: Figures) -> Figures:
     """Of `analysis.speed.speed`."""
     return {key: figures[key] for key in ("profile", "threads", "repeats", "decoders")}
@@ -180,4 +185,5 @@ _TAKE: dict[str, Callable[[Figures], Figures]] = {
     EVALUATION: evaluation,
     DEMO: demo,
     IMAGE_SEARCH: image_search,
+    LEDGER: ledger,
 }

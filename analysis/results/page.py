@@ -23,6 +23,7 @@ from analysis.results.measurements import (
     EVALUATION,
     IMAGE_SEARCH,
     KEPT,
+    LEDGER,
     SPEED,
     Figures,
     Measurement,
@@ -42,6 +43,13 @@ PAGE, PICTURE = ROOT / "docs" / "results.md", Path("images") / "decoders.png"
 PICTURED = "sheared"
 """The comparison whose picture the page shows."""
 TEMPLATE = "results.md.j2"
+LEDGER_LABELS = {
+    "bright": "quarter scale, 4x4, 15,000 electrons, shipped",
+    "32e": "quarter scale, 4x4, 32 electrons, two passes",
+    "full-size 4x4": "full size, 4x4, 32 electrons, two passes",
+    "full-size 2x2": "full size, 2x2, 32 electrons, two passes",
+}
+"""Data sets of the ledger of user bytes, in the order of its table."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +109,11 @@ def render(results: Results) -> str:
     environment.filters |= {"digits": digits, "kilobytes": kilobytes, "thousands": thousands}
     source = Path(__file__).with_name(TEMPLATE).read_text("utf-8")
     return environment.from_string(source).render(
-        results=results, device=Device(), symbols=symbols, learning_bits=SETTLED_BITS
+        results=results,
+        device=Device(),
+        symbols=symbols,
+        learning_bits=SETTLED_BITS,
+        LEDGER_LABELS=LEDGER_LABELS,
     )
 
 
@@ -147,6 +159,7 @@ def copy_picture(path: Path, to: Path) -> None:
 @click.option("--evaluation", type=click.Path(path_type=Path), help="Collect the JSON of `lightpage evaluate`.")
 @click.option("--demo", type=click.Path(path_type=Path), help="Collect the demo.json of `lightpage demo`.")
 @click.option("--image-search", type=click.Path(path_type=Path), help="Collect the figures.json of the image search.")
+@click.option("--ledger", type=click.Path(path_type=Path), help="Collect the ledger.json of the page code.")
 @click.option(
     "--speed",
     "speeds",
@@ -168,13 +181,14 @@ def main(
     evaluation: Path | None,
     demo: Path | None,
     image_search: Path | None,
+    ledger: Path | None,
     speeds: tuple[Path, ...],
     commit: str | None,
     kept: Path,
     out: Path,
 ) -> None:
     """Write docs/results.md from the kept figures."""
-    given = {EVALUATION: evaluation, DEMO: demo, IMAGE_SEARCH: image_search}
+    given = {EVALUATION: evaluation, DEMO: demo, IMAGE_SEARCH: image_search, LEDGER: ledger}
     found = {name: path for name, path in given.items() if path is not None}
     found |= {f"{SPEED}{read_object(path).get('profile')}": path for path in speeds}
     if comparisons is not None:
