@@ -16,7 +16,7 @@ from tests.runtime import toy
 ROOT = Path(__file__).resolve().parents[1]
 
 
-@pytest.mark.parametrize("package", ["lightpage", "runtime"])
+@pytest.mark.parametrize("package", ["lightpage", "lightpage.codec", "runtime"])
 def test_every_name_of_a_door_is_there(package: str) -> None:
     module = importlib.import_module(package)
     assert [name for name in module.__all__ if getattr(module, name, None) is None] == []

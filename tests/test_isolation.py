@@ -24,6 +24,7 @@ ROOMS = (
     "lightpage.device",
     "lightpage.page",
     "lightpage.metrics",
+    "lightpage.codec",
     "lightpage.waves",
     "lightpage.recording",
     "lightpage.calibration",
@@ -59,6 +60,7 @@ ROOMS = (
     "analysis.studies",
     "analysis.report",
     "analysis.comparison",
+    "analysis.codec",
     "analysis.speed",
     "analysis.tracking",
     "analysis.results",
@@ -251,3 +253,9 @@ def test_decoding_asks_for_no_connection_to_anybody(toy_zip: Path) -> None:
     assert without_internet("control").returncode == -signal.SIGSYS
     done = without_internet(str(toy_zip))
     assert (done.returncode, done.stdout.strip()) == (0, "decoded"), done.stderr
+
+
+def test_every_folder_of_code_is_a_package() -> None:
+    """Setuptools leaves out a folder without `__init__.py`: it would be missing in the image, and here nobody noticed."""
+    folders = {path.parent for package in PACKAGES for path in files(package)}
+    assert [str(folder.relative_to(ROOT)) for folder in folders if not (folder / "__init__.py").exists()] == []
