@@ -256,6 +256,6 @@ def test_decoding_asks_for_no_connection_to_anybody(toy_zip: Path) -> None:
 
 
 def test_every_folder_of_code_is_a_package() -> None:
-    """Setuptools leaves out a folder without `__init__.py`: it would be missing in the image, and here nobody noticed."""
+    """Setuptools leaves a folder without `__init__.py` out of the image, and here nobody would notice."""
     folders = {path.parent for package in PACKAGES for path in files(package)}
     assert [str(folder.relative_to(ROOT)) for folder in folders if not (folder / "__init__.py").exists()] == []
