@@ -88,6 +88,7 @@ class Recovery:
         user_bytes_per_page: that a page holds.
         symbols_per_page: all of them, pilots included.
         data_symbols_per_page: without pilots.
+        blocks_per_page: LDPC blocks that a page holds.
     """
 
     code: Code
@@ -101,6 +102,7 @@ class Recovery:
     user_bytes_per_page: int
     symbols_per_page: int
     data_symbols_per_page: int
+    blocks_per_page: int
 
     @property
     def unread(self) -> tuple[RecoveredPage, ...]:
@@ -133,6 +135,7 @@ class Recovery:
             "other_volumes": {str(key): count for key, count in self.foreign.items()},
             "user_bytes": 0 if volume is None else volume.file_bytes,
             "user_bytes_per_page": user,
+            "blocks_per_page": self.blocks_per_page,
             "air_bits_per_symbol": float(np.mean(rates)) if rates else None,
             "air_bytes_per_page": air_bytes,
             "share_of_air": user / air_bytes if air_bytes else None,
@@ -227,6 +230,7 @@ def recover(
             codec.user_bytes,
             bundle.pilot_mask.size,
             int(np.count_nonzero(~bundle.pilot_mask)),
+            codec.blocks,
         )
 
 
