@@ -1,1 +1,1 @@
-"""The report of a training run or of an evaluation: one HTML page for people."""
+"""The report of a training run, an evaluation or a recovery: one HTML page for people."""

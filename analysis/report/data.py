@@ -87,6 +87,11 @@ class ReportData:
         """What a page carries, by its AIR."""
         return page_kilobytes(self.measures.air_bits_per_symbol, int(np.count_nonzero(self.data)))
 
+    @property
+    def summary(self) -> str:
+        """What matters most, in a few words."""
+        return f"AIR {self.measures.air_bits_per_symbol:.3f} bit/symbol"
+
 
 def exit_centroids(profile: Profile, calibration: Calibration) -> Real:
     """Where each symbol's beam would leave a pipe without walls, over its width, (x, y') [2, ny, nx].

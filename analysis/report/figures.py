@@ -1,42 +1,23 @@
-"""The figures of a report: small, on white, as data that a page carries in itself."""
+"""The figures of the report of a run or of an evaluation."""
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from matplotlib import colormaps, patheffects
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from analysis.report.data import Golden, Real, ReportData
+from analysis.report.drawing import BLUE, GREEN, GREY, ORANGE, Picture, as_picture, new_figure, one_axis
 from analysis.report.tables import number, signed
 from train.fitting.curves import Curve
 from train.published.rays import RayTracer
 
-_SIZE, _IMAGE_SIZE = (4.8, 3.5), (4.8, 3.9)
-"""Inches. All figures equally wide, so that their letters are alike on the page."""
-_DOTS = 180
-"""Per inch, of images."""
-STYLE: dict[Any, Any] = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "svg.hashsalt": "lightpage",
-}
-"""Settings of matplotlib, in which all of these are to be drawn (`matplotlib.rc_context`)."""
-BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#666666"
-"""Okabe and Ito's, told apart without red and green."""
 _MISSING = "#bbbbbb"
 _TRIMMED = 1.0
 """Per cent at either end that do not stretch a colour scale."""
@@ -44,21 +25,6 @@ _BRIGHTEST = 99.8
 """Per cent of a frame's pixels that are not drawn white."""
 _RAYS = 15
 _LEAST_KAPPA = 1e-2
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure.
-
-    Attributes:
-        uri: the image itself, as a data URI.
-        alt: what it shows, for whom it is not shown.
-        caption: what to see in it.
-    """
-
-    uri: str
-    alt: str
-    caption: str
 
 
 def maps(data: ReportData, centroids: Real) -> list[Picture]:
@@ -104,7 +70,7 @@ def maps(data: ReportData, centroids: Real) -> list[Picture]:
 def _map(
     label: str, values: Real, colours: Colormap, limits: tuple[float, float], centroids: Real, caption: str
 ) -> Picture:
-    figure, axis = _one(image=True)
+    figure, axis = one_axis(image=True)
     shown = axis.imshow(values, cmap=colours.with_extremes(bad=_MISSING), vmin=limits[0], vmax=limits[1])
     figure.colorbar(shown, ax=axis, label=label, extend="both", orientation="horizontal", aspect=35)
     for centroid, style in zip(centroids, ("solid", "dashed"), strict=True):
@@ -114,7 +80,7 @@ def _map(
             lines.set_path_effects([patheffects.withStroke(linewidth=2.4, foreground="black")])
     _name_zones(axis, np.rint(centroids).astype(int))
     axis.set(xlabel="column, symbols", ylabel="row, symbols")
-    return _picture(figure, f"Map over the page. {caption}", caption, image=True)
+    return as_picture(figure, f"Map over the page. {caption}", caption, image=True)
 
 
 def _name_zones(axis: Axes, cells: NDArray[np.int_]) -> None:
@@ -135,7 +101,7 @@ def _name_zones(axis: Axes, cells: NDArray[np.int_]) -> None:
 def reliability(data: ReportData) -> Picture:
     """Confidence against accuracy, with how many symbols claim it."""
     bins = data.confidence_bins
-    figure = _figure()
+    figure = new_figure()
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     most = max(max(b.high for b in bins), max(b.accuracy for b in bins))
     above.plot([0, most], [0, most], color=GREY, linewidth=1, linestyle="dashed", label="calibrated")
@@ -153,13 +119,13 @@ def reliability(data: ReportData) -> Picture:
         f"Confidence against accuracy, {data.measures.count:,} symbols of {data.measures.levels} levels. "
         "Below the dashed line, decisions are less sure than they claim."
     )
-    return _picture(figure, f"Reliability diagram, ECE {data.measures.ece:.4f}.", caption)
+    return as_picture(figure, f"Reliability diagram, ECE {data.measures.ece:.4f}.", caption)
 
 
 def concentration(data: ReportData) -> Picture:
     """What concentrations promise against what happened, as distances from a perfect cosine."""
     bins = data.concentration_bins
-    figure, axis = _one()
+    figure, axis = one_axis()
     ends = np.maximum(np.array([(b.low, b.high) for b in bins]), _LEAST_KAPPA)
     middle = np.sqrt(ends[:, 0] * ends[:, 1])
     promised, observed = (np.array([1 - getattr(b, name) for b in bins]) for name in ("promised", "observed"))
@@ -175,14 +141,14 @@ def concentration(data: ReportData) -> Picture:
     )
     worst = max(abs(b.promised - b.observed) for b in bins)
     alt = f"Concentration against measured error; mean cosine and I1/I0 differ by at most {worst:.2g}."
-    return _picture(figure, alt, caption)
+    return as_picture(figure, alt, caption)
 
 
 def training(passes: Sequence[Mapping[str, Curve]]) -> list[Picture]:
     """Loss and AIR while the run was trained, and the pipe's angle where rays were; one pass behind the other."""
     pictures = []
     if losses := _in_a_row(passes, "train_nll"):
-        figure, axis = _one()
+        figure, axis = one_axis()
         for index, curve in enumerate(losses):
             axis.plot(*_xy(curve), color=BLUE, linewidth=0.8, label="training" if not index else None)
         _mark_passes(axis, losses)
@@ -191,11 +157,11 @@ def training(passes: Sequence[Mapping[str, Curve]]) -> list[Picture]:
         last = losses[-1][-1]
         caption = "Loss, the von Mises negative log-likelihood, of training batches. Validation is logged as AIR only."
         pictures.append(
-            _picture(figure, f"Loss over the steps, {number(last[1], 2)} nat/symbol at step {last[0]}.", caption)
+            as_picture(figure, f"Loss over the steps, {number(last[1], 2)} nat/symbol at step {last[0]}.", caption)
         )
     rates = {"train_air": ("training batches", BLUE, "-"), "val_air": ("validation pages", ORANGE, "o-")}
     if any(tag in curves for tag in rates for curves in passes):
-        figure, axis = _one()
+        figure, axis = one_axis()
         for tag, (name, colour, style) in rates.items():
             for index, curve in enumerate(_in_a_row(passes, tag)):
                 label = None if index else name
@@ -208,14 +174,14 @@ def training(passes: Sequence[Mapping[str, Curve]]) -> list[Picture]:
         if best:
             caption += f", at its best {', with one more pass '.join(f'{air:.3f}' for air in best)} bit/symbol"
         caption += "."
-        pictures.append(_picture(figure, f"AIR over the steps. {caption}", caption))
+        pictures.append(as_picture(figure, f"AIR over the steps. {caption}", caption))
     if angles := _in_a_row(passes, "angle_deg"):
-        figure, axis = _one()
+        figure, axis = one_axis()
         axis.plot(*_xy(angles[0]), color=GREEN, linewidth=1.2)
         axis.set(xlabel="step", ylabel="pipe angle, degree")
         last = angles[0][-1]
         caption = f"Pipe angle that the rays were trained to, {number(last[1], 3)} degrees at step {last[0]}."
-        pictures.append(_picture(figure, caption, caption))
+        pictures.append(as_picture(figure, caption, caption))
     return pictures
 
 
@@ -240,18 +206,18 @@ def page(golden: Golden) -> list[Picture]:
     """Both frames and the phase that is decoded from them."""
     pictures = []
     for name, frame in (("In-phase", golden.pair.in_phase), ("Quadrature", golden.pair.quadrature)):
-        figure, axis = _one(image=True)
+        figure, axis = one_axis(image=True)
         shown = axis.imshow(frame, cmap="gray", vmin=0, vmax=float(np.percentile(frame, _BRIGHTEST)))
         figure.colorbar(shown, ax=axis, label="counts", extend="max", orientation="horizontal", aspect=35)
         axis.set(xlabel="column, px", ylabel="row, px")
-        pictures.append(_picture(figure, f"{name} camera frame of one page.", f"{name} frame.", image=True))
-    figure, axis = _one(image=True)
+        pictures.append(as_picture(figure, f"{name} camera frame of one page.", f"{name} frame.", image=True))
+    figure, axis = one_axis(image=True)
     shown = axis.imshow(golden.phase, cmap="twilight", vmin=-math.pi, vmax=math.pi)
     bar = figure.colorbar(shown, ax=axis, label="phase, rad", orientation="horizontal", aspect=35)
     bar.set_ticks([-math.pi, 0, math.pi], labels=["−π", "0", "π"])
     axis.set(xlabel="column, symbols", ylabel="row, symbols")
     caption = "Phase that is decoded from the two, piston removed."
-    return [*pictures, _picture(figure, "Decoded phase of every symbol of the page.", caption, image=True)]
+    return [*pictures, as_picture(figure, "Decoded phase of every symbol of the page.", caption, image=True)]
 
 
 def rays(data: ReportData) -> list[Picture]:
@@ -280,7 +246,7 @@ def _side(
     entrance = float(middle[surfaces + 1])
     exit_ = entrance + 1e3 * pipe.length_m
     half = 1e3 * pipe.width_m / 2 / (1.0 if axis == 0 else math.cos(math.radians(data.rays.angle_deg)))
-    figure, view = _one()
+    figure, view = one_axis()
     kinds = sorted(set(met.tolist()))
     colours = dict(zip(kinds, colormaps["viridis"](np.linspace(0, 0.85, len(kinds))), strict=True))
     for ray in range(path.shape[1]):
@@ -301,30 +267,8 @@ def _side(
     figure.legend(frameon=False, loc="outside upper center", ncols=4, fontsize=8, title="reflections", title_fontsize=8)
     where = "inside of the pipe" if inside else "from modulator (left) to camera (right)"
     caption = f"{name}–z, {where}; black: walls." if inside else f"{name}–z, {where}; grey: lenses, black: walls."
-    return _picture(figure, f"Side view {name} against z of {_RAYS} rays {where}.", caption)
+    return as_picture(figure, f"Side view {name} against z of {_RAYS} rays {where}.", caption)
 
 
 def _xy(curve: Curve) -> tuple[list[int], list[float]]:
     return [step for step, _ in curve], [value for _, value in curve]
-
-
-def _figure(*, image: bool = False) -> Figure:
-    figure = Figure(figsize=_IMAGE_SIZE if image else _SIZE, layout="compressed" if image else "constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _one(*, image: bool = False) -> tuple[Figure, Axes]:
-    figure = _figure(image=image)
-    axis = figure.subplots()
-    if image:
-        axis.spines[:].set_visible(False)
-    return figure, axis
-
-
-def _picture(figure: Figure, alt: str, caption: str, *, image: bool = False) -> Picture:
-    """The figure as a data URI: PNG for images, SVG for lines. The same figure gives the same bytes."""
-    kind, mime = ("png", "image/png") if image else ("svg", "image/svg+xml")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=_DOTS, metadata={"Software": None} if image else {"Date": None})
-    return Picture(f"data:{mime};base64,{base64.b64encode(buffer.getvalue()).decode()}", alt, caption)

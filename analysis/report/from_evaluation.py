@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import io
-import math
 import zipfile
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from analysis.report.data import Golden, Rays, ReportData, how_long
+from analysis.report.json_file import Bits, JsonFile, Part, Seconds, Share
 from lightpage.calibration.document import parse_calibration
 from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError
@@ -24,25 +24,17 @@ from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.reader import FramePair
 
 Rows = list[list[float | None]]
-Bits = Annotated[float, Field(le=math.log2(MAX_LEVELS) + 1e-6)]
-"""An AIR may be as negative as a decoder is sure of what is wrong."""
-Share = Annotated[float, Field(ge=0, le=1)]
 
 _GOLDEN = "golden.npz"
-_NAMED_PROBLEMS = 3
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
-
-
-class _Maps(_Part):
+class _Maps(Part):
     air: Rows
     own_mi: Rows
     error_rad: Rows
 
 
-class _Bundle(_Part):
+class _Bundle(Part):
     path: str
     name: str
     profile: str
@@ -53,7 +45,7 @@ class _Bundle(_Part):
     golden_piston_rad: float
 
 
-class _Evaluation(_Part):
+class _Evaluation(Part):
     """The keys of the JSON that a report is made of."""
 
     bundle_version: str
@@ -66,7 +58,7 @@ class _Evaluation(_Part):
     gmi_bits_per_symbol: Bits | None
     symbol_error_rate: Share
     ece: Share
-    seconds_per_page: Annotated[float, Field(ge=0)]
+    seconds_per_page: Seconds
     concentration_bins: Annotated[list[ConcentrationBin], Field(min_length=1)]
     confidence_bins: Annotated[list[ConfidenceBin], Field(min_length=1)]
     maps: _Maps
@@ -74,17 +66,17 @@ class _Evaluation(_Part):
     refused_pages: list[dict[str, Any]]
 
 
-class _PageCount(_Part):
+class _PageCount(Part):
     pages: int | None = None
 
 
-def report_of_evaluation(path: Path) -> ReportData:
+def report_of_evaluation(file: JsonFile) -> ReportData:
     """Read the figures of an evaluation, and a page from its bundle if that is still there.
 
     Raises:
         InvalidInputError: not such a file, or maps of another shape than the bundle's page.
     """
-    found = _read(path)
+    path, found = file.path, _checked(file)
     bundle = found.bundle
     profile = parse_profile(bundle.profile, f"evaluation {path}: profile")
     calibration = parse_calibration(bundle.calibration, f"evaluation {path}: calibration")
@@ -117,20 +109,10 @@ def report_of_evaluation(path: Path) -> ReportData:
     )
 
 
-def _read(path: Path) -> _Evaluation:
-    subject = f"{path}"
-    expected = "a finished training run, or the JSON that this version's `lightpage evaluate` writes"
-    try:
-        text = path.read_bytes()
-        if _PageCount.model_validate_json(text).pages == 0:
-            raise InvalidInputError(subject, "an evaluation that read no page", "one of pages that could be read")
-        return _Evaluation.model_validate_json(text)
-    except OSError as error:
-        raise InvalidInputError(subject, error, expected) from None
-    except ValidationError as error:
-        problems = [f"{'.'.join(map(str, e['loc'])) or 'file'} ({e['msg']})" for e in error.errors()]
-        more = f" and {len(problems) - _NAMED_PROBLEMS} more" if len(problems) > _NAMED_PROBLEMS else ""
-        raise InvalidInputError(subject, "; ".join(problems[:_NAMED_PROBLEMS]) + more, expected) from None
+def _checked(file: JsonFile) -> _Evaluation:
+    if file.checked(_PageCount).pages == 0:
+        raise InvalidInputError(f"{file.path}", "an evaluation that read no page", "one of pages that could be read")
+    return file.checked(_Evaluation)
 
 
 def _page(path: Path, rows: Rows, shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -48,7 +48,7 @@ SUMMARIES = {
     "export": "Turn a training run into a bundle.",
     "recalibrate": "Re-fit a drifted device's geometry and write a new bundle.",
     "recover": "Read a file back from recorded pages.",
-    "report": "Show a training run or an evaluation as an HTML page.",
+    "report": "Show a training run, an evaluation or a recovery as an HTML page.",
     "rollback": "Put a service's previous model back in service.",
     "serve": "Run the service.",
     "simulate": "Record pages of a simulated device.",

@@ -5,23 +5,20 @@ from __future__ import annotations
 import html
 import json
 import math
-import re
 import shutil
-from html.parser import HTMLParser
 from pathlib import Path
 
-import click
 import h5py
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 from analysis.report.command import report
 from analysis.report.data import exit_centroids
 from analysis.report.figures import training
 from analysis.report.from_evaluation import report_of_evaluation
 from analysis.report.from_run import levels_of, report_of_run, validation_pages
+from analysis.report.json_file import JsonFile
 from analysis.report.tables import geometry, zones
 from export.command import export_run
 from lightpage.errors import InvalidInputError, RecordingError
@@ -29,6 +26,7 @@ from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording
 from runtime.commands.evaluate import evaluate
 from runtime.decoding.decoder import Decoder
+from tests.analysis.report.pages import check_whole, page_of, run
 from tests.lightpage.small import small_profile
 from train.commands.train import train
 from train.fitting.curves import curves_of
@@ -39,39 +37,6 @@ DATA_SYMBOLS = int(np.count_nonzero(~pilot_mask(small_profile())))
 STEPS = "12"
 ROUNDING = 5e-5
 """Half of the last of four decimals, which is what maps in JSON are rounded to."""
-
-
-class Seen(HTMLParser):
-    """What a page is made of: its sections, pictures, and everything that a browser would fetch."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.sections: list[str] = []
-        self.pictures: dict[str, list[str]] = {}
-        self.fetched: list[str] = []
-        self.tags: set[str] = set()
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {name: value or "" for name, value in attrs}
-        self.tags.add(tag)
-        if tag == "section":
-            self.sections.append(given["id"])
-        if tag == "img":
-            assert given["alt"]
-            self.pictures.setdefault(self.sections[-1], []).append(given["src"])
-        self.fetched += [given[name] for name in ("src", "href", "srcset", "data", "action") if name in given]
-
-
-def run(command: click.Command, *words: object) -> str:
-    arguments = [str(word) for word in words]
-    return CliRunner().invoke(command, arguments, standalone_mode=False, catch_exceptions=False).output
-
-
-def page_of(source: Path, out: Path, *more: object) -> tuple[str, Seen]:
-    run(report, source, "--out", out, *more)
-    text = out.read_text()
-    return text, Seen(text)
 
 
 @pytest.fixture(scope="module")
@@ -100,17 +65,9 @@ def evaluation(coherent: Path, small_device: list[str], tmp_path_factory: pytest
     return folder / "E.json"
 
 
-def check_whole(text: str, seen: Seen) -> None:
-    """Every section is there, and the page asks nobody for anything."""
-    assert seen.sections == SECTIONS
-    assert all(where.startswith(("data:image/", "#")) for where in seen.fetched)
-    assert not seen.tags & {"script", "link", "iframe", "object"}
-    assert not re.search(r"https?://|url\(|@import", text)
-
-
 def test_a_run_at_symbol_pitch(coherent: Path, tmp_path: Path) -> None:
     text, seen = page_of(coherent, tmp_path / "R.html")
-    check_whole(text, seen)
+    check_whole(text, seen, SECTIONS)
     counts = {name: len(pictures) for name, pictures in seen.pictures.items()}
     assert counts == {"maps": 4, "reliability": 2, "training": 2, "page": 3, "rays": 4}
     assert "the validation pages of this run (2)" in text
@@ -141,7 +98,7 @@ def test_a_run_by_rays_shows_the_angle_that_it_was_trained_to(
     ray: Path, small_device: list[str], tmp_path: Path
 ) -> None:
     text, seen = page_of(ray, tmp_path / "R.html", "--recording", small_device[3])
-    check_whole(text, seen)
+    check_whole(text, seen, SECTIONS)
     assert len(seen.pictures["training"]) == 3
     angle = np.rad2deg(torch.load(ray / "decoder.pt", weights_only=True)["localizer.angle"].item())
     data = report_of_run(ray, Path(small_device[3]))
@@ -202,7 +159,7 @@ def test_the_pipe_angle_is_told_in_degrees_with_what_is_nominal(coherent: Path) 
 
 def test_an_evaluation(evaluation: Path, tmp_path: Path) -> None:
     text, seen = page_of(evaluation, tmp_path / "E.html")
-    check_whole(text, seen)
+    check_whole(text, seen, SECTIONS)
     assert set(seen.pictures) == {"maps", "reliability", "page", "rays"}
     assert "an evaluation does not hold how its decoder was trained" in text
     assert "version small-1" in text
@@ -212,7 +169,7 @@ def test_an_evaluation_that_read_no_page(tmp_path: Path) -> None:
     path = tmp_path / "e.json"
     path.write_text(json.dumps({"pages": 0, "pages_left_out": 0, "refused_pages": [{"page": 0}]}))
     with pytest.raises(InvalidInputError, match="read no page"):
-        report_of_evaluation(path)
+        report_of_evaluation(JsonFile.read(path))
 
 
 def test_maps_of_an_evaluation_average_to_its_figures(evaluation: Path) -> None:
@@ -233,7 +190,7 @@ def test_maps_of_an_evaluation_average_to_its_figures(evaluation: Path) -> None:
 def test_a_golden_page_comes_from_the_bundle_that_was_evaluated_or_not_at_all(
     evaluation: Path, coherent: Path, tmp_path: Path
 ) -> None:
-    shown = report_of_evaluation(evaluation).golden
+    shown = report_of_evaluation(JsonFile.read(evaluation)).golden
     own = report_of_run(coherent).golden
     assert not isinstance(shown, str)
     assert not isinstance(own, str)
@@ -251,7 +208,7 @@ def test_a_golden_page_comes_from_the_bundle_that_was_evaluated_or_not_at_all(
     shutil.copy(evaluation.with_name("small.zip"), tmp_path / "gone.zip")
     found["bundle"]["golden_sha256"] = "0" * 64
     moved.write_text(json.dumps(found))
-    assert "is not the bundle that was evaluated" in str(report_of_evaluation(moved).golden)
+    assert "is not the bundle that was evaluated" in str(report_of_evaluation(JsonFile.read(moved)).golden)
 
 
 def test_text_from_files_is_escaped(coherent: Path, evaluation: Path, tmp_path: Path) -> None:
@@ -319,7 +276,7 @@ def test_what_is_no_source_is_refused(
         (tmp_path / f"{name}.json").write_text(json.dumps(json.loads(evaluation.read_text()) | {name: value}))
     for source, named in (
         (tmp_path / "unfinished", r"unfinished: got .*wanted a finished training run"),
-        (tmp_path / "notes.txt", r"notes.txt: got .*Invalid JSON.*wanted a finished training run, or the JSON"),
+        (tmp_path / "notes.txt", r"notes.txt: got text that is no JSON.*wanted a finished training run, or the JSON"),
         (tmp_path / "other.json", r"other.json: got pages_left_out \(Field required\).* more, wanted"),
         (tmp_path / "short.json", r"maps: got 27 rows of \[44\] symbols, wanted 28 rows of 44"),
         *((tmp_path / f"{name}.json", rf"{name}\.json: got {name} \(.*wanted a finished training run") for name in bad),
@@ -327,7 +284,7 @@ def test_what_is_no_source_is_refused(
     ):
         with pytest.raises(InvalidInputError, match=named):
             run(report, source, "--out", out)
-    with pytest.raises(InvalidInputError, match=r"--recording: got .*none with an evaluation"):
+    with pytest.raises(InvalidInputError, match=r"--recording: got .*none with the JSON of `lightpage evaluate`"):
         run(report, evaluation, "--out", out, "--recording", small_device[3])
     shutil.copytree(coherent, tmp_path / "bare", ignore=shutil.ignore_patterns("features"))
     with pytest.raises(InvalidInputError, match=r"features: got No such file.*that training left"):

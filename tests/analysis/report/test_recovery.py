@@ -1,0 +1,234 @@
+"""`lightpage report` of what `lightpage recover --json` writes, and JSON that is neither that nor an evaluation."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from analysis.report.command import report
+from analysis.report.from_recovery import CAUSES, report_of_recovery
+from analysis.report.json_file import JsonFile
+from lightpage.codec.code import Code
+from lightpage.codec.page_codec import Loss
+from lightpage.codec.volume import Volume
+from lightpage.errors import InvalidInputError
+from lightpage.files import write_json
+from runtime.bulk.recovery import RecoveredPage, Recovery
+from tests.analysis.report.pages import check_whole, page_of, run
+
+SECTIONS = ["figures", "pages", "causes", "unread"]
+BLOCKS = 3
+CODE = Code(levels=16, coded_bits=2, rate_per_mille=700, corrections=4, needed_information=0.75)
+VOLUME = Volume(id=7, file_bytes=5_500, page_bytes=1000, data_pages=4, parity_pages=2)
+READ = RecoveredPage(
+    0, 0, 7, None, "", margin_bits=0.2, corrected=2, iterations=5.0, air_bits=3.2, seconds=0.5, code_seconds=0.02
+)
+LOST = [
+    RecoveredPage(4, None, None, Loss.OPTICS, "in-phase frame: got black: no count above 0, wanted counts above 5"),
+    RecoveredPage(5, 5, 7, Loss.BODY, "its code does not converge", margin_bits=-0.3, failed_blocks=3, iterations=25.0),
+    RecoveredPage(6, 6, 7, Loss.BODY, "its code does not converge", margin_bits=-0.1, failed_blocks=1, iterations=11.0),
+]
+WHOLE = Recovery(
+    code=CODE,
+    volume=VOLUME,
+    pages=(*(replace(READ, page=page, number=page) for page in range(4)), *LOST, replace(READ, page=7, volume=9)),
+    restored=(3,),
+    lost=(),
+    missing=(3, 5, 6),
+    foreign={9: 1},
+    repeated=1,
+    user_bytes_per_page=1000,
+    symbols_per_page=2300,
+    data_symbols_per_page=2200,
+    blocks_per_page=BLOCKS,
+)
+NOTHING = replace(WHOLE, volume=None, pages=tuple(LOST), restored=(), missing=(), foreign={}, repeated=0)
+
+
+def written(recovery: Recovery, path: Path, **changes: Any) -> Path:
+    write_json(path, recovery.to_json() | changes)
+    return path
+
+
+def facts_of(recovery: Recovery, folder: Path) -> dict[str, str]:
+    return dict(report_of_recovery(JsonFile.read(written(recovery, folder / "r.json"))).facts)
+
+
+def labels(picture: str) -> set[str]:
+    """All text of a picture, an SVG as a data URI; matplotlib names the words that it draws in comments."""
+    return set(re.findall(r"<!-- (.+?) -->", base64.b64decode(picture.partition(",")[2]).decode()))
+
+
+def test_a_recovery(tmp_path: Path) -> None:
+    text, seen = page_of(written(WHOLE, tmp_path / "r.json"), tmp_path / "r.html")
+    check_whole(text, seen, SECTIONS)
+    margin, failed = seen.pictures["pages"]
+    assert {"read (5)", "optics (1)", "body (2)"} <= labels(margin)
+    assert {"page lost (2)", "page read all the same (0)", "not decoded (1)"} <= labels(failed)
+    assert "at least 0.200 bit/symbol where a page was read" in text
+    assert f"did not converge: 4 of {BLOCKS * 7}, {BLOCKS} a page" in text
+    assert "All 5,500 bytes of the file came back, 1 data page of it from parity pages." in text
+    for page in LOST:
+        assert html.escape(page.reason) in text
+    assert "<td>5</td><td>5</td>\n<td>7</td><td>body</td>" in text
+    assert "<td>4</td><td>unknown</td>\n<td>unknown</td><td>optics</td>" in text
+
+
+def test_the_facts_of_a_recovery(tmp_path: Path) -> None:
+    figures = WHOLE.to_json()
+    assert facts_of(WHOLE, tmp_path) == {
+        "Code": CODE.describe(),
+        "Volume": "7: 10 pages in groups of 4 data and 2 parity pages",
+        "File size": "5,500 bytes",
+        "Recorded pages": "8",
+        "Unread": "3 of the recorded pages",
+        "Repeated": "1 of the recorded pages",
+        "Pages of other volumes": "1 of volume 9",
+        "Missing": "3 pages of the volume, parity included: 3, 5-6",
+        "Restored": "1 data page: 3",
+        "Lost": "none",
+        "User bytes a page": "1,000",
+        "AIR bytes a page": "880",  # 3.2 bits of 2200 symbols
+        "Share of the AIR": "1.136",
+        "Q, q": "3.478 user bits a symbol, 0.870 of the raw bits",
+        "Page failure rate": f"0.3750, with 95% confidence at most {figures['page_failure_rate_bound_95']:.4f}",
+        "Margin of pages that were read": "0.200 bit a symbol in the mean, 0.200 bit a symbol at least",
+        "Corrected": "10 symbols by Reed-Solomon",
+        "Iterations": "5.0 a codeword, mean of pages that were read",
+        "Time": "0.520 s a page, code alone 0.020 s; medians",
+    }
+
+
+def test_losses_are_counted_by_cause(tmp_path: Path) -> None:
+    data = report_of_recovery(JsonFile.read(written(WHOLE, tmp_path / "r.json")))
+    assert [(cause, count, share) for cause, _, count, share in data.causes] == [
+        ("optics", 1, 1 / 8),
+        ("body", 2, 0.25),
+    ]
+    assert set(CAUSES) == set(Loss)
+
+
+def test_lost_data_are_said_to_be_lost(tmp_path: Path) -> None:
+    text, _ = page_of(written(replace(WHOLE, lost=(1, 2, 4), restored=()), tmp_path / "r.json"), tmp_path / "r.html")
+    assert "3 data pages lost." in text
+    assert "3 data pages: 1-2, 4" in text
+    assert "came back" not in text
+
+
+def test_a_file_of_which_no_page_was_read(tmp_path: Path) -> None:
+    text, seen = page_of(written(NOTHING, tmp_path / "r.json"), tmp_path / "r.html")
+    check_whole(text, seen, SECTIONS)
+    assert "No page of the file could be read" in text
+    assert "Margin over the recorded pages, no page was read." in text
+    facts = facts_of(NOTHING, tmp_path)
+    assert facts["Volume"] == facts["File size"] == "unknown: no page of it could be read"
+    assert facts["Page failure rate"] == "1.0000, with 95% confidence at most 1.0000"
+    assert facts["Iterations"] == "not known"
+
+
+def test_frames_without_light_have_no_margin_to_draw(tmp_path: Path) -> None:
+    dark = replace(NOTHING, pages=tuple(replace(LOST[0], page=page) for page in range(3)))
+    _, seen = page_of(written(dark, tmp_path / "r.json"), tmp_path / "r.html")
+    assert {"read (0)", "optics (3)"} <= labels(seen.pictures["pages"][0])
+
+
+def test_a_recovery_without_pages_or_losses(tmp_path: Path) -> None:
+    none = {"page_results": [], "pages": 0, "pages_unread": 0, "page_failure_rate": None, "seconds_per_page": None}
+    text, seen = page_of(written(NOTHING, tmp_path / "r.json", **none), tmp_path / "r.html")
+    check_whole(text, seen, SECTIONS)
+    assert not seen.pictures
+    text, _ = page_of(written(replace(WHOLE, pages=(READ,)), tmp_path / "r.json"), tmp_path / "r.html")
+    assert "Every recorded page gave its bytes." in text
+
+
+def test_long_lists_end(tmp_path: Path) -> None:
+    lost = tuple(replace(LOST[1], page=page, number=page, reason=9 * "very long " * 100) for page in range(2500))
+    many = replace(WHOLE, pages=lost, missing=tuple(range(0, 5000, 2)))
+    text, seen = page_of(written(many, tmp_path / "r.json"), tmp_path / "r.html")
+    assert text.count("<td>body</td>") == 200 + 1  # one of them counts the cause
+    assert "And 2,300 more" in text
+    assert "36, 38 and 2,480 more" in text
+    assert all(picture.startswith("data:image/png") for picture in seen.pictures["pages"])
+    assert len(text) < 500_000
+
+
+def test_text_of_a_recovery_is_escaped(tmp_path: Path) -> None:
+    evil = '<script>alert("1")</script>'
+    text, seen = page_of(
+        written(replace(WHOLE, pages=(replace(LOST[1], reason=evil),)), tmp_path / "r.json"), tmp_path / "r.html"
+    )
+    assert "script" not in seen.tags
+    assert html.escape(evil).replace("&quot;", "&#34;") in text
+
+
+def one(**changes: Any) -> dict[str, Any]:
+    """Results of one page, which is not as it should be."""
+    page = NOTHING.to_json()["page_results"][1] | changes
+    return {"page_results": [page], "pages": 1, "pages_unread": 1}
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"user_bytes_per_page": "1000"}, "user_bytes_per_page"),
+        ({"q": 2.0}, "q"),
+        ({"lost": [-1]}, r"lost\.0"),
+        ({"code": CODE.model_dump() | {"levels": "16"}}, r"code\.levels"),
+        ({"code": CODE.model_dump() | {"levels": 17}}, "code"),
+        ({"volume": VOLUME.to_json() | {"data_pages": 0}}, r"volume \(.*group of pages"),
+        ({"page_results": None}, "page_results"),
+        ({"pages": 9}, r"file \(.*pages, pages_unread: 9, 3, but page_results has 8 pages, 3"),
+        (one(loss="<b>"), r"page_results\.0\.loss"),
+        (one(margin_bits=1e308), r"page_results\.0\.margin_bits"),
+        (one(page=1 << 70), r"page_results\.0\.page"),
+        (one(reason=5), r"page_results\.0\.reason"),
+        (one(failed_blocks=BLOCKS + 1), r"file \(.*failed_blocks: 4 of the 3 of a page"),
+    ],
+)
+def test_figures_that_cannot_be_are_refused(changes: dict[str, Any], named: str, tmp_path: Path) -> None:
+    path = written(WHOLE, tmp_path / "r.json", **changes)
+    with pytest.raises(InvalidInputError, match=rf"r\.json: got {named}.*wanted a finished training run, or the JSON"):
+        run(report, path, "--out", tmp_path / "r.html")
+    assert not (tmp_path / "r.html").exists()
+
+
+def test_what_is_not_finite_is_refused(tmp_path: Path) -> None:
+    (path := tmp_path / "r.json").write_text(json.dumps(WHOLE.to_json() | {"air_bytes_per_page": float("inf")}))
+    with pytest.raises(InvalidInputError, match=r"got air_bytes_per_page \(.*finite number"):
+        run(report, path, "--out", tmp_path / "r.html")
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (
+            {"target": "127.0.0.1:50051", "levels": 256, "pages": [], "refused_pages": []},
+            "the JSON of `lightpage decode`",
+        ),
+        ({"pages": 3, "\x1b[2J": 1}, r"JSON with the keys 'pages', '\\x1b\[2J'"),
+        ({str(number): 0 for number in range(9)}, "JSON with the keys '0', '1', '2', '3', '4' and 4 more"),
+        ({}, "JSON without keys"),
+        ([1, 2], "JSON that is no object"),
+    ],
+)
+def test_other_json_is_named(content: Any, named: str, tmp_path: Path) -> None:
+    (path := tmp_path / "j.json").write_text(json.dumps(content))
+    wanted = "wanted a finished training run, or the JSON that this version's `lightpage evaluate` or `recover` writes"
+    with pytest.raises(InvalidInputError, match=f"j.json: got {named}, {wanted}"):
+        run(report, path, "--out", tmp_path / "r.html")
+    for text in (b"\xff", b"[" * 100_000, b""):
+        path.write_bytes(text)
+        with pytest.raises(InvalidInputError, match=r"got text that is no JSON \(.*wanted"):
+            run(report, path, "--out", tmp_path / "r.html")
+
+
+def test_a_recording_is_of_no_use_with_a_recovery(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"--recording: got .*none with the JSON of `lightpage recover`"):
+        run(report, written(WHOLE, tmp_path / "r.json"), "--out", tmp_path / "r.html", "--recording", "r.h5")
