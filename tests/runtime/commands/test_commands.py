@@ -614,7 +614,8 @@ def test_an_interrupted_measurement_leaves_no_figures(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(LightpageServer, "start", interrupting)
     assert run([command, "--json", tmp_path / "figures.json"]) == 130
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+    written = {"demo": ["pages.h5"]}.get(command, [])  # what the modulator shows is no figure
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == written
 
 
 def test_a_command_without_a_service_or_a_choice_says_so(
