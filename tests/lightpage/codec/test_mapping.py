@@ -1,0 +1,166 @@
+"""Bits on phases: the ratios are those of the posterior, labels are Gray, levels and labels are inverse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from lightpage.codec.mapping import (
+    MOST_LLR,
+    bit_information,
+    bit_llrs,
+    decide_in_coset,
+    labels,
+    level_bits,
+    to_levels,
+)
+from lightpage.errors import PageError
+
+ALL_SPLITS = [(1 << bits, coded) for bits in range(1, 9) for coded in range(1, bits + 1)]
+
+
+def label_of(levels: int, coded: int) -> np.ndarray:
+    """Label bits of every level, [levels, b], by the specification."""
+    number = np.arange(levels) % (1 << coded)
+    return (number ^ number >> 1)[:, None] >> np.arange(coded) & 1
+
+
+def brute_force(phase: np.ndarray, kappa: np.ndarray, levels: int, coded: int) -> np.ndarray:
+    """ln P(0) / P(1) in double precision over all levels, [symbols, b], not clipped."""
+    angles = 2 * np.pi * np.arange(levels) / levels
+    # kappa (cos - 1) by the half angle, which keeps the digits that a large kappa needs
+    log_weight = -2 * kappa[:, None] * np.sin((phase[:, None] - angles) / 2) ** 2
+    ratios = [
+        logsumexp(log_weight[:, bit == 0], axis=1) - logsumexp(log_weight[:, bit == 1], axis=1)
+        for bit in label_of(levels, coded).T
+    ]
+    return np.stack(ratios, axis=-1)
+
+
+@pytest.mark.parametrize(("levels", "coded"), ALL_SPLITS)
+def test_ratios_are_those_of_the_posterior(levels: int, coded: int) -> None:
+    rng = np.random.default_rng([levels, coded])
+    phase = np.concatenate([rng.uniform(-12, 12, 400), 2 * np.pi / levels * (np.arange(-levels, levels) + 0.5)])
+    kappa = np.where(rng.random(phase.size) < 0.05, 0, 10 ** rng.uniform(-3, 6, phase.size))
+    got = bit_llrs(phase, kappa, levels, coded)
+    assert got.dtype == np.float32
+    assert got.shape == (phase.size, coded)
+    expected = np.clip(brute_force(phase, kappa, levels, coded), -MOST_LLR, MOST_LLR)
+    # the exponents are at most 87 (where exp leaves float32), with 24 bits; the sums have at most 256 terms
+    np.testing.assert_allclose(got, expected, rtol=0, atol=87 * 2.0**-23 + 256 * 2.0**-24)
+    assert not got[kappa == 0].any()
+
+
+def test_all_label_bits_are_the_default() -> None:
+    phase, kappa = np.linspace(-3, 3, 20).reshape(4, 5), np.full((4, 5), 30.0)
+    got = bit_llrs(phase, kappa, 16)
+    assert got.shape == (4, 5, 4)
+    assert np.array_equal(got, bit_llrs(phase, kappa, 16, 4))
+    flat = bit_llrs(phase.ravel(), kappa.ravel(), 16)
+    assert np.array_equal(got.reshape(20, 4), flat)
+
+
+def test_many_symbols_are_as_few() -> None:
+    rng = np.random.default_rng(0)
+    phase, kappa = rng.uniform(-4, 4, 5000), rng.uniform(0, 1e4, 5000)  # more than are taken at once
+    whole = bit_llrs(phase, kappa, 256, 2)
+    assert np.array_equal(whole[4000:], bit_llrs(phase[4000:], kappa[4000:], 256, 2))
+
+
+@pytest.mark.parametrize("coded", range(1, 9))
+def test_labels_are_a_cyclic_gray_code(coded: int) -> None:
+    got = labels(coded)
+    assert sorted(got) == list(range(1 << coded))
+    assert [int(label).bit_count() for label in got ^ np.roll(got, 1)] == [1] * (1 << coded)
+
+
+@pytest.mark.parametrize(("levels", "coded"), ALL_SPLITS)
+def test_levels_and_their_labels_are_inverse(levels: int, coded: int) -> None:
+    level = np.arange(levels)
+    label, upper = label_of(levels, coded).astype(np.uint8), level >> coded
+    assert np.array_equal(to_levels(label, upper, levels), level)
+    rng = np.random.default_rng(0)
+    # less than half of the distance between levels of a coset, whatever the number of turns
+    off = rng.uniform(-0.499, 0.499, (20, levels)) * (1 << coded)
+    turns = rng.integers(-3, 4, (20, levels))
+    phases = 2 * np.pi * ((level + off) / levels + turns)
+    for phase in phases:
+        assert np.array_equal(decide_in_coset(phase, label, levels), upper)
+    if coded < level_bits(levels):
+        beyond = 2 * np.pi / levels * (level + 0.501 * (1 << coded))
+        assert np.array_equal(decide_in_coset(beyond, label, levels), (upper + 1) % (levels >> coded))
+
+
+class TestInformation:
+    def test_limits(self) -> None:
+        right = np.array([MOST_LLR, -MOST_LLR])
+        bits = np.array([0, 1], np.uint8)
+        assert bit_information(right, bits) == pytest.approx(1, abs=1e-15)
+        assert bit_information(right) == pytest.approx(1, abs=1e-15)
+        assert bit_information(np.zeros(5)) == bit_information(np.zeros(5), np.ones(5, np.uint8)) == 0
+        # certain and wrong: log2(1 + e^40) bits less than what is right
+        assert bit_information(right, 1 - bits) == pytest.approx(1 - MOST_LLR / np.log(2), rel=1e-12)
+
+    @pytest.mark.parametrize("error", [0.001, 0.11, 0.3, 0.5])
+    def test_a_binary_symmetric_channel_carries_one_less_its_entropy(self, error: float) -> None:
+        size = np.log((1 - error) / error)
+        capacity = 1 + error * np.log2(error) + (1 - error) * np.log2(1 - error)
+        assert bit_information(np.array([size, -size])) == pytest.approx(capacity, abs=1e-12)
+        wrong = round(1000 * error)
+        bits = np.zeros(1000, np.uint8)
+        ratios = np.where(np.arange(1000) < wrong, -size, size)
+        assert bit_information(ratios, bits) == pytest.approx(capacity, abs=1e-12)
+        assert bit_information(-ratios, bits + 1) == pytest.approx(capacity, abs=1e-12)
+
+    def test_erased_bits_carry_nothing(self) -> None:
+        ratios = np.where(np.arange(100) < 30, 0, MOST_LLR)
+        assert bit_information(ratios) == pytest.approx(0.7, abs=1e-12)
+
+    def test_honest_ratios_claim_what_they_carry(self) -> None:
+        rng = np.random.default_rng(1)
+        bits, variance = rng.integers(0, 2, 200_000).astype(np.uint8), 1.3
+        ratios = 2 * (1 - 2.0 * bits + np.sqrt(variance) * rng.standard_normal(bits.size)) / variance
+        # each bit's own deviates by less than one bit: five deviations of the mean
+        assert bit_information(ratios) == pytest.approx(bit_information(ratios, bits), abs=5 / np.sqrt(bits.size))
+
+    def test_ratios_that_over_claim_mislead(self) -> None:
+        rng = np.random.default_rng(2)
+        bits = rng.integers(0, 2, 1000).astype(np.uint8)
+        assert bit_information(np.full(1000, 30.0), bits) < -10
+
+
+class TestRefusals:
+    @pytest.mark.parametrize("levels", [3, 6, 100, 255])
+    def test_levels_that_carry_no_whole_bits(self, levels: int) -> None:
+        for call in (lambda: level_bits(levels), lambda: bit_llrs(np.zeros(2), np.ones(2), levels)):
+            with pytest.raises(PageError, match=f"got {levels}, wanted a power of two from 2 to 256"):
+                call()
+
+    @pytest.mark.parametrize("levels", [0, 1, 512])
+    def test_levels_out_of_range(self, levels: int) -> None:
+        with pytest.raises(PageError, match=f"got {levels}, wanted a whole number from 2 to 256"):
+            level_bits(levels)
+
+    @pytest.mark.parametrize("coded", [0, 5, -1])
+    def test_label_bits_that_the_levels_lack(self, coded: int) -> None:
+        with pytest.raises(PageError, match=f"label bits of 16 levels: got {coded}, wanted 1 to 4"):
+            bit_llrs(np.zeros(2), np.ones(2), 16, coded)
+
+    def test_too_many_label_bits_on_the_way_to_levels_and_back(self) -> None:
+        label = np.zeros((2, 3), np.uint8)
+        with pytest.raises(PageError, match="label bits of 4 levels: got 3, wanted 1 to 2"):
+            to_levels(label, np.zeros(2, np.int64), 4)
+        with pytest.raises(PageError, match="label bits of 4 levels: got 3, wanted 1 to 2"):
+            decide_in_coset(np.zeros(2), label, 4)
+
+    @pytest.mark.parametrize(("phase", "kappa"), [(np.nan, 1), (0, np.nan), (np.inf, 1), (0, np.inf), (0, -1e-9)])
+    def test_what_is_no_posterior(self, phase: float, kappa: float) -> None:
+        with pytest.raises(PageError, match="phase, concentration: got NaN, infinity or a negative concentration"):
+            bit_llrs(np.array([0.0, phase]), np.array([1.0, kappa]), 4)
+
+    def test_shapes_that_differ(self) -> None:
+        with pytest.raises(PageError, match=r"phase, concentration: got \(\(3,\), \(2,\)\), wanted two equal shapes"):
+            bit_llrs(np.zeros(3), np.zeros(2), 4)
+        with pytest.raises(PageError, match="wanted two equal shapes"):
+            bit_llrs(np.zeros((3, 2)), np.zeros((2, 3)), 4)
