@@ -82,8 +82,8 @@ def check_volume(volume: int, volume_bytes: int, pages: int) -> None:
     """
     if not 0 <= volume < 1 << 32:
         raise InvalidInputError("volume id", volume, f"0 to {(1 << 32) - 1}")
-    if volume_bytes > MOST_BYTES:
-        raise InvalidInputError("file", f"{volume_bytes} bytes", f"at most {MOST_BYTES} in a volume")
+    if not 0 <= volume_bytes <= MOST_BYTES:
+        raise InvalidInputError("file", f"{volume_bytes} bytes", f"0 to {MOST_BYTES} in a volume")
     if pages > MOST_PAGES:
         raise InvalidInputError("file", f"{pages} pages", f"at most {MOST_PAGES} in a volume")
 
