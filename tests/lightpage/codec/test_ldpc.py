@@ -140,8 +140,8 @@ class TestNearTheLimit:
     """Light in which some of the blocks fail."""
 
     LOSS_DB = 0.25
-    """That offset min-sum and 40 iterations may cost against the sum-product algorithm. Measured on 600 blocks of each of
-    the codes below: 0, 0.12, 0.08 and 0.19, half of the last by the bound on iterations."""
+    """That offset min-sum and 40 iterations may cost against the sum-product algorithm. Measured on 600 blocks of each
+    of the codes below: 0, 0.12, 0.08 and 0.19, half of the last by the bound on iterations."""
 
     @pytest.mark.parametrize(
         ("information", "sent", "decibel"), [(136, 204, 0.6), (400, 800, -1.8), (440, 500, 2.9), (330, 960, -4.0)]

@@ -1,0 +1,125 @@
+"""The parameters of a code: kept as TOML, refused by name, told apart by their id."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from lightpage.codec.checksum import crc16
+from lightpage.codec.code import Code, load_code, parse_code
+from lightpage.errors import InvalidInputError
+
+CODE = Code(levels=64, coded_bits=2, rate_per_mille=755, corrections=3, needed_information=0.8125)
+TEXT = CODE.to_toml()
+
+
+def changed(key: str, value: str) -> str:
+    """TOML of the code with another value of one key."""
+    lines = [f"{key} = {value}" if line.startswith(f"{key} ") else line for line in TEXT.splitlines()]
+    assert lines != TEXT.splitlines()
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        CODE,
+        Code(levels=2, coded_bits=1, rate_per_mille=340),
+        Code(levels=256, coded_bits=8, rate_per_mille=960, corrections=32, needed_information=1 / 3),
+    ],
+)
+def test_it_comes_back_from_toml(code: Code, tmp_path: Path) -> None:
+    assert parse_code(code.to_toml(), "code") == code
+    code.save(tmp_path / "code.toml")
+    assert load_code(tmp_path / "code.toml") == code
+    assert [path.name for path in tmp_path.iterdir()] == ["code.toml"]
+
+
+def test_what_may_be_left_out_has_a_default() -> None:
+    code = parse_code("levels = 16\ncoded_bits = 2\nrate_per_mille = 700", "code")
+    assert (code.corrections, code.needed_information) == (0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "complaint"),
+    [
+        ("levels", "1", "levels: .*greater than or equal to 2"),
+        ("levels", "512", "levels: .*less than or equal to 256"),
+        ("levels", "48", "got 48, wanted a power of two"),
+        ("levels", "64.5", "levels: .*integer"),
+        ("levels", '"many"', "levels: .*integer"),
+        ("coded_bits", "0", "coded_bits: .*greater than or equal to 1"),
+        ("coded_bits", "9", "coded_bits: .*less than or equal to 8"),
+        ("coded_bits", "7", "7 coded bits are more than the 6 of 64 levels"),
+        ("rate_per_mille", "339", "rate_per_mille: .*greater than or equal to 340"),
+        ("rate_per_mille", "961", "rate_per_mille: .*less than or equal to 960"),
+        ("corrections", "-1", "corrections: .*greater than or equal to 0"),
+        ("corrections", "33", "corrections: .*less than or equal to 32"),
+        ("needed_information", "0.0", "needed_information: .*greater than 0"),
+        ("needed_information", "1.01", "needed_information: .*less than or equal to 1"),
+        ("needed_information", "nan", "needed_information: "),
+        ("needed_information", "inf", "needed_information: "),
+    ],
+)
+def test_each_bad_value_is_refused_by_name(key: str, value: str, complaint: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"^my code: got .*{complaint}"):
+        parse_code(changed(key, value), "my code")
+
+
+def test_missing_and_unknown_keys_are_refused_by_name() -> None:
+    with pytest.raises(InvalidInputError, match=r"my code: got rate: .*not permitted"):
+        parse_code(TEXT + "rate = 1\n", "my code")
+    with pytest.raises(InvalidInputError, match=r"my code: got rate_per_mille: .*required"):
+        parse_code("levels = 16\ncoded_bits = 2", "my code")
+
+
+def test_what_is_no_toml_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="my code: got text that is not TOML"):
+        parse_code("levels: 16", "my code")
+    path = tmp_path / "code.toml"
+    with pytest.raises(InvalidInputError, match=r"code .*code\.toml: got No such file"):
+        load_code(path)
+    path.write_bytes(b"levels = \xff")
+    with pytest.raises(InvalidInputError, match=r"code .*code\.toml: got .*decode"):
+        load_code(path)
+    path.write_text("levels = 5")
+    with pytest.raises(InvalidInputError, match=r"code .*code\.toml: got coded_bits: "):
+        load_code(path)
+
+
+def test_a_path_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"code .*wanted a path that can be written"):
+        CODE.save(tmp_path / "no" / "code.toml")
+
+
+def test_the_id_is_the_documented_one() -> None:
+    assert CODE.id == crc16(b"64 2 755 3")
+
+
+def test_the_id_changes_with_every_parameter_that_the_page_depends_on() -> None:
+    changes = [{"levels": 128}, {"coded_bits": 3}, {"rate_per_mille": 760}, {"corrections": 4}]
+    ids = [CODE.id, *(CODE.model_copy(update=change).id for change in changes)]
+    assert len(set(ids)) == 5
+    assert CODE.model_copy(update={"needed_information": 0.5}).id == CODE.id
+
+
+def test_few_codes_share_an_id() -> None:
+    """16 bits tell codes apart that a device may have had; among all codes some coincide."""
+    codes = itertools.product((16, 32, 64, 128, 256), (2,), range(500, 900, 5), (0, 1, 2, 4))
+    ids = [Code(levels=m, coded_bits=b, rate_per_mille=r, corrections=t).id for m, b, r, t in codes]
+    pairs = len(ids) * (len(ids) - 1) / 2
+    expected = pairs / 65536
+    assert len(ids) - len(set(ids)) < expected + 5 * expected**0.5
+
+
+def test_it_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError):
+        CODE.levels = 4  # type: ignore[misc]
+    assert hash(CODE) == hash(CODE.model_copy())
+
+
+def test_it_describes_itself() -> None:
+    assert CODE.describe() == "64 levels, 2 of 6 bits coded at rate 0.755, 3 corrections a word"
