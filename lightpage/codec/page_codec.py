@@ -98,7 +98,11 @@ class PageCodec:
         self._upper_bits = code.level_bits - code.coded_bits
         self.blocks = -(-self._coded_bits * code.rate_per_mille // (1000 * MOST_INFORMATION_BITS))
         sent = self._coded_bits // self.blocks
-        self.ldpc = LdpcCode(sent * code.rate_per_mille // 1000, sent)
+        information = sent * code.rate_per_mille // 1000
+        small = InvalidInputError("page", f"{data} data symbols", f"more, to hold user bytes ({code.describe()})")
+        if information < 1:
+            raise small
+        self.ldpc = LdpcCode(information, sent)
         self._information = self.blocks * self.ldpc.information_bits
         self._total_bits = self._information + len(self._body) * self._upper_bits
         self._words = -(-(self._total_bits // SYMBOL_BITS) // LONGEST_WORD)
@@ -108,7 +112,7 @@ class PageCodec:
         self._bytes = data_bits // 8
         self.user_bytes = self._bytes - _GROUP_BYTES - CRC32C_BYTES
         if self.user_bytes < 1:
-            raise InvalidInputError("page", f"{data} data symbols", f"more, to hold user bytes ({code.describe()})")
+            raise small
 
     @cached_property
     def _order(self) -> NDArray[np.intp]:
