@@ -1,0 +1,431 @@
+"""A page of user bytes: what goes in comes out, or nothing does; never other bytes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lightpage.codec.choose import DrawnPage, needed_information
+from lightpage.codec.code import Code
+from lightpage.codec.header import header_symbols
+from lightpage.codec.page_codec import Loss, PageCodec
+from lightpage.errors import InvalidInputError, PageError
+from tests.lightpage.codec.light import GROUP, SHAPE, codec_of, header_of, noisy, pilot_mask, written
+
+CODES = [
+    # M, b, rate in thousandths, t
+    (2, 1, 700, 0),
+    (4, 2, 340, 0),
+    (8, 3, 600, 1),
+    (8, 1, 960, 0),
+    (16, 2, 700, 0),
+    (32, 2, 755, 3),
+    (64, 1, 700, 2),
+    (128, 2, 850, 8),
+    (256, 2, 700, 2),
+    (256, 8, 800, 32),
+]
+
+
+def header_places(codec: PageCodec) -> np.ndarray:
+    """Where the header lies in the flat page, by the specification."""
+    data, count = np.flatnonzero(~codec.pilots), header_symbols(codec.code.levels)
+    return data[[(2 * j + 1) * len(data) // (2 * count) for j in range(count)]]
+
+
+def body_places(codec: PageCodec) -> np.ndarray:
+    """Where the body lies in the flat page, in its order."""
+    return np.setdiff1d(np.flatnonzero(~codec.pilots), header_places(codec))
+
+
+def kappa_of(levels: int, deviation: float) -> float:
+    """Concentration of noise whose standard deviation is a share of the distance between levels."""
+    return (levels / (2 * np.pi * deviation)) ** 2
+
+
+class TestRoundTrip:
+    @pytest.mark.parametrize(("levels", "coded", "rate", "corrections"), CODES)
+    def test_what_is_written_is_read(self, levels: int, coded: int, rate: int, corrections: int) -> None:
+        codec, rng = codec_of(levels, coded, rate, corrections, shape=(28, 44)), np.random.default_rng(levels)
+        for page in (0, 3, (1 << 24) - 1):
+            header = header_of(codec, page)
+            data, symbols = written(codec, header, rng)
+            assert int(symbols.max()) < levels
+            found = codec.decode(*noisy(symbols, levels, np.inf, rng))
+            assert found.data == data
+            assert found.header == header
+            assert (found.data_pages, found.parity_pages) == GROUP
+            assert (found.loss, found.failed_blocks, found.corrected) == (None, 0, 0)
+            assert found.blocks == codec.blocks == 1
+            assert found.iterations <= 3  # bits that are not sent must be found first
+
+    def test_pages_of_a_batch_are_those_made_alone(self) -> None:
+        codec, rng = codec_of(64, 2, 700, 2), np.random.default_rng(0)
+        headers = [header_of(codec, page) for page in range(4)]
+        data = rng.integers(0, 256, (4, codec.user_bytes), np.uint8)
+        levels = rng.integers(0, 64, np.count_nonzero(codec.pilots), np.uint8)
+        pages = codec.encode(headers, data, GROUP, levels)
+        assert pages.shape == (4, *SHAPE)
+        assert pages.dtype == np.uint8
+        assert (pages[:, codec.pilots] == levels).all()
+        for header, row, page in zip(headers, data, pages, strict=True):
+            assert np.array_equal(codec.encode([header], row[None], GROUP, levels)[0], page)
+
+    def test_equal_bytes_look_different_on_every_page_and_use_all_levels_alike(self) -> None:
+        """A page of zeros would be a flat wave front, which blinds the camera in one place."""
+        codec = codec_of(16, 2, 700, 2, shape=(28, 44))
+        pilots = np.zeros(np.count_nonzero(codec.pilots), np.uint8)
+        headers = [header_of(codec, page) for page in range(8)]
+        pages = codec.encode(headers, np.zeros((8, codec.user_bytes), np.uint8), GROUP, pilots)
+        body = pages.reshape(8, -1)[:, body_places(codec)]
+        counts = np.array([np.bincount(page, minlength=16) for page in body])
+        mean = body.shape[1] / 16
+        assert np.abs(counts - mean).max() < 5 * np.sqrt(mean)
+        assert np.mean(body[0] == body[1]) < 1 / 16 + 5 * np.sqrt(1 / 16 / body.shape[1])
+
+    def test_several_blocks_and_words(self) -> None:
+        codec, rng = codec_of(256, 2, 900, 2, shape=(100, 100)), np.random.default_rng(1)
+        coded = 2 * len(body_places(codec))
+        assert codec.blocks == -(-coded * 900 // (1000 * 8448)) == 3
+        assert coded % codec.blocks  # some coded bits belong to no block
+        total = codec.blocks * codec.ldpc.information_bits + 6 * len(body_places(codec))
+        words = -(-(total // 12) // 4095)
+        assert words == 2
+        assert codec.user_bytes == 12 * (total // 12 - 4 * words) // 8 - 6
+        header = header_of(codec)
+        data, symbols = written(codec, header, rng)
+        phase, kappa = noisy(symbols, 256, kappa_of(256, 0.2), rng)
+        assert codec.decode(phase, kappa).data == data
+        # two wrong upper numbers, 12 bits apart and more: one in each word
+        wrong = body_places(codec)[[1000, 1002]]
+        phase.flat[wrong] += 4 * 2 * np.pi / 256
+        found = codec.decode(phase, kappa)
+        assert found.data == data
+        assert 2 <= found.corrected <= 4
+        phase.flat[body_places(codec)[1000:1040]] += 4 * 2 * np.pi / 256
+        assert codec.decode(phase, kappa).loss == Loss.CHECKSUM
+
+
+def changed_bits(codec: PageCodec, symbols: np.ndarray, which: np.ndarray) -> set[int]:
+    """Those of the T bits that change where body symbols of these numbers are decided one upper number too high."""
+    code, start = codec.code, codec.blocks * codec.ldpc.information_bits
+    bits = code.level_bits - code.coded_bits
+    upper = symbols.ravel()[body_places(codec)[which]].astype(int) >> code.coded_bits
+    changed = upper ^ (upper + 1) % (1 << bits)
+    return {
+        start + number * bits + bit
+        for number, change in zip(which, changed, strict=True)
+        for bit in range(bits)
+        if change >> (bits - 1 - bit) & 1
+    }
+
+
+class TestCorrections:
+    @pytest.mark.parametrize(("levels", "coded", "corrections"), [(64, 2, 4), (16, 2, 4), (256, 2, 16), (64, 1, 8)])
+    def test_wrong_upper_numbers_are_mended_and_counted(self, levels: int, coded: int, corrections: int) -> None:
+        codec, rng = codec_of(levels, coded, 700, corrections), np.random.default_rng([levels, coded])
+        step = 2 * np.pi / levels * (1 << coded)
+        seen = set()
+        for _ in range(60):
+            data, symbols = written(codec, header_of(codec), rng)
+            phase, kappa = noisy(symbols, levels, np.inf, rng)
+            which = rng.choice(len(body_places(codec)) - 12, rng.integers(0, corrections + 3), replace=False)
+            phase.flat[body_places(codec)[which]] += step
+            bits = changed_bits(codec, symbols, which)
+            wrong = len({bit // 12 for bit in bits})
+            found = codec.decode(phase, kappa)
+            assert found.failed_blocks == 0
+            if all(
+                bit >= 8 * (codec.user_bytes + 6) for bit in bits
+            ):  # none, or only parity: the body needs no mending
+                assert (found.data, found.corrected, found.loss) == (data, 0, None)
+            elif wrong <= corrections:
+                assert (found.data, found.corrected, found.loss) == (data, wrong, None)
+            else:
+                assert (found.data, found.corrected, found.loss) == (None, 0, Loss.CHECKSUM)
+            seen.add(wrong - corrections)
+        assert {-1, 0, 1} <= seen
+
+    def test_without_corrections_one_wrong_upper_number_loses_the_page(self) -> None:
+        codec, rng = codec_of(64, 2, 700, 0), np.random.default_rng(0)
+        data, symbols = written(codec, header_of(codec), rng)
+        phase, kappa = noisy(symbols, 64, np.inf, rng)
+        assert codec.decode(phase, kappa).data == data
+        phase.flat[body_places(codec)[0]] += 4 * 2 * np.pi / 64
+        found = codec.decode(phase, kappa)
+        assert (found.data, found.loss, found.failed_blocks) == (None, Loss.CHECKSUM, 0)
+
+    def test_corrections_cost_their_parity(self) -> None:
+        sizes = [codec_of(64, 2, 700, corrections).user_bytes for corrections in (1, 2, 6)]
+        assert sizes[0] - sizes[1] == 3  # two symbols of 12 bits each
+        assert sizes[1] - sizes[2] == 12
+
+
+def any_light(codec: PageCodec, symbols: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Phases and concentrations of a page in light about the code's limit and below, claims right or wrong."""
+    levels = codec.code.levels
+    kappa = kappa_of(levels, rng.uniform(0.2, 0.45) * (1 if codec.code.coded_bits > 1 else 0.8))
+    phase, concentration = noisy(symbols, levels, kappa, rng)
+    return phase, concentration * rng.choice([0.1, 1, 1, 1, 1, 30])
+
+
+def spoilt_region(codec: PageCodec, symbols: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A page with a rectangle of anything: of no light, of certain nonsense, or shifted by some levels."""
+    levels = codec.code.levels
+    phase, concentration = noisy(symbols, levels, kappa_of(levels, rng.uniform(0.1, 0.25)), rng)
+    (top, left), (height, width) = rng.integers(0, SHAPE), rng.integers(1, (9, 13))
+    region = np.s_[top : top + height, left : left + width]
+    kind = rng.integers(4)
+    if kind == 0:
+        concentration[region] = 0
+    elif kind == 1:
+        phase[region] = rng.uniform(-10, 10, phase[region].shape)
+    elif kind == 2:
+        phase[region] += 2 * np.pi * rng.integers(levels) / levels
+    else:
+        phase[region], concentration[region] = 0, 1e6
+    return phase, concentration
+
+
+def never_other_bytes(pages: int, seed: int, draw: object) -> Counter[Loss | None]:
+    """Decode drawn pages, all of which must give the right bytes or none; how often which."""
+    rng, seen = np.random.default_rng(seed), Counter[Loss | None]()
+    codecs = [codec_of(16, 2, 700, 0), codec_of(64, 2, 700, 2), codec_of(64, 1, 700, 4), codec_of(256, 2, 700, 16)]
+    for trial in range(pages):
+        codec = codecs[trial % len(codecs)]
+        header = header_of(codec, int(rng.integers(1 << 24)), int(rng.integers(1 << 32)))
+        data, symbols = written(codec, header, rng)
+        phase, concentration = draw(codec, symbols, rng)  # type: ignore[operator]
+        expected = [None, header, header_of(codec, header.page ^ 1, header.volume)][rng.integers(3)]
+        found = codec.decode(phase, concentration, expected)
+        assert found.data in (data, None)
+        if found.data is not None:
+            assert found.header == header
+            assert found.loss is None
+        else:
+            assert found.loss is not None
+            assert (found.data_pages, found.parity_pages, found.corrected) == (0, 0, 0)
+        seen[found.loss] += 1
+    return seen
+
+
+class TestNeverOtherBytes:
+    def test_in_light_about_the_limit(self) -> None:
+        seen = never_other_bytes(320, 0, any_light)
+        assert seen[None] > 80
+        assert seen[Loss.BODY] > 80
+
+    def test_with_regions_of_anything(self) -> None:
+        seen = never_other_bytes(320, 1, spoilt_region)
+        assert seen[None] > 80
+        assert seen[Loss.BODY] > 50
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("draw", [any_light, spoilt_region])
+    def test_in_ten_thousand_pages(self, draw: object) -> None:
+        seen = never_other_bytes(10_000, 2, draw)
+        assert seen[None] > 2000
+        assert seen[Loss.BODY] > 1500
+        assert seen[Loss.CHECKSUM] > 5
+
+
+class TestHeader:
+    CODEC = codec_of(64, 2, 700, 2)
+
+    def page(self, damaged: bool = True, code_id: int | None = None) -> tuple[bytes, np.ndarray, np.ndarray]:
+        """User bytes, phases and concentrations of page 3, its header unreadable if damaged."""
+        rng, header = np.random.default_rng(0), header_of(self.CODEC)
+        header = header if code_id is None else replace(header, code_id=code_id)
+        data, symbols = written(self.CODEC, header, rng)
+        phase, kappa = noisy(symbols, 64, kappa_of(64, 0.2), rng)
+        if damaged:
+            places = header_places(self.CODEC)
+            phase.flat[places] = rng.uniform(-np.pi, np.pi, len(places))
+        return data, phase, kappa
+
+    def test_without_it_the_page_is_lost(self) -> None:
+        _, phase, kappa = self.page()
+        found = self.CODEC.decode(phase, kappa)
+        assert (found.header, found.data, found.loss, found.failed_blocks) == (None, None, Loss.HEADER, 0)
+
+    def test_without_it_the_page_that_was_expected_is_read(self) -> None:
+        data, phase, kappa = self.page()
+        header = header_of(self.CODEC)
+        found = self.CODEC.decode(phase, kappa, header)
+        assert (found.header, found.data, found.loss) == (header, data, None)
+
+    @pytest.mark.parametrize("change", [{"page": 4}, {"volume": 1}, {"volume_bytes": 999_999}, {"code_id": 1}])
+    def test_without_it_another_page_is_not_taken_for_the_one_expected(self, change: dict[str, int]) -> None:
+        _, phase, kappa = self.page()
+        found = self.CODEC.decode(phase, kappa, replace(header_of(self.CODEC), **change))
+        assert (found.header, found.data, found.loss) == (None, None, Loss.HEADER)
+
+    def test_it_goes_before_what_was_expected(self) -> None:
+        data, phase, kappa = self.page(damaged=False)
+        found = self.CODEC.decode(phase, kappa, header_of(self.CODEC, 4))
+        assert (found.header, found.data) == (header_of(self.CODEC), data)
+
+    def test_a_page_of_another_code_is_known_as_such(self) -> None:
+        other = self.CODEC.code.id ^ 1
+        _, phase, kappa = self.page(damaged=False, code_id=other)
+        found = self.CODEC.decode(phase, kappa)
+        assert found.header is not None
+        assert (found.header.code_id, found.data, found.loss) == (other, None, Loss.CODE)
+        assert found.margin_bits < 0  # its bits are not made for this code, whose need is all of them
+
+    def test_a_page_of_another_rate_is_known_as_such(self) -> None:
+        other, rng = codec_of(64, 2, 705, 2), np.random.default_rng(1)
+        _, symbols = written(other, header_of(other), rng)
+        found = self.CODEC.decode(*noisy(symbols, 64, np.inf, rng), header_of(self.CODEC))
+        assert (found.data, found.loss) == (None, Loss.CODE)
+
+    def test_the_body_is_lost_and_the_header_tells_which(self) -> None:
+        _, phase, kappa = self.page(damaged=False)
+        places = body_places(self.CODEC)
+        phase.flat[places] = np.random.default_rng(2).uniform(-np.pi, np.pi, len(places))
+        found = self.CODEC.decode(phase, kappa)
+        assert (found.header, found.data, found.loss) == (header_of(self.CODEC), None, Loss.BODY)
+        assert found.failed_blocks == found.blocks == 1
+
+
+@pytest.mark.parametrize(("levels", "coded", "rate", "corrections"), CODES)
+class TestNoise:
+    def test_a_dark_page_is_lost(self, levels: int, coded: int, rate: int, corrections: int) -> None:
+        codec = codec_of(levels, coded, rate, corrections, shape=(28, 44))
+        dark = np.zeros(codec.pilots.shape)
+        for expected in (None, header_of(codec)):
+            found = codec.decode(dark, dark, expected)
+            assert (found.header, found.data) == (None, None)
+            assert found.loss is not None
+            assert found.margin_bits == pytest.approx(-coded)  # no information, where the code needs one bit of each
+
+    @pytest.mark.parametrize("kappa", [3.0, 1e6])
+    def test_random_phases_are_lost_however_sure(
+        self, levels: int, coded: int, rate: int, corrections: int, kappa: float
+    ) -> None:
+        codec = codec_of(levels, coded, rate, corrections, shape=(28, 44))
+        phase = np.random.default_rng([levels, coded]).uniform(-np.pi, np.pi, codec.pilots.shape)
+        for expected in (None, header_of(codec)):
+            found = codec.decode(phase, np.full(phase.shape, kappa), expected)
+            assert (found.header, found.data, found.loss) == (None, None, Loss.BODY)
+
+
+class TestMargin:
+    SHAPE = (56, 44)
+
+    def needed(self, codec: PageCodec, rng: np.random.Generator) -> float:
+        """What the code needs, measured as it is when it is chosen."""
+        pages = []
+        for _ in range(20):
+            _, symbols = written(codec, header_of(codec), rng)
+            phase, kappa = noisy(symbols, codec.code.levels, kappa_of(codec.code.levels, 0.25), rng)
+            body = body_places(codec)
+            pages.append(DrawnPage(phase.flat[body], kappa.flat[body], symbols.flat[body]))
+        return needed_information(codec.ldpc, pages, codec.code.levels, codec.code.coded_bits, rng)
+
+    def test_it_falls_with_noise_and_is_near_zero_where_pages_begin_to_fail(self) -> None:
+        rng = np.random.default_rng(3)
+        plain = codec_of(64, 2, 700, 2, self.SHAPE)
+        codec = codec_of(64, 2, 700, 2, self.SHAPE, self.needed(plain, rng))
+        # loss of pages and the mean margin of those read and of those lost
+        before, beginning = np.inf, []
+        for deviation in np.arange(0.2, 0.44, 0.02):
+            found = []
+            for _ in range(10):
+                _, symbols = written(codec, header_of(codec), rng)
+                found.append(codec.decode(*noisy(symbols, 64, kappa_of(64, deviation), rng)))
+            margin = float(np.mean([page.margin_bits for page in found]))
+            lost = np.mean([page.data is None for page in found])
+            assert margin < before
+            before = margin
+            if margin > 0.06:
+                assert lost == 0
+            elif margin < -0.06:
+                assert lost == 1
+            if 0 < lost < 1:
+                beginning.append(margin)
+            for page in found:
+                # a page's information deviates by 0.01 of each of two bits from that of the mean
+                assert page.margin_bits > -0.06 if page.data is not None else page.margin_bits < 0.06
+        assert beginning
+        assert np.abs(beginning).max() < 0.06
+
+    def test_it_is_all_that_the_code_does_not_need_on_a_perfect_page(self) -> None:
+        codec, rng = codec_of(64, 2, 700, 2, needed=0.75), np.random.default_rng(4)
+        _, symbols = written(codec, header_of(codec), rng)
+        assert codec.decode(*noisy(symbols, 64, np.inf, rng)).margin_bits == pytest.approx(0.5)
+
+    def test_it_is_of_the_truth_on_pages_that_are_read_and_of_claims_on_lost_ones(self) -> None:
+        codec, rng = codec_of(64, 2, 700, 2, needed=0.75), np.random.default_rng(5)
+        _, symbols = written(codec, header_of(codec), rng)
+        phase, kappa = noisy(symbols, 64, kappa_of(64, 0.25), rng)
+        honest, bold = codec.decode(phase, kappa), codec.decode(phase, 30 * kappa)
+        assert honest.data is not None
+        assert bold.data == honest.data
+        assert bold.margin_bits < honest.margin_bits - 0.1  # claims that mislead carry less
+        noise = codec.decode(np.random.default_rng(6).uniform(-9, 9, SHAPE), np.full(SHAPE, 1e6))
+        assert noise.data is None
+        assert noise.margin_bits == pytest.approx(0.5, abs=0.02)
+
+
+class TestRefusals:
+    CODEC = codec_of(16, 2, 700, 0)
+
+    @pytest.mark.parametrize("shape", [(1, -1), (1, 1), (2, 0), (0, 0)])
+    def test_data_of_another_shape(self, shape: tuple[int, int]) -> None:
+        size, levels = self.CODEC.user_bytes, np.zeros(np.count_nonzero(self.CODEC.pilots), np.uint8)
+        data = np.zeros((shape[0], size + shape[1]), np.uint8)
+        with pytest.raises(PageError, match=rf"user data: got shape .*, wanted \(1, {size}\)"):
+            self.CODEC.encode([header_of(self.CODEC)], data, GROUP, levels)
+        with pytest.raises(PageError, match=rf"user data: got shape \({size},\), wanted \(1, {size}\)"):
+            self.CODEC.encode([header_of(self.CODEC)], np.zeros(size, np.uint8), GROUP, levels)
+
+    def test_pilots_that_are_not_as_many(self) -> None:
+        count = np.count_nonzero(self.CODEC.pilots)
+        data, levels = np.zeros((1, self.CODEC.user_bytes), np.uint8), np.zeros(count + 1, np.uint8)
+        with pytest.raises(PageError, match=rf"pilot levels: got shape \({count + 1},\), wanted \({count},\)"):
+            self.CODEC.encode([header_of(self.CODEC)], data, GROUP, levels)
+
+    @pytest.mark.parametrize("shape", [(24, 16), (16, 25), (384,), (1, 16, 24)])
+    def test_a_page_of_another_shape(self, shape: tuple[int, ...]) -> None:
+        for phase, kappa in ((shape, SHAPE), (SHAPE, shape)):
+            with pytest.raises(PageError, match=r"phase, concentration: got .*, wanted \(16, 24\) twice"):
+                self.CODEC.decode(np.zeros(phase), np.ones(kappa))
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+    @pytest.mark.parametrize("of_header", [False, True])
+    def test_values_that_are_not_finite(self, value: float, of_header: bool) -> None:
+        place = (header_places if of_header else body_places)(self.CODEC)[5]
+        for phase, kappa in ((value, 1.0), (0.0, value)):
+            page = np.zeros(SHAPE), np.ones(SHAPE)
+            page[0].flat[place], page[1].flat[place] = phase, kappa
+            with pytest.raises(PageError, match="phase, concentration: got NaN, infinity"):
+                self.CODEC.decode(*page)
+
+    @pytest.mark.parametrize("levels", [2, 16, 256])
+    def test_a_page_without_room(self, levels: int) -> None:
+        code = Code(levels=levels, coded_bits=1, rate_per_mille=700)
+        count = header_symbols(levels)
+        for symbols in (1, count - 1, count):
+            with pytest.raises(InvalidInputError, match=f"page: got {symbols} data symbols, wanted more than"):
+                PageCodec(code, np.zeros((1, symbols), bool))
+        # the smallest page that holds a byte: no smaller one does, every larger one does
+        symbols = count + 1
+        while True:
+            with suppress(InvalidInputError):
+                sizes = [PageCodec(code, np.zeros((1, symbols), bool)).user_bytes]
+                break
+            with pytest.raises(InvalidInputError, match=f"page: got {symbols} data symbols, wanted more, to hold user"):
+                PageCodec(code, np.zeros((1, symbols), bool))
+            symbols += 1
+        sizes += [PageCodec(code, np.zeros((1, symbols + more), bool)).user_bytes for more in range(1, 50)]
+        assert sizes[0] == 1
+        assert sizes == sorted(sizes)
+
+    def test_a_page_that_is_all_parity(self) -> None:
+        with pytest.raises(InvalidInputError, match=r"data symbols, wanted more, to hold user bytes \(16 levels, .*32"):
+            PageCodec(Code(levels=16, coded_bits=2, rate_per_mille=700, corrections=32), pilot_mask())
