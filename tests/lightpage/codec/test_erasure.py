@@ -1,0 +1,110 @@
+"""Parity pages: what is lost comes back, whichever pages they are, and one more loss is noticed."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from lightpage.codec.erasure import check_group, parity_of, restore
+from lightpage.errors import InvalidInputError
+
+
+def product(a: int, b: int) -> int:
+    """In GF(2^8) with polynomial 0x11D."""
+    out = 0
+    while b:
+        out ^= a if b & 1 else 0
+        a = a << 1 ^ (0x11D if a & 0x80 else 0)
+        b >>= 1
+    return out
+
+
+INVERSE = {a: next(b for b in range(256) if product(a, b) == 1) for a in range(1, 256)}
+
+
+def group_of(data_pages: int, parity_pages: int, size: int, seed: int = 0) -> tuple[list[bytes], dict[int, bytes]]:
+    """Data pages, and all pages of their group by place."""
+    rng = np.random.default_rng([data_pages, parity_pages, seed])
+    data = [rng.bytes(size) for _ in range(data_pages)]
+    return data, dict(enumerate(data + parity_of(data, parity_pages)))
+
+
+@pytest.mark.parametrize(("data_pages", "parity_pages"), [(1, 1), (1, 4), (5, 3), (20, 6), (61, 3), (250, 5)])
+@pytest.mark.parametrize("size", [1, 3])
+def test_parity_is_the_documented_sum(data_pages: int, parity_pages: int, size: int) -> None:
+    data, pages = group_of(data_pages, parity_pages, size)
+    for i in range(parity_pages):
+        expected = bytearray(size)
+        for j, page in enumerate(data):
+            for place, byte in enumerate(page):
+                expected[place] ^= product(byte, INVERSE[(data_pages + i) ^ j])
+        assert pages[data_pages + i] == bytes(expected)
+
+
+def check_patterns(data_pages: int, parity_pages: int, patterns: int, size: int = 37) -> None:
+    """Any m pages that are lost come back; with one more they do not, unless all that is lost is parity."""
+    data, pages = group_of(data_pages, parity_pages, size)
+    rng = np.random.default_rng(patterns)
+    for _ in range(patterns):
+        lost = rng.choice(len(pages), parity_pages + 1, replace=False)
+        left = {place: page for place, page in pages.items() if place not in lost[1:]}
+        assert restore(left, data_pages, parity_pages) == data
+        del left[lost[0]]
+        assert (restore(left, data_pages, parity_pages) is None) == bool((lost < data_pages).any())
+
+
+@pytest.mark.parametrize(("data_pages", "parity_pages"), [(5, 3), (20, 6), (61, 3)])
+def test_any_losses_as_many_as_parity_pages_come_back(data_pages: int, parity_pages: int) -> None:
+    check_patterns(data_pages, parity_pages, 300)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("data_pages", "parity_pages"), [(20, 6), (30, 5), (12, 12), (120, 8), (247, 8)])
+def test_three_thousand_patterns_of_many_losses_come_back(data_pages: int, parity_pages: int) -> None:
+    check_patterns(data_pages, parity_pages, 3000)
+
+
+def test_every_pattern_of_a_small_group_comes_back() -> None:
+    data, pages = group_of(5, 3, 10)
+    for count in range(9):
+        for kept in itertools.combinations(pages, count):
+            found = restore({place: pages[place] for place in kept}, 5, 3)
+            assert found == (data if count >= 5 or set(kept) >= set(range(5)) else None)
+
+
+@pytest.mark.parametrize("size", [1, 2, 15, 16, 17, 62, 724, 4099])
+def test_pages_of_any_length(size: int) -> None:
+    data, pages = group_of(7, 2, size)
+    assert [len(page) for page in pages.values()] == [size] * 9
+    assert restore({place: page for place, page in pages.items() if place not in (0, 6)}, 7, 2) == data
+
+
+def test_the_order_in_which_pages_come_does_not_matter() -> None:
+    data, pages = group_of(6, 3, 20)
+    for order in itertools.islice(itertools.permutations([8, 5, 2, 7, 0, 3]), 100):
+        assert restore({place: pages[place] for place in order}, 6, 3) == data
+
+
+def test_without_parity_pages_nothing_is_restored() -> None:
+    data, pages = group_of(4, 0, 20)
+    assert len(pages) == 4
+    assert restore(pages, 4, 0) == data
+    assert restore({0: data[0], 1: data[1], 3: data[3]}, 4, 0) is None
+
+
+def test_nothing_left_gives_nothing() -> None:
+    assert restore({}, 3, 2) is None
+
+
+@pytest.mark.parametrize("group", [(0, 3), (-1, 2), (5, -1), (250, 6), (256, 0)])
+def test_groups_that_cannot_be_are_refused(group: tuple[int, int]) -> None:
+    for call in (lambda: check_group(*group), lambda: restore({}, *group)):
+        with pytest.raises(InvalidInputError, match=f"group of pages: got {group[0]} data and {group[1]} parity pages"):
+            call()
+
+
+def test_the_largest_groups_are_allowed() -> None:
+    for group in ((255, 0), (1, 254), (128, 127)):
+        check_group(*group)
