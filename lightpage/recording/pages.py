@@ -6,8 +6,11 @@ and `code` (JSON text: what the pages hold). Dataset `symbols` uint8 [page, ny, 
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 from collections.abc import Iterator
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -33,6 +36,51 @@ def read_attribute(file: h5py.File, name: str) -> Any:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 
+class _Disk(FileIO):
+    """The file that HDF5 writes to, locked.
+
+    It hides from HDF5 that a write has failed, after which HDF5 could neither close the file nor safely go on. The
+    first failure is kept for `check`, and what is written after it is dropped.
+
+    Raises:
+        OSError: the file cannot be written, or another process is writing it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+")
+        self._error: OSError | None = None
+        try:
+            fcntl.flock(self, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            super().truncate(0)
+        except OSError:
+            self.close()
+            raise
+
+    def write(self, data: Any) -> int:
+        """Write all of `data`, or from some failure on nothing."""
+        left = memoryview(data)
+        size = len(left)
+        try:
+            while left and self._error is None:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self._error = error
+        return size
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the file's length, or from some failure on do nothing."""
+        try:
+            return super().truncate(size) if self._error is None else 0
+        except OSError as error:
+            self._error = error
+            return 0
+
+    def check(self) -> None:
+        """Raise what has failed."""
+        if self._error is not None:
+            raise self._error
+
+
 class PagesWriter:
     """Writes pages to `<path>.partial`, and moves it to `path` when the `with` statement ends well.
 
@@ -52,9 +100,10 @@ class PagesWriter:
         self.path, self._partial = path, path.with_name(path.name + ".partial")
         self._shape, self._levels = profile.page_shape, levels
         try:
-            self._file = h5py.File(str(self._partial), "w")
+            self._disk = _Disk(self._partial)
         except OSError as error:
             raise RecordingError(f"pages {self._partial}", error, "a file that can be written") from None
+        self._file = h5py.File(self._disk, "w")  # type: ignore[arg-type]  # the stubs know only names
         attributes = {"format": FORMAT, "version": VERSION, "levels": levels, "profile": profile.to_toml()}
         for name, value in {**attributes, "code": json.dumps(code)}.items():
             self._file.attrs[name] = value
@@ -71,10 +120,11 @@ class PagesWriter:
         """
         pages = check_symbols(symbols, self._shape, self._levels, f"pages {self.path}").reshape(-1, *self._shape)
         count = self._symbols.shape[0]
+        self._symbols.resize(count + len(pages), axis=0)
+        self._symbols[count:] = pages
+        self._file.flush()
         try:
-            self._symbols.resize(count + len(pages), axis=0)
-            self._symbols[count:] = pages
-            self._file.flush()
+            self._disk.check()
         except OSError as error:
             raise RecordingError(f"pages {self.path}", error, "room for them on the disk") from None
 
@@ -84,12 +134,13 @@ class PagesWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._file.close()
+        self._disk.close()
         if kind is not None:
-            self._file.close()
             self._partial.unlink(missing_ok=True)
             return
         try:
-            self._file.close()
+            self._disk.check()
             move_into_place(self._partial, self.path)
         except OSError as failure:
             self._partial.unlink(missing_ok=True)
