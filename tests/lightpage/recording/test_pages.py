@@ -1,0 +1,225 @@
+"""Pages to write: what is written comes back, what is damaged is refused by name, nothing is left by half."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from lightpage.device.profile import parse_profile
+from lightpage.errors import PageError, RecordingError
+from lightpage.page.symbols import random_symbols
+from lightpage.recording.pages import Pages, PagesWriter
+from tests.lightpage.full_disk import full_disk
+from tests.lightpage.recording.test_recording import small_profile
+
+LEVELS = 16
+PROFILE = small_profile()
+CODE = {"levels": LEVELS, "coded_bits": 2, "needed_information": 0.75, "volume": 7}
+SYMBOLS = random_symbols(PROFILE, LEVELS, 7, np.random.default_rng(1))
+
+
+def write(path: Path, symbols: np.ndarray = SYMBOLS) -> Path:
+    with PagesWriter(path, PROFILE, LEVELS, CODE) as writer:
+        for start in range(0, len(symbols), 3):
+            writer.append(symbols[start : start + 3])
+    return path
+
+
+class TestWriting:
+    def test_what_is_written_comes_back(self, tmp_path: Path) -> None:
+        path = write(tmp_path / "p.h5")
+        with Pages.open(path) as pages:
+            assert (len(pages), pages.levels, pages.page_shape, pages.path) == (7, LEVELS, PROFILE.page_shape, path)
+            assert json.loads(pages.code or "") == CODE
+            assert np.array_equal(list(pages), SYMBOLS)
+            assert np.array_equal(pages[5], SYMBOLS[5])
+            assert pages[5].dtype == np.uint8
+
+    def test_the_layout_is_the_documented_one(self, tmp_path: Path) -> None:
+        with h5py.File(write(tmp_path / "p.h5")) as file:
+            assert set(file) == {"symbols"}
+            assert set(file.attrs) == {"format", "version", "levels", "profile", "code"}
+            assert (file.attrs["format"], file.attrs["version"], file.attrs["levels"]) == ("lightpage-pages", 1, LEVELS)
+            assert parse_profile(str(file.attrs["profile"])) == PROFILE
+            assert (file["symbols"].dtype, file["symbols"].chunks) == (np.uint8, (1, *PROFILE.page_shape))
+
+    def test_one_page_may_come_without_its_axis(self, tmp_path: Path) -> None:
+        with PagesWriter(tmp_path / "p.h5", PROFILE, LEVELS, CODE) as writer:
+            writer.append(SYMBOLS[0])
+            writer.append(SYMBOLS[1:3])
+        with Pages.open(tmp_path / "p.h5") as pages:
+            assert np.array_equal(list(pages), SYMBOLS[:3])
+
+    def test_nothing_has_the_final_name_until_all_is_there(self, tmp_path: Path) -> None:
+        path = tmp_path / "p.h5"
+        path.write_bytes(b"earlier")
+        with PagesWriter(path, PROFILE, LEVELS, CODE) as writer:
+            writer.append(SYMBOLS)
+            assert path.read_bytes() == b"earlier"
+        assert [entry.name for entry in tmp_path.iterdir()] == ["p.h5"]
+        with Pages.open(path) as pages:
+            assert len(pages) == 7
+
+    def test_an_interruption_leaves_the_earlier_file(self, tmp_path: Path) -> None:
+        path = write(tmp_path / "p.h5")
+        before = path.read_bytes()
+        with pytest.raises(KeyboardInterrupt), PagesWriter(path, PROFILE, LEVELS, CODE) as writer:  # noqa: PT012
+            writer.append(SYMBOLS[:2])
+            raise KeyboardInterrupt
+        assert [entry.name for entry in tmp_path.iterdir()] == ["p.h5"]
+        assert path.read_bytes() == before
+
+    @pytest.mark.parametrize(
+        ("symbols", "complaint"),
+        [
+            (np.full((2, 6, 9), LEVELS, np.uint8), "values from 16 to 16, wanted values from 0 to 15"),
+            (np.full((2, 6, 9), -1), "values from -1 to -1, wanted values from 0 to 15"),
+            (np.zeros((2, 9, 6), np.uint8), r"shape \(2, 9, 6\), wanted \(\.\.\., 6, 9\)"),
+            (np.zeros((2, 6, 9)), "type float64, wanted whole numbers"),
+        ],
+    )
+    def test_what_are_no_symbols_is_refused_and_nothing_left(
+        self, tmp_path: Path, symbols: np.ndarray, complaint: str
+    ) -> None:
+        with pytest.raises(PageError, match=rf"pages .*p\.h5: got {complaint}"):
+            write(tmp_path / "p.h5", symbols)
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize("levels", [1, 257])
+    def test_levels_out_of_range_are_refused(self, tmp_path: Path, levels: int) -> None:
+        with pytest.raises(PageError, match=rf"pages .*: levels: got {levels}, wanted a whole number from 2 to 256"):
+            PagesWriter(tmp_path / "p.h5", PROFILE, levels, CODE)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_folder_that_is_not_there_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(RecordingError, match=r"pages .*p\.h5\.partial: got .*wanted a file that can be written"):
+            PagesWriter(tmp_path / "no" / "p.h5", PROFILE, LEVELS, CODE)
+
+    def test_pages_that_are_being_written_are_not_destroyed(self, tmp_path: Path) -> None:
+        path = tmp_path / "p.h5"
+        with PagesWriter(path, PROFILE, LEVELS, CODE) as writer:
+            writer.append(SYMBOLS[:3])
+            with pytest.raises(RecordingError, match=r"p\.h5\.partial: got .*wanted a file that can be written"):
+                PagesWriter(path, PROFILE, LEVELS, CODE)
+            writer.append(SYMBOLS[3:])
+        with Pages.open(path) as pages:
+            assert np.array_equal(list(pages), SYMBOLS)
+
+    def test_what_an_earlier_program_left_is_written_over(self, tmp_path: Path) -> None:
+        (tmp_path / "p.h5.partial").write_bytes(b"left" * 100_000)
+        path = write(tmp_path / "p.h5")
+        assert path.stat().st_size < 100_000
+        with Pages.open(path) as pages:
+            assert np.array_equal(list(pages), SYMBOLS)
+
+    def test_a_name_that_cannot_be_taken_is_refused(self, tmp_path: Path) -> None:
+        (tmp_path / "p.h5").mkdir()
+        with pytest.raises(RecordingError, match=r"pages .*p\.h5: got .*wanted a file that can be completed"):
+            write(tmp_path / "p.h5")
+        assert [entry.name for entry in tmp_path.iterdir()] == ["p.h5"]
+
+
+class TestFullDisk:
+    """Wherever the disk becomes full, and without leaving the HDF5 library unable to go on."""
+
+    MANY = np.zeros((2000, *PROFILE.page_shape), np.uint8)
+
+    @pytest.mark.parametrize("room", [0, 100, 5_000, 20_000, 60_000])
+    def test_it_leaves_nothing(self, tmp_path: Path, room: int) -> None:
+        with full_disk(room), pytest.raises(RecordingError, match=r"pages .*p\.h5"):
+            write(tmp_path / "p.h5", self.MANY)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_it_leaves_the_earlier_file(self, tmp_path: Path) -> None:
+        path = write(tmp_path / "p.h5")
+        before = path.read_bytes()
+        with full_disk(20_000), pytest.raises(RecordingError, match=r"pages .*p\.h5"):
+            write(path, self.MANY)
+        assert [entry.name for entry in tmp_path.iterdir()] == ["p.h5"]
+        assert path.read_bytes() == before
+
+    def test_room_for_all_is_enough(self, tmp_path: Path) -> None:
+        with full_disk(1_000_000):
+            write(tmp_path / "p.h5", self.MANY)
+        with Pages.open(tmp_path / "p.h5") as pages:
+            assert len(pages) == 2000
+
+
+def set_attribute(name: str, value: object) -> Callable[[h5py.File], None]:
+    return lambda file: file.attrs.__setitem__(name, value)
+
+
+def set_symbols(symbols: np.ndarray) -> Callable[[h5py.File], None]:
+    def change(file: h5py.File) -> None:
+        del file["symbols"]
+        file["symbols"] = symbols
+
+    return change
+
+
+class TestReading:
+    @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
+    def test_a_truncated_file_is_refused(self, tmp_path: Path, share: float) -> None:
+        path = write(tmp_path / "p.h5")
+        whole = path.read_bytes()
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(RecordingError, match=r"pages .*p\.h5: got .*wanted a readable, complete HDF5 file"):
+            Pages.open(path)
+
+    def test_what_is_no_hdf5_or_not_there_is_refused(self, tmp_path: Path) -> None:
+        path = tmp_path / "p.h5"
+        for _ in range(2):
+            with pytest.raises(RecordingError, match=r"pages .*p\.h5: got .*wanted a readable, complete HDF5 file"):
+                Pages.open(path)
+            path.write_bytes(b"anything" * 1000)
+
+    @pytest.mark.parametrize(
+        ("change", "complaint"),
+        [
+            (set_attribute("format", "lightpage-recording"), "attribute 'format': got 'lightpage-recording', wanted"),
+            (lambda file: file.attrs.__delitem__("format"), "attribute 'format': got None, wanted 'lightpage-pages'"),
+            (set_attribute("version", 2), "attribute 'version': got 2, wanted 1"),
+            (set_attribute("levels", 1), "attribute 'levels': got 1, wanted a whole number from 2 to 256"),
+            (set_attribute("levels", 16.5), "attribute 'levels': got 16.5, wanted a whole number from 2 to 256"),
+            (lambda file: file.attrs.__delitem__("levels"), "attribute 'levels': got None, wanted a whole number"),
+            (lambda file: file.__delitem__("symbols"), "dataset 'symbols': got none, wanted uint8"),
+            (set_symbols(np.zeros((7, 6, 9), np.uint16)), r"dataset 'symbols': got uint16 \(7, 6, 9\), wanted uint8"),
+            (set_symbols(np.zeros((6, 9), np.uint8)), r"dataset 'symbols': got uint8 \(6, 9\), wanted uint8 \(pages"),
+            (set_symbols(np.zeros((0, 6, 9), np.uint8)), r"dataset 'symbols': got uint8 \(0, 6, 9\), .*at least one"),
+        ],
+    )
+    def test_a_foreign_file_is_refused_by_name(
+        self, tmp_path: Path, change: Callable[[h5py.File], None], complaint: str
+    ) -> None:
+        path = write(tmp_path / "p.h5")
+        with h5py.File(path, "r+") as file:
+            change(file)
+        with pytest.raises((RecordingError, PageError), match=rf"pages .*p\.h5: {complaint}"):
+            Pages.open(path)
+
+    def test_pages_by_other_software_are_read(self, tmp_path: Path) -> None:
+        path = tmp_path / "p.h5"
+        with h5py.File(path, "w") as file:
+            file.attrs["format"] = np.bytes_(b"lightpage-pages")
+            file.attrs["version"] = np.array([1], np.int16)
+            file.attrs["levels"] = np.uint8(LEVELS)
+            file["symbols"] = SYMBOLS
+        with Pages.open(path) as pages:
+            assert (pages.levels, pages.code) == (LEVELS, None)
+            assert np.array_equal(list(pages), SYMBOLS)
+
+    def test_a_symbol_beyond_the_levels_is_refused_where_it_is(self, tmp_path: Path) -> None:
+        path = write(tmp_path / "p.h5")
+        with h5py.File(path, "r+") as file:
+            file["symbols"][3, 2, 1] = LEVELS
+        with Pages.open(path) as pages:
+            assert np.array_equal(pages[2], SYMBOLS[2])
+            with pytest.raises(RecordingError, match=r"p\.h5: page 3: got a symbol of 16, wanted 0 to 15"):
+                pages[3]
+            with pytest.raises(RecordingError, match="page 3"):
+                list(pages)
