@@ -269,6 +269,15 @@ class TestHeader:
         found = self.CODEC.decode(phase, kappa, header_of(self.CODEC, 4))
         assert (found.header, found.data) == (header_of(self.CODEC), data)
 
+    def test_it_is_believed_with_its_own_body_only(self) -> None:
+        """A header that can be read on the body of the page that was expected: something is wrong, so nothing is."""
+        _, phase, kappa = self.page(damaged=False)
+        _, other = written(self.CODEC, header_of(self.CODEC, 4), np.random.default_rng(3))
+        places = header_places(self.CODEC)
+        phase.flat[places] = noisy(other, 64, np.inf, np.random.default_rng(4))[0].flat[places]
+        found = self.CODEC.decode(phase, kappa, header_of(self.CODEC))
+        assert (found.header, found.data, found.loss) == (header_of(self.CODEC, 4), None, Loss.CHECKSUM)
+
     def test_a_page_of_another_code_is_known_as_such(self) -> None:
         other = self.CODEC.code.id ^ 1
         _, phase, kappa = self.page(damaged=False, code_id=other)
