@@ -139,40 +139,48 @@ def by_sionna(code: LdpcCode, llrs: np.ndarray) -> np.ndarray:
 class TestNearTheLimit:
     """Light in which some of the blocks fail."""
 
-    LOSS_DB = 0.25
-    """That offset min-sum and 40 iterations may cost against the sum-product algorithm. Measured on 600 blocks of each
-    of the codes below: 0, 0.12, 0.08 and 0.19, half of the last by the bound on iterations."""
+    LOSS_DB = 0.2
+    """That offset min-sum may cost against the sum-product algorithm, and again the bound on iterations. Measured on
+    600 blocks of each of the codes below: 0, 0.07, 0.05, 0.12 dB, and 0.1, 0.09, 0.04, 0.14."""
+    BLOCKS = 120
+    CASES = ((136, 204, 0.6), (400, 800, -1.8), (440, 500, 2.9), (330, 960, -4.0))
 
-    @pytest.mark.parametrize(
-        ("information", "sent", "decibel"), [(136, 204, 0.6), (400, 800, -1.8), (440, 500, 2.9), (330, 960, -4.0)]
-    )
+    @pytest.mark.parametrize(("information", "sent", "decibel"), CASES)
     def test_it_agrees_with_the_ldpc_package(self, information: int, sent: int, decibel: float) -> None:
         code = LdpcCode(information, sent)
-        bits, llrs = noisy(code, 200, decibel, 1)
-        ours = decode(code, llrs)
+        bits, llrs = noisy(code, self.BLOCKS, decibel, 1)
+        ours = decode(code, llrs, iterations=100)
         words, converged = by_ldpc_package(code, llrs)
         both = ours.converged & converged
         assert np.array_equal(ours.information[both], words[both, :information])
         assert np.array_equal(ours.sent[both], words[both][:, code.sent])
         wrong = failures(ours.information, bits)
-        assert 0 < wrong < 120  # neither all nor none fail: else the comparison says nothing
+        assert 0 < wrong < 0.6 * self.BLOCKS  # neither all nor none fail: else the comparison says nothing
         assert failures(ours.information[both], bits[both]) <= 3
         # the same noise in light that is weaker by what this algorithm may cost
-        _, weaker = noisy(code, 200, decibel - self.LOSS_DB, 1)
+        _, weaker = noisy(code, self.BLOCKS, decibel - self.LOSS_DB, 1)
         assert wrong <= failures(by_ldpc_package(code, weaker)[0][:, :information], bits)
 
     @pytest.mark.parametrize(("information", "sent", "decibel"), [(136, 204, 0.6), (440, 500, 2.9)])
     def test_it_agrees_with_sionna(self, information: int, sent: int, decibel: float) -> None:
         code = LdpcCode(information, sent)
-        bits, llrs = noisy(code, 150, decibel, 2)
-        ours, theirs = decode(code, llrs), by_sionna(code, llrs)
+        bits, llrs = noisy(code, self.BLOCKS, decibel, 2)
+        ours, theirs = decode(code, llrs, iterations=100), by_sionna(code, llrs)
         right = (theirs == bits).all(axis=1)
-        assert np.count_nonzero(right & ours.converged) > 50
+        assert np.count_nonzero(right & ours.converged) > 40
         assert np.array_equal(ours.information[right & ours.converged], theirs[right & ours.converged])
         wrong = failures(ours.information, bits)
         assert wrong > 0
-        _, weaker = noisy(code, 150, decibel - self.LOSS_DB, 2)
+        _, weaker = noisy(code, self.BLOCKS, decibel - self.LOSS_DB, 2)
         assert wrong <= failures(by_sionna(code, weaker), bits)
+
+    @pytest.mark.parametrize(("information", "sent", "decibel"), CASES)
+    def test_the_bound_on_iterations_costs_little(self, information: int, sent: int, decibel: float) -> None:
+        code = LdpcCode(information, sent)
+        bits, llrs = noisy(code, self.BLOCKS, decibel, 3)
+        _, weaker = noisy(code, self.BLOCKS, decibel - self.LOSS_DB, 3)
+        wrong, patient = failures(decode(code, llrs).information, bits), decode(code, weaker, iterations=100)
+        assert 0 < wrong <= failures(patient.information, bits)
 
 
 class TestDecoder:

@@ -368,7 +368,7 @@ class TestMargin:
         _, symbols = written(codec, header_of(codec), rng)
         assert codec.decode(*noisy(symbols, 64, np.inf, rng)).margin_bits == pytest.approx(0.5)
 
-    def test_it_is_of_the_truth_on_pages_that_are_read_and_of_claims_on_lost_ones(self) -> None:
+    def test_it_is_of_the_truth_on_pages_that_are_read_and_nothing_on_lost_ones_that_are_sure(self) -> None:
         codec, rng = codec_of(64, 2, 700, 2, needed=0.75), np.random.default_rng(5)
         _, symbols = written(codec, header_of(codec), rng)
         phase, kappa = noisy(symbols, 64, kappa_of(64, 0.25), rng)
@@ -378,7 +378,7 @@ class TestMargin:
         assert bold.margin_bits < honest.margin_bits - 0.1  # claims that mislead carry less
         noise = codec.decode(np.random.default_rng(6).uniform(-9, 9, SHAPE), np.full(SHAPE, 1e6))
         assert noise.data is None
-        assert noise.margin_bits == pytest.approx(0.5, abs=0.02)
+        assert noise.margin_bits == 0
 
 
 class TestRefusals:
