@@ -60,8 +60,12 @@ def test_any_losses_as_many_as_parity_pages_come_back(data_pages: int, parity_pa
     check_patterns(data_pages, parity_pages, 300)
 
 
+def test_losses_of_the_largest_group_come_back() -> None:
+    check_patterns(247, 8, 10)
+
+
 @pytest.mark.long
-@pytest.mark.parametrize(("data_pages", "parity_pages"), [(20, 6), (30, 5), (12, 12), (120, 8), (247, 8)])
+@pytest.mark.parametrize(("data_pages", "parity_pages"), [(20, 6), (30, 5), (12, 12), (61, 8), (120, 8)])
 def test_three_thousand_patterns_of_many_losses_come_back(data_pages: int, parity_pages: int) -> None:
     check_patterns(data_pages, parity_pages, 3000)
 
