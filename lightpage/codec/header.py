@@ -26,8 +26,10 @@ MOST_BYTES = (1 << 40) - 1
 """Of a volume."""
 FIELD_BYTES = 15
 HEADER_BYTES = FIELD_BYTES + 2
-SENT_BITS = 204
-"""Two thirds of them information, on levels three bits coarser than the body's: far below what the page carries."""
+_SENT_BITS, _SENT_BITS_OF_FEW_LEVELS = 204, 408
+"""Two thirds of them information, on levels three bits coarser than the body's: far below what the page carries. Of few
+levels none are so much coarser, and one third are."""
+_FEW_LEVELS = 4
 _COARSER = 8
 _SCRAMBLER_SEED = 0x4C50_4844
 
@@ -88,9 +90,14 @@ def check_volume(volume: int, volume_bytes: int, pages: int) -> None:
         raise InvalidInputError("file", f"{pages} pages", f"at most {MOST_PAGES} in a volume")
 
 
-@lru_cache(1)
-def _code() -> LdpcCode:
-    return LdpcCode(8 * HEADER_BYTES, SENT_BITS)
+def sent_bits(levels: int) -> int:
+    """Bits of the header's block on a page of M levels."""
+    return _SENT_BITS_OF_FEW_LEVELS if levels <= _FEW_LEVELS else _SENT_BITS
+
+
+@lru_cache(2)
+def _code(sent: int) -> LdpcCode:
+    return LdpcCode(8 * HEADER_BYTES, sent)
 
 
 def header_levels(levels: int) -> int:
@@ -100,7 +107,7 @@ def header_levels(levels: int) -> int:
 
 def header_symbols(levels: int) -> int:
     """Symbols of a header on a page of M levels."""
-    return -(-SENT_BITS // level_bits(header_levels(levels)))
+    return -(-sent_bits(levels) // level_bits(header_levels(levels)))
 
 
 def encode_headers(headers: list[Header], levels: int) -> NDArray[np.uint8]:
@@ -112,10 +119,10 @@ def encode_headers(headers: list[Header], levels: int) -> NDArray[np.uint8]:
     """
     text = np.array([np.frombuffer(header.to_bytes(), np.uint8) for header in headers])
     text ^= random_bytes(_SCRAMBLER_SEED, HEADER_BYTES)
-    sent = _code().encode(np.unpackbits(text, axis=1))
+    sent = _code(sent_bits(levels)).encode(np.unpackbits(text, axis=1))
     coarse, bits = header_levels(levels), level_bits(header_levels(levels))
     padded = np.zeros((len(headers), header_symbols(levels) * bits), np.uint8)
-    padded[:, :SENT_BITS] = sent
+    padded[:, : sent.shape[1]] = sent
     label: Bits = padded.reshape(-1, bits)
     symbols = to_levels(label, np.zeros(len(label), np.int64), coarse).astype(np.int64) * (levels // coarse)
     return symbols.astype(np.uint8).reshape(len(headers), -1)
@@ -123,8 +130,8 @@ def encode_headers(headers: list[Header], levels: int) -> NDArray[np.uint8]:
 
 def decode_header(phase: NDArray[np.floating], concentration: NDArray[np.floating], levels: int) -> Header | None:
     """The header in its symbols' phases (radians) and concentrations; None where it cannot be read."""
-    llrs = bit_llrs(phase, concentration, header_levels(levels)).reshape(1, -1)[:, :SENT_BITS]
-    found = decode(_code(), llrs)
+    llrs = bit_llrs(phase, concentration, header_levels(levels)).reshape(1, -1)[:, : sent_bits(levels)]
+    found = decode(_code(sent_bits(levels)), llrs)
     if not found.converged[0]:
         return None
     text = np.packbits(found.information[0]) ^ random_bytes(_SCRAMBLER_SEED, HEADER_BYTES)

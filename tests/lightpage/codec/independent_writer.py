@@ -26,7 +26,7 @@ PROFILES = PACKAGE / "device" / "profiles"
 VECTORS = Path(__file__).with_name("vectors.json")
 MASK_32, MASK_64, MASK_128 = (1 << 32) - 1, (1 << 64) - 1, (1 << 128) - 1
 HEADER_SEED, ORDER_SEED, FILL_SEED = 0x4C504844, 0x4C50494C, 0x4C50464C
-HEADER_INFORMATION, HEADER_SENT = 136, 204
+HEADER_INFORMATION = 136
 
 
 def up(numerator: int, denominator: int) -> int:
@@ -356,10 +356,15 @@ def header_bits(levels: int) -> int:
     return max(2, levels // 8).bit_length() - 1
 
 
+def header_sent(levels: int) -> int:
+    """Sent bits of the header."""
+    return 408 if levels <= 4 else 204
+
+
 def sizes(code: Parameters, data_symbols: int) -> Sizes:
     """The sizes of a page's parts."""
     bits = code.levels.bit_length() - 1
-    header_symbols = up(HEADER_SENT, header_bits(code.levels))
+    header_symbols = up(header_sent(code.levels), header_bits(code.levels))
     body_symbols = data_symbols - header_symbols
     coded = body_symbols * code.coded_bits
     blocks = up(coded * code.rate_per_mille, 1000 * 8448)
@@ -397,7 +402,7 @@ def header(code: Parameters, volume: int, page: int, file_bytes: int) -> bytes:
 def header_levels(code: Parameters, data: bytes) -> list[int]:
     """The levels of the header's symbols."""
     width = header_bits(code.levels)
-    bits = ldpc_sent(bits_of_bytes(scrambled(data, HEADER_SEED)), HEADER_SENT)
+    bits = ldpc_sent(bits_of_bytes(scrambled(data, HEADER_SEED)), header_sent(code.levels))
     bits += [0] * (-len(bits) % width)
     step = code.levels >> width
     return [coset_level(bits[i : i + width]) * step for i in range(0, len(bits), width)]
