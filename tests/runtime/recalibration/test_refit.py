@@ -20,11 +20,13 @@ from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.decoding.page import DecodedPage
-from runtime.demo.demo import LEVELS, drifted
+from runtime.demo.demo import drifted
 from runtime.recalibration import refit as module
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.recalibration import recalibrate
 from runtime.recalibration.refit import refit
+
+LEVELS = 16
 
 
 def refused(device: Device, told: Callable[[np.ndarray], list[np.ndarray]], match: str, folder: Path) -> None:
