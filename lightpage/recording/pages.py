@@ -6,11 +6,8 @@ and `code` (JSON text: what the pages hold). Dataset `symbols` uint8 [page, ny, 
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 from collections.abc import Iterator
-from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,6 +20,7 @@ from lightpage.device.profile import Profile
 from lightpage.errors import RecordingError
 from lightpage.files import move_into_place
 from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.recording.hdf_file import HdfFile
 
 FORMAT = "lightpage-pages"
 VERSION = 1
@@ -34,51 +32,6 @@ def read_attribute(file: h5py.File, name: str) -> Any:
     if isinstance(value, (np.generic, np.ndarray)) and value.size == 1:
         value = value.item()
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
-
-
-class _Disk(FileIO):
-    """The file that HDF5 writes to, locked.
-
-    It hides from HDF5 that a write has failed, after which HDF5 could neither close the file nor safely go on. The
-    first failure is kept for `check`, and what is written after it is dropped.
-
-    Raises:
-        OSError: the file cannot be written, or another process is writing it.
-    """
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+")
-        self._error: OSError | None = None
-        try:
-            fcntl.flock(self, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            super().truncate(0)
-        except OSError:
-            self.close()
-            raise
-
-    def write(self, data: Any) -> int:
-        """Write all of `data`, or from some failure on nothing."""
-        left = memoryview(data)
-        size = len(left)
-        try:
-            while left and self._error is None:
-                left = left[super().write(left) :]
-        except OSError as error:
-            self._error = error
-        return size
-
-    def truncate(self, size: int | None = None) -> int:
-        """Set the file's length, or from some failure on do nothing."""
-        try:
-            return super().truncate(size) if self._error is None else 0
-        except OSError as error:
-            self._error = error
-            return 0
-
-    def check(self) -> None:
-        """Raise what has failed."""
-        if self._error is not None:
-            raise self._error
 
 
 class PagesWriter:
@@ -100,7 +53,7 @@ class PagesWriter:
         self.path, self._partial = path, path.with_name(path.name + ".partial")
         self._shape, self._levels = profile.page_shape, levels
         try:
-            self._disk = _Disk(self._partial)
+            self._disk = HdfFile(self._partial)
         except OSError as error:
             raise RecordingError(f"pages {self._partial}", error, "a file that can be written") from None
         self._file = h5py.File(self._disk, "w")  # type: ignore[arg-type]  # the stubs know only names

@@ -16,6 +16,7 @@ from lightpage.device.profile import Profile
 from lightpage.errors import PageError, RecordingError
 from lightpage.files import move_into_place
 from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.recording.hdf_file import HdfFile
 from lightpage.recording.layout import FORMAT, FRAMES, MAX_BIT_DEPTH, MIN_BIT_DEPTH, VERSION, FramePair, frame_type
 
 
@@ -150,6 +151,7 @@ class RecordingWriter:
             # The count comes last: pages beyond it were cut off in the middle, and resuming drops them.
             self._file.attrs["pages_complete"] = self._pages + 1
             self._file.flush()
+            self._disk.check()
         except OSError as error:
             raise RecordingError(f"{self._subject}: page {self._pages}", error, "room for it on the disk") from None
         self._pages += 1
@@ -180,6 +182,8 @@ class RecordingWriter:
             if "pages_complete" in self._file.attrs:
                 del self._file.attrs["pages_complete"]
             self._file.close()
+            self._disk.close()
+            self._disk.check()
             move_into_place(self._partial, self.path)
         except OSError as error:
             raise RecordingError(self._subject, error, "a file that can be completed") from None
@@ -187,6 +191,7 @@ class RecordingWriter:
     def abandon(self) -> None:
         """Close the partial file and leave it for `resume`."""
         self._file.close()
+        self._disk.close()
 
     def _prepare(self, path: str | Path, profile: Profile, levels: int, bit_depth: int) -> None:
         self.path = Path(path)
@@ -238,9 +243,10 @@ class RecordingWriter:
         fixed = self._checked_fixed(references, pilots)
         discard_partial(self.path)
         try:
-            self._file = h5py.File(str(self._partial), "w-")
+            self._disk = HdfFile(self._partial)
         except OSError as error:
             raise RecordingError(f"recording {self._partial}", error, "a file that can be written") from None
+        self._file = h5py.File(self._disk, "w")  # type: ignore[arg-type]  # the stubs know only names
         for name, value in self._header().items():
             self._file.attrs[name] = value
         for name, value in fixed.items():
@@ -249,6 +255,11 @@ class RecordingWriter:
             self._grow(name, self._profile.frame_shape, frame_type(self._bit_depth))
         self._file.attrs["pages_complete"] = 0
         self._file.flush()
+        try:
+            self._disk.check()
+        except OSError as error:
+            self.abandon()
+            raise RecordingError(f"recording {self._partial}", error, "room for it on the disk") from None
 
     def _continue(self, references: FramePair, pilots: ArrayLike | None) -> bool:
         """Open the partial file if it is sound and was started with the same arguments.
@@ -260,11 +271,14 @@ class RecordingWriter:
         if not _take(self._partial, remove=False):
             return False
         try:
-            file = h5py.File(str(self._partial), "r+")
+            disk = HdfFile(self._partial, keep=True)
         except OSError as error:
-            if error.errno is None:  # not the system but HDF5: the file was cut off or is none of its own
-                return False
             raise RecordingError(f"recording {self._partial}", error, "a file that can be read and written") from None
+        try:
+            file = h5py.File(disk, "r+")  # type: ignore[arg-type]
+        except OSError:  # the file was cut off or is none of HDF5's
+            disk.close()
+            return False
         try:
             # Without its count a file was interrupted while it was completed: all of its pages are there.
             pages = int(file.attrs.get("pages_complete", file[FRAMES[0]].shape[0]))
@@ -274,7 +288,7 @@ class RecordingWriter:
                 and ("pilots" in file) == ("pilots" in fixed)
             )
             if same:
-                self._file = file
+                self._file, self._disk = file, disk
                 for name in self._growing():
                     if file[name].shape[0] < pages:
                         same = False
@@ -285,6 +299,7 @@ class RecordingWriter:
             self._pages = pages
         else:
             file.close()
+            disk.close()
         return same
 
     def _growing(self) -> list[str]:
