@@ -25,11 +25,12 @@ from export.parity import check_parity, torch_answer
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.cli.progress_bar import percent_bar
-from lightpage.errors import BundleError
+from lightpage.errors import BundleError, InvalidInputError
 from lightpage.files import write_json
-from lightpage.progress import Progress, note
+from lightpage.progress import Progress, note, warn
 from lightpage.recording.reader import FramePair, Recording
 from runtime.bulk.coded_pages import choose_code
+from runtime.bulk.evaluation import check_recording
 from runtime.bundle.bundle import Bundle, npz, write_bundle
 from runtime.bundle.manifest import DECODER, FIELD, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version, sha256
 from runtime.decoding.decoder import Decoder
@@ -155,8 +156,12 @@ def export_run(
         if recording is not None:
             progress("choose the code of user bytes", 0.9)
             with Recording.open(recording) as pages:
-                best, _ = choose_code(proven, pages, tracker_for(proven))
-            manifest = manifest.model_copy(update={"code": best.code.to_toml()})
+                check_recording(proven, pages)
+                try:
+                    best, _ = choose_code(proven, pages, tracker_for(proven))
+                    manifest = manifest.model_copy(update={"code": best.code.to_toml()})
+                except InvalidInputError as error:
+                    warn(f"no code for user bytes: {error}")
     finally:
         _remove(partial)
     write_bundle(out, manifest, files)

@@ -1,9 +1,10 @@
-"""The ledger of user bytes: a random file through the simulated device, in every light, on pages nobody has seen.
+"""The ledger of user bytes: a random file through simulated devices, on pages that no decoder was trained on.
 
     python -m analysis.codec.ledger --out runs/bench-codec
 
-For each data set: a code is chosen on held-out pages, a random file is put on as many pages as are asked for, the
-device shows them, and the file is read back from frames and pilots. Interrupted, it goes on where it was.
+For each data set: the bundle's code is taken, or one is chosen on held-out pages. A random file is put on as many pages
+as are asked for, the device shows them, and the file is read back from frames and pilots. Interrupted, it goes on where
+it was.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from lightpage.cli.paths import OutputFolder
 from lightpage.codec.code import load_code
 from lightpage.codec.erasure import MOST_GROUP_PAGES
 from lightpage.codec.page_codec import PageCodec
-from lightpage.codec.volume import Volume, encode_volume
+from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
 from lightpage.files import write_json
@@ -40,7 +41,7 @@ from runtime.decoding.image_tracker import tracker_for
 WEIGHTS = Path("analysis/weights")
 LOSS = 1e-6
 """Of a data page behind the outer code."""
-VOLUME, DATA_PAGES, PARITY_PAGES = 7, 60, 4
+VOLUME = 7
 _SEED = 90_000
 
 
@@ -111,7 +112,9 @@ def through(data: DataSet, folder: Path) -> Recovery:
     folder.mkdir(parents=True, exist_ok=True)
     decoder = Decoder.load(data.bundle(folder))
     code_path, pages, sent = folder / "code.toml", folder / "pages.h5", folder / "sent.bin"
-    if not code_path.exists():
+    if decoder.bundle.code is not None:
+        decoder.bundle.code.save(code_path)
+    elif not code_path.exists():
         record(data, folder / "known.h5", _SEED, data.known)
         with Recording.open(folder / "known.h5") as recording:
             best, _ = choose_code(decoder, recording, tracker_for(decoder))
@@ -124,13 +127,11 @@ def through(data: DataSet, folder: Path) -> Recovery:
         share = -(-(data.pages - groups * parity) // groups)
         content = np.random.default_rng(_SEED).bytes(codec.user_bytes * (data.pages - groups * parity))
         sent.write_bytes(content)
-        volume = Volume(VOLUME, len(content), codec.user_bytes, share, parity)
-        with (
-            sent.open("rb") as file,
-            PagesWriter(pages, data.profile, code.levels, code.model_dump() | volume.to_json()) as writer,
-        ):
-            for some in encode_volume(codec, volume, file, decoder.bundle.written_pilots(code.levels)):
-                writer.append(some)
+        with sent.open("rb") as file:
+            volume = Volume.of_file(file, VOLUME, codec.user_bytes, share, parity)
+            with PagesWriter(pages, data.profile, code.levels, code.model_dump() | volume.to_json()) as writer:
+                for some in encode_volume(codec, volume, file, decoder.bundle.written_pilots(code.levels)):
+                    writer.append(some)
     record(data, folder / "shown.h5", _SEED + 1, 0, pages)
     read = folder / "read.bin"
     with Recording.open(folder / "shown.h5") as recording:

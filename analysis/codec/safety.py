@@ -19,7 +19,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import Code
 from lightpage.codec.header import Header
-from lightpage.codec.page_codec import PageCodec
+from lightpage.codec.page_codec import FileFacts, PageCodec
 from lightpage.device.profile import load_profile
 from lightpage.errors import LightpageError
 from lightpage.files import write_json
@@ -68,7 +68,7 @@ class Pages:
         code, rng = self.codec.code, self.rng
         header = Header(code.id, int(rng.integers(1 << 32)), int(rng.integers(1 << 24)), int(rng.integers(1 << 40)))
         data = rng.integers(0, 256, (1, self.codec.user_bytes), dtype=np.uint8)
-        symbols = self.codec.encode([header], data, (60, 4), self._pilots)[0]
+        symbols = self.codec.encode([header], data, FileFacts(60, 4, int(rng.integers(1 << 32))), self._pilots)[0]
         phase = symbol_phases(symbols, code.levels) + noise_rad * rng.standard_normal(symbols.shape)
         return data.tobytes(), header, phase, np.full(symbols.shape, noise_rad**-2)
 
@@ -143,12 +143,12 @@ def counted(outcomes: Counter[str]) -> Count:
 
 
 @click.command()
-@click.option("--blocks", default=30_000, show_default=True, type=click.IntRange(1), help="Pages at the limit.")
+@click.option("--pages", "count", default=30_000, show_default=True, type=click.IntRange(1), help="At the limit.")
 @click.option("--damaged", default=10_000, show_default=True, type=click.IntRange(1), help="Damaged pages.")
 @click.option("--corrections", default=3, show_default=True, type=click.IntRange(0, 32), help="t, so that words mend.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
 @click.option("--json", "json_path", type=OutputFile(), help="Write the counts to this file.")
-def main(blocks: int, damaged: int, corrections: int, seed: int, json_path: Path | None) -> None:
+def main(count: int, damaged: int, corrections: int, seed: int, json_path: Path | None) -> None:
     """Count pages that gave wrong bytes; any makes the exit status 1."""
     shipped = Bundle.open(bundle_path("bench")).code
     assert shipped is not None  # the shipped bundle has a code
@@ -156,7 +156,7 @@ def main(blocks: int, damaged: int, corrections: int, seed: int, json_path: Path
     counts: dict[str, Counter[str]] = {}
     limit = pages.limit()
     click.echo(f"half of the pages are lost at a phase noise of {limit:.4f} rad")
-    for index in track(range(blocks), "pages at the limit"):
+    for index in track(range(count), "pages at the limit"):
         share = NOISES[index % len(NOISES)]
         drawn = pages.drawn(share * limit)
         counts.setdefault(f"noise {share:g} of the limit", Counter())[pages.outcome(*drawn)] += 1
@@ -168,8 +168,8 @@ def main(blocks: int, damaged: int, corrections: int, seed: int, json_path: Path
         counts.setdefault(name, Counter())[pages.outcome(sent, header, phase, concentration)] += 1
     click.echo(f"{'pages':<24} {'right':>7} {'lost':>7} {'wrong':>7}")
     for name, outcomes in counts.items():
-        count = counted(outcomes)
-        click.echo(f"{name:<24} {count.right:>7} {count.lost:>7} {count.wrong:>7}")
+        of = counted(outcomes)
+        click.echo(f"{name:<24} {of.right:>7} {of.lost:>7} {of.wrong:>7}")
     if json_path is not None:
         write_json(json_path, {name: vars(counted(outcomes)) for name, outcomes in counts.items()})
     if any(outcomes["wrong"] for outcomes in counts.values()):

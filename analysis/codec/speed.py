@@ -28,8 +28,8 @@ from lightpage.codec.header import Header
 from lightpage.codec.ldpc.code import LdpcCode
 from lightpage.codec.ldpc.decoder import MOST_ITERATIONS, decode
 from lightpage.codec.mapping import bit_information
-from lightpage.codec.page_codec import PageCodec
-from lightpage.codec.volume import Volume, encode_volume
+from lightpage.codec.page_codec import FileFacts, PageCodec
+from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.files import write_json
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
@@ -152,7 +152,9 @@ def time_page(profile: Profile, code: Code, rounds: int) -> dict[str, float]:
     mask = pilot_mask(profile)
     codec, rng = PageCodec(code, mask), np.random.default_rng(0)
     data = rng.integers(0, 256, (1, codec.user_bytes), dtype=np.uint8)
-    symbols = codec.encode([Header(code.id, 1, 0, 1)], data, (1, 0), pilot_symbols(profile, code.levels)[mask])[0]
+    symbols = codec.encode(
+        [Header(code.id, 1, 0, 1)], data, FileFacts(1, 0, 0), pilot_symbols(profile, code.levels)[mask]
+    )[0]
     best, iterations = float("inf"), 0.0
     step = 2 * np.pi / code.levels
     for share in np.linspace(0.45, 0.2, 26):
@@ -172,7 +174,7 @@ def time_encoding(profile: Profile, code: Code, size: int) -> float:
     """Megabytes a second from a file to pages in HDF5, in groups of 60 + 4."""
     mask = pilot_mask(profile)
     codec, content = PageCodec(code, mask), np.random.default_rng(0).bytes(size)
-    volume = Volume(1, size, codec.user_bytes, 60, 4)
+    volume = Volume.of_file(io.BytesIO(content), 1, codec.user_bytes, DATA_PAGES, PARITY_PAGES)
     pilots = pilot_symbols(profile, code.levels)[mask]
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()

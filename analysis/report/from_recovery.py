@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from analysis.report.json_file import Bits, JsonFile, Part, Seconds, Share
 from lightpage.codec.code import Code
-from lightpage.codec.page_codec import Loss
+from lightpage.codec.page_codec import LOSSES, Loss
 from lightpage.codec.volume import Volume
 from lightpage.codec.volume_file import ranges
 from lightpage.errors import InvalidInputError
@@ -21,14 +21,6 @@ Count = Annotated[int, Field(ge=0, le=1 << 53)]
 Margin = Annotated[float, Field(ge=-1000, le=8)]
 """Bits a symbol, of which at most eight are coded; it can be as negative as confidences mislead."""
 
-CAUSES = {
-    Loss.OPTICS: "the frames could not be decoded into symbols",
-    Loss.HEADER: "the header could not be read, and it is not the page that was expected",
-    Loss.CODE: "the header names another code",
-    Loss.BODY: "codewords did not converge, and the rest could not be mended",
-    Loss.CHECKSUM: "the codewords converged, and the checksum does not hold all the same",
-}
-"""Why a page gives no bytes, for people."""
 UNDECODED = frozenset({Loss.OPTICS, Loss.CODE})
 """Losses that leave the codewords of a page undecoded."""
 _LISTED = 200
@@ -56,6 +48,7 @@ class _Volume(Part):
     page_bytes: Annotated[Count, Field(gt=0)]
     data_pages: Count
     parity_pages: Count
+    checksum: Count
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -67,7 +60,7 @@ class _Volume(Part):
 
     @property
     def whole(self) -> Volume:
-        return Volume(self.volume, self.file_bytes, self.page_bytes, self.data_pages, self.parity_pages)
+        return Volume(self.volume, self.file_bytes, self.page_bytes, self.data_pages, self.parity_pages, self.checksum)
 
 
 class _Recovery(Part):
@@ -160,7 +153,7 @@ def report_of_recovery(file: JsonFile) -> RecoveryData:
         blocks_per_page=found.blocks_per_page,
         causes=[
             (loss.value, meaning, counts[loss], counts[loss] / found.pages)
-            for loss, meaning in CAUSES.items()
+            for loss, meaning in LOSSES.items()
             if counts[loss]
         ],
         unread=unread[:_LISTED],

@@ -13,6 +13,19 @@ def crc16(data: bytes) -> int:
     return binascii.crc_hqx(data, 0xFFFF)
 
 
+class Checksum:
+    """CRC-32C of bytes that come in parts."""
+
+    def __init__(self) -> None:
+        self.value = 0
+
+    def add(self, data: bytes) -> None:
+        """Take in the next part."""
+        import google_crc32c
+
+        self.value = int(google_crc32c.extend(self.value, data))
+
+
 def crc32c(data: bytes) -> int:
     """CRC-32C (Castagnoli, RFC 3720); of b"123456789" it is 0xE3069283."""
     import google_crc32c

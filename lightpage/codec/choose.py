@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import poisson
+from scipy.stats import nct, poisson
 
 from lightpage.codec.code import MOST_CODED_BITS, Code
 from lightpage.codec.ldpc.code import LdpcCode
@@ -20,24 +20,31 @@ from lightpage.codec.ldpc.decoder import decode
 from lightpage.codec.mapping import bit_information, bit_llrs, decide_in_coset, labels, level_bits
 from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import InvalidInputError
+from lightpage.page.symbols import MIN_LEVELS
 
 FEWEST_PAGES = 3
 """Fewer say nothing of how pages differ."""
 
-HEADROOM = 0.01
+HEADROOM = 0.0075
 """Share of what a symbol carries that is kept for drift, so that it is noticed before pages are lost."""
 
-_QUANTILE = 3.09
+_QUANTILE = 3.0902
 """Standard deviations below the mean of the page that one of a thousand falls short of."""
-_CONFIDENCE = 1.645
-"""Standard deviations of what few pages know of mean and deviation: right in 95% of cases."""
-_RATE_STEP = 5
+_CONFIDENCE = 0.95
+"""Share of cases in which the pages that were seen say no more than they know: a one-sided tolerance bound."""
+_RATE_STEP = 2
 """Thousandths."""
 _CORRECTIONS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _PAGE_LOSS = 1e-3
 """Of a page whose upper bits Reed-Solomon does not mend: small beside the loss that the rate allows."""
+_UNSEEN = 3.0
+"""Errors that may have been there where so many pages show none, with 95% confidence."""
 _BISECTIONS = 7
 _LOWEST_RATE, _HIGHEST_RATE = 340, 960
+_LOWEST_RATE_OF_TWO_LEVELS = 460
+"""Where a symbol has one bit, the header's code is no better than the body's would be below."""
+_FIRST_GAP, _MOST_TRIED = 0.04, 30
+"""Information beyond the rate that a code is first thought to need; rates that are tried."""
 _DRAWS = 3
 """Code words drawn for each page when a choice is checked."""
 
@@ -133,29 +140,39 @@ def _best_of(
     corrections = _corrections(wrong)
     if corrections is None:
         return None
-    count, deviation = len(pages), float(information.std(ddof=1))
-    spread = _QUANTILE + _CONFIDENCE * np.sqrt(1 / count + _QUANTILE**2 / (2 * count))
-    weakest = float(information.mean()) - spread * deviation - kept_bits / coded
-    gap = 0.03
-    code: Code | None = None
-    for _ in range(3):  # the gap to the code's limit changes little with the rate
-        rate = int(1000 * (weakest - gap) / _RATE_STEP) * _RATE_STEP
-        if rate < _LOWEST_RATE:
+    deviation = float(information.std(ddof=1))
+    weakest = float(information.mean()) - tolerance_factor(len(pages)) * deviation - kept_bits / coded
+    lowest = _LOWEST_RATE_OF_TWO_LEVELS if levels == MIN_LEVELS else _LOWEST_RATE
+    rate, tried = min(_HIGHEST_RATE, _stepped(weakest - _FIRST_GAP)), 0
+    while True:  # the gap to the code's limit changes little with the rate
+        tried += 1
+        if rate < lowest or tried > _MOST_TRIED:
             return None
-        rate = min(rate, _HIGHEST_RATE)
         code = Code(levels=levels, coded_bits=coded, rate_per_mille=rate, corrections=corrections)
         needed = needed_information(PageCodec(code, pilots).ldpc, pages, levels, coded, rng)
-        code, gap = code.model_copy(update={"needed_information": needed}), needed - rate / 1000
-        if needed <= weakest:
+        if needed > weakest:
+            rate = min(rate - _RATE_STEP, _stepped(weakest - (needed - rate / 1000)))
+            continue
+        code = Code(**{**code.model_dump(), "needed_information": needed})
+        if _all_decode(draw, code, pilots, rng):
             break
-    while code is not None and not _all_decode(draw, code, pilots, rng):
-        rate = code.rate_per_mille - 2 * _RATE_STEP
-        updated = {"rate_per_mille": rate, "needed_information": rate / 1000 + gap}
-        code = code.model_copy(update=updated) if rate >= _LOWEST_RATE else None
-    if code is None:
-        return None
+        rate -= 2 * _RATE_STEP
     user_bytes = PageCodec(code, pilots).user_bytes
     return Choice(code, user_bytes, float(information.mean()), deviation, float(wrong.mean()))
+
+
+def tolerance_factor(count: int) -> float:
+    """Standard deviations below the mean of `count` pages above which all but one page of a thousand lie.
+
+    The factor of a one-sided tolerance interval of a normal distribution, by the noncentral t distribution.
+    """
+    root = np.sqrt(count)
+    return float(nct.ppf(_CONFIDENCE, count - 1, _QUANTILE * root) / root)
+
+
+def _stepped(information: float) -> int:
+    """The highest rate of the grid that is no more than some information, thousandths."""
+    return int(1000 * information / _RATE_STEP) * _RATE_STEP
 
 
 def _label_bits(symbols: NDArray[np.uint8], coded: int) -> NDArray[np.uint8]:
@@ -173,7 +190,7 @@ def _information(page: DrawnPage, levels: int, coded: int) -> tuple[float, int]:
 
 def _corrections(wrong: NDArray[np.int64]) -> int | None:
     """Corrections that a page needs; None where no word has so many. An upper number may spread over two symbols."""
-    expected = 2 * (float(wrong.sum()) + (3 if wrong.any() else 0)) / len(wrong)
+    expected = 2 * (float(wrong.sum()) + _UNSEEN) / len(wrong)
     # a word of a large page has only its share of them; counting all of them is on the safe side
     return next((t for t in _CORRECTIONS if poisson.sf(t, expected) <= _PAGE_LOSS), None)
 

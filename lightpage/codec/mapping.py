@@ -10,11 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.codec.ldpc.decoder import MOST_LLR
 from lightpage.errors import PageError
 from lightpage.page.symbols import check_levels
-
-MOST_LLR = 40.0
-"""Largest magnitude of a bit's log-likelihood ratio."""
 
 _CHUNK = 1 << 18
 """Probabilities at once: few enough for the cache."""

@@ -25,8 +25,8 @@ from lightpage.errors import InvalidInputError, PageError
 
 _INTERLEAVER_SEED = 0x4C50_494C
 _FILLING_SEED = 0x4C50_464C
-_GROUP_BYTES = 2
-"""Data and parity pages of a group, one byte each, before the user bytes."""
+_FILE_BYTES = 2 + CRC32C_BYTES
+"""Before the user bytes: data and parity pages of a group, one byte each, and the checksum of the whole file."""
 
 
 class Loss(StrEnum):
@@ -44,6 +44,39 @@ class Loss(StrEnum):
     """Its blocks converged, and the checksum does not hold all the same."""
 
 
+LOSSES = {
+    Loss.OPTICS: "it was not decoded into symbols",
+    Loss.HEADER: "its header cannot be read",
+    Loss.CODE: "its header names another code",
+    Loss.BODY: "its code does not converge",
+    Loss.CHECKSUM: "its checksum does not hold",
+}
+"""Losses for people."""
+
+
+@dataclass(frozen=True)
+class FileFacts:
+    """What every page says of the file that it belongs to.
+
+    Attributes:
+        data_pages, parity_pages: k and m of a group, 0 to 255.
+        checksum: CRC-32C of the whole file.
+    """
+
+    data_pages: int
+    parity_pages: int
+    checksum: int
+
+    def to_bytes(self) -> bytes:
+        """As they stand on the page."""
+        return bytes([self.data_pages, self.parity_pages]) + self.checksum.to_bytes(CRC32C_BYTES, "big")
+
+    @classmethod
+    def parse(cls, data: bytes) -> FileFacts:
+        """What `to_bytes` has made."""
+        return cls(data[0], data[1], int.from_bytes(data[2:_FILE_BYTES], "big"))
+
+
 @dataclass(frozen=True)
 class PageBytes:
     """What a page gave.
@@ -51,7 +84,7 @@ class PageBytes:
     Attributes:
         header: as it stands on the page; to be believed only where there is data. None where it could not be read.
         data: user bytes, None where the page is lost: nothing that fails its checksum is given out.
-        data_pages, parity_pages: k and m of the page's group, 0 where the page is lost.
+        file: what it says of its file, None where the page is lost.
         loss: why there is no data, None where there is.
         iterations: mean of the LDPC blocks.
         failed_blocks: LDPC blocks that did not converge.
@@ -63,8 +96,7 @@ class PageBytes:
 
     header: Header | None
     data: bytes | None
-    data_pages: int
-    parity_pages: int
+    file: FileFacts | None
     loss: Loss | None
     iterations: float
     failed_blocks: int
@@ -110,7 +142,7 @@ class PageCodec:
         self._data_symbols = self._total_bits // SYMBOL_BITS - parity_symbols if code.corrections else 0
         data_bits = SYMBOL_BITS * self._data_symbols if code.corrections else self._total_bits
         self._bytes = data_bits // 8
-        self.user_bytes = self._bytes - _GROUP_BYTES - CRC32C_BYTES
+        self.user_bytes = self._bytes - _FILE_BYTES - CRC32C_BYTES
         if self.user_bytes < 1:
             raise small
 
@@ -126,14 +158,14 @@ class PageCodec:
         return np.unpackbits(random_bytes(_FILLING_SEED, -(-count // 8)))[:count]
 
     def encode(
-        self, headers: Sequence[Header], data: NDArray[np.uint8], group: tuple[int, int], pilots: NDArray[np.uint8]
+        self, headers: Sequence[Header], data: NDArray[np.uint8], file: FileFacts, pilots: NDArray[np.uint8]
     ) -> NDArray[np.uint8]:
         """Symbols of pages.
 
         Args:
             headers: one a page; their code id must be this code's.
             data: user bytes, uint8 [pages, user_bytes].
-            group: (k, m) of the volume, 0 to 255 each.
+            file: of the pages' file.
             pilots: levels of the pilots in row order, uint8 [pilots].
 
         Returns:
@@ -147,8 +179,8 @@ class PageCodec:
         if pilots.shape != (int(np.count_nonzero(self.pilots)),):
             raise PageError("pilot levels", f"shape {pilots.shape}", f"({np.count_nonzero(self.pilots)},)")
         body = np.zeros((len(headers), self._bytes), np.uint8)
-        body[:, :_GROUP_BYTES] = group
-        body[:, _GROUP_BYTES:-CRC32C_BYTES] = data
+        body[:, :_FILE_BYTES] = np.frombuffer(file.to_bytes(), np.uint8)
+        body[:, _FILE_BYTES:-CRC32C_BYTES] = data
         for row, header in zip(body, headers, strict=True):
             check = crc32c(header.fields() + row[:-CRC32C_BYTES].tobytes())
             row[-CRC32C_BYTES:] = np.frombuffer(check.to_bytes(CRC32C_BYTES, "big"), np.uint8)
@@ -187,7 +219,7 @@ class PageCodec:
             raise PageError("phase, concentration", shapes, f"{self.pilots.shape} twice, as the pilots have")
         mu, kappa = phase.ravel(), concentration.ravel()
         header = decode_header(mu[self._header], kappa[self._header], self.code.levels)
-        other = header is not None and header.code_id != self.code.id
+        other = header is not None and header.code_id != self.code.id and expected is None
         llrs = bit_llrs(mu[self._body], kappa[self._body], self.code.levels, self.code.coded_bits).ravel()
         blocks = llrs[self._order[: self.blocks * self.ldpc.sent_bits]].reshape(self.blocks, -1)
         if other:
@@ -198,7 +230,7 @@ class PageCodec:
         upper = decide_in_coset(mu[self._body], label, self.code.levels)
         high = (upper[:, None] >> np.arange(self._upper_bits)[::-1] & 1).astype(np.uint8)
         bits = np.concatenate([found.information.ravel(), high.ravel()])
-        for candidate in (header, expected) if header is None else (header,):
+        for candidate in (header, expected):
             if candidate is None:
                 continue
             body, corrected = self._checked(bits, candidate)
@@ -206,18 +238,24 @@ class PageCodec:
                 # the code words are right where the checksum holds, but for what Reed-Solomon has mended
                 information = bit_information(blocks, found.sent)
                 margin = self.code.coded_bits * (information - self.code.needed_information)
-                data = body[_GROUP_BYTES:-CRC32C_BYTES].tobytes()
-                groups = int(body[0]), int(body[1])
-                return PageBytes(candidate, data, *groups, None, iterations, failed, self.blocks, corrected, margin)
-        loss = Loss.BODY if failed else Loss.CHECKSUM
-        return self._lost(header, Loss.HEADER if header is None and not failed else loss, blocks, failed, iterations)
+                data = body[_FILE_BYTES:-CRC32C_BYTES].tobytes()
+                file = FileFacts.parse(body[:_FILE_BYTES].tobytes())
+                margin = min(margin, 0.0) if failed else margin
+                return PageBytes(candidate, data, file, None, iterations, failed, self.blocks, corrected, margin)
+        if header is None and not failed:
+            loss = Loss.HEADER
+        elif header is not None and header.code_id != self.code.id:
+            loss = Loss.CODE
+        else:
+            loss = Loss.BODY if failed else Loss.CHECKSUM
+        return self._lost(header, loss, blocks, failed, iterations)
 
     def _lost(
         self, header: Header | None, loss: Loss, blocks: NDArray[np.float32], failed: int, iterations: float
     ) -> PageBytes:
         margin = self.code.coded_bits * (bit_information(blocks) - self.code.needed_information)
         # what is wrong and claims to be certain is no margin
-        return PageBytes(header, None, 0, 0, loss, iterations, failed, self.blocks, 0, min(margin, 0.0))
+        return PageBytes(header, None, None, loss, iterations, failed, self.blocks, 0, min(margin, 0.0))
 
     def _checked(self, bits: Bits, header: Header) -> tuple[NDArray[np.uint8] | None, int]:
         """The body in the bits of a page where its checksum holds, mended if need be; and how much was mended."""

@@ -7,6 +7,7 @@ few pages need, is the library's.
 
 from __future__ import annotations
 
+import threading
 from functools import lru_cache
 from typing import Any
 
@@ -18,6 +19,9 @@ Symbols = NDArray[np.int64]
 SYMBOL_BITS = 12
 LONGEST_WORD = (1 << SYMBOL_BITS) - 1
 POLYNOMIAL = 0x1053
+
+_LIBRARY = threading.Lock()
+"""Guards the library, whose tables are global: they are made anew with every number of corrections."""
 
 
 @lru_cache(1)
@@ -89,8 +93,10 @@ def repair(word: Symbols, corrections: int) -> tuple[Symbols, int] | None:
     """
     import reedsolo
 
-    try:
-        mended, _, wrong = _library(corrections).decode([int(symbol) for symbol in word])
-    except reedsolo.ReedSolomonError:
-        return None
+    symbols = [int(symbol) for symbol in word]
+    with _LIBRARY:
+        try:
+            mended, _, wrong = _library(corrections).decode(symbols)
+        except reedsolo.ReedSolomonError:
+            return None
     return np.array(mended, np.int64), len(wrong)

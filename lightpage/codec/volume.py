@@ -8,18 +8,24 @@ g. Data pages beyond the file's end have numbers but are not written; they count
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from io import SEEK_END
 from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.codec.checksum import Checksum
 from lightpage.codec.erasure import check_group, parity_of, restore
 from lightpage.codec.header import Header, check_volume
-from lightpage.codec.page_codec import PageCodec
+from lightpage.codec.page_codec import FileFacts, PageBytes, PageCodec
 from lightpage.errors import InvalidInputError
 
+DATA_PAGES, PARITY_PAGES = 60, 4
+"""Of a group, unless told otherwise: enough parity for a page in a hundred to be lost."""
+
 _PAGES_AT_ONCE = 32
+_READ_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,7 @@ class Volume:
         file_bytes: length of the file.
         page_bytes: user bytes of a page.
         data_pages, parity_pages: k and m of a group.
+        checksum: CRC-32C of the file.
     """
 
     id: int
@@ -38,6 +45,7 @@ class Volume:
     page_bytes: int
     data_pages: int
     parity_pages: int
+    checksum: int = 0
 
     def __post_init__(self) -> None:
         """Check that the file can be numbered.
@@ -97,7 +105,65 @@ class Volume:
             "page_bytes": self.page_bytes,
             "data_pages": self.data_pages,
             "parity_pages": self.parity_pages,
+            "checksum": self.checksum,
         }
+
+    @property
+    def facts(self) -> FileFacts:
+        """What every page says of the file."""
+        return FileFacts(self.data_pages, self.parity_pages, self.checksum)
+
+    @classmethod
+    def of_page(cls, page: PageBytes) -> Volume | None:
+        """The volume that a page says it belongs to; None of a lost page, or where no volume is such.
+
+        Args:
+            page: as it was read.
+        """
+        header, data, file = page.header, page.data, page.file
+        if header is None or data is None or file is None:
+            return None
+        try:
+            told = cls(header.volume, header.volume_bytes, len(data), file.data_pages, file.parity_pages, file.checksum)
+        except InvalidInputError:
+            return None
+        return told if told.holds(header.page) else None
+
+    @classmethod
+    def of_file(cls, file: IO[bytes], volume_id: int, page_bytes: int, data_pages: int, parity_pages: int) -> Volume:
+        """The volume of a file, which is read once for its size and checksum and stands at its start again.
+
+        Raises:
+            InvalidInputError: see the constructor.
+        """
+        start, check = file.tell(), Checksum()
+        size = file.seek(0, SEEK_END) - start
+        volume = cls(volume_id, size, page_bytes, data_pages, parity_pages)  # may refuse it before it is read
+        file.seek(start)
+        while part := file.read(_READ_BYTES):
+            check.add(part)
+        file.seek(start)
+        return replace(volume, checksum=check.value)
+
+
+@dataclass(frozen=True)
+class Successor:
+    """Which page should come next, after pages that were read.
+
+    Attributes:
+        volume: that the last page belongs to; None where nothing is known.
+        header: of the page that should come; None where nothing is known, or after the last one.
+    """
+
+    volume: Volume | None = None
+    header: Header | None = None
+
+    def after(self) -> Successor:
+        """What should come after that."""
+        if self.volume is None or self.header is None:
+            return Successor()
+        following = self.volume.following(self.header.page)
+        return Successor(self.volume, None if following is None else replace(self.header, page=following))
 
 
 def encode_volume(
@@ -115,9 +181,9 @@ def encode_volume(
         uint8 [pages, ny, nx].
 
     Raises:
-        InvalidInputError: the file is shorter or longer than the volume says.
+        InvalidInputError: the file is shorter or longer than the volume says, or its bytes have changed.
     """
-    size, left = volume.page_bytes, volume.file_bytes
+    size, left, check = volume.page_bytes, volume.file_bytes, Checksum()
     for group in range(volume.groups):
         data = []
         for _ in range(volume.data_in(group)):
@@ -126,12 +192,15 @@ def encode_volume(
                 read = volume.file_bytes - left + len(part)
                 raise InvalidInputError("file", f"{read} bytes", f"{volume.file_bytes}, as it had before")
             left -= len(part)
+            check.add(part)
             data.append(part.ljust(size, b"\0"))
         unwritten = [bytes(size)] * (volume.data_pages - len(data))
         pages = data + parity_of(data + unwritten, volume.parity_pages)
         yield from _encoded(codec, volume, volume.numbers_in(group), pages, pilots)
     if file.read(1):
         raise InvalidInputError("file", "more bytes", f"{volume.file_bytes}, as it had before")
+    if check.value != volume.checksum:
+        raise InvalidInputError("file", "other bytes", "the ones that it had before: it was written to meanwhile")
 
 
 def _encoded(
@@ -141,7 +210,7 @@ def _encoded(
         some = slice(start, start + _PAGES_AT_ONCE)
         headers = [Header(codec.code.id, volume.id, number, volume.file_bytes) for number in numbers[some]]
         data = np.stack([np.frombuffer(page, np.uint8) for page in pages[some]])
-        yield codec.encode(headers, data, (volume.data_pages, volume.parity_pages), pilots)
+        yield codec.encode(headers, data, volume.facts, pilots)
 
 
 def restore_group(volume: Volume, group: int, pages: dict[int, bytes]) -> list[bytes] | None:

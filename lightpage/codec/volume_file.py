@@ -1,18 +1,25 @@
-"""Collects the pages of a volume, in whatever order they come, and makes its file, whole or not at all."""
+"""Collects the pages of files, in whatever order they come, and makes one of the files, whole or not at all."""
 
 from __future__ import annotations
 
+import fcntl
+import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self
+from typing import Self
 
+from lightpage.codec.checksum import Checksum
 from lightpage.codec.page_codec import PageBytes
 from lightpage.codec.volume import Volume, restore_group
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, LostDataError
 from lightpage.files import move_into_place
+
+MOST_VOLUMES = 16
+"""Collected at once: each has a file of its own on the disk."""
+_COPIED = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -29,75 +36,68 @@ class Restored:
 
 
 class VolumeFile:
-    """The pages of one volume, kept in `<path>.partial` until the file is made; use it in a `with` statement.
+    """The pages of one volume, kept in a partial file beside `path` until the file is made.
 
     Args:
         path: of the file.
-        volume_id: whose pages are taken; those of the first page if left out.
+        volume: how it lies on its pages.
+        number: tells the partial files of several volumes apart.
 
     Raises:
-        InvalidInputError: the file cannot be written.
+        InvalidInputError: the partial file cannot be written, or another process is writing it.
     """
 
-    def __init__(self, path: Path, page_bytes: int, volume_id: int | None = None) -> None:
-        self.path, self._page_bytes, self._id = path, page_bytes, volume_id
-        self._partial = path.with_name(path.name + ".partial")
-        self.volume: Volume | None = None
+    def __init__(self, path: Path, volume: Volume, number: int = 0) -> None:
+        self.path, self.volume = path, volume
+        self._partial = path.with_name(f"{path.name}.{number}.partial")
         self._there: set[int] = set()
         self.repeated = 0
         """Pages that came again, with the same bytes."""
-        self.foreign: dict[int, int] = {}
-        """Pages of other volumes, by id."""
         try:
-            self._file: IO[bytes] = self._partial.open("w+b")
+            self._file = os.fdopen(os.open(self._partial, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644), "r+b")
         except OSError as error:
             raise InvalidInputError(f"file {self._partial}", error, "a file that can be written") from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        with suppress(OSError):  # on a full disk it tries once more to write what is not wanted any longer
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._file.truncate(0)
+        except OSError:
             self._file.close()
-        self._partial.unlink(missing_ok=True)
+            expected = "another name, or to wait for its end"
+            raise InvalidInputError(f"file {self._partial}", "a file that another process writes", expected) from None
 
-    def add(self, page: PageBytes) -> bool:
-        """Take a page that was read; returns whether it is of this volume.
+    def close(self) -> None:
+        """Drop the partial file, if the file was not made."""
+        if not self._file.closed:
+            self._partial.unlink(missing_ok=True)
+            with suppress(OSError):  # on a full disk it tries once more to write what is not wanted any longer
+                self._file.close()
+
+    @property
+    def pages(self) -> int:
+        """Pages that came, each once."""
+        return len(self._there)
+
+    def add(self, number: int, data: bytes) -> None:
+        """Take a page of this volume.
+
+        Args:
+            number: of the page.
+            data: its user bytes.
 
         Raises:
-            InvalidInputError: it contradicts an earlier page of the volume, or there is no room for it on the disk.
+            InvalidInputError: other bytes came under this number before, or there is no room for it on the disk.
         """
-        header, data = page.header, page.data
-        assert header is not None  # a page that was read has both
-        assert data is not None
-        if self._id is None:
-            self._id = header.volume
-        if header.volume != self._id:
-            self.foreign[header.volume] = self.foreign.get(header.volume, 0) + 1
-            return False
-        told = Volume(header.volume, header.volume_bytes, self._page_bytes, page.data_pages, page.parity_pages)
-        subject = f"volume {header.volume}: page {header.page}"
-        if self.volume is None:
-            self.volume = told
-        if told != self.volume:
-            raise InvalidInputError(subject, _shape(told), f"{_shape(self.volume)}, as its other pages say")
-        if not told.holds(header.page):
-            raise InvalidInputError(subject, "a number beyond the file's end", f"one of {told.pages} pages")
-        if header.page in self._there:
-            if self._read(header.page) != data:
-                raise InvalidInputError(subject, "two pages of this number with different bytes", "one of them")
+        if number not in self._there:
+            self._write(number, data)
+            self._there.add(number)
+        elif self._read(number) == data:
             self.repeated += 1
-            return True
-        self._write(header.page, data)
-        self._there.add(header.page)
-        return True
+        else:
+            subject = f"volume {self.volume.id}: page {number}"
+            raise InvalidInputError(subject, "two pages of this number with different bytes", "one of them")
 
     def missing(self) -> list[int]:
         """Numbers of the pages of the volume that did not come."""
-        if self.volume is None:
-            return []
         numbers = (number for group in range(self.volume.groups) for number in self.volume.numbers_in(group))
         return [number for number in numbers if number not in self._there]
 
@@ -109,8 +109,7 @@ class VolumeFile:
         """
         restored: list[int] = []
         lost: list[int] = []
-        for group in range(self.volume.groups if self.volume else 0):
-            assert self.volume is not None
+        for group in range(self.volume.groups):
             numbers = self.volume.numbers_in(group)
             data = numbers[: self.volume.data_in(group)]
             absent = [number for number in data if number not in self._there]
@@ -125,33 +124,45 @@ class VolumeFile:
             restored += absent
         return Restored(tuple(restored), tuple(lost))
 
-    def complete(self) -> None:
-        """Give the file its name. Data pages that are still missing are zeros in it.
+    def complete(self, lost: Sequence[int] = ()) -> None:
+        """Give the file its name.
+
+        Args:
+            lost: data pages that are zeros in it; without any the file's checksum must hold.
 
         Raises:
-            InvalidInputError: no page came, or the file cannot be completed.
+            LostDataError: it does not: the pages are of several files.
+            InvalidInputError: the file cannot be completed.
         """
-        if self.volume is None:
-            raise InvalidInputError(f"file {self.path}", "no page", "at least one")
         try:
             self._file.truncate(self.volume.file_bytes)
-            self._file.close()
+            if not lost and self._checksum() != self.volume.checksum:
+                expected = "that of the file that was encoded"
+                raise LostDataError(f"file {self.path}", "pages whose checksum as a file does not hold", expected)
+            self._file.flush()
             move_into_place(self._partial, self.path)
+            self._file.close()
         except OSError as error:
             raise InvalidInputError(f"file {self.path}", error, "a file that can be completed") from None
 
+    def _checksum(self) -> int:
+        check = Checksum()
+        self._file.seek(0)
+        while part := self._file.read(_COPIED):
+            check.add(part)
+        return check.value
+
     def _place(self, number: int) -> int:
         """Where a page lies in the partial file: data in order, parity behind all data."""
-        assert self.volume is not None
         group, place = divmod(number, self.volume.group_pages)
         if place < self.volume.data_pages:
-            return (group * self.volume.data_pages + place) * self._page_bytes
+            return (group * self.volume.data_pages + place) * self.volume.page_bytes
         parity = group * self.volume.parity_pages + place - self.volume.data_pages
-        return (self.volume.file_pages + parity) * self._page_bytes
+        return (self.volume.file_pages + parity) * self.volume.page_bytes
 
     def _read(self, number: int) -> bytes:
         self._file.seek(self._place(number))
-        return self._file.read(self._page_bytes)
+        return self._file.read(self.volume.page_bytes)
 
     def _write(self, number: int, data: bytes) -> None:
         try:
@@ -162,8 +173,73 @@ class VolumeFile:
             raise InvalidInputError(f"file {self._partial}", error, "room for it on the disk") from None
 
 
-def _shape(volume: Volume) -> str:
-    return f"{volume.file_bytes} bytes in groups of {volume.data_pages} + {volume.parity_pages} pages"
+class VolumeFiles:
+    """The pages of several volumes, of which one becomes a file; use it in a `with` statement.
+
+    Args:
+        path: of the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._files: dict[Volume, VolumeFile] = {}
+        self.dropped = 0
+        """Pages of volumes beyond the first `MOST_VOLUMES`."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for file in self._files.values():
+            file.close()
+
+    def add(self, page: PageBytes) -> Volume | None:
+        """Take a page that was read, and say whose it is; None where it names no volume that can be.
+
+        Raises:
+            InvalidInputError: see `VolumeFile`.
+        """
+        volume = Volume.of_page(page)
+        if volume is None or page.header is None or page.data is None:
+            return None
+        if volume not in self._files:
+            if len(self._files) == MOST_VOLUMES:
+                self.dropped += 1
+                return volume
+            self._files[volume] = VolumeFile(self.path, volume, len(self._files))
+        self._files[volume].add(page.header.page, page.data)
+        return volume
+
+    def counts(self) -> dict[Volume, int]:
+        """Pages that came of each volume."""
+        return {volume: file.pages for volume, file in self._files.items()}
+
+    def chosen(self, volume_id: int | None = None, checksum: int | None = None) -> VolumeFile | None:
+        """The one volume that was asked for; None where no page came at all.
+
+        Args:
+            volume_id: its number; any if left out.
+            checksum: of its file; any if left out.
+
+        Raises:
+            InvalidInputError: none of them, or several.
+        """
+        fitting = [
+            file
+            for volume, file in self._files.items()
+            if volume_id in (None, volume.id) and checksum in (None, volume.checksum)
+        ]
+        if len(fitting) == 1:
+            return fitting[0]
+        if not self._files:
+            return None
+        found = "; ".join(
+            f"{volume.id}:{volume.checksum:08x} with {file.pages} pages of a file of {volume.file_bytes} bytes"
+            for volume, file in self._files.items()
+        )
+        raise InvalidInputError("volume", f"pages of {found}", "one of them: --volume ID or --volume ID:CHECKSUM")
 
 
 def ranges(numbers: Sequence[int]) -> str:

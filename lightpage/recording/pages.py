@@ -88,16 +88,17 @@ class PagesWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._file.close()
-        self._disk.close()
-        if kind is not None:
-            self._partial.unlink(missing_ok=True)
-            return
-        try:
+        try:  # the lock is held until the file has its name, or is gone
+            if kind is not None:
+                self._partial.unlink(missing_ok=True)
+                return
             self._disk.check()
             move_into_place(self._partial, self.path)
         except OSError as failure:
             self._partial.unlink(missing_ok=True)
             raise RecordingError(f"pages {self.path}", failure, "a file that can be completed") from None
+        finally:
+            self._disk.close()
 
 
 class Pages:

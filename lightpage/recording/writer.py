@@ -182,11 +182,12 @@ class RecordingWriter:
             if "pages_complete" in self._file.attrs:
                 del self._file.attrs["pages_complete"]
             self._file.close()
-            self._disk.close()
             self._disk.check()
-            move_into_place(self._partial, self.path)
+            move_into_place(self._partial, self.path)  # still locked
         except OSError as error:
             raise RecordingError(self._subject, error, "a file that can be completed") from None
+        finally:
+            self._disk.close()
 
     def abandon(self) -> None:
         """Close the partial file and leave it for `resume`."""

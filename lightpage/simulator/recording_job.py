@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hashlib import sha256
+from hashlib import file_digest
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +65,8 @@ class RecordingJob:
         # references alone would not tell two devices apart: the pipe does not show in them
         text = f"light = {LIGHT}\nlevels = {self.levels}\nseed = {self.seed}\ntruth = {str(self.truth).lower()}\n"
         if self._written is not None:
-            text += f"symbols = {sha256(self._written.path.read_bytes()).hexdigest()}\n"
+            with self._written.path.open("rb") as file:
+                text += f"symbols = {file_digest(file, 'sha256').hexdigest()}\n"
         text += f"{to_toml(self.device)}\n# profile\n{self.profile.to_toml()}"
         try:
             begun = self.settings.read_text("utf-8") if self.settings.exists() else None

@@ -21,8 +21,8 @@ from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import Tracker
 from runtime.errors import LostPageError
 
-CONTINUOUS_LEVELS = 256
-"""AIR is stated over so many levels: log2 of what a phase that may take any value carries, to 1e-9 bit."""
+AIR_LEVELS = 256
+"""Level count of the AIR: fine enough that it does not bound what a phase carries."""
 
 
 def phase_errors(page: DecodedPage, symbols: NDArray[np.uint8], levels: int) -> NDArray[np.float32]:
@@ -33,7 +33,7 @@ def phase_errors(page: DecodedPage, symbols: NDArray[np.uint8], levels: int) -> 
 def air_bits(page: DecodedPage, symbols: NDArray[np.uint8], data: NDArray[np.bool_], levels: int) -> float:
     """AIR of a page as delivered, over 256 levels whatever its own count is, bits per data symbol."""
     error = (page.phase - symbol_phases(symbols, levels))[data]
-    rates = achievable_rate(error, page.concentration[data], np.zeros(error.shape, np.int64), CONTINUOUS_LEVELS)
+    rates = achievable_rate(error, page.concentration[data], np.zeros(error.shape, np.int64), AIR_LEVELS)
     return float(rates.mean())
 
 
@@ -72,7 +72,7 @@ def choose_code(
         concentrations.append(page.concentration)
     data = ~mask
     rates = [
-        achievable_rate(error[data], kappa[data], np.zeros(int(data.sum()), np.int64), CONTINUOUS_LEVELS).mean()
+        achievable_rate(error[data], kappa[data], np.zeros(int(data.sum()), np.int64), AIR_LEVELS).mean()
         for error, kappa in zip(errors, concentrations, strict=True)
     ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,12 @@ from scipy.stats import beta
 
 from lightpage.codec.code import Code
 from lightpage.codec.header import Header
-from lightpage.codec.page_codec import Loss, PageBytes, PageCodec
-from lightpage.codec.volume import Volume
-from lightpage.codec.volume_file import VolumeFile, ranges
+from lightpage.codec.page_codec import LOSSES, Loss, PageBytes, PageCodec
+from lightpage.codec.volume import Successor, Volume
+from lightpage.codec.volume_file import Restored, VolumeFiles, ranges
 from lightpage.errors import InvalidInputError, LostDataError, RecordingError
 from lightpage.progress import track
-from lightpage.recording.reader import Recording
+from lightpage.recording.reader import FramePair, Recording
 from runtime.bulk.coded_pages import air_bits
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.bundle import Bundle
@@ -65,14 +65,6 @@ class RecoveredPage:
     code_seconds: float = 0.0
 
 
-_REASONS = {
-    Loss.HEADER: "its header cannot be read",
-    Loss.CODE: "its header names another code",
-    Loss.BODY: "its code does not converge",
-    Loss.CHECKSUM: "its checksum does not hold",
-}
-
-
 @dataclass(frozen=True)
 class Recovery:
     """A file that was read back, or what is left of it.
@@ -83,7 +75,7 @@ class Recovery:
         pages: every page of the recording.
         restored, lost: see `lightpage.codec.volume_file.Restored`.
         missing: numbers of pages of the volume that gave no bytes, parity included.
-        foreign: pages of other volumes, by id.
+        foreign: pages of other volumes, by "id:checksum".
         repeated: pages that came again.
         user_bytes_per_page: that a page holds.
         symbols_per_page: all of them, pilots included.
@@ -97,7 +89,7 @@ class Recovery:
     restored: tuple[int, ...]
     lost: tuple[int, ...]
     missing: tuple[int, ...]
-    foreign: dict[int, int]
+    foreign: dict[str, int]
     repeated: int
     user_bytes_per_page: int
     symbols_per_page: int
@@ -132,7 +124,7 @@ class Recovery:
             "lost": list(self.lost),
             "restored": list(self.restored),
             "missing": list(self.missing),
-            "other_volumes": {str(key): count for key, count in self.foreign.items()},
+            "other_volumes": self.foreign,
             "user_bytes": 0 if volume is None else volume.file_bytes,
             "user_bytes_per_page": user,
             "blocks_per_page": self.blocks_per_page,
@@ -183,6 +175,7 @@ def recover(
     code: Code,
     out: Path,
     volume_id: int | None = None,
+    checksum: int | None = None,
     holes: bool = False,
 ) -> Recovery:
     """Read the file of one volume back.
@@ -192,41 +185,44 @@ def recover(
         recording: of its pages, in any order.
         tracker: follows the device from page to page.
         code: of the pages.
-        out: the file; written whole, or not at all.
-        volume_id: which volume; if left out, the recording must hold only one.
+        out: the file; written whole, or not at all: what is there stays then.
+        volume_id, checksum: which volume; if left out, the recording must hold only one.
         holes: write zeros where data are lost, in place of no file.
 
     Raises:
-        RecordingError: another device's recording, or one of another level count.
-        InvalidInputError: several volumes and no choice between them, pages that contradict each other, or no room.
+        RecordingError: another device's recording, or one of other levels or pilots.
+        InvalidInputError: several volumes and no choice between them, none of those asked for, pages that contradict
+            each other, or no room.
+        LostDataError: the file that was put together is not the one that was encoded.
     """
     check_recording(decoder, recording)
+    bundle = decoder.bundle
     if recording.declared_levels not in (None, code.levels):
         raise RecordingError(f"recording {recording.path}: levels", recording.levels, f"{code.levels}, as the code has")
-    bundle = decoder.bundle
+    own = recording.pilots()
+    if own is not None and not np.array_equal(own, bundle.pilot_mask):
+        raise RecordingError(f"recording {recording.path}: pilots", "other places", "those of the bundle")
     codec = PageCodec(code, bundle.pilot_mask)
     pilots = decoder.written_pilots(code.levels)
     reader = PageReader(codec, lambda pair: tracker.decode(pair, code.levels, pilots))
     pages: list[RecoveredPage] = []
-    with VolumeFile(out, codec.user_bytes, volume_id) as file:
+    with VolumeFiles(out) as files:
         for index in track(range(recording.pages), "recover"):
-            pages += [_read_page(reader, recording, index, file)]
-        if volume_id is None and file.foreign and file.volume is not None:
-            found = ", ".join(map(str, sorted({file.volume.id, *file.foreign})))
-            raise InvalidInputError(f"recording {recording.path}", f"pages of volumes {found}", "one of them: --volume")
-        missing = tuple(file.missing())
-        done = file.restore()
-        if file.volume is not None and (holes or not done.lost):
-            file.complete()
+            pages += [_read_page(reader, recording, index, files)]
+        file = files.chosen(volume_id, checksum)
+        done = Restored((), ()) if file is None else file.restore()
+        if file is not None and (holes or not done.lost):
+            file.complete(done.lost)
+        volume = None if file is None else file.volume
         return Recovery(
             code,
-            file.volume,
+            volume,
             tuple(pages),
             done.restored,
             done.lost,
-            missing,
-            file.foreign,
-            file.repeated,
+            () if file is None else tuple(file.missing()),
+            {f"{of.id}:{of.checksum:08x}": count for of, count in files.counts().items() if of != volume},
+            0 if file is None else file.repeated,
             codec.user_bytes,
             bundle.pilot_mask.size,
             int(np.count_nonzero(~bundle.pilot_mask)),
@@ -235,19 +231,23 @@ def recover(
 
 
 class PageReader:
-    """Frames to bytes, page after page.
+    """Frames to bytes, page after page; knows which page of its volume should come next.
 
     Args:
         codec: of the pages.
         decode: frame pair to decoded page.
     """
 
-    def __init__(self, codec: PageCodec, decode: Callable[[Any], DecodedPage]) -> None:
+    def __init__(self, codec: PageCodec, decode: Callable[[FramePair], DecodedPage]) -> None:
         self.codec, self._decode = codec, decode
-        self.expected: Header | None = None
-        """The page that should come next, where that is known."""
+        self._next = Successor()
 
-    def read(self, pair: Any) -> tuple[DecodedPage, PageBytes, float, float]:
+    @property
+    def expected(self) -> Header | None:
+        """The page that should come next, where that is known."""
+        return self._next.header
+
+    def read(self, pair: FramePair) -> tuple[DecodedPage, PageBytes, float, float]:
         """A page, its bytes, and the seconds of the optical decode and of the code.
 
         Raises:
@@ -259,23 +259,29 @@ class PageReader:
         found = self.codec.decode(page.phase, page.concentration, self.expected)
         return page, found, decoded - start, time.perf_counter() - decoded
 
+    def follow(self, volume: Volume | None, header: Header | None) -> None:
+        """Take note of a page: of the volume that it belongs to, or of none, where it is lost."""
+        if volume is not None and header is not None:
+            self._next = Successor(volume, header)
+        self.skip()
 
-def _read_page(reader: PageReader, recording: Recording, index: int, file: VolumeFile) -> RecoveredPage:
-    """Read one page of a recording into a file."""
+    def skip(self) -> None:
+        """Go on to the page after the one that was expected."""
+        self._next = self._next.after()
+
+
+def _read_page(reader: PageReader, recording: Recording, index: int, files: VolumeFiles) -> RecoveredPage:
+    """Read one page of a recording into the files."""
     expected = reader.expected
     try:
         pair = narrow(recording.frames(index), recording.bit_depth)
         page, found, seconds, code_seconds = reader.read(pair)
     except (InvalidInputError, LostPageError) as error:
-        _expect_next(reader, expected, file)
+        reader.skip()
         number, volume = (None, None) if expected is None else (expected.page, expected.volume)
         return RecoveredPage(index, number, volume, Loss.OPTICS, str(error))
+    reader.follow(files.add(found), found.header)
     header = found.header if found.header is not None else expected
-    if found.loss is None:
-        file.add(found)
-        _expect_next(reader, found.header, file)
-    else:
-        _expect_next(reader, header, file)
     symbols, data = recording.symbols(index), ~reader.codec.pilots
     rate = None if symbols is None else air_bits(page, symbols, data, reader.codec.code.levels)
     return RecoveredPage(
@@ -283,7 +289,7 @@ def _read_page(reader: PageReader, recording: Recording, index: int, file: Volum
         None if header is None else header.page,
         None if header is None else header.volume,
         found.loss,
-        "" if found.loss is None else _REASONS[found.loss],
+        "" if found.loss is None else LOSSES[found.loss],
         found.margin_bits,
         found.corrected,
         found.failed_blocks,
@@ -292,14 +298,6 @@ def _read_page(reader: PageReader, recording: Recording, index: int, file: Volum
         seconds,
         code_seconds,
     )
-
-
-def _expect_next(reader: PageReader, header: Header | None, file: VolumeFile) -> None:
-    """After this page the next one of the same volume is expected."""
-    reader.expected = None
-    if header is not None and file.volume is not None and header.volume == file.volume.id:
-        following = file.volume.following(header.page)
-        reader.expected = None if following is None else replace(header, page=following)
 
 
 def lost_data(recovery: Recovery, out: Path, holes: bool) -> LostDataError | None:

@@ -11,8 +11,9 @@ from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
+from runtime.bulk.coded_pages import AIR_LEVELS
 from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.demo.demo import AIR_LEVELS, DemoResult, run_demo
+from runtime.demo.demo import DemoResult, run_demo
 
 
 @click.command()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import secrets
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import Code, load_code
 from lightpage.codec.page_codec import PageCodec
-from lightpage.codec.volume import Volume, encode_volume
+from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
@@ -73,9 +73,9 @@ def target_of(bundle: str | None, profile_name: str | None, code_path: Path | No
     "--code", "code_path", type=click.Path(path_type=Path), help="Code of its pages; the bundle's by default."
 )
 @click.option("--out", required=True, type=OutputFile(), help="The pages to write, PAGES.h5.")
-@click.option("--volume", "volume_id", default=1, show_default=True, help="Number that tells files on a medium apart.")
-@click.option("--data-pages", default=60, show_default=True, help="Data pages of a group.")
-@click.option("--parity-pages", default=4, show_default=True, help="Pages of a group that may be lost.")
+@click.option("--volume", "volume_id", type=int, help="Number that tells files on a medium apart; random if left out.")
+@click.option("--data-pages", default=DATA_PAGES, show_default=True, help="Data pages of a group.")
+@click.option("--parity-pages", default=PARITY_PAGES, show_default=True, help="Pages of a group that may be lost.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def encode(
     file: Path,
@@ -83,7 +83,7 @@ def encode(
     profile_name: str | None,
     code_path: Path | None,
     out: Path,
-    volume_id: int,
+    volume_id: int | None,
     data_pages: int,
     parity_pages: int,
     json_path: Path | None,
@@ -91,21 +91,27 @@ def encode(
     """Put FILE on pages to write: user bytes in, levels with pilots out."""
     target = target_of(bundle, profile_name, code_path)
     codec = PageCodec(target.code, target.mask)
+    number = secrets.randbits(32) if volume_id is None else volume_id
     try:
-        with file.open("rb") as source:
-            size = os.fstat(source.fileno()).st_size
-            volume = Volume(volume_id, size, codec.user_bytes, data_pages, parity_pages)
-            told = target.code.model_dump() | volume.to_json()
-            with PagesWriter(out, target.profile, target.code.levels, told) as writer:
-                batches = encode_volume(codec, volume, source, target.pilots)
-                for pages in track(batches, "encode", unit="batch"):
-                    writer.append(pages)
+        source = file.open("rb")
     except OSError as error:
         raise InvalidInputError(f"file {file}", error, "a file that can be read") from None
-    figures = {"file_bytes": size, "pages": volume.pages, "user_bytes_per_page": codec.user_bytes, "code": told}
+    with source:
+        volume = Volume.of_file(source, number, codec.user_bytes, data_pages, parity_pages)
+        told = target.code.model_dump() | volume.to_json()
+        with PagesWriter(out, target.profile, target.code.levels, told) as writer:
+            batches = encode_volume(codec, volume, source, target.pilots)
+            for pages in track(batches, "encode", unit="batch"):
+                writer.append(pages)
+    figures = {
+        "file_bytes": volume.file_bytes,
+        "pages": volume.pages,
+        "user_bytes_per_page": codec.user_bytes,
+        "code": told,
+    }
     if json_path is not None:
         write_json(json_path, figures)
     click.echo(
-        f"{out}: {volume.pages} pages of {target.code.levels} levels, {codec.user_bytes} user bytes each; "
-        f"{volume.file_pages} hold {size} bytes, {volume.pages - volume.file_pages} are parity"
+        f"{out}: volume {volume.id}, {volume.pages} pages of {target.code.levels} levels and {codec.user_bytes} bytes; "
+        f"{volume.file_pages} hold {volume.file_bytes} bytes, {volume.pages - volume.file_pages} are parity"
     )

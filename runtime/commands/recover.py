@@ -9,6 +9,7 @@ import click
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import load_code
 from lightpage.codec.volume_file import ranges
+from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording
@@ -25,7 +26,7 @@ from runtime.decoding.tracking import NoTracker
 @click.option("--recording", required=True, type=click.Path(), help="HDF5 recording of the file's pages.")
 @click.option("--code", "code_path", type=click.Path(path_type=Path), help="Code; the recording's or the bundle's.")
 @click.option("--out", required=True, type=OutputFile(), help="The file.")
-@click.option("--volume", "volume_id", type=click.IntRange(0), help="Which volume, where the recording holds several.")
+@click.option("--volume", metavar="ID[:CHECKSUM]", help="Which volume, where the recording holds several.")
 @click.option("--holes", is_flag=True, help="Write zeros where data are lost, in place of no file.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
@@ -35,7 +36,7 @@ def recover(
     recording: str,
     code_path: Path | None,
     out: Path,
-    volume_id: int | None,
+    volume: str | None,
     holes: bool,
     json_path: Path | None,
     threads: int | None,
@@ -50,7 +51,7 @@ def recover(
     with Recording.open(recording) as pages:
         code = code_of(pages, decoder.bundle) if code_path is None else load_code(code_path)
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
-        result = recover_file(decoder, pages, tracker, code, out, volume_id, holes)
+        result = recover_file(decoder, pages, tracker, code, out, *which(volume), holes=holes)
     if json_path is not None:
         write_json(json_path, result.to_json())
     click.echo(describe(result))
@@ -59,6 +60,22 @@ def recover(
         warn(f"recorded page {page.page}{number} gave no bytes: {page.reason}")
     if (error := lost_data(result, out, holes)) is not None:
         raise error
+
+
+def which(volume: str | None) -> tuple[int | None, int | None]:
+    """Number and checksum of a volume that is asked for.
+
+    Raises:
+        InvalidInputError: neither ID nor ID:CHECKSUM.
+    """
+    if volume is None:
+        return None, None
+    number, _, checksum = volume.partition(":")
+    try:
+        return int(number), int(checksum, 16) if checksum else None
+    except ValueError:
+        expected = "ID, or ID:CHECKSUM in hexadecimal digits"
+        raise InvalidInputError("--volume", repr(volume), expected) from None
 
 
 def describe(result: Recovery) -> str:

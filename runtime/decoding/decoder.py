@@ -92,6 +92,8 @@ class Decoder:
         if graph is None:
             self._check_graph()
             self.pilots(MAX_LEVELS)  # damaged pilots are noticed now, not with the first page
+            if bundle.code is not None:
+                _ = self.page_codec
             self._check_golden()
 
     @classmethod

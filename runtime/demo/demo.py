@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lightpage.codec.code import Code
 from lightpage.codec.volume import Volume, encode_volume
-from lightpage.codec.volume_file import VolumeFile
+from lightpage.codec.volume_file import Restored, VolumeFiles
 from lightpage.device.state import CameraPose, Device
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.information import achievable_rate
@@ -26,6 +26,7 @@ from lightpage.progress import Progress
 from lightpage.recording.pages import Pages, PagesWriter
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.simulator import SimulatorSource
+from runtime.bulk.coded_pages import AIR_LEVELS
 from runtime.client.answers import Recalibrated
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
@@ -40,9 +41,6 @@ from runtime.service.registry import ModelRegistry
 from runtime.wire.pages import RemotePage
 
 Floats = NDArray[np.float64]
-
-AIR_LEVELS = 256
-"""Level count of the AIR: fine enough that it does not bound what a phase carries."""
 
 GROUPS = 2
 PARITY_PAGES = 2
@@ -247,7 +245,7 @@ def write_pages(decoder: Decoder, path: Path, seed: int) -> Volume:
     """
     codec, content = decoder.page_codec, pgm(picture())
     data = -(-len(content) // codec.user_bytes)
-    volume = Volume(1 + seed, len(content), codec.user_bytes, -(-data // GROUPS), PARITY_PAGES)
+    volume = Volume.of_file(io.BytesIO(content), 1 + seed, codec.user_bytes, -(-data // GROUPS), PARITY_PAGES)
     profile, levels = decoder.bundle.profile, codec.code.levels
     rng = np.random.default_rng(seed)
     count = 0
@@ -296,7 +294,7 @@ def read_picture(
     pages: list[RemotePage] = []
     unread = 0
     margins: list[float] = []
-    with VolumeFile(path, volume.page_bytes, volume.id) as file:
+    with VolumeFiles(path) as files:
         for number in range(volume.pages):
             told(number / volume.pages)
             try:
@@ -310,11 +308,12 @@ def read_picture(
             if page.user_data is None or page.user_data.data is None:
                 unread += 1
                 continue
-            file.add(page.user_data)
+            files.add(page.user_data)
             margins.append(page.user_data.margin_bits)
-        done = file.restore()
-        if file.volume is not None:
-            file.complete()
+        file = files.chosen()
+        done = Restored((), ()) if file is None else file.restore()
+        if file is not None:
+            file.complete(done.lost)
     black = np.zeros_like(picture())
     if not margins:
         path.write_bytes(pgm(black))

@@ -63,8 +63,9 @@ def user_data_message(found: PageBytes) -> pb.UserData:
         else pb.PageHeader(
             volume=header.volume, page=header.page, volume_bytes=header.volume_bytes, code_id=header.code_id
         ),
-        data_pages=found.data_pages,
-        parity_pages=found.parity_pages,
+        data_pages=0 if found.file is None else found.file.data_pages,
+        parity_pages=0 if found.file is None else found.file.parity_pages,
+        file_checksum=0 if found.file is None else found.file.checksum,
         margin_bits=found.margin_bits,
         corrected=found.corrected,
         blocks=found.blocks,

@@ -12,15 +12,19 @@ from importlib.metadata import version as installed_version
 import grpc
 
 from lightpage.errors import FrameError, InvalidInputError, LimitError
+from lightpage.page.symbols import MAX_LEVELS
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.replies import data_reply, decode_reply, model_message, read_reply, result_message
 from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
+from runtime.service.dataplane import DataPlane, levels_for
 from runtime.service.recalibrator import Recalibrator, Step
 from runtime.service.user_data import read_data
 from runtime.wire.messages import PIXEL_CODES, check_options, pilots_of, pixel_type
 from runtime.wire.status import abort, status_of, without_folders
+
+_MOST_PAGES = 1 << 32
+"""Of a source: their numbers travel in 32 bits."""
 
 _log = logging.getLogger(__name__)
 
@@ -74,9 +78,10 @@ class LightpageServicer(pb_grpc.LightpageServicer):
                 header = _header(request_iterator)
             check_options(header.options)
             caller, user_data = _caller(context), header.options.want_user_data
-            levels = self._plane.levels_of(header.options.levels, user_data)
-            page_shape = self._plane.registry.current.decoder.bundle.profile.page_shape
-            pilots = pilots_of(header.pilots, page_shape, levels) if header.HasField("pilots") else None
+            levels = header.options.levels or None
+            decoder = self._plane.registry.current.decoder
+            page_shape, usual = decoder.bundle.profile.page_shape, levels_for(decoder, levels, MAX_LEVELS, user_data)
+            pilots = pilots_of(header.pilots, page_shape, usual) if header.HasField("pilots") else None
             shape = (header.rows_px, header.columns_px)
             with self._plane.receiving(shape, pixel_type(header.pixel_type), header.bit_depth, caller) as receiver:
                 with _stall_guard(context, receive_s):  # from here: waiting for the slot is not the client's doing
@@ -110,10 +115,17 @@ class LightpageServicer(pb_grpc.LightpageServicer):
     def ReadData(self, request: pb.ReadDataRequest, context: grpc.ServicerContext) -> Iterator[pb.ReadDataReply]:
         """Read the bytes of a range of pages."""
         with self._call("ReadData", context):
+            limits = self._plane.limits
             if request.pages < 1:
                 raise InvalidInputError("pages to read", request.pages, "at least 1")
-            for page in read_data(self._plane, request.first_page, request.pages, _caller(context)):
-                yield data_reply(page)
+            if request.pages > limits.range_pages:
+                raise LimitError("pages to read", request.pages, f"at most {limits.range_pages}")
+            if request.first_page + request.pages > _MOST_PAGES:
+                raise InvalidInputError("first page to read", request.first_page, f"less than {_MOST_PAGES} with all")
+            caller = _caller(context)
+            with self._plane.ranges.held(caller), _stall_guard(context, limits.range_s):
+                for page in read_data(self._plane, request.first_page, request.pages, caller):
+                    yield data_reply(page)
 
     def Recalibrate(
         self, request: pb.RecalibrateRequest, context: grpc.ServicerContext

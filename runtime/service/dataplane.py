@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.codec.header import Header
-from lightpage.codec.page_codec import PageBytes
+from lightpage.codec.page_codec import Loss, PageBytes
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import MAX_LEVELS
@@ -79,6 +79,7 @@ class DataPlane:
             _check_source(source, registry.current.decoder)
         self.receives = Slots(self.limits.concurrent_receives, "receives", self.limits.deadline_s)
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s)
+        self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s)
         self.metrics.in_service(registry.current.version)
 
     @property
@@ -120,18 +121,19 @@ class DataPlane:
         with self.receives.held(caller):
             yield PairReceiver(shape, dtype, self.limits.pair_bytes)
 
-    def levels_of(self, asked: int, user_data: bool) -> int:
-        """The level count that a caller's 0 stands for: that of the model's code for user bytes, else 256.
+    def check_user_data(self) -> None:
+        """Check that the source's pages can be read for their bytes.
 
         Raises:
-            BundleError: user bytes are asked for, and the model has no code.
+            BundleError: the model in service has no code.
+            SourceError: there is no source.
         """
-        return asked or (self.registry.current.decoder.page_codec.code.levels if user_data else MAX_LEVELS)
+        _ = self.source, self.registry.current.decoder.page_codec
 
     def decode(
         self,
         pair: FramePair,
-        levels: int,
+        levels: int | None,
         caller: Caller,
         pilots: Pilots | None = None,
         *,
@@ -143,7 +145,7 @@ class DataPlane:
 
         Args:
             pair: both frames.
-            levels: M.
+            levels: M; None stands for 256, or for that of the model's code where user bytes are asked for.
             caller: who waits; nothing is computed for one who has gone.
             pilots: known symbols where they differ from the device's pattern.
             start: when the call began, in `time.perf_counter` seconds.
@@ -165,10 +167,11 @@ class DataPlane:
             # Taken once: a swap in the meantime changes the next request, not this one.
             model = self.registry.current
             sure = pilots is None
+            levels = levels_for(model.decoder, levels, MAX_LEVELS, user_data)
             if user_data:
-                check_code_levels(model.decoder, levels)
                 pilots = pilots or model.decoder.written_pilots(levels)
-            page = self._decode(model, pair, levels, pilots, "frame pair", sure=sure)
+            with self._optics(user_data):
+                page = self._decode(model, pair, levels, pilots, "frame pair", sure=sure)
             found = self._user_data(model, page) if user_data else None
         return Answer(page, model.version, received - start, time.perf_counter() - start, found)
 
@@ -197,8 +200,6 @@ class DataPlane:
         """
         start = time.perf_counter()
         source = self.source
-        if levels is None:
-            levels = self.levels_of(0, True) if user_data else source.levels
         # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
         with self.decodes.held(caller):
             caller.check()
@@ -207,8 +208,9 @@ class DataPlane:
                 found = source.read(page)
             received = time.perf_counter()
             mask = self._mask(found, model.decoder)
-            if user_data:
-                check_code_levels(model.decoder, levels)
+            levels = levels_for(model.decoder, levels, source.levels, user_data)
+            if user_data and not np.array_equal(mask, model.decoder.bundle.pilot_mask):
+                raise SourceError(f"{source.name}: pilots", "other places", "those of the model in service")
             # Pilots are what was written, whatever level count the caller wants to see.
             if found.symbols is not None:
                 pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
@@ -216,11 +218,21 @@ class DataPlane:
                 own = model.decoder
                 pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
             subject = f"page {found.page_index} of {source.name}"
-            with own_fault(f"{subject}: "):
+            with own_fault(f"{subject}: "), self._optics(user_data):
                 decoded = self._decode(model, found.pair, levels, pilots, subject)
             data = self._user_data(model, decoded, expected) if user_data else None
         answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start, data)
         return ReadAnswer(answer, found, mask)
+
+    @contextmanager
+    def _optics(self, user_data: bool) -> Iterator[None]:
+        """Count a page whose bytes were asked for and that is not decoded."""
+        try:
+            yield
+        except (LostPageError, FrameError):
+            if user_data:
+                self.metrics.no_user_data(Loss.OPTICS)
+            raise
 
     def _user_data(self, model: Model, page: DecodedPage, expected: Header | None = None) -> PageBytes:
         """The bytes of a page that was decoded, counted."""
@@ -274,16 +286,25 @@ class DataPlane:
         return page
 
 
-def check_code_levels(decoder: Decoder, levels: int) -> None:
-    """Check that a page is decoded at the level count of its code.
+def levels_for(decoder: Decoder, asked: int | None, usual: int, user_data: bool) -> int:
+    """The level count to decode a page at.
+
+    Args:
+        decoder: of the model.
+        asked: by the caller; None leaves the choice.
+        usual: that None stands for where only symbols are asked for.
+        user_data: whether its bytes are asked for: then it must be that of the code.
 
     Raises:
-        BundleError: the model has no code.
-        InvalidInputError: it has another level count.
+        BundleError: user bytes are asked for, and the model has no code.
+        InvalidInputError: they are, and another level count.
     """
+    if not user_data:
+        return usual if asked is None else asked
     expected = decoder.page_codec.code.levels
-    if levels != expected:
-        raise InvalidInputError("levels", levels, f"{expected}, as the code of {decoder.version} has, or 0")
+    if asked not in (None, expected):
+        raise InvalidInputError("levels", asked, f"{expected}, as the code of {decoder.version} has, or 0")
+    return expected
 
 
 def _check_source(source: FrameSource, decoder: Decoder) -> None:

@@ -30,6 +30,15 @@ DEADLINE_S = 60.0
 RECALIBRATION_PAGES = 16
 """Pages that one recalibration reads into memory."""
 
+CONCURRENT_RANGES = 4
+"""Ranges of pages being read for their bytes: each holds a thread for as long as its caller takes."""
+
+RANGE_PAGES = 4096
+"""Pages of one range."""
+
+RANGE_S = 3600.0
+"""A range that is not read to its end by then is dropped, with a caller that does not take it."""
+
 GRACE_S = 10.0
 """Time that calls in flight get when the service is told to stop."""
 
@@ -49,4 +58,7 @@ class Limits:
     receive_s: float = RECEIVE_S
     deadline_s: float = DEADLINE_S
     recalibration_pages: int = RECALIBRATION_PAGES
+    concurrent_ranges: int = CONCURRENT_RANGES
+    range_pages: int = RANGE_PAGES
+    range_s: float = RANGE_S
     grace_s: float = GRACE_S

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
 
-from lightpage.codec.page_codec import PageBytes
+from lightpage.codec.page_codec import Loss, PageBytes
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import unconfirmed_page
 from runtime.errors import LostPageError, UnconfirmedPageError
@@ -65,6 +65,10 @@ class ServiceMetrics:
         self.margin.set(found.margin_bits)
         self.corrected.inc(found.corrected)
         self.code_iterations.set(found.iterations)
+
+    def no_user_data(self, loss: Loss) -> None:
+        """Count a page whose bytes were asked for and that was not decoded."""
+        self.data_pages.labels(loss.value).inc()
 
     def lost(self, error: LostPageError, *, tells: bool = True) -> None:
         """Count a page that was not given out; where it `tells` of the device, that is a sign of drift too."""

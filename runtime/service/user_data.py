@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
-from lightpage.codec.header import Header
 from lightpage.codec.page_codec import PageBytes
-from lightpage.codec.volume import Volume, restore_group
-from lightpage.errors import LightpageError
+from lightpage.codec.volume import Successor, Volume, restore_group
+from lightpage.errors import LightpageError, PageError
 from runtime.errors import LostPageError, SourceError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
+
+GROUPS = 4
+"""Groups whose pages are held: pages of a few files may take turns. A group of full-size pages is 40 MB."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class DataPage:
         source_page: its number in the source; None where its bytes were restored.
         found: what it gave; None where it could not be decoded.
         error: why not.
-        model_version: what decoded it; empty where nothing did.
+        model_version: what decoded it, or the last page of its group; empty where nothing did.
     """
 
     source_page: int | None
@@ -31,32 +33,31 @@ class DataPage:
     model_version: str = ""
 
 
+@dataclass
 class _Group:
-    """The pages of one group that were read, in one volume."""
+    """The pages of one group that were read."""
 
-    def __init__(self) -> None:
-        self.volume: Volume | None = None
-        self.number = -1
-        self.pages: dict[int, bytes] = {}
+    volume: Volume
+    number: int
+    last: PageBytes
+    model_version: str
+    pages: dict[int, bytes] = field(default_factory=dict)
 
-    def holds(self, volume: Volume, number: int) -> bool:
-        return self.volume == volume and self.number == number
-
-    def restored(self, template: PageBytes | None) -> Iterator[PageBytes]:
+    def restored(self) -> Iterator[DataPage]:
         """Data pages of the group that were not read, where the others give them."""
-        if self.volume is None or template is None or template.header is None:
-            return
         numbers = self.volume.numbers_in(self.number)[: self.volume.data_in(self.number)]
         absent = [number for number in numbers if number not in self.pages]
         whole = restore_group(self.volume, self.number, self.pages) if absent else None
-        for number in absent if whole is not None else ():
-            assert whole is not None  # for the type checker, which does not follow the line above
-            header = replace(template.header, page=number)
-            yield replace(template, header=header, data=whole[numbers.index(number)], corrected=0)
+        if whole is None or self.last.header is None:
+            return
+        for number in absent:
+            header = replace(self.last.header, page=number)
+            page = PageBytes(header, whole[numbers.index(number)], self.last.file, None, 0.0, 0, 0, 0, 0.0)
+            yield DataPage(None, page, model_version=self.model_version)
 
 
 def read_data(plane: DataPlane, first: int, count: int, caller: Caller) -> Iterator[DataPage]:
-    """Read pages `first` to `first + count - 1` of the source.
+    """Read pages `first` to `first + count - 1` of the source, or to its last one.
 
     Args:
         plane: reads and decodes.
@@ -66,40 +67,37 @@ def read_data(plane: DataPlane, first: int, count: int, caller: Caller) -> Itera
     Raises:
         BundleError: the model has no code.
         SourceError: there is no source.
-        PageError: no such page.
+        PageError: there is no page `first`.
     """
-    plane.levels_of(0, user_data=True)
-    _ = plane.source
-    group, last, expected = _Group(), None, None
+    plane.check_user_data()
+    groups: dict[tuple[Volume, int], _Group] = {}
+    successor = Successor()
     for index in range(first, first + count):
         try:
-            answer = plane.read_page(index, None, caller, user_data=True, expected=expected).answer
+            answer = plane.read_page(index, None, caller, user_data=True, expected=successor.header).answer
         except (LostPageError, SourceError) as error:
-            expected = _following(group.volume, expected)
+            successor = successor.after()
             yield DataPage(index, None, error)
             continue
+        except PageError:
+            if index == first:
+                raise
+            break
         found = answer.user_data
-        if found is None:
-            raise SourceError(f"page {index}", "no user data", "user data, as was asked for")
-        if found.data is not None and found.header is not None:
-            volume = Volume(
-                found.header.volume, found.header.volume_bytes, len(found.data), found.data_pages, found.parity_pages
-            )
-            number = found.header.page // volume.group_pages
-            if not group.holds(volume, number):
-                yield from (DataPage(None, page, model_version=answer.model_version) for page in group.restored(last))
-                group = _Group()
-                group.volume, group.number = volume, number
+        assert found is not None  # it was asked for
+        volume = Volume.of_page(found)
+        if volume is not None and found.header is not None and found.data is not None:
+            key = volume, found.header.page // volume.group_pages
+            if key not in groups and len(groups) == GROUPS:
+                yield from groups.pop(next(iter(groups))).restored()
+            group = groups.pop(key, None) or _Group(*key, found, answer.model_version)
+            groups[key] = group  # the one used last is the last to go
+            group.last, group.model_version = found, answer.model_version
             group.pages[found.header.page] = found.data
-            last = found
-        expected = _following(group.volume, found.header or expected)
+            if len(group.pages) == len(volume.numbers_in(group.number)):
+                del groups[key]  # nothing is missing
+            successor = Successor(volume, found.header)
+        successor = successor.after()
         yield DataPage(index, found, model_version=answer.model_version)
-    yield from (DataPage(None, page) for page in group.restored(last))
-
-
-def _following(volume: Volume | None, header: Header | None) -> Header | None:
-    """The header of the page after one; None where that is not known."""
-    if volume is None or header is None or header.volume != volume.id:
-        return None
-    following = volume.following(header.page)
-    return None if following is None else replace(header, page=following)
+    for group in groups.values():
+        yield from group.restored()

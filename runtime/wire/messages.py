@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.codec.header import Header
-from lightpage.codec.page_codec import Loss, PageBytes
+from lightpage.codec.page_codec import FileFacts, Loss, PageBytes
 from lightpage.errors import InvalidInputError, PageError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import check_levels, symbol_phases
@@ -104,8 +104,7 @@ def user_data_of(message: pb.UserData) -> PageBytes:
     return PageBytes(
         header,
         message.data if loss is None else None,
-        message.data_pages,
-        message.parity_pages,
+        FileFacts(message.data_pages, message.parity_pages, message.file_checksum) if loss is None else None,
         loss,
         message.iterations,
         message.failed_blocks,

@@ -9,6 +9,7 @@ import numpy as np
 from click.testing import CliRunner
 
 from lightpage.codec.code import Code
+from lightpage.errors import PageError
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import FramePair, RecordingWriter
 from runtime.acquisition.source import SourcePage
@@ -85,6 +86,8 @@ class ShownPages:
 
     def read(self, page: int | None = None) -> SourcePage:
         number = page or 0
+        if number >= len(self._symbols):
+            raise PageError("page of toy:pages", number, f"0..{len(self._symbols) - 1}")
         pair = self.device.page(self._symbols[number], CODE.levels, 0.1)
         return SourcePage(self._spoilt.get(number, lambda same: same)(pair), number)
 

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 from analysis.report.command import report
-from analysis.report.from_recovery import CAUSES, report_of_recovery
+from analysis.report.from_recovery import report_of_recovery
 from analysis.report.json_file import JsonFile
 from lightpage.codec.code import Code
-from lightpage.codec.page_codec import Loss
+from lightpage.codec.page_codec import LOSSES, Loss
 from lightpage.codec.volume import Volume
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
@@ -112,7 +112,7 @@ def test_losses_are_counted_by_cause(tmp_path: Path) -> None:
         ("optics", 1, 1 / 8),
         ("body", 2, 0.25),
     ]
-    assert set(CAUSES) == set(Loss)
+    assert set(LOSSES) == set(Loss)
 
 
 def test_lost_data_are_said_to_be_lost(tmp_path: Path) -> None:

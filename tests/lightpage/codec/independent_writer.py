@@ -348,7 +348,7 @@ class Sizes:
 
     @property
     def user_bytes(self) -> int:
-        return self.body_bytes - 6
+        return self.body_bytes - 10
 
 
 def header_bits(levels: int) -> int:
@@ -446,7 +446,16 @@ def body_levels(code: Parameters, sizes: Sizes, body: bytes) -> list[int]:
 
 
 def page_symbols(
-    code: Parameters, layout: Layout, user: bytes, *, volume: int, page: int, file_bytes: int, k: int, m: int
+    code: Parameters,
+    layout: Layout,
+    user: bytes,
+    *,
+    volume: int,
+    page: int,
+    file_bytes: int,
+    checksum: int,
+    k: int,
+    m: int,
 ) -> list[int]:
     """A page's symbols, pilots included, row by row."""
     data_symbols = layout.pilots.count(None)
@@ -454,7 +463,7 @@ def page_symbols(
     if len(user) != parts.user_bytes:
         raise ValueError("wrong number of user bytes")
     head = header(code, volume, page, file_bytes)
-    body = bytes([k, m]) + user
+    body = bytes([k, m]) + checksum.to_bytes(4, "big") + user
     body += crc_32c(head[:15] + body).to_bytes(4, "big")
     body = scrambled(body, (volume << 24) + page)
     count = parts.header_symbols
@@ -484,10 +493,11 @@ def page_users(file: bytes, length: int, *, k: int, m: int) -> dict[int, bytes]:
 def file_pages(code: Parameters, layout: Layout, file: bytes, *, volume: int, k: int, m: int) -> dict[int, np.ndarray]:
     """All pages of a file by their numbers: uint8 [rows, columns]."""
     users = page_users(file, page_user_bytes(code, layout), k=k, m=m)
+    facts = {"volume": volume, "file_bytes": len(file), "checksum": crc_32c(file), "k": k, "m": m}
     return {
-        page: np.array(
-            page_symbols(code, layout, user, volume=volume, page=page, file_bytes=len(file), k=k, m=m), dtype=np.uint8
-        ).reshape(layout.rows, layout.columns)
+        page: np.array(page_symbols(code, layout, user, page=page, **facts), dtype=np.uint8).reshape(
+            layout.rows, layout.columns
+        )
         for page, user in users.items()
     }
 
@@ -517,6 +527,7 @@ def write_pages(
         "page_bytes": page_user_bytes(code, layout),
         "data_pages": k,
         "parity_pages": m,
+        "checksum": crc_32c(file),
     }
     with h5py.File(path, "w") as out:
         out.attrs["format"] = "lightpage-pages"

@@ -6,11 +6,11 @@ import numpy as np
 
 from lightpage.codec.code import Code
 from lightpage.codec.header import Header
-from lightpage.codec.page_codec import PageCodec
+from lightpage.codec.page_codec import FileFacts, PageCodec
 from lightpage.page.symbols import symbol_phases
 
 SHAPE = (16, 24)
-GROUP = (5, 3)
+GROUP = FileFacts(5, 3, 0xFEDCBA98)
 
 
 def pilot_mask(shape: tuple[int, int] = SHAPE) -> np.ndarray:

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from lightpage.codec.code import Code
 from lightpage.codec.header import Header
-from lightpage.codec.page_codec import PageCodec
+from lightpage.codec.page_codec import FileFacts, PageCodec
 from lightpage.codec.volume import Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.page.symbols import pilot_mask, pilot_symbols
@@ -49,7 +49,7 @@ def project_pages(
 ) -> dict[int, np.ndarray]:
     """All pages of a file by their numbers, as the project makes them; `pilots` is a full page of levels."""
     codec = PageCodec(code, mask)
-    whole = Volume(volume, len(file), codec.user_bytes, k, m)
+    whole = Volume.of_file(io.BytesIO(file), volume, codec.user_bytes, k, m)
     pages = np.concatenate(list(encode_volume(codec, whole, io.BytesIO(file), pilots[mask])))
     numbers = [number for group in range(whole.groups) for number in whole.numbers_in(group)]
     return dict(zip(numbers, pages, strict=True))
@@ -112,12 +112,14 @@ def test_a_page_of_many_blocks_and_words_is_the_same(code: Code, blocks: int, wo
     assert (parts.blocks, parts.words) == (blocks, words)
     codec, user = PageCodec(code, mask), some_bytes(parts.user_bytes)
     header = Header(code.id, (1 << 32) - 2, (1 << 24) - 3, (1 << 40) - 4)
-    theirs = codec.encode([header], np.frombuffer(user, np.uint8)[None], (200, 55), pilots[mask])[0]
+    user_bytes, facts = np.frombuffer(user, np.uint8)[None], FileFacts(200, 55, 0x89ABCDEF)
+    theirs = codec.encode([header], user_bytes, facts, pilots[mask])[0]
     ours = writer.page_symbols(
         parameters(code),
         layout,
         user,
         volume=header.volume,
+        checksum=0x89ABCDEF,
         page=header.page,
         file_bytes=header.volume_bytes,
         k=200,

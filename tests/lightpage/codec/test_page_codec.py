@@ -58,7 +58,7 @@ class TestRoundTrip:
             found = codec.decode(*noisy(symbols, levels, np.inf, rng))
             assert found.data == data
             assert found.header == header
-            assert (found.data_pages, found.parity_pages) == GROUP
+            assert found.file == GROUP
             assert (found.loss, found.failed_blocks, found.corrected) == (None, 0, 0)
             assert found.blocks == codec.blocks == 1
             assert found.iterations <= 3  # bits that are not sent must be found first
@@ -95,7 +95,7 @@ class TestRoundTrip:
         total = codec.blocks * codec.ldpc.information_bits + 6 * len(body_places(codec))
         words = -(-(total // 12) // 4095)
         assert words == 2
-        assert codec.user_bytes == 12 * (total // 12 - 4 * words) // 8 - 6
+        assert codec.user_bytes == 12 * (total // 12 - 4 * words) // 8 - 10
         header = header_of(codec)
         data, symbols = written(codec, header, rng)
         phase, kappa = noisy(symbols, 256, kappa_of(256, 0.2), rng)
@@ -140,7 +140,7 @@ class TestCorrections:
             found = codec.decode(phase, kappa)
             assert found.failed_blocks == 0
             if all(
-                bit >= 8 * (codec.user_bytes + 6) for bit in bits
+                bit >= 8 * (codec.user_bytes + 10) for bit in bits
             ):  # none, or only parity: the body needs no mending
                 assert (found.data, found.corrected, found.loss) == (data, 0, None)
             elif wrong <= corrections:
@@ -208,7 +208,7 @@ def never_other_bytes(pages: int, seed: int, draw: object) -> Counter[Loss | Non
             assert found.loss is None
         else:
             assert found.loss is not None
-            assert (found.data_pages, found.parity_pages, found.corrected) == (0, 0, 0)
+            assert (found.file, found.corrected) == (None, 0)
         seen[found.loss] += 1
     return seen
 
@@ -270,13 +270,15 @@ class TestHeader:
         assert (found.header, found.data) == (header_of(self.CODEC), data)
 
     def test_it_is_believed_with_its_own_body_only(self) -> None:
-        """A header that can be read on the body of the page that was expected: something is wrong, so nothing is."""
-        _, phase, kappa = self.page(damaged=False)
+        """A header that can be read on the body of another page: the body's checksum says which page it is."""
+        data, phase, kappa = self.page(damaged=False)
         _, other = written(self.CODEC, header_of(self.CODEC, 4), np.random.default_rng(3))
         places = header_places(self.CODEC)
         phase.flat[places] = noisy(other, 64, np.inf, np.random.default_rng(4))[0].flat[places]
-        found = self.CODEC.decode(phase, kappa, header_of(self.CODEC))
+        found = self.CODEC.decode(phase, kappa)
         assert (found.header, found.data, found.loss) == (header_of(self.CODEC, 4), None, Loss.CHECKSUM)
+        found = self.CODEC.decode(phase, kappa, header_of(self.CODEC))
+        assert (found.header, found.data, found.loss) == (header_of(self.CODEC), data, None)
 
     def test_a_page_of_another_code_is_known_as_such(self) -> None:
         other = self.CODEC.code.id ^ 1

@@ -14,8 +14,8 @@ import pytest
 from lightpage.codec.header import MOST_BYTES
 from lightpage.codec.page_codec import PageBytes
 from lightpage.codec.volume import Volume, encode_volume, restore_group
-from lightpage.codec.volume_file import VolumeFile, ranges
-from lightpage.errors import InvalidInputError
+from lightpage.codec.volume_file import MOST_VOLUMES, VolumeFile, VolumeFiles, ranges
+from lightpage.errors import InvalidInputError, LostDataError
 from tests.lightpage.codec.light import codec_of, noisy
 from tests.lightpage.full_disk import full_disk
 
@@ -64,6 +64,7 @@ class TestNumbers:
             "page_bytes": 10,
             "data_pages": 5,
             "parity_pages": 3,
+            "checksum": 0,
         }
 
     @pytest.mark.parametrize(
@@ -118,29 +119,40 @@ def write(file: bytes, volume: Volume) -> Written:
 def written() -> Written:
     """23 data pages, the last not full, in groups of 5 + 3: the last group lacks two data pages."""
     file = np.random.default_rng(1).bytes(22 * SIZE + 5)
-    return write(file, Volume(0xCAFE, len(file), SIZE, 5, 3))
+    return write(file, whole(0xCAFE, file))
+
+
+def whole(number: int, file: bytes, data_pages: int = 5, parity_pages: int = 3) -> Volume:
+    return Volume.of_file(BytesIO(file), number, SIZE, data_pages, parity_pages)
+
+
+def chosen(files: VolumeFiles) -> VolumeFile:
+    """The only volume."""
+    found = files.chosen()
+    assert found is not None
+    return found
 
 
 def collect(path: Path, pages: Iterator[PageBytes] | list[PageBytes]) -> tuple[bytes, VolumeFile]:
     """The file that comes of pages."""
-    with VolumeFile(path, SIZE) as volume_file:
+    with VolumeFiles(path) as files:
         for page in pages:
-            assert volume_file.add(page)
-        volume_file.restore()
-        volume_file.complete()
+            assert files.add(page)
+        file = chosen(files)
+        file.restore()
+        file.complete()
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
-    return path.read_bytes(), volume_file
+    return path.read_bytes(), file
 
 
 class TestEncoding:
     def test_pages_hold_the_file_and_its_parity(self, written: Written) -> None:
-        k, m = written.volume.data_pages, written.volume.parity_pages
         for number, kind, place in listing(written.volume):
             page = written.pages[number]
             assert page.header is not None
             assert (page.header.volume, page.header.volume_bytes) == (0xCAFE, len(written.file))
             assert page.header.code_id == CODEC.code.id
-            assert (page.data_pages, page.parity_pages) == (k, m)
+            assert page.file == written.volume.facts
             if kind == "data":
                 assert page.data == written.file[place * SIZE :][:SIZE].ljust(SIZE, b"\0")
 
@@ -199,25 +211,25 @@ class TestFile:
         data = sorted(n for n, kind, _ in listing(volume) if kind == "data" and n in lost)
         assert data
         path = tmp_path / "file"
-        with VolumeFile(path, SIZE) as volume_file:
+        with VolumeFiles(path) as files:
             for number, page in reversed(written.pages.items()):
                 if number not in lost:
-                    volume_file.add(page)
-            assert volume_file.missing() == sorted(lost)
-            done = volume_file.restore()
+                    files.add(page)
+            assert chosen(files).missing() == sorted(lost)
+            done = chosen(files).restore()
             assert (done.restored, done.lost) == (tuple(data), ())
-            volume_file.complete()
+            chosen(files).complete()
         assert path.read_bytes() == written.file
 
     def test_data_that_are_lost_are_named_and_zero(self, written: Written, tmp_path: Path) -> None:
         path, lost = tmp_path / "file", {8, 9, 11, 14}  # three data pages and one parity page of the second group
-        with VolumeFile(path, SIZE) as volume_file:
+        with VolumeFiles(path) as files:
             for number, page in written.pages.items():
                 if number not in lost | {0}:
-                    volume_file.add(page)
-            done = volume_file.restore()
+                    files.add(page)
+            done = chosen(files).restore()
             assert (done.restored, done.lost) == ((0,), (8, 9, 11))
-            volume_file.complete()
+            chosen(files).complete(done.lost)
         expected = bytearray(written.file)
         for page in (5, 6, 8):
             expected[page * SIZE : (page + 1) * SIZE] = bytes(SIZE)
@@ -225,112 +237,128 @@ class TestFile:
 
     def test_lost_pages_at_the_end_leave_the_length_right(self, written: Written, tmp_path: Path) -> None:
         path = tmp_path / "file"
-        with VolumeFile(path, SIZE) as volume_file:
-            volume_file.add(written.pages[0])
-            assert volume_file.restore().lost == tuple(
-                n for n, kind, _ in listing(written.volume) if kind == "data" and n
-            )
-            volume_file.complete()
+        with VolumeFiles(path) as files:
+            files.add(written.pages[0])
+            lost = chosen(files).restore().lost
+            assert lost == tuple(n for n, kind, _ in listing(written.volume) if kind == "data" and n)
+            chosen(files).complete(lost)
         assert path.read_bytes() == written.file[:SIZE].ljust(len(written.file), b"\0")
 
     @pytest.mark.parametrize("size", [0, 1, SIZE - 1, SIZE, SIZE + 1, 5 * SIZE, 5 * SIZE + 1])
     @pytest.mark.parametrize("group", [(5, 3), (1, 0), (3, 1)])
     def test_files_of_any_length(self, tmp_path: Path, size: int, group: tuple[int, int]) -> None:
         file = np.random.default_rng(size).bytes(size)
-        case = write(file, Volume(1, size, SIZE, *group))
+        case = write(file, whole(1, file, *group))
         assert collect(tmp_path / "whole", list(case.pages.values()))[0] == file
         (tmp_path / "whole").unlink()
         if group[1]:
             kept = [page for number, page in case.pages.items() if number]  # without the first page
             assert collect(tmp_path / "restored", kept)[0] == file
 
-    def test_pages_of_another_volume_are_counted_and_left_out(self, written: Written, tmp_path: Path) -> None:
-        other = write(b"other", Volume(9, 5, SIZE, 5, 3))
-        for volume_id, first, file in ((None, written, written.file), (9, written, b"other"), (None, other, b"other")):
-            path = tmp_path / "file"
-            second = other if first is written else written
-            with VolumeFile(path, SIZE, volume_id) as volume_file:
-                taken = [volume_file.add(page) for case in (first, second) for page in case.pages.values()]
-                kept, foreign = (written, other) if file == written.file else (other, written)
-                assert taken.count(True) == len(kept.pages)
-                assert volume_file.foreign == {foreign.volume.id: len(foreign.pages)}
-                volume_file.restore()
-                volume_file.complete()
-            assert path.read_bytes() == file
+    def test_one_of_several_volumes_is_chosen(self, written: Written, tmp_path: Path) -> None:
+        path, others = tmp_path / "file", [write(b"other", whole(9, b"other")), write(b"third", whole(9, b"third"))]
+        with VolumeFiles(path) as files:
+            for case in (others[0], written, others[1]):
+                assert {files.add(page) for page in case.pages.values()} == {case.volume}
+            assert files.counts() == {case.volume: len(case.pages) for case in (others[0], written, others[1])}
+            for asked in ((), (9,), (8,), (written.volume.id, 1)):
+                with pytest.raises(InvalidInputError, match=r"volume: got pages of 9:.* 51966:.*; 9:.*ID:CHECK"):
+                    files.chosen(*asked)
+            assert files.chosen(9, others[1].volume.checksum).volume == others[1].volume
+            files.chosen(written.volume.id).complete()
+        assert path.read_bytes() == written.file
+        assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+    def test_the_files_checksum_tells_pages_of_two_files_apart(self, written: Written, tmp_path: Path) -> None:
+        """As if two files had the same number, size, groups and, by accident, checksum."""
+        other = write(written.file[::-1], whole(written.volume.id, written.file[::-1]))
+        with VolumeFiles(tmp_path / "file") as files:
+            for number, page in written.pages.items():
+                files.add(page if number % 2 else replace(other.pages[number], file=page.file))
+            assert chosen(files).restore().lost == ()
+            with pytest.raises(LostDataError, match="checksum as a file does not hold"):
+                chosen(files).complete()
+        assert list(tmp_path.iterdir()) == []
+
+    def test_two_processes_do_not_share_a_partial_file(self, written: Written, tmp_path: Path) -> None:
+        path = tmp_path / "file"
+        with VolumeFiles(path) as files, VolumeFiles(path) as second:
+            files.add(written.pages[0])
+            with pytest.raises(InvalidInputError, match="a file that another process writes"):
+                second.add(written.pages[1])
+            chosen(files).complete([1])
+        assert path.exists()
 
     def test_two_pages_of_a_number_with_different_bytes_are_refused(self, written: Written, tmp_path: Path) -> None:
         page = written.pages[6]
         other = replace(page, data=written.pages[5].data)
-        with VolumeFile(tmp_path / "file", SIZE) as volume_file:
-            volume_file.add(page)
+        with VolumeFiles(tmp_path / "file") as files:
+            files.add(page)
             with pytest.raises(InvalidInputError, match=r"volume 51966: page 6: got two pages of this number"):
-                volume_file.add(other)
-            assert volume_file.repeated == 0
+                files.add(other)
+            assert chosen(files).repeated == 0
 
-    @pytest.mark.parametrize("change", [{"data_pages": 6}, {"parity_pages": 2}])
-    def test_pages_that_disagree_about_their_groups_are_refused(
-        self, written: Written, tmp_path: Path, change: dict[str, int]
-    ) -> None:
-        with VolumeFile(tmp_path / "file", SIZE) as volume_file:
-            volume_file.add(written.pages[0])
-            with pytest.raises(
-                InvalidInputError, match=r"volume 51966: page 1: got .* \+ \d pages, wanted .*5 \+ 3 pag"
-            ):
-                volume_file.add(replace(written.pages[1], **change))
-
-    def test_pages_that_disagree_about_the_files_size_are_refused(self, written: Written, tmp_path: Path) -> None:
+    def test_pages_that_disagree_about_the_file_are_of_other_volumes(self, written: Written, tmp_path: Path) -> None:
         page = written.pages[1]
-        assert page.header is not None
-        with VolumeFile(tmp_path / "file", SIZE) as volume_file:
-            volume_file.add(written.pages[0])
-            with pytest.raises(
-                InvalidInputError, match=rf"page 1: got 5 bytes in .*wanted {len(written.file)} bytes in"
-            ):
-                volume_file.add(replace(page, header=replace(page.header, volume_bytes=5)))
+        changes = [
+            replace(page, file=replace(page.file, data_pages=6)),
+            replace(page, file=replace(page.file, parity_pages=2)),
+            replace(page, file=replace(page.file, checksum=1)),
+            replace(page, header=replace(page.header, volume_bytes=len(written.file) - 1)),
+        ]
+        with VolumeFiles(tmp_path / "file") as files:
+            volumes = {files.add(each) for each in (written.pages[0], *changes)}
+        assert len(volumes) == 5
+        assert None not in volumes
 
     @pytest.mark.parametrize("number", [4 * 8 + 3, 4 * 8 + 4, 5 * 8, (1 << 24) - 1])
-    def test_a_number_beyond_the_files_end_is_refused(self, written: Written, tmp_path: Path, number: int) -> None:
+    def test_a_number_beyond_the_files_end_is_of_no_volume(self, written: Written, tmp_path: Path, number: int) -> None:
         page = written.pages[0]
-        assert page.header is not None
-        with VolumeFile(tmp_path / "file", SIZE) as volume_file:
-            volume_file.add(page)
-            with pytest.raises(InvalidInputError, match=f"page {number}: got a number beyond the file's end"):
-                volume_file.add(replace(page, header=replace(page.header, page=number)))
+        with VolumeFiles(tmp_path / "file") as files:
+            assert files.add(replace(page, header=replace(page.header, page=number))) is None
+            assert files.add(replace(page, file=replace(page.file, data_pages=0))) is None
+            assert files.add(replace(page, data=None)) is None
+            assert files.counts() == {}
+
+    def test_more_volumes_than_are_collected_are_counted(self, written: Written, tmp_path: Path) -> None:
+        page = written.pages[0]
+        with VolumeFiles(tmp_path / "file") as files:
+            for checksum in range(MOST_VOLUMES + 3):
+                files.add(replace(page, file=replace(page.file, checksum=checksum)))
+            assert (len(files.counts()), files.dropped) == (MOST_VOLUMES, 3)
 
     def test_no_page_makes_no_file(self, tmp_path: Path) -> None:
-        with VolumeFile(tmp_path / "file", SIZE) as volume_file:
-            assert volume_file.missing() == []
-            assert volume_file.restore().lost == ()
-            with pytest.raises(InvalidInputError, match=r"file .*file: got no page, wanted at least one"):
-                volume_file.complete()
+        with VolumeFiles(tmp_path / "file") as files:
+            assert files.chosen(7) is None
         assert list(tmp_path.iterdir()) == []
 
     def test_a_file_that_is_not_completed_is_not_there(self, written: Written, tmp_path: Path) -> None:
         path = tmp_path / "file"
         path.write_bytes(b"earlier")
-        with VolumeFile(path, SIZE) as volume_file:
-            volume_file.add(written.pages[0])
-        with pytest.raises(KeyboardInterrupt), VolumeFile(path, SIZE) as volume_file:  # noqa: PT012
-            volume_file.add(written.pages[0])
+        with VolumeFiles(path) as files:
+            files.add(written.pages[0])
+        with pytest.raises(KeyboardInterrupt), VolumeFiles(path) as files:  # noqa: PT012
+            files.add(written.pages[0])
             raise KeyboardInterrupt
         assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
         assert path.read_bytes() == b"earlier"
 
-    def test_a_folder_that_is_not_there_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(
-            InvalidInputError, match=r"file .*file\.partial: got No such file.*wanted a file that can be w"
+    def test_a_folder_that_is_not_there_is_refused(self, written: Written, tmp_path: Path) -> None:
+        with (
+            VolumeFiles(tmp_path / "no" / "file") as files,
+            pytest.raises(InvalidInputError, match=r"\.partial: got No such file.*wanted a file that can be w"),
         ):
-            VolumeFile(tmp_path / "no" / "file", SIZE)
+            files.add(written.pages[0])
 
 
 def make_file(path: Path, pages: list[PageBytes], room_for_pages: int, room_to_restore: int) -> None:
     """Make the file of pages on a disk that is full beyond so many bytes."""
-    with VolumeFile(path, SIZE) as volume_file:
+    with VolumeFiles(path) as files:
         with full_disk(room_for_pages):
             for page in pages:
-                volume_file.add(page)
+                files.add(page)
         with full_disk(room_to_restore):
-            volume_file.restore()
+            chosen(files).restore()
 
 
 class TestFullDisk:
@@ -338,23 +366,23 @@ class TestFullDisk:
 
     @pytest.mark.parametrize("room", [0, SIZE, 2 * SIZE + 10])
     def test_pages_that_find_no_room_leave_nothing(self, written: Written, tmp_path: Path, room: int) -> None:
-        with pytest.raises(InvalidInputError, match=r"file .*file\.partial: got .*wanted room for it on the disk"):
+        with pytest.raises(InvalidInputError, match=r"file .*file\..*partial: got .*wanted room for it on the disk"):
             make_file(tmp_path / "file", list(written.pages.values()), room, self.ENOUGH)
         assert list(tmp_path.iterdir()) == []
 
     def test_restored_pages_that_find_no_room_leave_nothing(self, written: Written, tmp_path: Path) -> None:
         pages = [page for number, page in written.pages.items() if number not in (8, 9)]
-        with pytest.raises(InvalidInputError, match=r"file .*file\.partial: got .*wanted room for it on the disk"):
+        with pytest.raises(InvalidInputError, match=r"file .*file\..*partial: got .*wanted room for it on the disk"):
             make_file(tmp_path / "file", pages, self.ENOUGH, 5 * SIZE)
         assert list(tmp_path.iterdir()) == []
 
     def test_a_file_that_cannot_be_completed_leaves_the_earlier_one(self, written: Written, tmp_path: Path) -> None:
         path = tmp_path / "file"
         path.mkdir()  # no file can have this name
-        with VolumeFile(path, SIZE) as volume_file:
-            volume_file.add(written.pages[0])
+        with VolumeFiles(path) as files:
+            files.add(written.pages[0])
             with pytest.raises(InvalidInputError, match=r"file .*file: got .*wanted a file that can be completed"):
-                volume_file.complete()
+                chosen(files).complete([1])
         assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 

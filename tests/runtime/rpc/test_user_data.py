@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 from lightpage.codec.page_codec import Loss
-from lightpage.errors import BundleError, InvalidInputError, PageError
+from lightpage.errors import BundleError, InvalidInputError, LimitError, PageError
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.rpc.server import LightpageServer
+from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
+from runtime.service.user_data import read_data
 from tests.runtime import coded, toy
 
 
@@ -53,7 +55,8 @@ def test_a_page_carries_its_bytes_when_asked(serve) -> None:  # type: ignore[no-
         assert found.data == coded.CONTENT[size : 2 * size]
         assert found.header is not None
         assert (found.header.volume, found.header.page, found.header.volume_bytes) == (9, 1, 1000)
-        assert (found.loss, found.data_pages, found.parity_pages, page.levels) == (None, 3, 2, 32)
+        assert (found.loss, page.levels) == (None, 32)
+        assert (found.file.data_pages, found.file.parity_pages) == (3, 2)
         assert found.margin_bits > 0
     assert client.decode(pair, 32).user_data is None
     assert plane.metrics.registry.get_sample_value("lightpage_data_pages_total", {"loss": "none"}) == 2
@@ -92,8 +95,7 @@ def test_a_range_is_streamed_and_lost_pages_are_restored(serve) -> None:  # type
     assert "frames that contradict each other" in found[0].error
     restored = {each.user_data.header.page: each.user_data.data for each in found if each.page is None}
     assert restored == {0: coded.CONTENT[:size], 1: coded.CONTENT[size : 2 * size]}  # of group 1 too many are lost
-    # restored pages follow at the end of their group, before the next group's first page
-    assert [each.page for each in found].index(None) == 5
+    assert found[-1].page is None  # restored pages follow at the end
     read = {each.user_data.header.page: each.user_data.data for each in found if each.user_data.data is not None}
     assert read[2] == coded.CONTENT[2 * size : 3 * size]
 
@@ -102,4 +104,32 @@ def test_ranges_that_are_none(serve) -> None:  # type: ignore[no-untyped-def]
     client, _, _ = serve()
     with pytest.raises(InvalidInputError, match="pages to read: got 0, wanted at least 1"):
         list(client.read_data(0, 0))
-    assert issubclass(PageError, InvalidInputError)
+    with pytest.raises(LimitError, match="pages to read: got 4097, wanted at most 4096"):
+        list(client.read_data(0, 4097))
+    with pytest.raises(InvalidInputError, match="first page to read: got 4294967295"):
+        list(client.read_data((1 << 32) - 1, 2))
+    with pytest.raises(PageError, match="page of toy:pages"):
+        list(client.read_data(99, 1))
+
+
+def test_a_range_ends_with_the_source(serve) -> None:  # type: ignore[no-untyped-def]
+    client, _, pages = serve({0: coded.half_lost})
+    found = list(client.read_data(0, 1000))
+    assert len(found) == len(pages) + 1
+    assert found[-1].user_data.header.page == 0
+
+
+def test_files_whose_pages_take_turns_are_restored(serve) -> None:  # type: ignore[no-untyped-def]
+    _, plane, pages = serve()
+    folder = plane.registry.current.decoder.bundle.path.parent / "other"
+    folder.mkdir()
+    other = coded.pages(coded.bundle(folder / "toy.zip"), folder, b"y" * 400)
+    mixed = [page for pair in zip(pages[:5], other[:5], strict=True) for page in pair]
+    source = coded.ShownPages(mixed, {2: coded.half_lost, 3: coded.half_lost})
+    both = DataPlane(plane.registry, source)
+    found = list(read_data(both, 0, 10, Caller()))
+    restored = [(page.found.header.page, page.found.file.checksum) for page in found if page.source_page is None]
+    assert len(restored) == 2
+    assert {number for number, _ in restored} == {1}
+    assert len({checksum for _, checksum in restored}) == 2
+    assert all(page.model_version == "toy-1" for page in found)

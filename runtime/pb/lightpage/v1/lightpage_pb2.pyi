@@ -228,7 +228,7 @@ class DecodeReply(_message.Message):
     def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ..., claimed_bits: _Optional[float] = ..., confirmed_bits: _Optional[float] = ..., recalibration_due: _Optional[bool] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ...) -> None: ...
 
 class UserData(_message.Message):
-    __slots__ = ("data", "loss", "header", "data_pages", "parity_pages", "margin_bits", "corrected", "blocks", "failed_blocks", "iterations")
+    __slots__ = ("data", "loss", "header", "data_pages", "parity_pages", "margin_bits", "corrected", "blocks", "failed_blocks", "iterations", "file_checksum")
     DATA_FIELD_NUMBER: _ClassVar[int]
     LOSS_FIELD_NUMBER: _ClassVar[int]
     HEADER_FIELD_NUMBER: _ClassVar[int]
@@ -239,6 +239,7 @@ class UserData(_message.Message):
     BLOCKS_FIELD_NUMBER: _ClassVar[int]
     FAILED_BLOCKS_FIELD_NUMBER: _ClassVar[int]
     ITERATIONS_FIELD_NUMBER: _ClassVar[int]
+    FILE_CHECKSUM_FIELD_NUMBER: _ClassVar[int]
     data: bytes
     loss: DataLoss
     header: PageHeader
@@ -249,7 +250,8 @@ class UserData(_message.Message):
     blocks: int
     failed_blocks: int
     iterations: float
-    def __init__(self, data: _Optional[bytes] = ..., loss: _Optional[_Union[DataLoss, str]] = ..., header: _Optional[_Union[PageHeader, _Mapping]] = ..., data_pages: _Optional[int] = ..., parity_pages: _Optional[int] = ..., margin_bits: _Optional[float] = ..., corrected: _Optional[int] = ..., blocks: _Optional[int] = ..., failed_blocks: _Optional[int] = ..., iterations: _Optional[float] = ...) -> None: ...
+    file_checksum: int
+    def __init__(self, data: _Optional[bytes] = ..., loss: _Optional[_Union[DataLoss, str]] = ..., header: _Optional[_Union[PageHeader, _Mapping]] = ..., data_pages: _Optional[int] = ..., parity_pages: _Optional[int] = ..., margin_bits: _Optional[float] = ..., corrected: _Optional[int] = ..., blocks: _Optional[int] = ..., failed_blocks: _Optional[int] = ..., iterations: _Optional[float] = ..., file_checksum: _Optional[int] = ...) -> None: ...
 
 class PageHeader(_message.Message):
     __slots__ = ("volume", "page", "volume_bytes", "code_id")

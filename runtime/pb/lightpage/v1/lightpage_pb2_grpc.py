@@ -104,9 +104,9 @@ class LightpageServicer:
         raise NotImplementedError('Method not implemented!')
 
     def ReadData(self, request, context):
-        """Read a range of pages from the service's own source and send their user bytes, a message a page. Where pages of a
-        group are lost and enough of it was read, their bytes follow at the end of the group, restored from parity. A lost page
-        ends nothing: its message says why.
+        """Read a range of pages from the service's own source and send their user bytes, a message a page. A lost page ends
+        nothing: its message says why. Where data pages of a group are missing and enough of it was read, their bytes follow
+        once three other groups have begun, or at the end; their figures are 0. The range ends with the source's last page.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
