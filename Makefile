@@ -90,6 +90,7 @@ bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 
 bench-codec: $(STAMP)  ## user bytes on recorded pages, wrong bytes ever given out, time of the code: about three hours
 	$(BIN)/python -m analysis.codec.ledger --out runs/bench-codec
+	$(BIN)/python -m analysis.codec.refit --recording runs/bench-codec/32e/known.h5 --bundle runs/bench-codec/32e/kept.zip
 	$(ONE_THREAD) $(BIN)/python -m analysis.codec.safety --json runs/bench-codec/safety.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.codec.speed --json runs/bench-codec/speed.json
 

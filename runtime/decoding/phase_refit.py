@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from lightpage.page.pilots import Pilots
 
 ROUNDS = 5
-"""Of expectation maximisation. More gain nothing where levels are told apart, and fit noise where they are not."""
+"""Of expectation maximisation. More gain nothing where levels are told apart, and fit noise where they are not:
+`python -m analysis.codec.refit` prints it."""
 
 _NEIGHBOURS = 4
 """Levels on either side of the nearest one that may be the true one."""
@@ -50,7 +51,12 @@ class PhaseRefit:
         self._taken = np.arange(0, ny * nx, -(-ny * nx // _MOST_SYMBOLS))
 
     def error(
-        self, phase: NDArray[np.floating], concentration: NDArray[np.floating], levels: int, pilots: Pilots
+        self,
+        phase: NDArray[np.floating],
+        concentration: NDArray[np.floating],
+        levels: int,
+        pilots: Pilots,
+        rounds: int = ROUNDS,
     ) -> NDArray[np.float32]:
         """The smooth error of a page's phases, radians [ny, nx]: to be taken off.
 
@@ -59,6 +65,7 @@ class PhaseRefit:
             concentration: von Mises kappa, [ny, nx].
             levels: M.
             pilots: the known symbols of this page.
+            rounds: of expectation maximisation.
         """
         known = np.full(self._shape, np.nan)
         known[pilots.mask] = pilots.phases
@@ -69,7 +76,7 @@ class PhaseRefit:
         basis = self._basis[:, self._taken]
         normal = (basis * kappa) @ basis.T + np.eye(len(basis)) / _PRIOR_RAD**2
         step, coefficients = 2 * np.pi / levels, np.zeros(len(basis))
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             left = mu - coefficients @ basis
             distance = _mean_distance(left, kappa, step)
             distance[is_known] = _wrapped(left[is_known] - truth[is_known])
