@@ -61,6 +61,8 @@ def simulate(
         if written is not None and levels not in (None, written.levels):
             raise InvalidInputError("--levels", levels, f"{written.levels}, as {symbols} has, or nothing")
         many = levels or MAX_LEVELS if written is None else written.levels
+        if written is not None:
+            written.check()
         job = RecordingJob(profile, device, many, seed, truth, out, written)
         job.claim(force)
         job.run(pages or len(written or ()))

@@ -42,7 +42,7 @@ class Code(BaseModel):
         try:
             bits = level_bits(self.levels)
         except LightpageError as error:
-            raise ValueError(str(error)) from None
+            raise ValueError(f"{self.levels} levels are not {error.expected}") from None
         if self.coded_bits > bits:
             raise ValueError(f"{self.coded_bits} coded bits are more than the {bits} of {self.levels} levels")
         return self
@@ -88,8 +88,14 @@ def parse_code(text: str, subject: str) -> Code:
     except tomllib.TOMLDecodeError as error:
         raise InvalidInputError(subject, f"text that is not TOML ({error})", "the parameters of a code") from None
     except ValidationError as error:
-        problems = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'code'}: {e['msg']}" for e in error.errors())
-        raise InvalidInputError(subject, problems, "the parameters of a code") from None
+        raise InvalidInputError(subject, problems_of(error), "the parameters of a code") from None
+
+
+def problems_of(error: ValidationError) -> str:
+    """What is wrong with the parameters of a code, in a line."""
+    return "; ".join(
+        f"{'.'.join(map(str, e['loc'])) or 'code'}: {e['msg'].removeprefix('Value error, ')}" for e in error.errors()
+    )
 
 
 def load_code(path: str | Path) -> Code:

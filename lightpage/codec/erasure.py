@@ -27,7 +27,7 @@ def check_group(data_pages: int, parity_pages: int) -> None:
         raise InvalidInputError(
             "group of pages",
             f"{data_pages} data and {parity_pages} parity pages",
-            f"at least one data page, {MOST_GROUP_PAGES} pages at most",
+            f"at least 1 and at least 0, {MOST_GROUP_PAGES} at most in all",
         )
 
 

@@ -132,10 +132,13 @@ class Pages:
         Raises:
             RecordingError: missing, truncated, foreign or inconsistent.
         """
+        expected = "a readable, complete HDF5 file"
+        if not path.is_file():
+            raise RecordingError(f"pages {path}", "no regular file" if path.exists() else "no such file", expected)
         try:
             file = h5py.File(str(path), "r")
         except OSError as error:
-            raise RecordingError(f"pages {path}", error, "a readable, complete HDF5 file") from None
+            raise RecordingError(f"pages {path}", error, expected) from None
         try:
             return cls(file, path)
         except BaseException:
@@ -168,6 +171,22 @@ class Pages:
         """Symbols as (rows, columns)."""
         _, rows, columns = self._symbols.shape
         return int(rows), int(columns)
+
+    def check(self) -> None:
+        """Read every page once, before long work is begun on them.
+
+        Raises:
+            RecordingError: a page cannot be read, or holds a symbol beyond the levels; or `code` is no JSON object.
+        """
+        for _ in self:
+            pass
+        text = self._file.attrs.get("code")
+        try:
+            told = {} if text is None else json.loads(text)
+        except (TypeError, ValueError):
+            told = None
+        if not isinstance(told, dict):
+            raise RecordingError(f"pages {self.path}: attribute 'code'", repr(text)[:100], "a JSON object, or none")
 
     def __getitem__(self, page: int) -> NDArray[np.uint8]:
         """The symbols [ny, nx] of one page.

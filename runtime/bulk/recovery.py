@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 from scipy.stats import beta
 
-from lightpage.codec.code import Code
+from lightpage.codec.code import Code, problems_of
 from lightpage.codec.header import Header
 from lightpage.codec.page_codec import LOSSES, Loss, PageBytes, PageCodec
 from lightpage.codec.volume import Successor, Volume
@@ -160,12 +161,14 @@ def code_of(recording: Recording, bundle: Bundle) -> Code:
             expected = "--code CODE.toml, as `lightpage code` makes it"
             raise InvalidInputError(f"{bundle.subject}, recording {recording.path}", "no code in either", expected)
         return bundle.code
+    subject, expected = f"recording {recording.path}: attribute 'code'", "the parameters of a code as JSON"
     try:
         told = json.loads(text)
         return Code.model_validate({key: told[key] for key in Code.model_fields if key in told})
+    except ValidationError as error:
+        raise RecordingError(subject, problems_of(error), expected) from None
     except (ValueError, TypeError) as error:
-        expected = "the parameters of a code as JSON"
-        raise RecordingError(f"recording {recording.path}: attribute 'code'", error, expected) from None
+        raise RecordingError(subject, error, expected) from None
 
 
 def recover(
@@ -300,19 +303,31 @@ def _read_page(reader: PageReader, recording: Recording, index: int, files: Volu
     )
 
 
+def told_losses(pages: Sequence[RecoveredPage]) -> list[str]:
+    """A line for each cause by which pages gave no bytes, with the pages and, of one alone, the reason."""
+    groups: dict[tuple[Loss, int | None], list[RecoveredPage]] = {}
+    for page in pages:
+        if page.loss is not None:
+            groups.setdefault((page.loss, page.volume), []).append(page)
+    lines = []
+    for (loss, volume), some in groups.items():
+        many = "s" if len(some) > 1 else ""
+        numbers = ranges([page.number for page in some if page.number is not None])
+        where = f" (page{many} {numbers} of volume {volume})" if numbers else ""
+        reason = some[0].reason if len(some) == 1 else LOSSES[loss]
+        lines.append(f"recorded page{many} {ranges([page.page for page in some])}{where}: {reason}")
+    return lines
+
+
 def lost_data(recovery: Recovery, out: Path, holes: bool) -> LostDataError | None:
     """The error that `recover` ends with where data are lost, which names every page; None where none are."""
     if recovery.volume is not None and not recovery.lost:
         return None
-    told = "; ".join(
-        f"recorded page {page.page}"
-        + ("" if page.number is None else f" (page {page.number} of volume {page.volume})")
-        + f": {page.reason}"
-        for page in recovery.unread
-    )
+    told = "; ".join(told_losses(recovery.unread))
     unread = f"{len(recovery.unread)} of {len(recovery.pages)} pages gave no bytes ({told})" if told else ""
     if recovery.volume is None:
-        return LostDataError(f"file {out}", unread or "no page", "at least one page that can be read")
+        expected = "at least one page that can be read: pages, bundle and code of this device"
+        return LostDataError(f"file {out}", unread or "no page", expected)
     data = f"data pages {ranges(recovery.lost)} of volume {recovery.volume.id} lost"
     state = "written with zeros in their place" if holes else "not written; --holes writes it with zeros"
     got = f"{data}, {state}" + (f"; {unread}" if unread else "")

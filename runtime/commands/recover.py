@@ -13,7 +13,7 @@ from lightpage.errors import InvalidInputError
 from lightpage.files import write_json
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording
-from runtime.bulk.recovery import Recovery, code_of, lost_data
+from runtime.bulk.recovery import Recovery, code_of, lost_data, told_losses
 from runtime.bulk.recovery import recover as recover_file
 from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.decoding.decoder import Decoder
@@ -55,9 +55,8 @@ def recover(
     if json_path is not None:
         write_json(json_path, result.to_json())
     click.echo(describe(result))
-    for page in result.unread if not result.lost and result.volume is not None else ():
-        number = "" if page.number is None else f" (page {page.number} of volume {page.volume})"
-        warn(f"recorded page {page.page}{number} gave no bytes: {page.reason}")
+    for line in told_losses(result.unread) if not result.lost and result.volume is not None else ():
+        warn(f"no bytes: {line}")
     if (error := lost_data(result, out, holes)) is not None:
         raise error
 
@@ -82,11 +81,12 @@ def describe(result: Recovery) -> str:
     """The figures as a table for people."""
     figures, volume = result.to_json(), result.volume
     air, share, margin = figures["air_bytes_per_page"], figures["share_of_air"], figures["margin_bits_least"]
+    lost = f"data pages {ranges(result.lost)}" if result.lost else "none" if volume is not None else "all"
     rows = [
         ("code", result.code.describe()),
         ("recorded pages", f"{len(result.pages)}, of which {len(result.unread)} gave no bytes"),
         ("restored", f"data pages {ranges(result.restored)}" if result.restored else "none needed"),
-        ("lost", f"data pages {ranges(result.lost)}" if result.lost else "none"),
+        ("lost", lost),
         ("volume", "unknown" if volume is None else f"{volume.id}: {volume.file_bytes} bytes on {volume.pages} pages"),
         ("user bytes a page", f"{result.user_bytes_per_page}"),
         ("of the AIR", "symbols unknown" if share is None else f"{share:.3f} of {air:.0f} bytes"),

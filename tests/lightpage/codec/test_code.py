@@ -48,7 +48,7 @@ def test_what_may_be_left_out_has_a_default() -> None:
     [
         ("levels", "1", "levels: .*greater than or equal to 2"),
         ("levels", "512", "levels: .*less than or equal to 256"),
-        ("levels", "48", "got 48, wanted a power of two"),
+        ("levels", "48", "48 levels are not a power of two"),
         ("levels", "64.5", "levels: .*integer"),
         ("levels", '"many"', "levels: .*integer"),
         ("coded_bits", "0", "coded_bits: .*greater than or equal to 1"),

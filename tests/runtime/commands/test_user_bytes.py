@@ -77,7 +77,8 @@ def test_lost_pages_are_restored_and_named(
     assert result.exception is None
     assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
     assert (figures["pages_unread"], figures["restored"], figures["lost"]) == (3, [1, 2], [])
-    assert "recorded page 1 (page 1 of volume 9) gave no bytes" in caplog.text
+    assert "no bytes: recorded pages 1, 13 (pages 1, 13 of volume 9): it was not decoded" in caplog.text
+    assert "no bytes: recorded page 2 (page 2 of volume 9): its code does not converge" in caplog.text
     assert [page["number"] for page in figures["page_results"] if page["loss"]] == [1, 2, 13]
 
 
@@ -86,8 +87,8 @@ def test_too_many_lost_pages_are_named_and_leave_no_file(bundle: Path, pages: np
     result, figures = recovered(bundle, recording)
     assert isinstance(result.exception, LostDataError)
     assert "data pages 1-2 of volume 9 lost, not written" in str(result.exception)
-    for page in (1, 2, 3):
-        assert f"recorded page {page} (page {page} of volume 9)" in str(result.exception)
+    for told in ("recorded pages 1, 3 (pages 1, 3 of volume 9)", "recorded page 2 (page 2 of volume 9): its code"):
+        assert told in str(result.exception)
     assert figures["lost"] == [1, 2]
     assert not (tmp_path / "read.bin").exists()
     assert not list(tmp_path.glob("*.partial"))
@@ -227,7 +228,7 @@ class TestBadInput:
             ("--bundle B --profile bench", "both --bundle and --profile"),
             ("", "neither --bundle nor --profile"),
             ("--profile bench", "--profile without --code"),
-            ("--bundle B --code C --data-pages 0", "0 data and 4 parity pages"),
+            ("--bundle B --code C --data-pages 0", "0 data and 4 parity pages, wanted at least 1 and at least 0"),
             ("--bundle B --code C --data-pages 254 --parity-pages 2", "254 data and 2 parity pages"),
             ("--bundle B --code C --volume 4294967296", "volume id: got 4294967296"),
             ("--bundle B --code gone.toml", "code gone.toml: got No such file or directory"),
