@@ -14,6 +14,8 @@ from click.testing import CliRunner, Result
 from analysis.results.measurements import COMPARISONS, Measurement, collected, kept_measurements
 from analysis.results.page import PAGE, ROOT, Results, kilobytes, main, render
 from lightpage.errors import InvalidInputError
+from runtime.bundle.bundle import Bundle
+from runtime.bundle.shipped import bundle_path
 
 README = {
     "published, ray localizer": "ray",
@@ -66,6 +68,19 @@ def test_the_readme_says_what_the_kept_figures_say() -> None:
     assert told == [[name, f"{of['air']:.2f}", f"{of['page_kB']:.2f}"] for name, of in found if of is not None]
     shipped = kept["evaluation"].figures["air_bits_per_symbol"]
     assert f"148 pages and 4,800 steps read {shipped:.1f} bits" in readme
+    ledger = kept["ledger"].figures
+    dim, bright = ledger["32e"], ledger["bright"]
+    assert f"**{dim['user_bytes_per_page']:,} error-free bytes a page**" in readme
+    shares = f"{100 * dim['share_of_air']:.0f} and {100 * bright['share_of_air']:.0f}% of the AIR"
+    told = " ".join(readme.split())
+    assert f"{bright['user_bytes_per_page']:,} in bright light: {shares}, on {dim['pages']} of" in told
+    assert dim["pages_unread"] == bright["pages_unread"] == 0
+
+
+def test_the_ledger_is_that_of_the_shipped_code() -> None:
+    shipped = Bundle.open(bundle_path("bench")).code
+    assert shipped is not None
+    assert kept_measurements()["ledger"].figures["bright"]["code"] == shipped.model_dump()
 
 
 def test_no_kept_figures_are_long_or_of_an_unknown_source() -> None:
