@@ -5,10 +5,14 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
+
+from lightpage.errors import RecordingError
 
 FORMAT = "lightpage-recording"
 VERSION = 1
@@ -25,6 +29,29 @@ class FramePair:
 
     in_phase: NDArray[np.integer[Any]]
     quadrature: NDArray[np.integer[Any]]
+
+
+def open_hdf5(path: Path, subject: str) -> h5py.File:
+    """An HDF5 file opened for reading.
+
+    Raises:
+        RecordingError: missing, truncated, or something else.
+    """
+    expected = "a readable, complete HDF5 file"
+    if not path.is_file():
+        raise RecordingError(subject, "no regular file" if path.exists() else "no such file", expected)
+    try:
+        return h5py.File(str(path), "r")
+    except OSError as error:
+        raise RecordingError(subject, error, expected) from None
+
+
+def read_attribute(file: h5py.File, name: str, default: object = None) -> Any:
+    """A root attribute as a plain Python value."""
+    value = file.attrs.get(name, default)
+    if isinstance(value, (np.generic, np.ndarray)) and value.size == 1:
+        value = value.item()
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 
 def hash_frames(frames: FramePair) -> str:

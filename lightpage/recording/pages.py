@@ -21,17 +21,10 @@ from lightpage.errors import RecordingError
 from lightpage.files import move_into_place
 from lightpage.page.symbols import check_levels, check_symbols
 from lightpage.recording.hdf_file import HdfFile
+from lightpage.recording.layout import open_hdf5, read_attribute
 
 FORMAT = "lightpage-pages"
 VERSION = 1
-
-
-def read_attribute(file: h5py.File, name: str) -> Any:
-    """A root attribute as a plain Python value, None where there is none."""
-    value = file.attrs.get(name)
-    if isinstance(value, (np.generic, np.ndarray)) and value.size == 1:
-        value = value.item()
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 
 class PagesWriter:
@@ -132,13 +125,7 @@ class Pages:
         Raises:
             RecordingError: missing, truncated, foreign or inconsistent.
         """
-        expected = "a readable, complete HDF5 file"
-        if not path.is_file():
-            raise RecordingError(f"pages {path}", "no regular file" if path.exists() else "no such file", expected)
-        try:
-            file = h5py.File(str(path), "r")
-        except OSError as error:
-            raise RecordingError(f"pages {path}", error, expected) from None
+        file = open_hdf5(path, f"pages {path}")
         try:
             return cls(file, path)
         except BaseException:
@@ -171,6 +158,16 @@ class Pages:
         """Symbols as (rows, columns)."""
         _, rows, columns = self._symbols.shape
         return int(rows), int(columns)
+
+    def check_against(self, profile: Profile) -> None:
+        """Check that the pages are for devices of this profile.
+
+        Raises:
+            RecordingError: pages of another shape.
+        """
+        if self.page_shape != profile.page_shape:
+            expected = f"{profile.page_shape} (profile {profile.name})"
+            raise RecordingError(f"pages {self.path}", f"pages of {self.page_shape} symbols", expected)
 
     def check(self) -> None:
         """Read every page once, before long work is begun on them.

@@ -31,7 +31,9 @@ from lightpage.recording.layout import (
     FramePair,
     frame_type,
     hash_frames,
+    open_hdf5,
     page_hashes,
+    read_attribute,
 )
 from lightpage.recording.writer import RecordingWriter
 
@@ -65,13 +67,7 @@ class Recording:
                 file, the dataset or attribute, what came and what was wanted.
         """
         path = Path(path)
-        if not path.is_file():
-            came = "no regular file" if path.exists() else "no such file"
-            raise RecordingError(f"recording {path}", came, "a readable, complete HDF5 file")
-        try:
-            file = h5py.File(str(path), "r")
-        except OSError as error:
-            raise RecordingError(f"recording {path}", error, "a readable, complete HDF5 file") from None
+        file = open_hdf5(path, f"recording {path}")
         try:
             return cls(file, path)
         except BaseException:
@@ -230,10 +226,7 @@ class Recording:
 
     def _attribute(self, name: str, default: object = None) -> Any:
         """A root attribute as a plain Python value."""
-        value = self._file.attrs.get(name, default)
-        if isinstance(value, (np.generic, np.ndarray)) and value.size == 1:
-            value = value.item()
-        return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+        return read_attribute(self._file, name, default)
 
     def _whole(self, name: str, default: int | None = None) -> int:
         value = self._attribute(name, default)

@@ -9,7 +9,7 @@ import numpy as np
 
 from lightpage.device.profile import Profile, to_toml
 from lightpage.device.state import Device
-from lightpage.errors import InvalidInputError, RecordingError
+from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
 from lightpage.recording.pages import Pages
@@ -49,9 +49,8 @@ class RecordingJob:
     ) -> None:
         self.profile, self.device, self.levels, self.seed, self.truth = profile, device, levels, seed, truth
         self.out, self._written = out, written
-        if written is not None and written.page_shape != profile.page_shape:
-            expected = f"{profile.page_shape} (profile {profile.name})"
-            raise RecordingError(f"pages {written.path}", f"pages of {written.page_shape} symbols", expected)
+        if written is not None:
+            written.check_against(profile)
         self._simulator = Simulator(profile, device, levels, seed)
         self.partial = partial_path(out)
         self.settings = out.with_name(out.name + ".partial.toml")

@@ -10,7 +10,7 @@ import numpy as np
 
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device, load_device
-from lightpage.errors import InvalidInputError, PageError, RecordingError
+from lightpage.errors import InvalidInputError, PageError
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import FramePair
@@ -43,9 +43,8 @@ class SimulatorSource:
     ) -> None:
         from lightpage.simulator.simulator import Simulator
 
-        if written is not None and written.page_shape != profile.page_shape:
-            expected = f"{profile.page_shape} (profile {profile.name})"
-            raise RecordingError(f"pages {written.path}", f"pages of {written.page_shape} symbols", expected)
+        if written is not None:
+            written.check_against(profile)
         levels = levels if written is None else written.levels
         self._written = written
         self._simulator = Simulator(profile, device, levels, seed)

@@ -76,7 +76,7 @@ class Recovery:
         pages: every page of the recording.
         restored, lost: see `lightpage.codec.volume_file.Restored`.
         missing: numbers of pages of the volume that gave no bytes, parity included.
-        foreign: pages of other volumes, by "id:checksum".
+        foreign: pages of other volumes, by "id:checksum", and of "others" beyond the number that is collected.
         repeated: pages that came again.
         user_bytes_per_page: that a page holds.
         symbols_per_page: all of them, pilots included.
@@ -217,6 +217,9 @@ def recover(
         if file is not None and (holes or not done.lost):
             file.complete(done.lost)
         volume = None if file is None else file.volume
+        foreign = {f"{of.id}:{of.checksum:08x}": count for of, count in files.counts().items() if of != volume}
+        if files.dropped:
+            foreign["others"] = files.dropped
         return Recovery(
             code,
             volume,
@@ -224,7 +227,7 @@ def recover(
             done.restored,
             done.lost,
             () if file is None else tuple(file.missing()),
-            {f"{of.id}:{of.checksum:08x}": count for of, count in files.counts().items() if of != volume},
+            foreign,
             0 if file is None else file.repeated,
             codec.user_bytes,
             bundle.pilot_mask.size,

@@ -161,7 +161,7 @@ def test_the_other_benchmarks_are_collected_as_numbers(tmp_path: Path) -> None:
     assert kept["speed-bench"].figures == times
     page = (tmp_path / "page.md").read_text()
     assert "| 6.50 bits a symbol, 3.91 kB a page |" in page
-    assert "a drift that costs 50% of the AIR, recalibrated with 2 pages | 95% of the AIR before |" in page
+    assert "a drift that costs 50% of the AIR, recalibrated with 2 pages | 95.0% of the AIR before |" in page
     assert "image up to 12 pixels off | found 2 of 4 times |" in page
     assert "given out | 4 of 80 |" in page
     assert Results(kept).times("bench", "wave", "coherent") == 2
