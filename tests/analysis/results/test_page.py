@@ -70,10 +70,13 @@ def test_the_readme_says_what_the_kept_figures_say() -> None:
     assert f"148 pages and 4,800 steps read {shipped:.1f} bits" in readme
     ledger = kept["ledger"].figures
     dim, bright = ledger["32e"], ledger["bright"]
-    assert f"**{dim['user_bytes_per_page']:,} error-free bytes a page**" in readme
+    assert f"**{dim['user_bytes_per_page']:,} user bytes a page**" in readme
     shares = f"{100 * dim['share_of_air']:.0f} and {100 * bright['share_of_air']:.0f}% of the AIR"
     told = " ".join(readme.split())
-    assert f"{bright['user_bytes_per_page']:,} in bright light: {shares}, on {dim['pages']} of" in told
+    assert (
+        f"{bright['user_bytes_per_page']:,} in bright light. That is {shares}; {dim['pages']} of {dim['pages']}" in told
+    )
+    assert f"2x2 symbols holds {ledger['full-size 2x2']['user_bytes_per_page']:,} (4 of 4 read)" in told
     assert dim["pages_unread"] == bright["pages_unread"] == 0
 
 
