@@ -86,8 +86,8 @@ def data_sets(pages: int) -> dict[str, DataSet]:
     sets = [
         DataSet("bright", lambda _: bundle_path("bench"), load_profile("bench"), Device(), 120, pages),
         kept("32e", "bench/-0.6deg-32e-4px", 120, pages),
-        kept("full-size 4x4", "paper/-0.6deg-32e-4px", 4, 4),
-        kept("full-size 2x2", "paper/-0.6deg-32e-2px", 4, 4),
+        kept("full-size 4x4", "paper/-0.6deg-32e-4px", 8, 4),
+        kept("full-size 2x2", "paper/-0.6deg-32e-2px", 8, 4),
     ]
     return {each.name: each for each in sets}
 
