@@ -34,6 +34,30 @@ class Reason(StrEnum):
     """The same, and a search did not find the image: it lies further off, or the frames are not this page's."""
     TOO_FEW_PILOTS = "TOO_FEW_PILOTS"
     """The pilots agree, but are too few, or too dim, to tell a page from chance."""
+    MISSING_FRAME = "MISSING_FRAME"
+    """A camera sent no frame after a trigger."""
+    INCOMPLETE_FRAME = "INCOMPLETE_FRAME"
+    """Parts of a frame were lost on the way from a camera."""
+    SKIPPED_FRAME = "SKIPPED_FRAME"
+    """A frame's number does not follow the last one: a frame, or a trigger, was missed or doubled."""
+    STRAY_FRAME = "STRAY_FRAME"
+    """A frame came that no trigger was waiting for."""
+    OTHER_SHOT = "OTHER_SHOT"
+    """By its camera's clock a frame is not of this trigger."""
+    NOT_SYNCHRONISED = "NOT_SYNCHRONISED"
+    """The cameras' clocks do not agree with the trigger's for long enough to tell whose a frame is."""
+    CAMERA_GONE = "CAMERA_GONE"
+    """A camera does not answer any more."""
+    TRIGGER_GONE = "TRIGGER_GONE"
+    """The trigger does not answer any more."""
+    TRIGGER_REFUSED = "TRIGGER_REFUSED"
+    """The trigger answers with an error."""
+    NOT_ON_DISPLAY = "NOT_ON_DISPLAY"
+    """The page was not on display in time, or not until both frames were in."""
+    BEAM_CONTROL_FAILED = "BEAM_CONTROL_FAILED"
+    """A beam could not be blocked or let through."""
+    SATURATED = "SATURATED"
+    """So many pixels are saturated that a page cannot be read."""
 
 
 class LostPageError(LightpageError):
@@ -59,6 +83,10 @@ class LostPageError(LightpageError):
     def about(self, page: str) -> Self:
         """The same error, and of which page it is."""
         return type(self)(f"{page}: {self.subject}", self.got, self.expected, self.reason, self.recalibration_due)
+
+
+class LostShotError(LostPageError):
+    """A page was not photographed as one whole pair of frames; what is wrong is in the device."""
 
 
 class UnconfirmedPageError(LostPageError):

@@ -22,6 +22,19 @@ MAX_BIT_DEPTH = 16
 FRAMES = ("in_phase", "quadrature")
 REFERENCES = ("reference_in_phase", "reference_quadrature")
 
+CAMERAS = "cameras"
+"""Group of what cameras say; optional, with every dataset in it."""
+SHOT_DATA = {
+    "cameras/frame_ids": np.dtype(np.uint64),
+    "cameras/device_times_s": np.dtype(np.float64),
+    "cameras/host_times_s": np.dtype(np.float64),
+    "cameras/exposures_s": np.dtype(np.float64),
+}
+"""[page, 2], of the in-phase and the quadrature frame; an exposure that is not known is NaN."""
+DARK = ("cameras/dark_in_phase", "cameras/dark_quadrature")
+HOT = ("cameras/hot_in_phase", "cameras/hot_quadrature")
+LOSSES = "cameras/losses"
+
 
 @dataclass(frozen=True)
 class FramePair:
@@ -29,6 +42,44 @@ class FramePair:
 
     in_phase: NDArray[np.integer[Any]]
     quadrature: NDArray[np.integer[Any]]
+
+
+@dataclass(frozen=True)
+class FrameInfo:
+    """What a camera and its driver say of a frame.
+
+    Attributes:
+        serial: of the camera.
+        frame_id: the camera's own count of frames; it wraps.
+        device_time_s: of the exposure, by the camera's clock, seconds from any moment.
+        host_time_s: when the frame was complete, seconds since 1970.
+        pixel_format: as GenICam names it, e.g. ``Mono8``.
+        exposure_s: None where it is not known.
+    """
+
+    serial: str
+    frame_id: int
+    device_time_s: float
+    host_time_s: float
+    pixel_format: str
+    exposure_s: float | None = None
+
+
+@dataclass(frozen=True)
+class LostShot:
+    """A shot that gave no page.
+
+    Attributes:
+        page: that was to be photographed.
+        reason: a word, e.g. ``MISSING_FRAME``.
+        detail: for people.
+        time_s: seconds since 1970.
+    """
+
+    page: int
+    reason: str
+    detail: str
+    time_s: float
 
 
 def open_hdf5(path: Path, subject: str) -> h5py.File:

@@ -5,11 +5,12 @@ The layout is the contract with other people's devices. Root attributes: `format
 `black_level` (counts of a camera in the dark, 0 if absent; taken off when frames are read).
 Datasets: `in_phase` and `quadrature` [page, row, column], `reference_in_phase` and `reference_quadrature`
 [row, column], uint8 or uint16, counts right-aligned; optionally `symbols` uint8 [page, ny, nx] and `pilots`, boolean
-[ny, nx]. A simulator adds the group `truth`, which no decoder reads.
+[ny, nx]. A simulator adds the group `truth`, which no decoder reads. Cameras add the group `cameras`, see `layout`.
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -22,13 +23,20 @@ from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import ProfileError, RecordingError
 from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.layout import (
+    CAMERAS,
+    DARK,
     FORMAT,
     FRAMES,
+    HOT,
+    LOSSES,
     MAX_BIT_DEPTH,
     MIN_BIT_DEPTH,
     REFERENCES,
+    SHOT_DATA,
     VERSION,
+    FrameInfo,
     FramePair,
+    LostShot,
     frame_type,
     hash_frames,
     open_hdf5,
@@ -173,6 +181,59 @@ class Recording:
             RecordingError: the data cannot be read.
         """
         return self._read("pilots", ()).astype(np.bool_) if "pilots" in self._file else None
+
+    def frame_infos(self, page: int) -> tuple[FrameInfo, FrameInfo] | None:
+        """What the cameras said of a page's in-phase and quadrature frame, or None where that was not noted.
+
+        Raises:
+            RecordingError: no such page, or the data cannot be read, or do not fit the frames.
+        """
+        if not all(name in self._file for name in SHOT_DATA):
+            return None
+        names = [self._file[CAMERAS].attrs.get(name) for name in ("serials", "pixel_formats")]
+        subject, expected = self._subject(f"group '{CAMERAS}'"), f"({self.pages}, 2), and two serials and pixel formats"
+        shapes = {self._file[name].shape for name in SHOT_DATA}
+        if shapes != {(self.pages, 2)} or any(name is None or len(name) != 2 for name in names):
+            raise RecordingError(subject, f"shapes {sorted(shapes)}, {names}", expected)
+        ids, device, host, exposures = (self._read_page(name, page) for name in SHOT_DATA)
+        first, second = (
+            FrameInfo(
+                str(names[0][one]),
+                int(ids[one]),
+                float(device[one]),
+                float(host[one]),
+                str(names[1][one]),
+                None if np.isnan(exposures[one]) else float(exposures[one]),
+            )
+            for one in (0, 1)
+        )
+        return first, second
+
+    def dark_frames(self) -> FramePair | None:
+        """What the cameras saw without light, as it was, or None where that was not recorded."""
+        if not all(name in self._file for name in DARK):
+            return None
+        return FramePair(*(self._read(name, ()) for name in DARK))
+
+    def hot_pixels(self) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
+        """Row and column [n, 2] of the pixels of each camera that were mended, or None where that was not noted."""
+        if not all(name in self._file for name in HOT):
+            return None
+        first, second = (self._read(name, ()).astype(np.intp).reshape(-1, 2) for name in HOT)
+        return first, second
+
+    def losses(self) -> list[LostShot]:
+        """Shots that gave no page.
+
+        Raises:
+            RecordingError: a note that cannot be read.
+        """
+        if LOSSES not in self._file:
+            return []
+        try:
+            return [LostShot(**json.loads(text)) for text in self._file[LOSSES].asstr()[()]]
+        except (OSError, TypeError, ValueError) as error:
+            raise RecordingError(self._subject(f"dataset '{LOSSES}'"), error, "notes of lost shots") from None
 
     def page_hash(self, page: int) -> str:
         """SHA-256 of one frame pair in hex, by which pages that were trained on are recognised; see `page_hashes`.

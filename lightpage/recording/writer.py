@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import fcntl
+import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -17,7 +19,26 @@ from lightpage.errors import PageError, RecordingError
 from lightpage.files import move_into_place
 from lightpage.page.symbols import check_levels, check_symbols
 from lightpage.recording.hdf_file import HdfFile
-from lightpage.recording.layout import FORMAT, FRAMES, MAX_BIT_DEPTH, MIN_BIT_DEPTH, VERSION, FramePair, frame_type
+from lightpage.recording.layout import (
+    CAMERAS,
+    DARK,
+    FORMAT,
+    FRAMES,
+    HOT,
+    LOSSES,
+    MAX_BIT_DEPTH,
+    MIN_BIT_DEPTH,
+    SHOT_DATA,
+    VERSION,
+    FrameInfo,
+    FramePair,
+    LostShot,
+    frame_type,
+)
+
+Infos = tuple[FrameInfo, FrameInfo]
+HotPixels = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Of both cameras, [n, 2]: row and column."""
 
 
 def partial_path(path: Path) -> Path:
@@ -124,7 +145,11 @@ class RecordingWriter:
         return self._partial
 
     def append(
-        self, symbols: ArrayLike | None, frames: FramePair, truth: Mapping[str, NDArray[Any]] | None = None
+        self,
+        symbols: ArrayLike | None,
+        frames: FramePair,
+        truth: Mapping[str, NDArray[Any]] | None = None,
+        infos: Infos | None = None,
     ) -> None:
         """Append one page and flush it to the disk.
 
@@ -132,6 +157,7 @@ class RecordingWriter:
             symbols: [ny, nx], or None when they are unknown; either for all pages or for none.
             frames: counts [row, column] within the bit depth.
             truth: what only a simulator knows, one array a name, of the same shape and type on every page.
+            infos: what the cameras say of both frames; either for all pages or for none.
 
         Raises:
             RecordingError: wrong frames, symbols or truth on some pages only, or a page that cannot be written.
@@ -144,7 +170,13 @@ class RecordingWriter:
             if data["symbols"].ndim != 2:
                 raise PageError(f"{self._subject}: symbols", f"shape {data['symbols'].shape}", "one page [ny, nx]")
         data |= {f"truth/{name}": np.asarray(value) for name, value in (truth or {}).items()}
+        if infos is not None:
+            data |= _shot_data(infos)
         self._check_same_datasets(data)
+        if infos is not None and CAMERAS not in self._file:
+            group = self._file.require_group(CAMERAS)
+            group.attrs["serials"] = [info.serial for info in infos]
+            group.attrs["pixel_formats"] = [info.pixel_format for info in infos]
         try:
             for name, value in data.items():
                 self._write_page(name, value)
@@ -159,6 +191,29 @@ class RecordingWriter:
     def set_truth(self, device_toml: str) -> None:
         """Keep the true state of a simulated device as TOML text, where no decoder looks."""
         self._file.require_group("truth").attrs["device"] = device_toml
+        self._file.flush()
+
+    def set_dark_frames(self, dark: FramePair, hot: HotPixels) -> None:
+        """Keep what the cameras see without light, and the pixels that were mended because they always see some.
+
+        Raises:
+            RecordingError: frames that do not fit.
+        """
+        for name, hot_name, which, pixels in zip(DARK, HOT, FRAMES, hot, strict=True):
+            value = self._checked(name, getattr(dark, which))
+            for key, data in ((name, value), (hot_name, np.asarray(pixels, np.uint32).reshape(-1, 2))):
+                if key in self._file:
+                    del self._file[key]
+                self._file.create_dataset(key, data=data)
+        self._file.flush()
+
+    def add_loss(self, loss: LostShot) -> None:
+        """Note a shot that gave no page."""
+        if LOSSES not in self._file:
+            self._file.create_dataset(LOSSES, shape=(0,), maxshape=(None,), dtype=h5py.string_dtype())
+        losses = self._file[LOSSES]
+        losses.resize(losses.shape[0] + 1, axis=0)
+        losses[-1] = json.dumps(asdict(loss))
         self._file.flush()
 
     def __enter__(self) -> Self:
@@ -305,7 +360,7 @@ class RecordingWriter:
 
     def _growing(self) -> list[str]:
         """The datasets that grow by one with each page."""
-        names = [name for name in (*FRAMES, "symbols") if name in self._file]
+        names = [name for name in (*FRAMES, "symbols", *SHOT_DATA) if name in self._file]
         truth = self._file.get("truth")
         return names + ([f"truth/{name}" for name in truth] if isinstance(truth, h5py.Group) else [])
 
@@ -331,3 +386,14 @@ class RecordingWriter:
         dataset = self._file[name] if name in self._file else self._grow(name, value.shape, value.dtype)
         dataset.resize(self._pages + 1, axis=0)
         dataset[self._pages] = value
+
+
+def _shot_data(infos: Infos) -> dict[str, NDArray[Any]]:
+    exposures = [np.nan if info.exposure_s is None else info.exposure_s for info in infos]
+    columns = (
+        [info.frame_id for info in infos],
+        [info.device_time_s for info in infos],
+        [info.host_time_s for info in infos],
+        exposures,
+    )
+    return {name: np.array(values, kind) for (name, kind), values in zip(SHOT_DATA.items(), columns, strict=True)}

@@ -8,11 +8,11 @@ from pathlib import Path
 from lightpage.device.profile import Profile
 from lightpage.errors import PageError, RecordingError
 from lightpage.recording.reader import FramePair, Recording
-from runtime.acquisition.source import SourcePage
+from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 from runtime.decoding.frames import narrow
 
 
-class RecordingSource:
+class RecordingSource(FrameSource):
     """Pages of a recording, over and over again: after the last page the next one is the first.
 
     Raises:
@@ -26,12 +26,13 @@ class RecordingSource:
         self._next = 0
         self.name = f"recording:{path}"
         self.levels, self.bit_depth = self._recording.levels, self._recording.bit_depth
+        self.frame_shape, self.page_shape = self._recording.frame_shape, self._recording.page_shape
 
     def check_against(self, profile: Profile) -> None:
         """Raise `RecordingError` unless the recording's shapes are those of `profile`."""
         self._recording.check_against(profile)
 
-    def read(self, page: int | None = None) -> SourcePage:
+    def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         """Read page `page` of the file, or the next one.
 
         Raises:
@@ -46,7 +47,7 @@ class RecordingSource:
                 raise PageError(f"page of {self.name}", page, f"0..{recording.pages - 1}")
             try:
                 pair, symbols = narrow(recording.frames(page), self.bit_depth), recording.symbols(page)
-                return SourcePage(pair, page, symbols, recording.pilots())
+                return Shot(pair, page, symbols, recording.pilots(), recording.frame_infos(page))
             except RecordingError as error:
                 raise RecordingError(f"page {page}, {error.subject}", error.got, error.expected) from None
 

@@ -14,10 +14,10 @@ from lightpage.errors import InvalidInputError, PageError
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import FramePair
-from runtime.acquisition.source import SourcePage
+from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 
 
-class SimulatorSource:
+class SimulatorSource(FrameSource):
     """A simulated device that writes a page whenever one is read.
 
     Args:
@@ -52,20 +52,15 @@ class SimulatorSource:
         """Guards the simulator and the position; held while one page is simulated."""
         self._next, self._seed = 0, seed
         self.profile, self.levels, self.bit_depth = profile, levels, device.sensor.bit_depth
+        self.frame_shape, self.page_shape = profile.frame_shape, profile.page_shape
         self.name = name or f"simulator:{profile.name}"
-
-    def check_against(self, profile: Profile) -> None:
-        """Raise `InvalidInputError` unless the simulated device's shapes are those of `profile`."""
-        own = (self.profile.frame_shape, self.profile.page_shape)
-        if own != (expected := (profile.frame_shape, profile.page_shape)):
-            raise InvalidInputError(f"source {self.name}", f"frames and pages of {own}", f"{expected}")
 
     def set_device(self, device: Device) -> None:
         """Let the device drift to another true state; the next page shows it."""
         with self._lock:
             self._simulator.set_device(device)
 
-    def read(self, page: int | None = None) -> SourcePage:
+    def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         """Write and record page number `page`, or the next one; after the last page to write the next is the first.
 
         Raises:
@@ -84,7 +79,7 @@ class SimulatorSource:
             else:
                 rng = np.random.default_rng([self._seed, page])
                 symbols = random_symbols(self.profile, self.levels, 1, rng)[0]
-            return SourcePage(self._simulator.page(symbols), page, symbols, pilot_mask(self.profile))
+            return Shot(self._simulator.page(symbols), page, symbols, pilot_mask(self.profile))
 
     def references(self) -> FramePair:
         """Reference-only frames of the device as it is now."""

@@ -2,63 +2,117 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
-from lightpage.errors import FrameError, RecordingError
+from lightpage.errors import FrameError, InvalidInputError, RecordingError
+from lightpage.recording.layout import FrameInfo
 from lightpage.recording.reader import FramePair
 from runtime.errors import SourceError
 
+SHOT_S = 10.0
+"""Usual time that a shot may take."""
+
 
 @dataclass(frozen=True)
-class SourcePage:
-    """One page as a source delivers it.
+class Shot:
+    """One page as a source photographed it.
 
     Attributes:
         pair: both frames.
         page_index: which page.
         symbols: what was written, uint8 [ny, nx], or None where nobody knows.
         pilot_mask: where the pilots are, bool [ny, nx], or None for the device's usual positions.
+        infos: of the in-phase and the quadrature frame, or None where there were no cameras.
     """
 
     pair: FramePair
     page_index: int
     symbols: NDArray[np.uint8] | None = None
     pilot_mask: NDArray[np.bool_] | None = None
+    infos: tuple[FrameInfo, FrameInfo] | None = None
 
 
-class FrameSource(Protocol):
-    """A thing to read pages from; its methods may be called from many threads."""
+class FrameSource(ABC):
+    """A thing to read pages from, to be used in a `with` statement: armed inside it, closed behind it.
 
-    @property
-    def name(self) -> str:
-        """For people, e.g. ``recording:R.h5``."""
+    Its methods may be called from many threads. A source of your own sets the attributes and overrides `shot`, and what
+    else it can do.
 
-    @property
-    def levels(self) -> int:
-        """Level count of its pages."""
+    Attributes:
+        name: for people, e.g. ``recording:R.h5``.
+        levels: level count of its pages.
+        bit_depth: bits of a camera count.
+        frame_shape: (rows, columns) of its frames.
+        page_shape: (rows, columns) of its pages where it knows them, else None.
+    """
 
-    @property
-    def bit_depth(self) -> int:
-        """Bits of a camera count."""
+    name: str
+    levels: int
+    bit_depth: int
+    frame_shape: tuple[int, int]
+    page_shape: tuple[int, int] | None = None
+
+    @abstractmethod
+    def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
+        """Photograph page number `page`, or the next one.
+
+        Args:
+            timeout_s: longest wait for it.
+            page: which.
+
+        Raises:
+            PageError: there is no such page.
+            LostShotError: this shot is lost, and says why; the next one may succeed.
+            SourceError: the source is missing, damaged or dark.
+        """
 
     def check_against(self, profile: Profile) -> None:
-        """Raise `InvalidInputError` unless its frames and pages have the shapes of `profile`."""
+        """Raise `InvalidInputError` unless frames and pages have the shapes of `profile`."""
+        pages = profile.page_shape if self.page_shape is None else self.page_shape
+        if (own := (self.frame_shape, pages)) != (expected := (profile.frame_shape, profile.page_shape)):
+            raise InvalidInputError(f"source {self.name}", f"frames and pages of {own}", f"{expected}")
 
-    def read(self, page: int | None = None) -> SourcePage:
-        """Read page number `page`, or the next one; raises `PageError` where there is no such page."""
+    def arm(self) -> None:  # noqa: B027 — a source without a device needs none
+        """Make ready for shots; `disarm` and `arm` may take turns.
+
+        Raises:
+            SourceError: it cannot be made ready.
+        """
+
+    def disarm(self) -> None:  # noqa: B027 — a source without a device needs none
+        """Stop being ready for shots, and leave the device in peace."""
 
     def references(self) -> FramePair | None:
-        """Reference-only frames as they are now, where the source has them."""
+        """Reference-only frames as they are now, where the source has them.
 
-    def close(self) -> None:
+        Raises:
+            LostShotError, SourceError: see `shot`.
+        """
+        return None
+
+    def close(self) -> None:  # noqa: B027 — a source without a device needs none
         """Let go of files and devices."""
+
+    def __enter__(self) -> Self:
+        self.arm()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.disarm()
+        finally:
+            self.close()
 
 
 @contextmanager

@@ -214,7 +214,7 @@ def run_demo(bundle: Path, out: Path, seed: int, progress: Progress = lambda wha
         plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
         server = stack.enter_context(LightpageServer(plane, Recalibrator(plane, refit), "127.0.0.1:0"))
         client = stack.enter_context(LightpageClient(server.target))
-        frames = source.read(0).pair
+        frames = source.shot(page=0).pair
         levels = decoder.page_codec.code.levels
         symbols = client.decode(frames, levels).symbols
 

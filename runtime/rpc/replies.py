@@ -88,10 +88,10 @@ def data_reply(page: DataPage) -> pb.ReadDataReply:
 
 def read_reply(read: ReadAnswer, request: pb.ReadPageRequest) -> pb.ReadPageReply:
     """A page read from the source as its message."""
-    written = read.source_page.symbols if request.want_written else None
+    written = read.shot.symbols if request.want_written else None
     return pb.ReadPageReply(
         decoded=decode_reply(read.answer, request.options),
-        page=read.source_page.page_index,
+        page=read.shot.page_index,
         written=b"" if written is None else written.tobytes(),
         pilot_mask=b"" if written is None else read.pilot_mask.astype(np.uint8).tobytes(),
     )

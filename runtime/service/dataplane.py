@@ -16,7 +16,7 @@ from lightpage.errors import FrameError, InvalidInputError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import MAX_LEVELS
 from lightpage.recording.reader import FramePair
-from runtime.acquisition.source import FrameSource, SourcePage, own_fault
+from runtime.acquisition.source import SHOT_S, FrameSource, Shot, own_fault
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
 from runtime.errors import LostPageError, SourceError
@@ -45,7 +45,7 @@ class ReadAnswer:
     """An answer for a page of the source, with what the source knows of it."""
 
     answer: Answer
-    source_page: SourcePage
+    shot: Shot
     pilot_mask: NDArray[np.bool_]
 
 
@@ -205,7 +205,7 @@ class DataPlane:
             caller.check()
             model, begun = self.registry.current, time.perf_counter()
             with own_fault():
-                found = source.read(page)
+                found = source.shot(min(SHOT_S, caller.seconds_left()), page)
             received = time.perf_counter()
             mask = self._mask(found, model.decoder)
             levels = levels_for(model.decoder, levels, source.levels, user_data)
@@ -264,7 +264,7 @@ class DataPlane:
         self.metrics.in_service(model.version)
 
     @staticmethod
-    def _mask(found: SourcePage, decoder: Decoder) -> NDArray[np.bool_]:
+    def _mask(found: Shot, decoder: Decoder) -> NDArray[np.bool_]:
         return decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
 
     def _decode(

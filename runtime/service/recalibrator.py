@@ -252,7 +252,7 @@ def read_known(source: FrameSource, pages: Sequence[int | None], heard: Callable
     with own_fault():
         for page in pages:
             heard()
-            found.append(source.read(page))
+            found.append(source.shot(page=page))
         references = source.references()
     symbols = [read.symbols for read in found if read.symbols is not None]
     if len(symbols) != len(found):

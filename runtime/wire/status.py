@@ -46,12 +46,7 @@ _BY_NAME: dict[str, type[LightpageError]] = {
     if isinstance(kind, type) and issubclass(kind, LightpageError)
 }
 
-_REASONS = {
-    Reason.UNSPECIFIED: pb.LOSS_REASON_UNSPECIFIED,
-    Reason.PILOTS_DISAGREE: pb.LOSS_REASON_PILOTS_DISAGREE,
-    Reason.IMAGE_NOT_FOUND: pb.LOSS_REASON_IMAGE_NOT_FOUND,
-    Reason.TOO_FEW_PILOTS: pb.LOSS_REASON_TOO_FEW_PILOTS,
-}
+_REASONS: dict[Reason, Any] = {reason: pb.LossReason.Value(f"LOSS_REASON_{reason}") for reason in Reason}
 
 _FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")
 """The folders of an absolute path, up to its last name."""

@@ -12,7 +12,7 @@ from lightpage.codec.code import Code
 from lightpage.errors import PageError
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import FramePair, RecordingWriter
-from runtime.acquisition.source import SourcePage
+from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 from runtime.commands.encode import encode
 from tests.runtime import toy
 
@@ -72,27 +72,21 @@ def recording(
     return path
 
 
-class ShownPages:
+class ShownPages(FrameSource):
     """A source that shows pages, some of them spoilt; it does not know what was written."""
 
-    name, bit_depth, levels = "toy:pages", 8, CODE.levels
+    name, bit_depth, levels, frame_shape = "toy:pages", 8, CODE.levels, toy.SHAPE
 
     def __init__(self, symbols: Iterable[np.ndarray], spoilt: dict[int, Spoil] | None = None) -> None:
         self._symbols, self._spoilt = list(symbols), spoilt or {}
         self.device = toy.ToyDevice(noise=8.0)
 
-    def check_against(self, profile: object) -> None:
-        pass
-
-    def read(self, page: int | None = None) -> SourcePage:
+    def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         number = page or 0
         if number >= len(self._symbols):
             raise PageError("page of toy:pages", number, f"0..{len(self._symbols) - 1}")
         pair = self.device.page(self._symbols[number], CODE.levels, 0.1)
-        return SourcePage(self._spoilt.get(number, lambda same: same)(pair), number)
+        return Shot(self._spoilt.get(number, lambda same: same)(pair), number)
 
     def references(self) -> FramePair:
         return self.device.references()
-
-    def close(self) -> None:
-        pass

@@ -18,7 +18,7 @@ from lightpage.errors import CalibrationError
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.reader import FramePair, RecordingWriter
-from runtime.acquisition.source import SourcePage
+from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 from runtime.bundle.bundle import Bundle, npz, write_bundle
 from runtime.bundle.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest
 from runtime.decoding.decoder import Decoder
@@ -261,28 +261,23 @@ def fit_references(bundle: Bundle, pages: KnownPages, progress: Progress, decode
     return RefitResult(table, "angle_deg = 0.5\n", RefitReport(0.5, 0.4, 0.9))
 
 
-class ToySource:
+class ToySource(FrameSource):
     """A source of toy pages whose device may drift."""
 
     name = "toy:device"
     bit_depth = 8
+    frame_shape = SHAPE
 
     def __init__(self, device: ToyDevice, levels: int = 16, pages: int | None = None) -> None:
         self.device, self.levels, self.pages = device, levels, pages
         self._next, self._lock = 0, threading.Lock()
 
-    def check_against(self, profile: Profile) -> None:
-        assert profile.frame_shape == SHAPE
-
-    def read(self, page: int | None = None) -> SourcePage:
+    def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         with self._lock:
             if page is None:
                 page, self._next = self._next, self._next + 1
             symbols = symbols_of(self.levels, page)[0]
-            return SourcePage(self.device.page(symbols, self.levels, 0.1 * page), page, symbols)
+            return Shot(self.device.page(symbols, self.levels, 0.1 * page), page, symbols)
 
     def references(self) -> FramePair:
         return self.device.references()
-
-    def close(self) -> None:
-        pass

@@ -28,8 +28,8 @@ def test_a_recording_is_read_in_turn_again_and_again_or_by_number(recording: tup
     source = open_source(f"recording:{path}")
     source.check_against(toy.PROFILE)
     assert source.levels == 16
-    assert [source.read().page_index for _ in range(5)] == [0, 1, 2, 0, 1]
-    page = source.read(2)
+    assert [source.shot().page_index for _ in range(5)] == [0, 1, 2, 0, 1]
+    page = source.shot(page=2)
     assert (page.symbols == symbols[2]).all()
     assert page.pair.in_phase.shape == toy.SHAPE
     references = source.references()
@@ -37,7 +37,7 @@ def test_a_recording_is_read_in_turn_again_and_again_or_by_number(recording: tup
     assert references.in_phase[0, 0] == toy.OFFSETS[0]
     for wrong in (-1, 3):
         with pytest.raises(PageError, match=r"0\.\.2"):
-            source.read(wrong)
+            source.shot(page=wrong)
     source.close()
 
 
@@ -67,17 +67,17 @@ class FakeSimulator:
 def test_a_simulated_page_depends_on_seed_and_number_only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lightpage.simulator.simulator.Simulator", FakeSimulator)
     one, same, other = (SimulatorSource(toy.PROFILE, Device(), 8, seed) for seed in (1, 1, 2))
-    first = [one.read() for _ in range(3)]
+    first = [one.shot() for _ in range(3)]
     assert [page.page_index for page in first] == [0, 1, 2]
-    again = same.read(2)
+    again = same.shot(page=2)
     assert again.symbols is not None
     assert first[2].symbols is not None
     assert (again.symbols == first[2].symbols).all()
-    assert (other.read(2).symbols != again.symbols).any()
+    assert (other.shot(page=2).symbols != again.symbols).any()
     assert again.symbols.max() < 8
     assert (again.pilot_mask == pilot_mask(toy.PROFILE)).all()
     with pytest.raises(PageError):
-        one.read(-1)
+        one.shot(page=-1)
     with pytest.raises(InvalidInputError, match="frames and pages"):
         one.check_against(load_profile("bench"))
 

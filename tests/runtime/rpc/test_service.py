@@ -425,13 +425,13 @@ def test_a_damaged_page_of_the_source_is_the_services_own_fault(toy_zip: Path, t
 
 def test_pages_without_symbols_are_the_fault_of_who_named_them(start: Start, tmp_path: Path) -> None:
     service = start()
-    as_it_was = service.source.read
+    as_it_was = service.source.shot
 
-    def unknown(page: int | None = None) -> object:
-        found = as_it_was(page)
+    def unknown(timeout_s: float = 1.0, page: int | None = None) -> object:
+        found = as_it_was(timeout_s, page)
         return type(found)(found.pair, found.page_index)
 
-    service.source.read = unknown  # type: ignore[method-assign,assignment]
+    service.source.shot = unknown  # type: ignore[method-assign,assignment]
     toy.write_toy_recording(tmp_path / "plain.h5", toy.ToyDevice(DRIFTED), 16, 2)
     with h5py.File(tmp_path / "plain.h5", "r+") as file:
         del file["symbols"]
@@ -562,17 +562,17 @@ def test_without_a_store_recalibration_goes_on_after_a_rollback_and_keeps_only_t
 
 def test_recalibration_with_wrong_pilots_is_refused_and_the_old_model_stays(start: Start) -> None:
     service = start()
-    as_it_was = service.source.read
+    as_it_was = service.source.shot
 
-    def lying(page: int | None = None) -> object:
-        found = as_it_was(page)
+    def lying(timeout_s: float = 1.0, page: int | None = None) -> object:
+        found = as_it_was(timeout_s, page)
         wrong = np.random.default_rng(1).integers(16, size=toy.PAGE).astype(np.uint8)
         return type(found)(found.pair, found.page_index, wrong)
 
-    service.source.read = lying  # type: ignore[method-assign,assignment]
+    service.source.shot = lying  # type: ignore[method-assign,assignment]
     with pytest.raises(RecalibrationRefusedError, match="does not match"):
         service.client.recalibrate(count=3)
-    service.source.read = as_it_was  # type: ignore[method-assign]
+    service.source.shot = as_it_was  # type: ignore[method-assign]
     assert service.client.describe().model.version == "toy-1"
     assert [m.version for m in service.client.models()] == ["toy-1"]
     assert service.count("lightpage_recalibrations_total", result="refused") == 1
@@ -710,15 +710,15 @@ def test_a_recalibration_that_the_end_of_the_service_cuts_off_says_so(start: Sta
 
 def test_a_recalibration_that_is_stopped_reads_and_decodes_no_more_pages(start: Start) -> None:
     service, read = start(), list[int]()
-    as_it_was = service.source.read
+    as_it_was = service.source.shot
 
-    def leaving(page: int | None = None) -> object:
+    def leaving(timeout_s: float = 1.0, page: int | None = None) -> object:
         read.append(len(read))
         if len(read) == 2:
             service.recalibrator._stop.set()
-        return as_it_was(page)
+        return as_it_was(timeout_s, page)
 
-    service.source.read = leaving  # type: ignore[method-assign,assignment]
+    service.source.shot = leaving  # type: ignore[method-assign,assignment]
     with pytest.raises(StoppingError):
         service.client.recalibrate(count=5)
     assert read == [0, 1]

@@ -1,0 +1,1 @@
+"""Cameras: what one is, and the drivers."""

@@ -1,0 +1,89 @@
+"""What a camera is to those who take pictures with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.recording.layout import FrameInfo
+
+
+class FrameStatus(StrEnum):
+    """How a frame arrived."""
+
+    COMPLETE = "COMPLETE"
+    INCOMPLETE = "INCOMPLETE"
+    """Parts of it were lost on the way; nothing of it can be used, its number and time included."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame as a camera delivered it.
+
+    Attributes:
+        status: only of a complete frame the rest is there.
+        pixels: counts [row, column], uint8 or uint16, right-aligned, native byte order.
+        info: number, times, format, camera and exposure.
+        detail: what is wrong with an incomplete one, for people.
+    """
+
+    status: FrameStatus
+    pixels: NDArray[np.unsignedinteger[Any]] | None = None
+    info: FrameInfo | None = None
+    detail: str = ""
+
+
+class Camera(Protocol):
+    """A camera that is triggered. One thread at a time uses it."""
+
+    @property
+    def name(self) -> str:
+        """For people, e.g. ``in-phase camera (FLIR-12345678)``."""
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """(rows, columns) of its frames; from `arm` on."""
+
+    @property
+    def bit_depth(self) -> int:
+        """Bits of a count."""
+
+    @property
+    def frame_numbers(self) -> int:
+        """After this number of a frame comes 1: 65535 where numbers have 16 bits and leave out 0."""
+
+    @property
+    def opened(self) -> int:
+        """How often it was opened. A camera that was opened anew begins with other numbers and another clock."""
+
+    def arm(self) -> None:
+        """Open it unless it is open, set it up, drop frames from before; from here on a trigger makes a frame.
+
+        Raises:
+            SourceError: no such camera, or it does not take a setting.
+            LostShotError: `Reason.CAMERA_GONE`: it has gone away.
+        """
+
+    def fire(self) -> None:
+        """Trigger it by a command over its own line; only of a camera that is set up for that.
+
+        Raises:
+            LostShotError: `Reason.CAMERA_GONE`.
+        """
+
+    def frame(self, timeout_s: float) -> Frame | None:
+        """The next frame, or None where none comes within `timeout_s`; 0 takes what is there already.
+
+        Raises:
+            LostShotError: `Reason.CAMERA_GONE`.
+        """
+
+    def disarm(self) -> None:
+        """Stop taking frames; it stays open."""
+
+    def close(self) -> None:
+        """Let go of it; `arm` opens it again."""

@@ -1,0 +1,1 @@
+"""The writer: what shows a page, and what blocks the beams."""

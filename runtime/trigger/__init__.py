@@ -1,0 +1,1 @@
+"""What fires both cameras at once."""
