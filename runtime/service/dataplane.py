@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -23,6 +23,7 @@ from runtime.errors import LostPageError, SourceError
 from runtime.service.caller import Caller
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
+from runtime.service.observation import Observer, Seen, observed
 from runtime.service.receiver import PairReceiver
 from runtime.service.registry import Model, ModelRegistry
 from runtime.service.slots import Slots
@@ -58,6 +59,7 @@ class DataPlane:
         store: remembers which model is in service, or None.
         limits: what is accepted.
         metrics: what is counted.
+        observers: are told of every page.
 
     Raises:
         InvalidInputError: the source is not for this device.
@@ -70,10 +72,12 @@ class DataPlane:
         store: ModelStore | None = None,
         limits: Limits | None = None,
         metrics: ServiceMetrics | None = None,
+        observers: Sequence[Observer] = (),
     ) -> None:
         self.registry, self.store = registry, store
         self.limits = limits or Limits()
         self.metrics = metrics or ServiceMetrics()
+        self.observers = tuple(observers)
         self._source = source
         if source is not None:
             _check_source(source, registry.current.decoder)
@@ -170,9 +174,11 @@ class DataPlane:
             levels = levels_for(model.decoder, levels, MAX_LEVELS, user_data)
             if user_data:
                 pilots = pilots or model.decoder.written_pilots(levels)
-            with self._optics(user_data):
-                page = self._decode(model, pair, levels, pilots, "frame pair", sure=sure)
-            found = self._user_data(model, page) if user_data else None
+            seen = Seen("frame pair", None, model.version, tells=sure, pair=pair)
+            with observed(self.observers, seen):
+                with self._optics(user_data):
+                    seen.page = page = self._decode(model, pair, levels, pilots, seen.subject, sure=sure)
+                seen.user_data = found = self._user_data(model, page) if user_data else None
         return Answer(page, model.version, received - start, time.perf_counter() - start, found)
 
     def read_page(
@@ -204,25 +210,36 @@ class DataPlane:
         with self.decodes.held(caller):
             caller.check()
             model, begun = self.registry.current, time.perf_counter()
-            with own_fault():
-                found = source.shot(min(SHOT_S, caller.seconds_left()), page)
-            received = time.perf_counter()
-            mask = self._mask(found, model.decoder)
-            levels = levels_for(model.decoder, levels, source.levels, user_data)
-            if user_data and not np.array_equal(mask, model.decoder.bundle.pilot_mask):
-                raise SourceError(f"{source.name}: pilots", "other places", "those of the model in service")
-            # Pilots are what was written, whatever level count the caller wants to see.
-            if found.symbols is not None:
-                pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
-            else:
-                own = model.decoder
-                pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
-            subject = f"page {found.page_index} of {source.name}"
-            with own_fault(f"{subject}: "), self._optics(user_data):
-                decoded = self._decode(model, found.pair, levels, pilots, subject)
-            data = self._user_data(model, decoded, expected) if user_data else None
+            seen = Seen(f"{'next page' if page is None else f'page {page}'} of {source.name}", page, model.version)
+            with observed(self.observers, seen):
+                found = self._shot(source, page, caller, user_data)
+                received = time.perf_counter()
+                seen.subject, seen.page_index = f"page {found.page_index} of {source.name}", found.page_index
+                seen.pair, seen.infos = found.pair, found.infos
+                mask = self._mask(found, model.decoder)
+                levels = levels_for(model.decoder, levels, source.levels, user_data)
+                if user_data and not np.array_equal(mask, model.decoder.bundle.pilot_mask):
+                    raise SourceError(f"{source.name}: pilots", "other places", "those of the model in service")
+                # Pilots are what was written, whatever level count the caller wants to see.
+                if found.symbols is not None:
+                    pilots = Pilots.of_symbols(mask, found.symbols, source.levels)
+                else:
+                    own = model.decoder
+                    pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
+                with own_fault(f"{seen.subject}: "), self._optics(user_data):
+                    seen.page = decoded = self._decode(model, found.pair, levels, pilots, seen.subject)
+                seen.user_data = data = self._user_data(model, decoded, expected) if user_data else None
         answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start, data)
         return ReadAnswer(answer, found, mask)
+
+    def _shot(self, source: FrameSource, page: int | None, caller: Caller, user_data: bool) -> Shot:
+        """A page of the source; a lost shot is counted."""
+        try:
+            with own_fault(), self._optics(user_data):
+                return source.shot(min(SHOT_S, caller.seconds_left()), page)
+        except LostPageError as error:
+            self.metrics.lost(error)
+            raise
 
     @contextmanager
     def _optics(self, user_data: bool) -> Iterator[None]:

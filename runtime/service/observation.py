@@ -1,0 +1,138 @@
+"""What is noted of every page, given out or lost, for those who watch the device: monitor, console, flight recorder."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from lightpage.codec.page_codec import PageBytes
+from lightpage.metrics.information import own_information
+from lightpage.recording.layout import FrameInfo
+from lightpage.recording.reader import FramePair
+from runtime.decoding.page import DecodedPage
+from runtime.decoding.tracking import unconfirmed_page
+from runtime.errors import LostPageError, Reason, UnconfirmedPageError
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One page.
+
+    Attributes:
+        subject: for people, e.g. ``page 3 of recording:R.h5``.
+        page_index: its number in the source, None where a caller sent its frames, or nobody knows.
+        model_version: what decoded it.
+        time_s: seconds since 1970.
+        seconds: that it took, waiting for a slot left out.
+        lost: why it was not given out, None where it was.
+        detail: of the loss, for people.
+        tells: whether it says something of the device. A lost page whose pilots a caller sent does not: they
+            may be wrong.
+        pair: its frames, None where no pair was photographed.
+        infos: what the cameras said of them.
+        page: what was decoded, of a page that its pilots do not confirm too; None where nothing was.
+        user_data: its bytes, None where nobody asked for them.
+    """
+
+    subject: str
+    page_index: int | None
+    model_version: str
+    time_s: float
+    seconds: float
+    lost: Reason | None = None
+    detail: str = ""
+    tells: bool = True
+    pair: FramePair | None = None
+    infos: tuple[FrameInfo, FrameInfo] | None = None
+    page: DecodedPage | None = None
+    user_data: PageBytes | None = None
+
+    @property
+    def margin_bits(self) -> float | None:
+        """Information beyond what the code needs, bits a symbol; None where its bytes were not read."""
+        return None if self.user_data is None else self.user_data.margin_bits
+
+    @property
+    def unread(self) -> bool:
+        """Whether it was lost, or its bytes were asked for and could not be read."""
+        return self.lost is not None or (self.user_data is not None and self.user_data.data is None)
+
+    def estimated_air_bits(self) -> float | None:
+        """Information that a symbol is claimed to carry, as far as the pilots bear it out, bits; None without a page."""
+        if self.page is None:
+            return None
+        return float(own_information(self.page.phase, self.page.concentration, self.page.levels).mean())
+
+    def residual_rad(self) -> float | None:
+        """Smooth phase error that was taken off the page, root mean square, radians; None without a page."""
+        return None if self.page is None else float(np.sqrt(np.mean(np.square(self.page.phase_error))))
+
+
+class Observer(Protocol):
+    """Is told of every page, by the thread that decoded it: it must be quick, and may be called by many at once."""
+
+    def observe(self, observation: Observation) -> None:
+        """Take note of a page."""
+
+
+@dataclass
+class Seen:
+    """What becomes known of a page while it is read and decoded; the fields of `Observation`."""
+
+    subject: str
+    page_index: int | None
+    model_version: str
+    tells: bool = True
+    pair: FramePair | None = None
+    infos: tuple[FrameInfo, FrameInfo] | None = None
+    page: DecodedPage | None = None
+    user_data: PageBytes | None = None
+    begun: float = field(default_factory=time.perf_counter)
+
+
+@contextmanager
+def observed(observers: Sequence[Observer], seen: Seen) -> Iterator[Seen]:
+    """Tell the observers of a page that is read and decoded inside the block, given out or lost.
+
+    Other errors say nothing of a page. What an observer raises is logged: it costs nobody a page.
+    """
+    try:
+        yield seen
+    except LostPageError as error:
+        if isinstance(error, UnconfirmedPageError):
+            seen.page = unconfirmed_page(error)
+        _tell(observers, seen, error.reason, str(error))
+        raise
+    _tell(observers, seen, None, "")
+
+
+def _tell(observers: Sequence[Observer], seen: Seen, lost: Reason | None, detail: str) -> None:
+    if not observers:
+        return
+    observation = Observation(
+        subject=seen.subject,
+        page_index=seen.page_index,
+        model_version=seen.model_version,
+        time_s=time.time(),
+        seconds=time.perf_counter() - seen.begun,
+        lost=lost,
+        detail=detail,
+        tells=seen.tells,
+        pair=seen.pair,
+        infos=seen.infos,
+        page=seen.page,
+        user_data=seen.user_data,
+    )
+    for observer in observers:
+        try:
+            observer.observe(observation)
+        except Exception:
+            _log.exception("%s could not take note of %s", type(observer).__name__, seen.subject)

@@ -1,0 +1,67 @@
+"""Observers are told of every page, given out or lost, and cost nobody a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lightpage.page.pilots import Pilots
+from runtime.acquisition.source import SHOT_S, Shot
+from runtime.bundle.bundle import Bundle
+from runtime.decoding.decoder import Decoder
+from runtime.errors import LostShotError, Reason, UnconfirmedPageError
+from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane
+from runtime.service.observation import Observation
+from runtime.service.registry import ModelRegistry
+from tests.runtime import toy
+
+
+class Notebook:
+    def __init__(self, *, broken: bool = False) -> None:
+        self.seen: list[Observation] = []
+        self.broken = broken
+
+    def observe(self, observation: Observation) -> None:
+        self.seen.append(observation)
+        if self.broken:
+            raise RuntimeError("no more paper")
+
+
+class LosingSource(toy.ToySource):
+    def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
+        if page == 1:
+            raise LostShotError("page 1 of toy:device", "no frame", "two frames", Reason.MISSING_FRAME)
+        return super().shot(timeout_s, page)
+
+
+def test_pages_given_out_and_lost_are_observed(toy_zip: Path) -> None:
+    broken, notebook = Notebook(broken=True), Notebook()
+    registry = ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1))
+    plane = DataPlane(registry, LosingSource(toy.ToyDevice()), observers=[broken, notebook])
+    plane.read_page(0, None, Caller())
+    with pytest.raises(LostShotError):
+        plane.read_page(1, None, Caller())
+    pair = toy.ToyDevice().page(toy.symbols_of(16, 3)[0], 16, 0.1)
+    wrong = Pilots.of_symbols(registry.current.decoder.bundle.pilot_mask, np.zeros(toy.PAGE, np.uint8), 16)
+    with pytest.raises(UnconfirmedPageError):
+        plane.decode(pair, 16, Caller(), wrong)
+    given, shot, unconfirmed = notebook.seen
+    assert (given.page_index, given.lost, given.tells) == (0, None, True)
+    assert given.page is not None
+    assert given.pair is not None
+    air, residual = given.estimated_air_bits(), given.residual_rad()
+    assert air is not None
+    assert 0 < air <= 8
+    assert residual is not None
+    assert not given.unread
+    assert (shot.page_index, shot.lost, shot.pair, shot.page) == (1, Reason.MISSING_FRAME, None, None)
+    assert shot.unread
+    assert unconfirmed.lost is Reason.PILOTS_DISAGREE
+    assert unconfirmed.page is not None
+    assert not unconfirmed.tells
+    assert len(broken.seen) == 3
+    lost = plane.metrics.lost_pages.labels("MISSING_FRAME")._value.get()
+    assert lost == 1
