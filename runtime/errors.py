@@ -56,8 +56,6 @@ class Reason(StrEnum):
     """The page was not on display in time, or not until both frames were in."""
     BEAM_CONTROL_FAILED = "BEAM_CONTROL_FAILED"
     """A beam could not be blocked or let through."""
-    SATURATED = "SATURATED"
-    """So many pixels are saturated that a page cannot be read."""
 
 
 class LostPageError(LightpageError):

@@ -66,7 +66,7 @@ class Observation:
         return self.lost is not None or (self.user_data is not None and self.user_data.data is None)
 
     def estimated_air_bits(self) -> float | None:
-        """Information that a symbol is claimed to carry, as far as the pilots bear it out, bits; None without a page."""
+        """Information claimed of a symbol, as far as the pilots bear it out, bits; None without a page."""
         if self.page is None:
             return None
         return float(own_information(self.page.phase, self.page.concentration, self.page.levels).mean())

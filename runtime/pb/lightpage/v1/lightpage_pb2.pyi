@@ -46,7 +46,6 @@ class LossReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     LOSS_REASON_TRIGGER_REFUSED: _ClassVar[LossReason]
     LOSS_REASON_NOT_ON_DISPLAY: _ClassVar[LossReason]
     LOSS_REASON_BEAM_CONTROL_FAILED: _ClassVar[LossReason]
-    LOSS_REASON_SATURATED: _ClassVar[LossReason]
 PIXEL_TYPE_UNSPECIFIED: PixelType
 PIXEL_TYPE_UINT8: PixelType
 PIXEL_TYPE_UINT16: PixelType
@@ -74,7 +73,6 @@ LOSS_REASON_TRIGGER_GONE: LossReason
 LOSS_REASON_TRIGGER_REFUSED: LossReason
 LOSS_REASON_NOT_ON_DISPLAY: LossReason
 LOSS_REASON_BEAM_CONTROL_FAILED: LossReason
-LOSS_REASON_SATURATED: LossReason
 
 class DescribeRequest(_message.Message):
     __slots__ = ()
