@@ -1,0 +1,275 @@
+"""Tells which two frames belong to one shot: a frame is of this trigger only if its own camera's clock says so.
+
+Cameras count the frames that they took, so one missed trigger shifts all later numbers. Neither order of arrival nor
+equal numbers nor the nearest time tell whose a frame is. So one trigger is in flight at a time, and a pair counts only where
+every one of these rules holds:
+
+1. No frame waits before the trigger, and none is left over after both frames are in.
+2. Both frames are complete. Number and time of any other may be those of an earlier frame.
+3. Both numbers follow their camera's last one; after a fault they are not known, and anything may follow.
+4. For each camera, device time less the time of the trigger is within a tolerance of the camera's reference. This
+   reference comes from three shots at unequal distances that agree, follows accepted shots, and expires before the
+   clocks can have drifted apart by a quarter of the tolerance.
+5. The page was on display for at least the tolerance before the trigger, and still is when both frames are in.
+
+A frame of another shot is off by at least the distance of two shots, which is more than twice the tolerance: rule 4
+excludes it. A trigger edge that is late by so much that it looks like the next shot's still exposes the page that is on
+display then: rule 5. The other rules say what went wrong.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from lightpage.recording.layout import FrameInfo
+from runtime.cameras.camera import Camera, Frame, FrameStatus
+from runtime.errors import LostShotError, Reason, SourceError
+from runtime.trigger.trigger import Trigger
+
+_GAPS = (0.0, 3.0, 7.0)
+"""Distances of the three shots of a synchronisation beyond the least one, in tolerances: unequal, so that a queue that
+is one frame behind shows."""
+_TRIES = 8
+"""Synchronisations in a row."""
+_MOST_QUIET = 20
+"""A line that is never silent is given up after so many times the silence that is waited for."""
+_FOLLOWING = 0.1
+"""Share of an accepted shot's deviation by which the reference follows."""
+
+
+@dataclass(frozen=True)
+class PairingSettings:
+    """How strictly frames are told apart.
+
+    Attributes:
+        tolerance_s: largest deviation of a frame's time from its camera's reference. A wider one loses fewer shots to a
+            busy machine, and takes longer for every shot.
+        frame_s: longest wait for both frames after a trigger.
+        quiet_s: silence that ends a fault.
+        spacing_s: least distance of two triggers; at least 2.5 tolerances.
+        clock_drift: relative drift of a camera's clock against this machine's that is allowed for.
+    """
+
+    tolerance_s: float = 0.02
+    frame_s: float = 0.5
+    quiet_s: float = 0.15
+    spacing_s: float = 0.06
+    clock_drift: float = 1e-4
+
+    @property
+    def expires_s(self) -> float:
+        """Age from which a reference is no longer relied on."""
+        return self.tolerance_s / (4 * self.clock_drift)
+
+
+@dataclass
+class _Channel:
+    """One camera, and what is known of it.
+
+    Attributes:
+        last_id: number of its last frame, None where it is not known.
+        reference_s: device time less trigger time of a good shot, None before a synchronisation.
+        opened: how often the camera was opened when that was learnt.
+    """
+
+    camera: Camera
+    last_id: int | None = None
+    reference_s: float | None = None
+    opened: int = -1
+
+    def forget(self) -> None:
+        """Know nothing any more."""
+        self.last_id, self.reference_s, self.opened = None, None, self.camera.opened
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """Two frames of one trigger, and each one's device time less the trigger's."""
+
+    frames: tuple[Frame, ...]
+    offsets_s: tuple[float, ...]
+
+
+@dataclass
+class Pairing:
+    """Takes pairs of frames. One thread at a time uses it.
+
+    Args:
+        cameras: in-phase and quadrature, armed.
+        trigger: armed.
+        settings: how strict.
+    """
+
+    cameras: Sequence[Camera]
+    trigger: Trigger
+    settings: PairingSettings = field(default_factory=PairingSettings)
+
+    def __post_init__(self) -> None:
+        least = 2.5 * self.settings.tolerance_s
+        if self.settings.spacing_s < least:
+            raise SourceError("pairing: spacing_s", self.settings.spacing_s, f"at least {least:g}, 2.5 tolerances")
+        self._channels = [_Channel(camera) for camera in self.cameras]
+        self._referenced_at = -float("inf")
+        self._next_at = -float("inf")
+        self._settled = False
+
+    @property
+    def synchronised(self) -> bool:
+        """Whether frames can be told apart now, without a synchronisation before."""
+        fresh = time.monotonic() - self._referenced_at < self.settings.expires_s
+        return fresh and all(
+            channel.reference_s is not None and channel.opened == channel.camera.opened for channel in self._channels
+        )
+
+    def shot(
+        self, deadline: float, display: Callable[[], None] | None = None, displayed: Callable[[], bool] | None = None
+    ) -> tuple[Frame, ...]:
+        """Take one pair, synchronised before where that is needed.
+
+        Args:
+            deadline: `time.monotonic` time after which no more trigger is fired.
+            display: puts the page on display and returns once it is; called once, before the first trigger.
+            displayed: whether the page is still on display.
+
+        Raises:
+            LostShotError: there is no pair, and why. The next shot begins with silence.
+        """
+        try:
+            if display is not None:
+                display()
+            self._displayed_at = time.monotonic()
+            if not self._settled:
+                self._settle(deadline)
+            if not self.synchronised:
+                self._synchronise(deadline)
+            taken = self._take(deadline)
+            self._check_times(taken)
+            if displayed is not None and not displayed():
+                raise LostShotError(
+                    "page", "no longer on display", "there until both frames are in", Reason.NOT_ON_DISPLAY
+                )
+        except BaseException:
+            self._settled = False
+            raise
+        return taken.frames
+
+    def _check_times(self, taken: _Taken) -> None:
+        """Rule 4; the references follow where it holds."""
+        deviations = [
+            offset - (channel.reference_s or 0.0)
+            for channel, offset in zip(self._channels, taken.offsets_s, strict=True)
+        ]
+        if max(map(abs, deviations)) > self.settings.tolerance_s:
+            told = ", ".join(
+                f"{channel.camera.name} {1e3 * deviation:+.1f} ms"
+                for channel, deviation in zip(self._channels, deviations, strict=True)
+            )
+            expected = f"at most {1e3 * self.settings.tolerance_s:g} ms after the trigger's usual time"
+            raise LostShotError("frames", told, expected, Reason.OTHER_SHOT)
+        for channel, deviation in zip(self._channels, deviations, strict=True):
+            channel.reference_s = (channel.reference_s or 0.0) + _FOLLOWING * deviation
+        self._referenced_at = time.monotonic()
+
+    def _synchronise(self, deadline: float) -> None:
+        """Learn the references from three shots that agree.
+
+        Raises:
+            LostShotError: `NOT_SYNCHRONISED`, or a fault that no further try mends.
+        """
+        tolerance = self.settings.tolerance_s
+        last: LostShotError | None = None
+        for _ in range(_TRIES):
+            for channel in self._channels:
+                channel.forget()
+            try:
+                self._settle(deadline)
+                offsets = []
+                for gap in _GAPS:
+                    self._next_at += gap * tolerance
+                    offsets.append(self._take(deadline).offsets_s)
+                each = [sorted(of_one) for of_one in zip(*offsets, strict=True)]
+                spread = max(ordered[-1] - ordered[0] for ordered in each)
+                if spread <= tolerance:
+                    for channel, ordered in zip(self._channels, each, strict=True):
+                        channel.reference_s = ordered[len(ordered) // 2]
+                    self._referenced_at = time.monotonic()
+                    return
+                told = f"times that differ by {1e3 * spread:.1f} ms"
+                last = LostShotError("three shots", told, f"at most {1e3 * tolerance:g} ms", Reason.NOT_SYNCHRONISED)
+            except LostShotError as error:
+                if error.reason in (Reason.CAMERA_GONE, Reason.TRIGGER_GONE, Reason.TRIGGER_REFUSED):
+                    raise
+                last = error
+            if time.monotonic() > deadline:
+                break
+        told = str(last) if last is not None else "no time left"
+        raise LostShotError("synchronisation", told, "three shots that agree", Reason.NOT_SYNCHRONISED)
+
+    def _take(self, deadline: float) -> _Taken:
+        """Fire once, and take both frames by rules 1 to 3, the page on display for long enough before."""
+        settings = self.settings
+        earliest = max(self._next_at, self._displayed_at + settings.tolerance_s)
+        if earliest > deadline or time.monotonic() > deadline:
+            raise LostShotError("shot", "no time left", "a longer wait", Reason.MISSING_FRAME)
+        time.sleep(max(0.0, earliest - time.monotonic()))
+        if self._drain():
+            raise LostShotError("frame", "one before the trigger", "none", Reason.STRAY_FRAME)
+        fired = self.trigger.fire()
+        self._next_at = time.monotonic() + settings.spacing_s
+        end = time.monotonic() + settings.frame_s
+        frames, ids = list[Frame](), list[int]()
+        for channel in self._channels:
+            frame = channel.camera.frame(max(1e-3, end - time.monotonic()))
+            frames.append(frame := self._checked(channel, frame))
+            ids.append(_info(frame).frame_id)
+        if self._drain():
+            raise LostShotError("frame", "one more than the trigger asked for", "two", Reason.STRAY_FRAME)
+        for channel, number in zip(self._channels, ids, strict=True):
+            channel.last_id = number
+        return _Taken(tuple(frames), tuple(_info(frame).device_time_s - fired for frame in frames))
+
+    def _checked(self, channel: _Channel, frame: Frame | None) -> Frame:
+        """A frame that came, by rules 2 and 3."""
+        name = channel.camera.name
+        if frame is None:
+            wanted = f"one within {self.settings.frame_s:g} s of the trigger"
+            raise LostShotError(f"{name}: frame", "none", wanted, Reason.MISSING_FRAME)
+        if frame.status is not FrameStatus.COMPLETE or frame.info is None or frame.pixels is None:
+            raise LostShotError(f"{name}: frame", frame.detail or "parts of it", "all of it", Reason.INCOMPLETE_FRAME)
+        if channel.last_id is not None:
+            expected = channel.last_id % channel.camera.frame_numbers + 1
+            if frame.info.frame_id != expected:
+                raise LostShotError(f"{name}: frame number", frame.info.frame_id, expected, Reason.SKIPPED_FRAME)
+        return frame
+
+    def _drain(self) -> int:
+        """Drop the frames that wait; returns how many."""
+        dropped = 0
+        for channel in self._channels:
+            while channel.camera.frame(0.0) is not None:
+                dropped += 1
+                channel.last_id = None
+        return dropped
+
+    def _settle(self, deadline: float) -> None:
+        """Wait until no frame has come for a while; what came before is not known any more."""
+        quiet = self.settings.quiet_s
+        end = time.monotonic() + quiet
+        give_up = min(deadline, end + _MOST_QUIET * quiet)
+        while (now := time.monotonic()) < end:
+            if now > give_up:
+                raise LostShotError("cameras", "frames without end", f"silence for {quiet:g} s", Reason.STRAY_FRAME)
+            if self._drain():
+                end = time.monotonic() + quiet
+            time.sleep(0.005)
+        for channel in self._channels:
+            channel.last_id = None
+        self._next_at = max(self._next_at, time.monotonic())
+        self._settled = True
+
+
+def _info(frame: Frame) -> FrameInfo:
+    assert frame.info is not None  # of a complete frame
+    return frame.info

@@ -1,0 +1,197 @@
+"""No two frames of different shots ever make a pair, whatever goes wrong."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from runtime.acquisition.pairing import Pairing, PairingSettings
+from runtime.cameras.camera import FrameStatus
+from runtime.errors import LostShotError, Reason, SourceError
+from tests.runtime.acquisition.lab import Lab, LabCamera
+
+SETTINGS = PairingSettings(tolerance_s=0.012, frame_s=0.15, quiet_s=0.05, spacing_s=0.032)
+
+
+def pairing_of(lab: Lab) -> Pairing:
+    return Pairing(lab.cameras, lab, SETTINGS)
+
+
+def shoot(pairing: Pairing, lab: Lab, seconds: float = 10.0) -> tuple[int, int]:
+    first, second = pairing.shot(time.monotonic() + seconds, lab.display, lambda: True)
+    assert first.pixels is not None
+    assert second.pixels is not None
+    return int(first.pixels[0, 0]), int(second.pixels[0, 0])
+
+
+def tried(pairing: Pairing, lab: Lab) -> Reason | None:
+    """Why a shot was lost; None for a pair, which shows the page."""
+    try:
+        pair = shoot(pairing, lab)
+    except LostShotError as error:
+        return error.reason
+    assert pair == (lab.page % 251, lab.page % 251)
+    return None
+
+
+def test_pairs_show_the_page_over_the_wrap_of_numbers() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    for _ in range(12):
+        assert shoot(pairing, lab) == (lab.page, lab.page)
+    assert lab.fired == 12 + 3
+    assert lab.cameras[0].id < 20
+
+
+def faults(lab: Lab) -> dict[str, tuple[Callable[[], None], set[Reason]]]:
+    first, second = lab.cameras
+
+    def both(**how: float) -> None:
+        for camera in lab.cameras:
+            camera.edge(**how)  # type: ignore[arg-type]
+
+    def doubled() -> None:
+        both()
+        first.edge(after_s=0.004)
+
+    def incomplete() -> None:
+        first.edge()
+        second.edge(status=FrameStatus.INCOMPLETE)
+
+    def missed_and_late() -> None:
+        first.edge(after_s=0.04)
+        second.edge()
+
+    return {
+        "missed by one": (lambda: first.edge(), {Reason.MISSING_FRAME}),
+        "missed by both": (lambda: None, {Reason.MISSING_FRAME}),
+        "one late": (missed_and_late, {Reason.OTHER_SHOT}),
+        "both late": (lambda: both(after_s=0.05), {Reason.OTHER_SHOT}),
+        "doubled": (doubled, {Reason.STRAY_FRAME, Reason.SKIPPED_FRAME}),
+        "packets lost": (incomplete, {Reason.INCOMPLETE_FRAME}),
+        "delivered too late": (lambda: both(delivery_s=0.3), {Reason.MISSING_FRAME}),
+    }
+
+
+@pytest.mark.parametrize("fault", list(faults(Lab())))
+def test_each_fault_is_named_and_the_shot_after_it_is_right(fault: str) -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    shoot(pairing, lab)
+    lab.plan, reasons = faults(lab)[fault]
+    outcome = tried(pairing, lab)
+    assert outcome in reasons or (fault == "doubled" and outcome is None)  # its second edge may spoil the next shot
+    after = [tried(pairing, lab) for _ in range(9)]
+    spoilt = {Reason.STRAY_FRAME, Reason.SKIPPED_FRAME} if fault in ("doubled", "delivered too late") else set()
+    assert set(after) <= {None, *spoilt}
+    assert after[-1] is None
+
+
+def test_a_camera_that_was_restarted_is_synchronised_anew() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    shoot(pairing, lab)
+    lab.cameras[1].restart()
+    before = lab.fired
+    assert shoot(pairing, lab) == (lab.page, lab.page)
+    assert lab.fired == before + 4
+
+
+def test_a_queue_that_is_one_frame_behind_is_never_believed() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    shoot(pairing, lab)
+    for camera in lab.cameras:
+        camera.edge(after_s=0.03)  # a trigger from elsewhere
+    assert {tried(pairing, lab) for _ in range(2)} & {Reason.STRAY_FRAME, Reason.SKIPPED_FRAME}
+    assert shoot(pairing, lab) == (lab.page, lab.page)
+
+
+def test_a_page_that_is_taken_away_is_not_given_out() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    with pytest.raises(LostShotError) as raised:
+        pairing.shot(time.monotonic() + 5, lab.display, lambda: False)
+    assert raised.value.reason is Reason.NOT_ON_DISPLAY
+
+
+def test_devices_that_are_gone_are_named_at_once() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    lab.gone = True
+    begun = time.monotonic()
+    with pytest.raises(LostShotError) as raised:
+        shoot(pairing, lab)
+    assert raised.value.reason is Reason.TRIGGER_GONE
+    lab.gone, lab.cameras[0].gone = False, True
+    with pytest.raises(LostShotError) as raised:
+        shoot(pairing, lab)
+    assert raised.value.reason is Reason.CAMERA_GONE
+    assert time.monotonic() - begun < 5
+    lab.cameras[0].gone = False
+    assert shoot(pairing, lab) == (lab.page, lab.page)
+
+
+def test_cameras_that_never_answer_end_with_the_time_of_the_shot() -> None:
+    lab = Lab()
+    for camera in lab.cameras:
+        camera.edge = lambda *_, **__: None  # type: ignore[method-assign]
+    begun = time.monotonic()
+    with pytest.raises(LostShotError) as raised:
+        shoot(pairing_of(lab), lab, seconds=1.0)
+    assert raised.value.reason is Reason.NOT_SYNCHRONISED
+    assert time.monotonic() - begun < 5
+
+
+def test_a_clock_whose_times_jump_is_not_synchronised() -> None:
+    lab = Lab()
+    rng = np.random.default_rng(0)
+    first = lab.cameras[0]
+    edge = first.edge
+
+    def jumping(after_s: float = 0.0, delivery_s: float = 0.001, status: FrameStatus = FrameStatus.COMPLETE) -> None:
+        first.clock_s += float(rng.uniform(0.1, 1))
+        edge(after_s, delivery_s, status)
+
+    first.edge = jumping  # type: ignore[method-assign]
+    with pytest.raises(LostShotError) as raised:
+        shoot(pairing_of(lab), lab, seconds=1.0)
+    assert raised.value.reason is Reason.NOT_SYNCHRONISED
+
+
+def test_a_spacing_that_does_not_tell_shots_apart_is_refused() -> None:
+    lab = Lab()
+    with pytest.raises(SourceError, match="spacing"):
+        Pairing(lab.cameras, lab, PairingSettings(tolerance_s=0.05, spacing_s=0.06))
+
+
+def test_no_wrong_pair_among_shots_with_many_faults() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    rng = np.random.default_rng(5)
+    outcome: Counter[str] = Counter()
+    for _ in range(40):
+        known = faults(lab)
+        if rng.random() < 0.4:
+            lab.plan = known[str(rng.choice(list(known)))][0]
+        if rng.random() < 0.05:
+            lab.cameras[int(rng.integers(2))].restart()
+        lost = tried(pairing, lab)
+        outcome["taken" if lost is None else lost.value] += 1
+    assert outcome["taken"] >= 15
+    assert sum(outcome.values()) == 40
+
+
+def test_the_lab_itself_shows_what_is_on_display() -> None:
+    camera = LabCamera("I", lambda: np.full((4, 4), 7, np.uint8))
+    camera.edge(after_s=0.01)
+    frame = camera.frame(0.0)
+    assert frame is None
+    frame = camera.frame(1.0)
+    assert frame is not None
+    assert frame.pixels is not None
+    assert frame.pixels[0, 0] == 7
