@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import ProfileError, RecordingError
 from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
+from lightpage.recording.black_level import without_black
 from lightpage.recording.layout import (
     CAMERAS,
     DARK,
@@ -414,11 +415,7 @@ class Recording:
         return data
 
     def _without_black(self, frame: NDArray[Any]) -> NDArray[Any]:
-        """Counts above the black level, of the same type; noise below it becomes 0, full scale stays: it is clipped."""
-        if self._black_level == 0:
-            return frame
-        black, full_scale = frame.dtype.type(self._black_level), 2**self._bit_depth - 1
-        return np.where(frame == full_scale, frame, np.maximum(frame, black) - black)
+        return without_black(frame, self._black_level, self._bit_depth)
 
     def _check_counts(self, name: str, frame: NDArray[Any], where: str) -> None:
         full_scale = 2**self._bit_depth - 1
