@@ -1,8 +1,8 @@
 """Tells which two frames belong to one shot: a frame is of this trigger only if its own camera's clock says so.
 
 Cameras count the frames that they took, so one missed trigger shifts all later numbers. Neither order of arrival nor
-equal numbers nor the nearest time tell whose a frame is. So one trigger is in flight at a time, and a pair counts only where
-every one of these rules holds:
+equal numbers nor the nearest time tell whose a frame is. So one trigger is in flight at a time, and a pair counts only
+where every one of these rules holds:
 
 1. No frame waits before the trigger, and none is left over after both frames are in.
 2. Both frames are complete. Number and time of any other may be those of an earlier frame.

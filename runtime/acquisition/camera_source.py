@@ -1,0 +1,285 @@
+"""Two cameras, a trigger, a modulator and the beams' shutters as one source of pages."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.device.profile import Profile
+from lightpage.errors import FrameError
+from lightpage.page.symbols import MAX_LEVELS
+from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
+from lightpage.recording.exposure import check_pair_light
+from lightpage.recording.layout import FramePair, frame_type
+from runtime.acquisition.page_store import PageStore
+from runtime.acquisition.pairing import Pairing, PairingSettings
+from runtime.acquisition.source import SHOT_S, FrameSource, Shot
+from runtime.cameras.camera import Camera, Frame
+from runtime.errors import LostShotError, Reason, SourceError
+from runtime.modulator.modulator import Beams, Modulator
+from runtime.trigger.trigger import Trigger
+
+Counts = NDArray[np.unsignedinteger[Any]]
+
+_log = logging.getLogger(__name__)
+
+_GONE = frozenset({Reason.CAMERA_GONE, Reason.TRIGGER_GONE})
+_AGAIN_S = 0.5
+"""Between two attempts to reach a device that has gone."""
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """How frames are taken.
+
+    Attributes:
+        repeats: further shots of a page whose shot is lost, while it is on display.
+        reference_frames, dark_frames: shots that make the mean of each.
+        flips: (vertical, horizontal) of each camera that sees a mirror image, for in-phase and quadrature.
+    """
+
+    repeats: int = 1
+    reference_frames: int = 8
+    dark_frames: int = 8
+    flips: tuple[tuple[bool, bool], tuple[bool, bool]] = ((False, False), (False, False))
+
+
+class CameraSource(FrameSource):
+    """Shows a page, triggers both cameras and pairs their frames.
+
+    A shot that is lost is repeated while its page is on display. A device that has gone is looked for until the shot's
+    time is up; the first shot after it is back finds it.
+
+    Args:
+        profile: nominal device.
+        cameras: in-phase and quadrature.
+        trigger: fires both.
+        modulator: shows the pages; None where something else does, which then is to hold one page still for each shot.
+        beams: block signal and reference beam.
+        pages: what the modulator shows.
+        pairing: how strictly frames are told apart.
+        exposures: how they are taken.
+        name: for people.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        cameras: tuple[Camera, Camera],
+        trigger: Trigger,
+        modulator: Modulator | None,
+        beams: Beams,
+        pages: PageStore | None = None,
+        pairing: PairingSettings | None = None,
+        exposures: Exposures | None = None,
+        name: str = "camera",
+    ) -> None:
+        self.name, self.profile = name, profile
+        self.frame_shape, self.page_shape = profile.frame_shape, profile.page_shape
+        self.modulator, self.beams = modulator, beams
+        self.pages = pages if pages is not None else PageStore(profile)
+        self._cameras, self._trigger = cameras, trigger
+        self._exposures = exposures or Exposures()
+        self._pairing = Pairing(cameras, trigger, pairing or PairingSettings())
+        self._lock = threading.RLock()
+        """Held while the devices are used: one shot at a time."""
+        self._armed = self._was_armed = False
+        self._next = 0
+        self._dark: tuple[DarkFrame, DarkFrame] | None = None
+        self._repairs: tuple[PixelRepair, ...] = ()
+        self._outcomes: Counter[str] = Counter()
+        self._saturated: dict[str, float] = {}
+        self.on_lost: Callable[[int, LostShotError], None] = lambda page, error: None
+        """Called for each lost shot with the page's number, repeated shots included."""
+
+    @property
+    def levels(self) -> int:  # type: ignore[override]
+        """Level count of its pages; 256 before any page is known."""
+        return self.pages.levels or MAX_LEVELS
+
+    @property
+    def bit_depth(self) -> int:  # type: ignore[override]
+        """Bits of a camera count."""
+        return self._cameras[0].bit_depth
+
+    def shots_by_outcome(self) -> Mapping[str, int]:
+        """Shots so far by how they ended: ``TAKEN``, or the reason of the loss."""
+        return dict(self._outcomes)
+
+    def saturated_shares(self) -> Mapping[str, float]:
+        """Share of pixels at full scale in each camera's last frame."""
+        return dict(self._saturated)
+
+    def arm(self) -> None:
+        """See `FrameSource.arm`."""
+        with self._lock:
+            if self._armed:
+                return
+            for camera in self._cameras:
+                self._arm(camera, Reason.CAMERA_GONE)
+            self._arm(self._trigger, Reason.TRIGGER_GONE)
+            depths = [camera.bit_depth for camera in self._cameras]
+            if depths[0] != depths[1]:
+                raise SourceError(f"{self.name}: cameras", f"{depths[0]} and {depths[1]} bits", "the same for both")
+            self._armed = self._was_armed = True
+
+    def _arm(self, device: Camera | Trigger, reason: Reason) -> None:
+        """Make one device ready. One that was ready before and cannot be found now has gone, and may come back."""
+        try:
+            device.arm()
+        except SourceError as error:
+            if not self._was_armed:
+                raise
+            raise LostShotError(error.subject, error.got, error.expected, reason) from None
+
+    def disarm(self) -> None:
+        """See `FrameSource.disarm`."""
+        with self._lock:
+            self._armed = False
+            for device in (self._trigger, *self._cameras):
+                device.disarm()
+
+    def close(self) -> None:
+        """See `FrameSource.close`."""
+        with self._lock:
+            self._armed = False
+            for device in (self._trigger, *self._cameras, self.modulator, self.beams):
+                if device is not None:
+                    device.close()
+            self.pages.close()
+
+    def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
+        """See `FrameSource.shot`."""
+        deadline = time.monotonic() + timeout_s
+        with self._lock:
+            index, symbols = self._page(page)
+            frames = self._persistent(index, deadline, lambda: self._attempt(index, symbols, deadline))
+            pair = FramePair(*(self._cleaned(one, frame) for one, frame in enumerate(frames)))
+            first, second = (frame.info for frame in frames)
+            assert first is not None  # of complete frames
+            assert second is not None
+            return Shot(pair, index, symbols, None, (first, second))
+
+    def references(self) -> FramePair:
+        """Mean of reference-only frames, taken now: the signal beam is blocked for them.
+
+        Raises:
+            LostShotError: they could not be taken.
+            SourceError: they are dark or saturated, or this device cannot block its signal beam.
+        """
+        with self._lock, self._beams_as(signal=False, reference=True):
+            stacks = self._stacks(self._exposures.reference_frames)
+            means = [np.rint(stack.mean(axis=0)).astype(stack.dtype) for stack in stacks]
+        pair = FramePair(means[0], means[1])
+        try:
+            check_pair_light(f"{self.name}: reference ", pair, self.bit_depth)
+        except FrameError as error:
+            raise SourceError(error.subject, error.got, error.expected) from None
+        return pair
+
+    def dark_frames(self) -> tuple[DarkFrame, DarkFrame]:
+        """What both cameras see without light, taken now; black level and hot pixels are minded from here on.
+
+        Raises:
+            LostShotError: they could not be taken.
+            SourceError: there was light, or this device cannot block its beams.
+        """
+        with self._lock, self._beams_as(signal=False, reference=False):
+            before, self._dark = self._dark, None
+            try:
+                stacks = self._stacks(self._exposures.dark_frames)
+                first, second = (
+                    DarkFrame.of(stack, self.bit_depth, f"{camera.name}: dark frames")
+                    for stack, camera in zip(stacks, self._cameras, strict=True)
+                )
+            except BaseException as error:
+                self._dark = before
+                if isinstance(error, FrameError):
+                    raise SourceError(error.subject, error.got, error.expected) from None
+                raise
+            self._dark = (first, second)
+            self._repairs = tuple(PixelRepair(self.frame_shape, dark.hot) for dark in self._dark)
+            for camera, dark in zip(self._cameras, self._dark, strict=True):
+                _log.info("%s: black level %d, %d hot pixels", camera.name, dark.black_level, len(dark.hot))
+            return self._dark
+
+    def _page(self, page: int | None) -> tuple[int, NDArray[np.uint8] | None]:
+        """Number and symbols of page `page`, or of the next one; without pages of its own the number only counts."""
+        count = len(self.pages)
+        if page is None:
+            page, self._next = self._next, self._next + 1
+            page = page % count if count else page
+        if not count and self.modulator is None:
+            return page, None
+        return page, self.pages[page]
+
+    def _attempt(self, index: int, symbols: NDArray[np.uint8] | None, deadline: float) -> tuple[Frame, ...]:
+        modulator = self.modulator
+        if modulator is None or symbols is None:
+            return self._pairing.shot(deadline)
+        left = max(0.0, deadline - time.monotonic())
+        return self._pairing.shot(
+            deadline, lambda: modulator.show(symbols, self.levels, index, left), lambda: modulator.shows()
+        )
+
+    def _persistent(self, index: int, deadline: float, attempt: Callable[[], tuple[Frame, ...]]) -> tuple[Frame, ...]:
+        """A pair of one page: lost shots are repeated, and devices that have gone are waited for."""
+        repeats = self._exposures.repeats
+        while True:
+            try:
+                self.arm()
+                frames = attempt()
+            except LostShotError as error:
+                self._outcomes[error.reason.value] += 1
+                self.on_lost(index, error)
+                if error.reason in _GONE:
+                    self._armed = False
+                    if time.monotonic() + _AGAIN_S < deadline:
+                        time.sleep(_AGAIN_S)
+                        continue
+                elif repeats > 0 and time.monotonic() < deadline:
+                    repeats -= 1
+                    continue
+                raise error.about(f"page {index} of {self.name}") from None
+            self._outcomes["TAKEN"] += 1
+            return frames
+
+    def _cleaned(self, one: int, frame: Frame) -> Counts:
+        """The counts of a frame, upright, hot pixels mended, the black level taken off."""
+        pixels = frame.pixels
+        assert pixels is not None  # of a complete frame
+        camera, full_scale = self._cameras[one], 2**self.bit_depth - 1
+        if pixels.shape != self.frame_shape:
+            raise SourceError(f"{camera.name}: frame", f"{pixels.shape}", f"{self.frame_shape}")
+        self._saturated[camera.name] = float(np.count_nonzero(pixels >= full_scale) / pixels.size)
+        pixels = pixels.astype(frame_type(self.bit_depth), copy=False)
+        vertical, horizontal = self._exposures.flips[one]
+        pixels = np.ascontiguousarray(pixels[:: -1 if vertical else 1, :: -1 if horizontal else 1])
+        if self._dark is None:
+            return pixels
+        return without_black(self._repairs[one](pixels), self._dark[one].black_level, self.bit_depth)
+
+    def _stacks(self, count: int) -> list[Counts]:
+        """Frames of both cameras [exposure, row, column], whatever is on display."""
+        shots = []
+        for _ in range(count):
+            deadline = time.monotonic() + SHOT_S
+            shots.append(self._persistent(-1, deadline, lambda end=deadline: self._pairing.shot(end)))  # type: ignore[misc]
+        return [np.stack([self._cleaned(one, frames[one]) for frames in shots]) for one in (0, 1)]
+
+    @contextmanager
+    def _beams_as(self, *, signal: bool, reference: bool) -> Iterator[None]:
+        self.beams.let_through(signal=signal, reference=reference)
+        try:
+            yield
+        finally:
+            self.beams.let_through(signal=True, reference=True)

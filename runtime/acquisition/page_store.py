@@ -1,0 +1,97 @@
+"""Pages that a source's modulator shows: rows of a file, followed by pages that a caller has uploaded."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.device.profile import Profile
+from lightpage.errors import InvalidInputError, LimitError, PageError
+from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.recording.pages import Pages
+
+UPLOADED_BYTES = 256 << 20
+"""Most bytes of uploaded pages: 50,000 bench pages, 800 full-size pages of 2x2 pixels. They lie in memory."""
+
+
+class PageStore:
+    """Pages by number. Its methods may be called from many threads.
+
+    Args:
+        profile: nominal device.
+        written: pages of a file, or None; it is closed with the store.
+        levels: M, where there is no file to say it; None leaves it to the first upload.
+
+    Raises:
+        RecordingError: pages for another profile.
+        PageError: a level count outside 2..256.
+    """
+
+    def __init__(self, profile: Profile, written: Pages | None = None, levels: int | None = None) -> None:
+        if written is not None:
+            written.check_against(profile)
+            levels = written.levels
+        if levels is not None:
+            check_levels(levels)
+        self._shape, self._written, self._levels = profile.page_shape, written, levels
+        self._uploaded: list[NDArray[np.uint8]] = []
+        self._lock = threading.Lock()
+        """Guards all of it; the file is read under it too."""
+
+    @property
+    def levels(self) -> int | None:
+        """M of all pages, None before it is known."""
+        return self._levels
+
+    def __len__(self) -> int:
+        with self._lock:
+            return self._in_file + len(self._uploaded)
+
+    @property
+    def _in_file(self) -> int:
+        return 0 if self._written is None else len(self._written)
+
+    def __getitem__(self, page: int) -> NDArray[np.uint8]:
+        """The symbols [ny, nx] of a page.
+
+        Raises:
+            PageError: no such page.
+            RecordingError: it cannot be read.
+        """
+        with self._lock:
+            count = self._in_file + len(self._uploaded)
+            if not 0 <= page < count:
+                expected = f"0..{count - 1}" if count else "a page: none was given or uploaded"
+                raise PageError("page to show", page, expected)
+            if self._written is not None and page < len(self._written):
+                return self._written[page]
+            return self._uploaded[page - self._in_file]
+
+    def append(self, symbols: NDArray[np.uint8], levels: int) -> int:
+        """Take in pages [page, ny, nx] of M levels behind those that are there; returns the first one's number.
+
+        Raises:
+            PageError: another shape, or symbols beyond the levels.
+            InvalidInputError: other levels than the pages that are there.
+            LimitError: more than the store holds.
+        """
+        check_levels(levels)
+        pages = check_symbols(symbols, self._shape, levels, "uploaded pages").reshape(-1, *self._shape)
+        with self._lock:
+            if self._levels is not None and levels != self._levels:
+                raise InvalidInputError("levels of uploaded pages", levels, f"{self._levels}, as the pages before have")
+            held = sum(page.nbytes for page in self._uploaded) + pages.nbytes
+            if held > UPLOADED_BYTES:
+                raise LimitError("uploaded pages", f"{held} bytes with those held", f"at most {UPLOADED_BYTES}")
+            first = self._in_file + len(self._uploaded)
+            self._levels = levels
+            self._uploaded.extend(page.copy() for page in pages)
+            return first
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            if self._written is not None:
+                self._written.close()
