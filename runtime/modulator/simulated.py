@@ -1,0 +1,69 @@
+"""Modulator and shutters of a simulated device, over the Unix socket on which it listens.
+
+A message is a line of JSON, followed by the page's symbols where it shows one. Each is answered by a line of JSON, once
+the page is on display or the shutters have moved; an answer with `error` says why not.
+"""
+
+from __future__ import annotations
+
+import json
+from multiprocessing.connection import Client, Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.errors import LostShotError, Reason
+
+ANSWER_S = 30.0
+"""Longest wait for shutters. A full-size page takes minutes to simulate, but it has the wait of its shot."""
+
+
+class SimulatedModulator:
+    """Satisfies `Modulator` and `Beams`.
+
+    Args:
+        address: of the simulated device's socket.
+    """
+
+    def __init__(self, address: Path) -> None:
+        self._address = address
+        self._connection: Connection[Any, Any] | None = None
+        self.name = f"simulated modulator {address.name}"
+
+    def show(self, symbols: NDArray[np.uint8], levels: int, page: int, timeout_s: float) -> None:
+        """See `Modulator`."""
+        head = {"levels": levels, "shape": symbols.shape, "page": page}
+        self._ask(head, symbols.tobytes(), timeout_s, Reason.NOT_ON_DISPLAY)
+
+    def shows(self) -> bool:
+        """See `Modulator`."""
+        return self._connection is not None
+
+    def let_through(self, *, signal: bool, reference: bool) -> None:
+        """See `Beams`."""
+        self._ask({"signal": signal, "reference": reference}, b"", ANSWER_S, Reason.BEAM_CONTROL_FAILED)
+
+    def close(self) -> None:
+        """See `Modulator`."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
+
+    def _ask(self, head: dict[str, Any], content: bytes, timeout_s: float, reason: Reason) -> None:
+        try:
+            if self._connection is None:
+                self._connection = Client(str(self._address), "AF_UNIX")
+            self._connection.send_bytes(json.dumps(head).encode() + b"\n" + content)
+            if not self._connection.poll(timeout_s):
+                raise LostShotError(self.name, f"no answer within {timeout_s:.1f} s", "an answer", reason)
+            answer = json.loads(self._connection.recv_bytes(1 << 16))
+        except (OSError, EOFError, ValueError) as error:
+            self.close()
+            raise LostShotError(self.name, error or "no connection", "a simulated device", reason) from None
+        except LostShotError:
+            self.close()  # what comes later is no answer to anything else
+            raise
+        if "error" in answer:
+            raise LostShotError(self.name, answer["error"], "a page on display, and shutters that moved", reason)

@@ -1,0 +1,1 @@
+"""A simulated device that looks like hardware: cameras, pulse generator, modulator."""
