@@ -47,6 +47,7 @@ SUMMARIES = {
     "evaluate": "Measure a bundle on a recording with known symbols.",
     "export": "Turn a training run into a bundle.",
     "recalibrate": "Re-fit a drifted device's geometry and write a new bundle.",
+    "record": "Record pages of cameras, or of any other source.",
     "recover": "Read a file back from recorded pages.",
     "report": "Show a training run, an evaluation or a recovery as an HTML page.",
     "rollback": "Put a service's previous model back in service.",

@@ -263,15 +263,19 @@ class Recording:
                 f"{_size(profile.page_shape)} (profile {profile.name})",
             )
 
+    def own_profile(self) -> Profile | None:
+        """The nominal profile that the recording carries; None where it has none that can be read."""
+        try:
+            return None if self._profile_text is None else parse_profile(self._profile_text, "profile of the recording")
+        except ProfileError:
+            return None
+
     def differences(self, profile: Profile) -> list[str]:
         """What the recording's own nominal profile says otherwise than `profile`, a line each.
 
         Empty where it has none that can be read: another program's notes are no reason to stop.
         """
-        try:
-            own = None if self._profile_text is None else parse_profile(self._profile_text, "profile of the recording")
-        except ProfileError:
-            own = None
+        own = self.own_profile()
         if own is None:
             return []
         told, expected = own.model_dump(), profile.model_dump()

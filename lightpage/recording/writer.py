@@ -28,6 +28,7 @@ from lightpage.recording.layout import (
     LOSSES,
     MAX_BIT_DEPTH,
     MIN_BIT_DEPTH,
+    REFERENCES,
     SHOT_DATA,
     VERSION,
     FrameInfo,
@@ -95,6 +96,7 @@ class RecordingWriter:
         *,
         resume: bool = False,
         code: str | None = None,
+        keep_references: bool = False,
     ) -> None:
         """Start a new recording; a partial file of the same name that nobody is writing is overwritten.
 
@@ -107,13 +109,15 @@ class RecordingWriter:
             pilots: boolean [ny, nx]; None leaves the profile's default positions in force.
             resume: as `RecordingWriter.resume` does.
             code: what the pages hold, JSON text, where they were made by an encoder.
+            keep_references: whether a recording that is gone on with keeps its own reference frames, where `references`
+                are others: no camera takes the same ones twice.
 
         Raises:
             RecordingError: wrong bit depth, frames or pilots, or the file cannot be written or is being written.
             PageError: a level count outside 2..256.
         """
         self._prepare(path, profile, levels, bit_depth)
-        self._code = code
+        self._code, self._keep_references = code, keep_references
         if not (resume and self._continue(references, pilots)):
             self._create(references, pilots)
 
@@ -127,12 +131,24 @@ class RecordingWriter:
         references: FramePair,
         pilots: ArrayLike | None = None,
         code: str | None = None,
+        *,
+        keep_references: bool = False,
     ) -> Self:
         """Go on with `<path>.partial` if it was started with the same arguments, else start anew.
 
         `pages` tells how many pages are there already. Arguments and errors as for the constructor.
         """
-        return cls(path, profile, levels, bit_depth, references, pilots, resume=True, code=code)
+        return cls(
+            path,
+            profile,
+            levels,
+            bit_depth,
+            references,
+            pilots,
+            resume=True,
+            code=code,
+            keep_references=keep_references,
+        )
 
     @property
     def pages(self) -> int:
@@ -173,8 +189,7 @@ class RecordingWriter:
         if infos is not None:
             data |= _shot_data(infos)
         self._check_same_datasets(data)
-        if infos is not None and CAMERAS not in self._file:
-            group = self._file.require_group(CAMERAS)
+        if infos is not None and "serials" not in (group := self._file.require_group(CAMERAS)).attrs:
             group.attrs["serials"] = [info.serial for info in infos]
             group.attrs["pixel_formats"] = [info.pixel_format for info in infos]
         try:
@@ -340,7 +355,7 @@ class RecordingWriter:
             pages = int(file.attrs.get("pages_complete", file[FRAMES[0]].shape[0]))
             same = (
                 all(file.attrs[name] == value for name, value in self._header().items())
-                and all(np.array_equal(file[name][()], value) for name, value in fixed.items())
+                and all(self._is_same(file[name], name, value) for name, value in fixed.items())
                 and ("pilots" in file) == ("pilots" in fixed)
             )
             if same:
@@ -357,6 +372,11 @@ class RecordingWriter:
             file.close()
             disk.close()
         return same
+
+    def _is_same(self, dataset: h5py.Dataset, name: str, value: NDArray[Any]) -> bool:
+        if self._keep_references and name in REFERENCES:
+            return dataset.shape == value.shape and dataset.dtype == value.dtype
+        return np.array_equal(dataset[()], value)
 
     def _growing(self) -> list[str]:
         """The datasets that grow by one with each page."""

@@ -86,7 +86,7 @@ class CameraSource(FrameSource):
         self.name, self.profile = name, profile
         self.frame_shape, self.page_shape = profile.frame_shape, profile.page_shape
         self.modulator, self.beams = modulator, beams
-        self.pages = pages if pages is not None else PageStore(profile)
+        self.pages: PageStore = pages if pages is not None else PageStore(profile)
         self._cameras, self._trigger = cameras, trigger
         self._exposures = exposures or Exposures()
         self._pairing = Pairing(cameras, trigger, pairing or PairingSettings())
@@ -98,8 +98,6 @@ class CameraSource(FrameSource):
         self._repairs: tuple[PixelRepair, ...] = ()
         self._outcomes: Counter[str] = Counter()
         self._saturated: dict[str, float] = {}
-        self.on_lost: Callable[[int, LostShotError], None] = lambda page, error: None
-        """Called for each lost shot with the page's number, repeated shots included."""
 
     @property
     def levels(self) -> int:  # type: ignore[override]
@@ -111,12 +109,18 @@ class CameraSource(FrameSource):
         """Bits of a camera count."""
         return self._cameras[0].bit_depth
 
+    def show_pages(self, pages: PageStore) -> None:
+        """See `FrameSource.show_pages`."""
+        with self._lock:
+            self.pages.close()
+            self.pages = pages
+
     def shots_by_outcome(self) -> Mapping[str, int]:
-        """Shots so far by how they ended: ``TAKEN``, or the reason of the loss."""
+        """See `FrameSource.shots_by_outcome`."""
         return dict(self._outcomes)
 
     def saturated_shares(self) -> Mapping[str, float]:
-        """Share of pixels at full scale in each camera's last frame."""
+        """See `FrameSource.saturated_shares`."""
         return dict(self._saturated)
 
     def arm(self) -> None:

@@ -25,6 +25,7 @@ class RecordingSource(FrameSource):
         """Guards the file and the position; held while one page is read."""
         self._next = 0
         self.name = f"recording:{path}"
+        self.profile = self._recording.own_profile()
         self.levels, self.bit_depth = self._recording.levels, self._recording.bit_depth
         self.frame_shape, self.page_shape = self._recording.frame_shape, self._recording.page_shape
 

@@ -11,9 +11,10 @@ import numpy as np
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError, PageError
-from lightpage.page.symbols import pilot_mask, random_symbols
+from lightpage.page.symbols import MAX_LEVELS, pilot_mask, random_symbols
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import FramePair
+from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 
 
@@ -43,10 +44,8 @@ class SimulatorSource(FrameSource):
     ) -> None:
         from lightpage.simulator.simulator import Simulator
 
-        if written is not None:
-            written.check_against(profile)
         levels = levels if written is None else written.levels
-        self._written = written
+        self.pages = None if written is None else PageStore(profile, written)
         self._simulator = Simulator(profile, device, levels, seed)
         self._lock = threading.Lock()
         """Guards the simulator and the position; held while one page is simulated."""
@@ -70,26 +69,33 @@ class SimulatorSource(FrameSource):
         with self._lock:
             if page is None:
                 page, self._next = self._next, self._next + 1
-                page = page if self._written is None else page % len(self._written)
-            if page < 0 or (self._written is not None and page >= len(self._written)):
-                expected = "a number of at least 0" if self._written is None else f"0..{len(self._written) - 1}"
-                raise PageError(f"page of {self.name}", page, expected)
-            if self._written is not None:
-                symbols = self._written[page]
+                page = page if self.pages is None else page % max(1, len(self.pages))
+            if self.pages is not None:
+                symbols = self.pages[page]
+            elif page < 0:
+                raise PageError(f"page of {self.name}", page, "a number of at least 0")
             else:
                 rng = np.random.default_rng([self._seed, page])
-                symbols = random_symbols(self.profile, self.levels, 1, rng)[0]
-            return Shot(self._simulator.page(symbols), page, symbols, pilot_mask(self.profile))
+                symbols = random_symbols(self._simulator.profile, self.levels, 1, rng)[0]
+            return Shot(self._simulator.page(symbols), page, symbols, pilot_mask(self._simulator.profile))
 
     def references(self) -> FramePair:
         """Reference-only frames of the device as it is now."""
         with self._lock:
             return self._simulator.references()
 
+    def show_pages(self, pages: PageStore) -> None:
+        """See `FrameSource.show_pages`."""
+        with self._lock:
+            if self.pages is not None:
+                self.pages.close()
+            self.pages, self.levels = pages, pages.levels or MAX_LEVELS
+            self._simulator.levels = self.levels
+
     def close(self) -> None:
         """Close the pages to write."""
-        if self._written is not None:
-            self._written.close()
+        if self.pages is not None:
+            self.pages.close()
 
 
 def open_simulator(rest: str) -> SimulatorSource:

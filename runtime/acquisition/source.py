@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
@@ -14,12 +14,23 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, InvalidInputError, RecordingError
+from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.layout import FrameInfo
 from lightpage.recording.reader import FramePair
-from runtime.errors import SourceError
+from runtime.acquisition.page_store import PageStore
+from runtime.errors import LostShotError, SourceError
 
 SHOT_S = 10.0
 """Usual time that a shot may take."""
+
+
+def nobody(text: str) -> None:
+    """The operator of a device that nobody stands beside.
+
+    Raises:
+        SourceError: always.
+    """
+    raise SourceError("operator", "nobody", f"somebody who does this, as `lightpage record` asks: {text}")
 
 
 @dataclass(frozen=True)
@@ -53,6 +64,10 @@ class FrameSource(ABC):
         bit_depth: bits of a camera count.
         frame_shape: (rows, columns) of its frames.
         page_shape: (rows, columns) of its pages where it knows them, else None.
+        profile: nominal device, where it knows it.
+        pages: what its modulator shows, where it has one that shows what it is given.
+        operator: is asked to do by hand what the device cannot; returns once that is done.
+        on_lost: is told of every lost shot and its page's number, of those too that a further shot made good.
     """
 
     name: str
@@ -60,6 +75,10 @@ class FrameSource(ABC):
     bit_depth: int
     frame_shape: tuple[int, int]
     page_shape: tuple[int, int] | None = None
+    profile: Profile | None = None
+    pages: PageStore | None = None
+    operator: Callable[[str], None] = staticmethod(nobody)
+    on_lost: Callable[[int, LostShotError], None] = staticmethod(lambda page, error: None)
 
     @abstractmethod
     def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
@@ -98,6 +117,30 @@ class FrameSource(ABC):
             LostShotError, SourceError: see `shot`.
         """
         return None
+
+    def dark_frames(self) -> tuple[DarkFrame, DarkFrame] | None:
+        """What both cameras see without light, taken now, where the source can; it minds them from here on.
+
+        Raises:
+            LostShotError, SourceError: see `shot`.
+        """
+        return None
+
+    def show_pages(self, pages: PageStore) -> None:
+        """Show these pages from now on.
+
+        Raises:
+            SourceError: it shows none that it is given.
+        """
+        raise SourceError(f"source {self.name}", "pages to show", "a source with a modulator")
+
+    def shots_by_outcome(self) -> Mapping[str, int]:
+        """Shots so far by how they ended: ``TAKEN``, or the reason of the loss; empty where nobody counts."""
+        return {}
+
+    def saturated_shares(self) -> Mapping[str, float]:
+        """Share of pixels at full scale in each camera's last frame; empty where nobody looks."""
+        return {}
 
     def close(self) -> None:  # noqa: B027 — a source without a device needs none
         """Let go of files and devices."""

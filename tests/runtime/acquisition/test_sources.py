@@ -52,7 +52,7 @@ class FakeSimulator:
     """Stands in for the wave simulator, which takes seconds a page."""
 
     def __init__(self, profile: object, device: Device, levels: int, seed: int) -> None:
-        self.device = device
+        self.device, self.profile, self.levels = device, profile, levels
 
     def set_device(self, device: Device) -> None:
         self.device = device
