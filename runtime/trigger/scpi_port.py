@@ -1,0 +1,311 @@
+"""A serial port with an SCPI device behind it: one message, one answer, and never the answer of another message.
+
+An SCPI device numbers neither messages nor answers, but answers in order: once a `*IDN?` has been answered, nothing can
+come of a message from before. After anything unexpected the port is therefore synchronised before the next message:
+wait for silence, send `*IDN?`, and want exactly one identification for every `*IDN?` sent so far, then silence again;
+and all of it twice. Identifications that are still due are counted, so that a late one is not taken for a newer one.
+"""
+
+from __future__ import annotations
+
+import re
+import termios
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from runtime.errors import LostShotError, Reason, SourceError
+
+if TYPE_CHECKING:
+    from serial import Serial
+
+GONE = (OSError, termios.error, TypeError)
+"""What pyserial raises of a port that was unplugged: its own SerialException is an OSError, `termios.error` is none,
+and TypeError comes of a descriptor that is gone."""
+REFUSALS = {
+    1: "incorrect prefix",
+    2: "missing keyword",
+    3: "invalid keyword",
+    4: "missing parameter",
+    5: "invalid parameter",
+    6: "this can only be queried",
+    7: "this cannot be queried",
+    8: "not possible in the present state",
+}
+"""Answers `?1` to `?8` of the BNC 575 and Quantum Composers 9520 family."""
+
+_IDENTIFY = "*IDN?"
+_IDENTIFICATION = re.compile(r"[!-~][ -~]*,[ -~]+,[ -~]+")
+"""Maker, model, serial number, and mostly versions."""
+_REFUSED = re.compile(r"\?([1-8])")
+_POLL_S = 0.02
+"""Longest wait inside pyserial."""
+_LONGEST_LINE = 512
+_ROUNDS = 2
+"""Identifications in a row, each with silence after, that make a port synchronised."""
+
+
+@dataclass(frozen=True)
+class LineTimes:
+    """How long is waited on a line.
+
+    Attributes:
+        answer_s: for an answer.
+        quiet_s: silence that makes a line quiet.
+        late_s: for an identification that is due while another has come already; what is later still is taken as lost.
+        synchronise_s: for synchronising, all in all.
+    """
+
+    answer_s: float = 0.5
+    quiet_s: float = 0.05
+    late_s: float = 1.0
+    synchronise_s: float = 4.0
+
+    @property
+    def longest_s(self) -> float:
+        """Bound of one query: pyserial connects within 5 s, the line may have to be synchronised twice."""
+        return 6.0 + 2 * self.synchronise_s + 3 * self.answer_s
+
+
+class ScpiPort:
+    """Used by one thread only; `runtime.trigger.scpi_line` has the thread.
+
+    Args:
+        port: device path or pyserial URL.
+        baud: of a tty.
+        times: how long is waited.
+
+    Attributes:
+        session: grows whenever the port is synchronised. As long as it stays, every message was answered.
+        identity: what the device says of itself, once that is known.
+    """
+
+    def __init__(self, port: str, baud: int, times: LineTimes) -> None:
+        self.name = f"pulse generator {port}"
+        self.session = 0
+        self.identity: str | None = None
+        self._path, self._baud, self._times = port, baud, times
+        self._port: Serial | None = None
+        self._buffer = bytearray()
+        self._synchronised = self._echo = False
+        self._known = False
+        """Whether `identity` has come often enough, since the port was opened, to be relied on."""
+        self._due = 0
+        """Identifications that were asked for and have not come."""
+        self._given_up = 0
+        """Those of them that are taken as lost."""
+
+    def ask(self, message: str, answer: re.Pattern[str], session: int | None, deadline: float) -> tuple[str, float]:
+        """Send a message and return its answer, and the middle of its sending in `time.monotonic` seconds.
+
+        Args:
+            message: without line end.
+            answer: what an answer looks like, all of it.
+            session: send it in this session only; None connects and synchronises first where that is needed.
+            deadline: it is not sent after this, `time.monotonic` seconds.
+
+        Raises:
+            LostShotError: `Reason.TRIGGER_GONE`: no such answer, or no port; `Reason.TRIGGER_REFUSED`: answered `?n`.
+            SourceError: the port's name or the baud rate makes no sense.
+        """
+        port = self._ready(session)
+        if time.monotonic() > deadline:
+            raise self._gone(f"no time left to send {message}", "an answer in time")
+        try:
+            begin, end = self._send(port, message)
+            found = self._answer(port, message, answer)
+            return found, (begin + min(end, time.monotonic())) / 2  # it was sent when the answer came
+        except GONE as error:
+            self.close()
+            raise self._gone(f"{_words(error)} at {message}", "a device that is plugged in") from None
+
+    def ask_twice(self, message: str, answer: re.Pattern[str], session: int | None, deadline: float) -> str:
+        """Send a query twice and return the answer if both are the same: a digit that a line alters shows.
+
+        Raises:
+            LostShotError, SourceError: see `ask`.
+        """
+        first, _ = self.ask(message, answer, session, deadline)
+        second, _ = self.ask(message, answer, self.session, deadline)
+        if first != second:
+            self._synchronised = False
+            raise self._gone(f"{first!r}, then {second!r} as answers to {message}", "the same answer twice")
+        return first
+
+    def close(self) -> None:
+        """Let go of the port; the next message opens it again."""
+        port, self._port = self._port, None
+        self._synchronised = False
+        self._buffer.clear()
+        self._given_up, self._due = self._given_up + self._due, 0
+        if port is not None:
+            try:
+                port.close()
+            except GONE:
+                return
+
+    def _ready(self, session: int | None) -> Serial:
+        """The open port, synchronised."""
+        port = self._port
+        if port is not None and self._synchronised:
+            try:
+                self._synchronised = not (self._buffer or port.in_waiting)  # nothing was asked: whose answer is that?
+            except GONE:
+                self.close()
+        if port is not None and self._synchronised and session in (None, self.session):
+            return port
+        if session is not None:
+            raise self._gone("a line that was interrupted since the device was set up", "a device that is set up")
+        if self._port is not None:
+            try:
+                self._synchronise(self._port)
+                return self._port
+            except GONE:
+                self.close()  # unplugged since; it may be back by now
+        port = self._open()
+        try:
+            self._synchronise(port)
+        except GONE as error:
+            self.close()
+            raise self._gone(_words(error), "a device that is plugged in") from None
+        return port
+
+    def _open(self) -> Serial:
+        import serial  # takes a while, and most have no such device
+
+        alone = None if "://" in self._path else True
+        try:
+            self._port = serial.serial_for_url(
+                self._path,
+                baudrate=self._baud,
+                timeout=_POLL_S,
+                write_timeout=self._times.answer_s,
+                exclusive=alone,
+            )
+        except ValueError as error:
+            raise SourceError(self.name, error, "a serial port or a pyserial URL, and a baud rate") from None
+        except GONE as error:
+            raise self._gone(_words(error), "a serial port that can be opened") from None
+        self._known = False
+        return self._port
+
+    def _send(self, port: Serial, message: str) -> tuple[float, float]:
+        """Send a line; returns begin and end of its sending, as far as that can be known."""
+        line = message.encode("ascii") + b"\r\n"
+        begin = time.monotonic()
+        port.write(line)
+        end = time.monotonic()
+        if "://" not in self._path:
+            end = max(end, begin + 10 * len(line) / self._baud)  # write() only fills the driver's buffer
+        return begin, end
+
+    def _answer(self, port: Serial, message: str, answer: re.Pattern[str]) -> str:
+        until = time.monotonic() + self._times.answer_s
+        line = self._line(port, until)
+        if line == message:  # the port echoes
+            self._echo = True
+            line = self._line(port, until)
+        elif self._echo and line is not None:
+            self._synchronised = False
+            self._identified(line)
+            raise self._gone(f"{line!r} before the echo of {message}", "the echo first")
+        if line is not None and (refused := _REFUSED.fullmatch(line)):
+            meaning = REFUSALS[int(refused[1])]
+            raise LostShotError(self.name, f"{line} ({meaning}) to {message}", "no refusal", Reason.TRIGGER_REFUSED)
+        if line is not None and answer.fullmatch(line):
+            return line
+        self._synchronised = False
+        if line is None:
+            raise self._gone(f"no answer to {message} within {self._times.answer_s:g} s", "an answer")
+        self._identified(line)
+        raise self._gone(f"{line!r} to {message}", f"an answer like {answer.pattern}")
+
+    def _synchronise(self, port: Serial) -> None:
+        """Make sure that nothing is on its way any more; see the module.
+
+        Raises:
+            LostShotError: that cannot be had in time; the port is closed.
+        """
+        self._synchronised = False
+        end = time.monotonic() + self._times.synchronise_s
+        rounds = 0
+        while rounds < _ROUNDS:
+            if time.monotonic() > end:
+                self.close()
+                raise self._gone(
+                    f"no clear answer to {_IDENTIFY} within {self._times.synchronise_s:g} s", "its identification"
+                )
+            if not self._quiet(port, end):
+                continue
+            self._send(port, _IDENTIFY)
+            self._due += 1
+            rounds = rounds + 1 if self._one_round(port, end) else 0
+        self._synchronised = self._known = True
+        self.session += 1
+
+    def _one_round(self, port: Serial, end: float) -> bool:
+        """Whether every identification that was due has come and nothing after it."""
+        until = min(end, time.monotonic() + self._times.answer_s)
+        known, came, echo = self.identity, False, False
+        while self._due:
+            line = self._line(port, until)
+            if line is None:
+                if came:  # a later one answers all that came before: those that are missing were lost, or are very late
+                    self._given_up, self._due = self._given_up + self._due, 0
+                return False
+            if line == _IDENTIFY:
+                echo = True
+            elif self._identified(line):
+                came, until = True, min(end, time.monotonic() + self._times.late_s)
+        self._echo = echo
+        return self._quiet(port, end) and self.identity == known
+
+    def _identified(self, line: str) -> bool:
+        """Whether a line is the identification, and one fewer is due then."""
+        if not (line == self.identity if self._known else _IDENTIFICATION.fullmatch(line)):
+            return False
+        self.identity = line
+        if not self._due:
+            self._due, self._given_up = self._given_up, 0  # none is lost, they are late
+        self._due = max(0, self._due - 1)
+        return True
+
+    def _quiet(self, port: Serial, end: float) -> bool:
+        """Read until nothing has come for a while; whether nothing came at all."""
+        nothing, since = True, time.monotonic()
+        while (now := time.monotonic()) - since < self._times.quiet_s and now < end:
+            if self._read(port):
+                nothing, since = False, time.monotonic()
+            while (line := self._next_line()) is not None:
+                self._identified(line)
+        nothing = nothing and not self._buffer
+        self._buffer.clear()
+        return nothing
+
+    def _line(self, port: Serial, until: float) -> str | None:
+        """The next line without its CR and LF, or None where it does not end in time; a damaged one keeps its LF."""
+        while (line := self._next_line()) is None and time.monotonic() < until:
+            self._read(port)
+        return line
+
+    def _next_line(self) -> str | None:
+        end = self._buffer.find(b"\n") + 1
+        if not end and len(self._buffer) < _LONGEST_LINE:
+            return None
+        end = end or len(self._buffer)
+        line = bytes(self._buffer[:end])
+        del self._buffer[:end]
+        return line.removesuffix(b"\r\n").decode("latin-1") if end < _LONGEST_LINE else repr(line)
+
+    def _read(self, port: Serial) -> int:
+        found = port.read(max(1, port.in_waiting))
+        self._buffer += found
+        return len(found)
+
+    def _gone(self, got: object, expected: object) -> LostShotError:
+        return LostShotError(self.name, got, expected, Reason.TRIGGER_GONE)
+
+
+def _words(error: BaseException) -> str:
+    """What an exception of pyserial says, with its kind: some say little else."""
+    return f"{type(error).__name__} ({error})"
