@@ -1,0 +1,95 @@
+"""Shutters open and close as they are told, and are left open."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from lightpage.errors import InvalidInputError
+from runtime.errors import LostShotError, Reason
+from runtime.modulator.modulator import Beams
+from runtime.modulator.shutters import Shutter, ShutterBeams
+from runtime.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
+from runtime.virtual_device.pulse_generator import PulseGeneratorEmulator
+from runtime.virtual_device.serial_port import Pty
+
+SIGNAL, REFERENCE = Shutter(3, "high", 0.01), Shutter(4, "low", 0.0)
+
+
+class Lab:
+    def __init__(self, folder: Path) -> None:
+        self.level = {channel: False for channel in range(1, 9)}
+        self.device = PulseGeneratorEmulator(on_state=self.level.__setitem__)
+        self.port = Pty(self.device.answer, folder / "tty")
+        self.generator = PulseGenerator(
+            PulseGeneratorSettings(
+                port=self.port.address, answer_s=0.15, quiet_s=0.03, late_s=0.4, synchronise_s=1.0, reset=True
+            )
+        )
+        self.beams = ShutterBeams(self.generator, SIGNAL, REFERENCE)
+
+    def open(self) -> tuple[bool, bool]:
+        """Signal and reference, by the levels at the outputs."""
+        return self.level[3], not self.level[4]
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[Lab]:
+    made = Lab(tmp_path)
+    with made.port:
+        yield made
+        made.generator.close()
+
+
+def test_both_shutters_move(lab: Lab) -> None:
+    beams: Beams = lab.beams
+    for signal in (False, True):
+        for reference in (False, True):
+            beams.let_through(signal=signal, reference=reference)
+            assert lab.open() == (signal, reference)
+    beams.let_through(signal=False, reference=False)
+    beams.close()
+    assert lab.open() == (True, True)
+
+
+def test_they_stay_as_they_are_when_the_trigger_is_set_up(lab: Lab) -> None:
+    lab.beams.let_through(signal=True, reference=False)
+    lab.generator.arm()
+    assert lab.open() == (True, False)
+    lab.generator.fire()
+    lab.beams.let_through(signal=False, reference=True)
+    lab.generator.fire()
+    assert (lab.open(), lab.device.shots) == ((False, True), 2)
+
+
+def test_they_are_opened_after_the_trigger_was_closed(lab: Lab) -> None:
+    lab.generator.arm()
+    lab.beams.let_through(signal=False, reference=False)
+    lab.generator.close()
+    lab.beams.close()
+    assert lab.open() == (True, True)
+
+
+def test_a_generator_that_has_gone(lab: Lab) -> None:
+    lab.beams.let_through(signal=True, reference=True)
+    lab.port.unplug()
+    with pytest.raises(LostShotError, match="shutters on channels 3 and 4") as raised:
+        lab.beams.let_through(signal=False, reference=True)
+    assert raised.value.reason is Reason.BEAM_CONTROL_FAILED
+    lab.beams.close()
+    lab.port.plug()
+    lab.beams.let_through(signal=False, reference=True)
+    assert lab.open() == (False, True)
+
+
+def test_what_makes_no_sense(lab: Lab) -> None:
+    with pytest.raises(InvalidInputError, match="channel 3 for both"):
+        ShutterBeams(lab.generator, SIGNAL, Shutter(3))
+    with pytest.raises(InvalidInputError, match="settle_s"):
+        Shutter(3, "high", float("nan"))
+    with pytest.raises(InvalidInputError, match="open_when"):
+        Shutter(3, "up")  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match="cameras"):
+        ShutterBeams(lab.generator, Shutter(1), REFERENCE).let_through(signal=True, reference=True)
