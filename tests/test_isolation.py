@@ -67,6 +67,7 @@ ROOMS = (
     "analysis.codec",
     "analysis.speed",
     "analysis.tracking",
+    "analysis.hardware",
     "analysis.results",
     "analysis",
 )

@@ -1,0 +1,1 @@
+"""How well drivers of hardware stand up to it, measured on simulated devices."""
