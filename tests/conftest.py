@@ -23,7 +23,7 @@ from runtime.decoding.decoder import Decoder
 from tests.lightpage.small import small_profile
 from tests.runtime import toy
 
-pytest_plugins = ["pytester", "tests.skips"]
+pytest_plugins = ["pytester", "tests.skips", "tests.own_network"]
 
 BENCH_PAGES = 3
 SMALL_PAGES = 8

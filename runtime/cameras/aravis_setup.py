@@ -1,0 +1,224 @@
+"""Gives a camera its settings over Aravis, and reads each one back: cameras round, clip and ignore what they get."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from ctypes import byref, c_int
+from dataclasses import dataclass
+from typing import Any
+
+from runtime.cameras.aravis_connection import AravisConnection, says_gone
+from runtime.cameras.aravis_library import RANGE_CHECK_ENABLE, SOCKET_BUFFER_AUTO, AravisError, aravis
+from runtime.cameras.gige_network import route_mtu
+from runtime.cameras.pixel_formats import pixel_format
+from runtime.cameras.settings import CameraSettings
+from runtime.errors import SourceError
+
+_SELECTORS = ("FrameStart", "FrameBurstStart")
+"""Triggers that start a frame, the better one first."""
+_OTHER_SELECTORS = ("AcquisitionStart", "AcquisitionEnd", "FrameEnd", "FrameActive", "ExposureStart", "LineStart")
+_EXPOSURE_TOLERANCE = 0.05
+"""Cameras expose for whole lines of the sensor."""
+_GAIN_TOLERANCE_DB = 0.1
+_BLACK_LEVEL_TOLERANCE = 0.5
+
+
+@dataclass
+class AravisSetup:
+    """The settings of one camera that is open. One thread at a time uses it.
+
+    Args:
+        connection: the camera.
+        settings: what it is to be set to.
+        frame_shape: (rows, columns) of the region that is read.
+        name: of the camera, for errors.
+
+    Every method raises `SourceError` where the camera does not take a setting, and `AravisError` where it is gone.
+    """
+
+    connection: AravisConnection
+    settings: CameraSettings
+    frame_shape: tuple[int, int]
+    name: str
+
+    def __post_init__(self) -> None:
+        self._library, self._camera = aravis(), self.connection.handle
+        self._packet_bytes = 0
+
+    def stop(self) -> None:
+        """Stop the acquisition, whoever started it: cameras lock settings during one."""
+        with self._setting("acquisition", "stopped"):
+            self._do("stop_acquisition")
+
+    def set_image(self) -> None:
+        """Set all that a frame depends on but its trigger, which is switched off."""
+        settings = self.settings
+        self._do("set_range_check_policy", RANGE_CHECK_ENABLE)
+        for selector in (*_OTHER_SELECTORS, *_SELECTORS):
+            if self._has_entry("TriggerSelector", selector):
+                self._set_string("TriggerSelector", selector)
+                self._set_string("TriggerMode", "Off")
+        self._set_string("AcquisitionMode", "Continuous")
+        for feature in ("ChunkModeActive", "AcquisitionFrameRateEnable"):
+            if self._has(feature):
+                with self._setting(feature, "off"):
+                    self._do("set_boolean", feature.encode(), 0)
+        for feature in ("ExposureAuto", "GainAuto", "BlackLevelAuto"):
+            if self._has(feature):
+                self._set_string(feature, "Off")
+        rows, columns = self.frame_shape
+        self._set_string("PixelFormat", settings.pixel_format)
+        with self._setting("region", self._region()):
+            self._do("set_region", settings.offset_x_px, settings.offset_y_px, columns, rows)
+        with self._setting("exposure_us", settings.exposure_us):
+            self._do("set_exposure_time", settings.exposure_us)
+        if settings.gain_db is not None:
+            with self._setting("gain_db", settings.gain_db):
+                self._do("set_gain", settings.gain_db)
+        if settings.black_level_counts is not None:
+            with self._setting("black_level_counts", settings.black_level_counts):
+                self._do("set_black_level", settings.black_level_counts)
+        if self.connection.is_gige:
+            self._set_packets()
+
+    def _set_packets(self) -> None:
+        """The size of packets: as asked for, as large as test packets get through, or as the network card takes."""
+        with self._setting("packet_bytes", self.settings.packet_bytes or "one that gets through"):
+            if self.settings.packet_bytes is not None:
+                self._packet_bytes = self.settings.packet_bytes
+            elif self._has("GevSCPSFireTestPacket"):
+                self._packet_bytes = self._do("gv_auto_packet_size")
+                return
+            else:
+                self._packet_bytes = route_mtu(self.connection.address)
+            self._do("gv_set_packet_size", self._packet_bytes)
+
+    def make_stream(self, payload: int) -> int:
+        """A stream with empty buffers of `payload` bytes; it ends when it is let go of."""
+        with self._setting("stream", "one"):
+            stream: int = self._do("create_stream", None, None, None)
+        if self.connection.is_gige:
+            self._library.set_property(stream, "socket-buffer", SOCKET_BUFFER_AUTO)
+        for _ in range(self.settings.buffers):
+            self._library("arv_stream_push_buffer", stream, self._library("arv_buffer_new_allocate", payload))
+        return stream
+
+    def payload(self) -> int:
+        """Bytes of a frame, which must be pixels alone."""
+        rows, columns = self.frame_shape
+        expected = pixel_format(self.settings.pixel_format).nbytes(rows * columns)
+        with self._setting("PayloadSize", expected):
+            payload: int = self._do("get_payload")
+        self._compare("PayloadSize", payload, expected)
+        return payload
+
+    def set_trigger(self) -> None:
+        """Set the trigger; last of all, for some settings switch it off again."""
+        settings = self.settings
+        selector = next((name for name in _SELECTORS if self._has_entry("TriggerSelector", name)), None)
+        if selector is not None:
+            self._set_string("TriggerSelector", selector)
+        self._set_string("TriggerSource", settings.trigger_source)
+        if self._uses_activation():
+            self._set_string("TriggerActivation", settings.trigger_activation)
+        self._set_string("TriggerMode", "On")
+
+    def check(self) -> float:
+        """Read everything back; returns the exposure time that the camera keeps, in seconds."""
+        settings = self.settings
+        wanted = {
+            "TriggerMode": "On",
+            "TriggerSource": settings.trigger_source,
+            "AcquisitionMode": "Continuous",
+            "PixelFormat": settings.pixel_format,
+        }
+        if self._uses_activation():
+            wanted["TriggerActivation"] = settings.trigger_activation
+        for feature, expected in wanted.items():
+            with self._setting(feature, expected):
+                got = self._do("get_string", feature.encode())
+            self._compare(feature, (got or b"").decode("utf-8", "replace"), expected)
+        corners = [c_int() for _ in range(4)]
+        with self._setting("region", self._region()):
+            self._do("get_region", *map(byref, corners))
+        x, y, columns, rows = (corner.value for corner in corners)
+        self._compare("region", _region(x, y, columns, rows), self._region())
+        if self.connection.is_gige:
+            with self._setting("packet_bytes", self._packet_bytes):
+                got = self._do("gv_get_packet_size")
+            self._compare("packet_bytes", got, self._packet_bytes)
+        if settings.gain_db is not None:
+            self._check_number("gain_db", "get_gain", settings.gain_db, _GAIN_TOLERANCE_DB)
+        if settings.black_level_counts is not None:
+            level = settings.black_level_counts
+            self._check_number("black_level_counts", "get_black_level", level, _BLACK_LEVEL_TOLERANCE)
+        tolerance = _EXPOSURE_TOLERANCE * settings.exposure_us
+        return 1e-6 * self._check_number("exposure_us", "get_exposure_time", settings.exposure_us, tolerance)
+
+    @property
+    def packet_bytes(self) -> int:
+        """Size of a GigE packet, headers included; 0 before it is chosen, and of other cameras."""
+        return self._packet_bytes
+
+    def frame_numbers(self) -> int:
+        """The largest number of a frame: 16 bits of a GigE camera without extended block ids, else 64."""
+        if not self.connection.is_gige:
+            return 2**64 - 1
+        mode = b"Off"
+        if self._has("GevGVSPExtendedIDMode"):
+            mode = self._do("get_string", b"GevGVSPExtendedIDMode")
+        return 2**64 - 1 if mode == b"On" else 2**16 - 1
+
+    def start(self) -> None:
+        """Start the acquisition; from here on a trigger makes a frame."""
+        with self._setting("acquisition", "started"):
+            self._do("start_acquisition")
+
+    def _do(self, what: str, *arguments: Any) -> Any:
+        return self._library(f"arv_camera_{what}", self._camera, *arguments)
+
+    def _has(self, feature: str) -> bool:
+        return bool(self._do("is_feature_available", feature.encode()))
+
+    def _has_entry(self, feature: str, entry: str) -> bool:
+        return self._has(feature) and bool(self._do("is_enumeration_entry_available", feature.encode(), entry.encode()))
+
+    def _uses_activation(self) -> bool:
+        """A command has no edges, and a camera that knows none is taken at its word unless another one is wanted."""
+        if self.settings.trigger_source == "Software":
+            return False
+        return self.settings.trigger_activation != "RisingEdge" or self._has("TriggerActivation")
+
+    def _set_string(self, feature: str, value: str) -> None:
+        with self._setting(feature, value):
+            self._do("set_string", feature.encode(), value.encode())
+
+    def _check_number(self, setting: str, getter: str, expected: float, tolerance: float) -> float:
+        with self._setting(setting, expected):
+            got = float(self._do(getter))
+        if abs(got - expected) > tolerance:
+            self._compare(setting, got, expected)
+        return got
+
+    def _compare(self, setting: str, got: object, expected: object) -> None:
+        if got != expected:
+            raise SourceError(f"{self.name}: {setting}", got, expected)
+
+    def _region(self) -> str:
+        rows, columns = self.frame_shape
+        return _region(self.settings.offset_x_px, self.settings.offset_y_px, columns, rows)
+
+    @contextmanager
+    def _setting(self, setting: str, expected: object) -> Iterator[None]:
+        """Name the setting that the camera refuses."""
+        try:
+            yield
+        except AravisError as error:
+            if says_gone(error):
+                raise
+            raise SourceError(f"{self.name}: {setting}", error.message, expected) from None
+
+
+def _region(x: int, y: int, columns: int, rows: int) -> str:
+    return f"{columns} x {rows} pixels at ({x}, {y})"

@@ -1,0 +1,78 @@
+"""A fake camera and what it sees, for tests in a private network."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.recording.layout import FrameInfo
+from runtime.cameras.aravis import AravisCamera
+from runtime.cameras.camera import Frame, FrameStatus
+from runtime.cameras.pixel_formats import bit_depth
+from runtime.cameras.settings import CameraSettings
+from runtime.virtual_device.fake_camera import FakeCamera
+
+SENSOR = (96, 128)
+ADDRESS = "127.0.0.1"
+SERIAL = "CAM-I"
+WAIT_S = 5.0
+"""Bounds every wait for something that comes within milliseconds."""
+
+Counts = NDArray[np.unsignedinteger[Any]]
+
+
+def noise(pixel_format: str, seed: int, shape: tuple[int, int] = SENSOR) -> Counts:
+    """Counts of every size that the format has."""
+    depth = bit_depth(pixel_format)
+    return np.random.default_rng(seed).integers(0, 2**depth, shape, dtype=np.uint8 if depth == 8 else np.uint16)
+
+
+@dataclass
+class Scene:
+    """A fake camera, its driver, and what the sensor sees."""
+
+    fake: FakeCamera
+    camera: AravisCamera
+    seen: list[Counts]
+
+    def take(self) -> Frame:
+        """One edge, one frame."""
+        assert self.fake.edge()
+        frame = self.camera.frame(WAIT_S)
+        assert frame is not None
+        return frame
+
+
+@contextmanager
+def scene(shape: tuple[int, int] = SENSOR, **settings: Any) -> Iterator[Scene]:
+    """A fake camera at ADDRESS, and a driver that is not armed yet."""
+    given = {"address": ADDRESS, "trigger_source": "Line1", **settings}
+    camera = AravisCamera(CameraSettings.model_validate(given), shape, "in-phase camera")
+    seen = [noise(camera._settings.pixel_format, 0)]
+    with FakeCamera(ADDRESS, SERIAL, lambda: seen[0], SENSOR) as fake:
+        try:
+            yield Scene(fake, camera, seen)
+            fake.check()
+        finally:
+            camera.close()
+
+
+def info_of(frame: Frame) -> FrameInfo:
+    """Of a complete frame."""
+    assert frame.status is FrameStatus.COMPLETE, frame.detail
+    assert frame.info is not None
+    return frame.info
+
+
+def until(true: Callable[[], bool]) -> None:
+    """Wait for it."""
+    end = time.monotonic() + WAIT_S
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.005)

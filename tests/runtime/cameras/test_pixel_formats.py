@@ -1,0 +1,106 @@
+"""Every count survives every pixel format, and lies in the bytes where the standard says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lightpage.errors import FrameError, InvalidInputError
+from runtime.cameras.pixel_formats import bit_depth, pack, pixel_format, pixel_format_of, unpack
+
+DEPTHS = {
+    "Mono8": 8,
+    "Mono10": 10,
+    "Mono12": 12,
+    "Mono14": 14,
+    "Mono16": 16,
+    "Mono10Packed": 10,
+    "Mono12Packed": 12,
+    "Mono10p": 10,
+    "Mono12p": 12,
+}
+BYTES = {
+    "Mono8": [0x21, 0x43],
+    "Mono10": [0x21, 0x03, 0x43, 0x02],
+    "Mono12": [0x21, 0x0A, 0x43, 0x0B],
+    "Mono14": [0x21, 0x2A, 0x43, 0x3B],
+    "Mono16": [0x21, 0xFA, 0x43, 0xEB],
+    "Mono10Packed": [0x321 >> 2, (0x321 & 3) | (0x243 & 3) << 4, 0x243 >> 2],
+    "Mono12Packed": [0xA2, 0x31, 0xB4],
+    "Mono12p": [0x21, 0x3A, 0xB4],
+    "Mono10p": [0x21, (0x321 >> 8) | (0x243 & 0x3F) << 2, 0x243 >> 6],
+}
+"""Two pixels whose counts have the high bits of their place: of 12 bits 0xA21 and 0xB43."""
+FIRST_TWO = {8: (0x21, 0x43), 10: (0x321, 0x243), 12: (0xA21, 0xB43), 14: (0x2A21, 0x3B43), 16: (0xFA21, 0xEB43)}
+
+
+def bits_of(raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """All bits of a stream from the lowest one up."""
+    return np.unpackbits(raw, bitorder="little")
+
+
+def kind(depth: int) -> type[np.uint8] | type[np.uint16]:
+    return np.uint8 if depth == 8 else np.uint16
+
+
+@pytest.mark.parametrize("name", DEPTHS)
+def test_every_pair_of_neighbours_survives(name: str) -> None:
+    """Every value in every place of a group, beside others."""
+    depth = DEPTHS[name]
+    assert bit_depth(name) == depth
+    values = np.arange(2**depth, dtype=kind(depth))
+    shuffled = np.random.default_rng(depth).permutation(values)
+    frame = np.concatenate([np.roll(values, shift) for shift in range(4)] + [shuffled, values[:64]]).reshape(-1, 64)
+    raw = pack(frame, name)
+    assert raw.size == pixel_format(name).nbytes(frame.size)
+    again = unpack(raw, frame.shape, name)
+    assert again.dtype == frame.dtype
+    assert again.dtype.isnative
+    assert (again == frame).all()
+
+
+@pytest.mark.parametrize("name", BYTES)
+def test_two_pixels_lie_where_the_standard_says(name: str) -> None:
+    frame = np.array([FIRST_TWO[DEPTHS[name]]], kind(DEPTHS[name]))
+    assert pack(frame, name).tolist() == BYTES[name]
+    assert (unpack(np.array(BYTES[name], np.uint8), (1, 2), name) == frame).all()
+
+
+@pytest.mark.parametrize("name", ["Mono10p", "Mono12p"])
+def test_p_formats_are_a_stream_of_bits(name: str) -> None:
+    depth = DEPTHS[name]
+    raw = np.random.default_rng(1).integers(0, 256, 15 * depth, dtype=np.uint8)
+    places = bits_of(raw).reshape(-1, depth) @ (1 << np.arange(depth))
+    assert (unpack(raw, (1, places.size), name).ravel() == places).all()
+
+
+@pytest.mark.parametrize("pixels", [1, 2, 3, 5, 65_537, 65_539])
+@pytest.mark.parametrize("name", ["Mono10p", "Mono12p"])
+def test_odd_sizes(name: str, pixels: int) -> None:
+    frame = np.random.default_rng(pixels).integers(0, 2 ** DEPTHS[name], (1, pixels), dtype=np.uint16)
+    assert (unpack(pack(frame, name), frame.shape, name) == frame).all()
+
+
+def test_the_copy_is_free_of_the_buffer() -> None:
+    raw = np.zeros(16, np.uint8)
+    frame = unpack(raw, (4, 4), "Mono8")
+    raw[:] = 7
+    assert not frame.any()
+
+
+def test_bad_input_is_named() -> None:
+    with pytest.raises(InvalidInputError, match="RGB8"):
+        bit_depth("RGB8")
+    with pytest.raises(InvalidInputError, match="0x02180014"):
+        pixel_format_of(0x02180014)
+    with pytest.raises(FrameError, match="5 bytes"):
+        unpack(np.zeros(5, np.uint8), (2, 2), "Mono12p")
+    with pytest.raises(FrameError, match="12 bits"):
+        pack(np.full((1, 2), 4096, np.uint16), "Mono12p")
+    with pytest.raises(FrameError, match="int64"):
+        pack(np.zeros((1, 2), np.int64), "Mono8")
+
+
+def test_codes_lead_back_to_names() -> None:
+    assert {pixel_format_of(pixel_format(name).code).name for name in DEPTHS} == set(DEPTHS)

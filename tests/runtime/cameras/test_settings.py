@@ -1,0 +1,38 @@
+"""Settings of a camera say what is wrong with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from runtime.cameras.settings import CameraSettings
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({}, "either serial or address"),
+        ({"serial": "1", "address": "10.0.0.1"}, "either serial or address"),
+        ({"serial": "1", "pixel_format": "RGB8"}, "RGB8"),
+        ({"serial": "1", "exposure_us": 0}, "exposure_us"),
+        ({"serial": "1", "exposure_us": float("inf")}, "exposure_us"),
+        ({"serial": "1", "buffers": 1}, "buffers"),
+        ({"serial": "1", "packet_bytes": 70_000}, "packet_bytes"),
+        ({"serial": "1", "driver": "gentl"}, "producer"),
+        ({"serial": "1", "producer": "a.cti"}, "producer"),
+        ({"serial": "1", "exposure_ms": 1}, "exposure_ms"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(ValidationError, match=told):
+        CameraSettings.model_validate(given)
+
+
+def test_settings_stay_as_they_are() -> None:
+    settings = CameraSettings(driver="gentl", serial="A1", producer=Path("a.cti"), pixel_format="Mono12p")
+    assert settings.label == "A1"
+    with pytest.raises(ValidationError, match="frozen"):
+        settings.serial = "B"
