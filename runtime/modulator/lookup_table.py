@@ -1,0 +1,180 @@
+"""The lookup table of a phase modulator: which grey value shows which level."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lightpage.errors import InvalidInputError, PageError
+from lightpage.page.symbols import check_levels
+
+GREYS = 256
+"""Grey values of a modulator: 8 bits."""
+CALIBRATION_HEADER = ["phase_rad", "grey"]
+LEVELS_HEADER = ["grey"]
+
+_COMMENT = re.compile(r"#.*")
+_SEPARATOR = re.compile(r"[\s,;]+")
+
+
+@dataclass(frozen=True)
+class LookupTable:
+    """Grey value of each level.
+
+    Attributes:
+        greys: uint8 [M], all different.
+    """
+
+    greys: NDArray[np.uint8]
+
+    @property
+    def levels(self) -> int:
+        """M."""
+        return self.greys.size
+
+    @classmethod
+    def linear(cls, levels: int) -> LookupTable:
+        """The table of a modulator whose 256 grey values span one wave evenly: grey = round(256 level / M).
+
+        Raises:
+            PageError: a level count outside 2..256.
+        """
+        check_levels(levels)
+        return cls((np.arange(levels) * GREYS / levels).round().astype(np.uint8))
+
+    @classmethod
+    def from_file(cls, path: str | Path, levels: int) -> LookupTable:
+        """Read a table from a text file: numbers separated by commas, semicolons or white space, comments after ``#``.
+
+        The first line says which of two forms it has:
+
+        - ``phase_rad grey``: a calibration of the modulator. Each line below it has a phase in radians and the grey
+          value that shows it. Phases may be wrapped, and differ by less than pi from one grey value to the next. Level
+          k gets the grey value that lies 2 pi k / M above the lowest phase, interpolated and rounded; a phase that all
+          levels share makes no difference to a page.
+        - ``grey``, or the first number: grey values of level 0, 1, ... M - 1, in lines of any length.
+
+        Args:
+            path: the file.
+            levels: M.
+
+        Raises:
+            InvalidInputError: a file that cannot be read; not a number; a grey value that is not whole or not in
+                0..255; another count than M; two levels of one grey value; a calibration whose phase does not rise or
+                fall all along, or that spans too little for M levels.
+            PageError: a level count outside 2..256.
+        """
+        check_levels(levels)
+        subject = f"lookup table {path}"
+        try:
+            text = Path(path).read_text("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise InvalidInputError(subject, error, "a readable text file") from None
+        lines = [
+            (number, words)
+            for number, line in enumerate(text.splitlines(), 1)
+            if (words := [word for word in _SEPARATOR.split(_COMMENT.sub("", line)) if word])
+        ]
+        if lines and lines[0][1] == CALIBRATION_HEADER:
+            return cls(_different(_of_calibration(lines[1:], levels, subject), subject))
+        return cls(_different(_of_levels(lines, levels, subject), subject))
+
+    def greys_of(self, symbols: ArrayLike, levels: int) -> NDArray[np.uint8]:
+        """Grey values of `symbols`, uint8 in their shape.
+
+        Raises:
+            PageError: symbols of another number of levels than the table has, or beyond them.
+        """
+        array = np.asarray(symbols)
+        if levels != self.levels:
+            raise PageError("page to show", f"{levels} levels", f"{self.levels} levels, as the lookup table has")
+        if array.dtype.kind not in "ui":
+            raise PageError("page to show", f"type {array.dtype}", "whole numbers")
+        if array.size and not 0 <= int(array.min()) <= int(array.max()) < levels:
+            raise PageError("page to show", f"values from {array.min()} to {array.max()}", f"0 to {levels - 1}")
+        greys: NDArray[np.uint8] = self.greys[array]
+        return greys
+
+
+Line = tuple[int, list[str]]
+"""Number of a line in its file, and its words."""
+
+
+def _number(word: str, where: str) -> float:
+    try:
+        number = float(word)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InvalidInputError(where, repr(word), "a number")
+    return number
+
+
+def _grey(word: str, where: str) -> int:
+    number = _number(word, where)
+    if not number.is_integer() or not 0 <= number < GREYS:
+        raise InvalidInputError(where, f"grey value {word}", f"a whole number from 0 to {GREYS - 1}")
+    return int(number)
+
+
+def _of_levels(lines: list[Line], levels: int, subject: str) -> NDArray[np.uint8]:
+    """Grey values as the file lists them."""
+    if lines and lines[0][1] == LEVELS_HEADER:
+        lines = lines[1:]
+    greys = [_grey(word, f"{subject}, line {number}") for number, words in lines for word in words]
+    if len(greys) != levels:
+        raise InvalidInputError(
+            subject,
+            f"{len(greys)} grey values",
+            f"{levels}, one per level, or a calibration below the line '{' '.join(CALIBRATION_HEADER)}'",
+        )
+    return np.array(greys, np.uint8)
+
+
+def _of_calibration(lines: list[Line], levels: int, subject: str) -> NDArray[np.uint8]:
+    """Grey values interpolated in a measured phase curve."""
+    points: dict[int, float] = {}
+    for number, words in lines:
+        where = f"{subject}, line {number}"
+        if len(words) != 2:
+            raise InvalidInputError(where, f"{len(words)} values", "two: a phase in radians and a grey value")
+        grey = _grey(words[1], where)
+        if grey in points:
+            raise InvalidInputError(where, f"grey value {grey} once more", "one phase per grey value")
+        points[grey] = _number(words[0], where)
+    if len(points) < 2:
+        raise InvalidInputError(subject, f"a calibration of {len(points)} grey values", "at least 2")
+    greys = np.array(sorted(points))
+    phase = np.unwrap([points[grey] for grey in greys])
+    steps = np.diff(phase)
+    if not ((steps > 0).all() or (steps < 0).all()):
+        turn = int(np.argmax(np.sign(steps) != np.sign(steps[0])))
+        raise InvalidInputError(
+            subject,
+            f"a phase that turns back, or stands still, between grey values {greys[turn]} and {greys[turn + 1]}",
+            "one that rises or falls all along; smooth a noisy calibration first",
+        )
+    if steps[0] < 0:
+        greys, phase = greys[::-1], phase[::-1]
+    wanted = 2 * math.pi * np.arange(levels) / levels
+    if (span := phase[-1] - phase[0]) < wanted[-1] - 1e-9:
+        raise InvalidInputError(
+            subject, f"phases that span {span:.4g} rad", f"{wanted[-1]:.4g} rad for {levels} levels"
+        )
+    found: NDArray[np.float64] = np.interp(phase[0] + wanted, phase, greys)
+    return found.round().astype(np.uint8)
+
+
+def _different(greys: NDArray[np.uint8], subject: str) -> NDArray[np.uint8]:
+    """The same, each grey value that of one level alone."""
+    values, counts = np.unique(greys, return_counts=True)
+    if (counts > 1).any():
+        shared = int(values[counts > 1][0])
+        first, second = np.flatnonzero(greys == shared)[:2]
+        raise InvalidInputError(subject, f"grey value {shared} for levels {first} and {second}", "one for each level")
+    return greys

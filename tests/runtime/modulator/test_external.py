@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from runtime.errors import LostShotError, Reason
+from runtime.modulator.beam_state import BeamState
+from runtime.modulator.external import ExternalBeams, ExternalModulator
+
+SYMBOLS = np.zeros((2, 3), np.uint8)
+WAIT_S = 20.0
+
+Start = Callable[..., "Future[None]"]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Runs a call in another thread."""
+    with ThreadPoolExecutor() as pool:
+        yield pool.submit
+
+
+def show(modulator: ExternalModulator, page: int, timeout_s: float = WAIT_S) -> None:
+    modulator.show(SYMBOLS, 4, page, timeout_s)
+
+
+def test_show_waits_until_the_controller_says_that_the_page_is_on_display(start: Start) -> None:
+    modulator = ExternalModulator()
+    assert modulator.wanted() is None
+    shown = start(show, modulator, 5)
+    assert modulator.wanted(WAIT_S) == 5
+    modulator.shown(4)
+    assert modulator.wanted() == 5
+    assert not shown.done()
+    assert not modulator.shows()
+    modulator.shown(5)
+    shown.result(WAIT_S)
+    assert modulator.shows()
+    assert modulator.wanted() is None
+
+
+def test_a_page_that_was_announced_before_needs_no_wait() -> None:
+    modulator = ExternalModulator()
+    modulator.shown(5)
+    show(modulator, 5, 0.0)
+    assert modulator.shows()
+    modulator.shown(5)  # said twice
+    assert modulator.shows()
+    show(modulator, 5, 0.0)
+
+
+@pytest.mark.parametrize("leave", [lambda m: m.withdrawn(), lambda m: m.shown(6), lambda m: m.close()])
+def test_a_page_is_on_display_until_it_is_withdrawn_or_another_one_announced(
+    leave: Callable[[ExternalModulator], None],
+) -> None:
+    modulator = ExternalModulator()
+    modulator.shown(5)
+    show(modulator, 5)
+    leave(modulator)
+    assert not modulator.shows()
+    modulator.shown(5)  # back again, but it was away
+    assert not modulator.shows()
+    show(modulator, 5)
+    assert modulator.shows()
+
+
+def test_a_page_that_nobody_shows_in_time_is_lost_and_named() -> None:
+    modulator = ExternalModulator()
+    for said, message in ((None, "no page announced after 0.01 s"), (8, "page 8 announced after 0.01 s")):
+        if said is not None:
+            modulator.shown(said)
+        with pytest.raises(LostShotError, match=f"page 7 on the controller's modulator: got {message}") as lost:
+            show(modulator, 7, 0.01)
+        assert lost.value.reason is Reason.NOT_ON_DISPLAY
+        assert not modulator.shows()
+        assert modulator.wanted() is None
+
+
+def test_a_controller_that_follows_what_is_wanted_shows_every_page(start: Start) -> None:
+    modulator = ExternalModulator()
+
+    def control() -> None:
+        while (page := modulator.wanted(WAIT_S)) != 200:
+            if page is not None:
+                modulator.shown(page)
+
+    control_ended = start(control)
+    for page in range(200):
+        show(modulator, page)
+        assert modulator.shows()
+    with pytest.raises(LostShotError):
+        show(modulator, 200, 0.5)
+    control_ended.result(WAIT_S)
+
+
+def test_beams_are_waited_for_in_the_same_way(start: Start) -> None:
+    beams = ExternalBeams(WAIT_S)
+    moved = start(beams.let_through, signal=False, reference=True)
+    assert beams.wanted(WAIT_S) == BeamState(signal=False, reference=True)
+    beams.beams_set(signal=True, reference=True)
+    assert not moved.done()
+    beams.beams_set(signal=False, reference=True)
+    moved.result(WAIT_S)
+    assert beams.wanted() is None
+    beams.close()
+    assert beams.wanted() == BeamState(signal=True, reference=True)
+    beams.beams_set(signal=True, reference=True)
+    assert beams.wanted() is None
+    beams.close()
+    assert beams.wanted() is None
+
+
+def test_beams_that_nobody_sets_are_named() -> None:
+    beams = ExternalBeams(0.01)
+    with pytest.raises(
+        LostShotError, match=r"got nothing announced .* signal beam blocked, reference beam let thr"
+    ) as lost:
+        beams.let_through(signal=False, reference=True)
+    assert lost.value.reason is Reason.BEAM_CONTROL_FAILED
+    beams.close()
+    assert beams.wanted() is None
