@@ -54,6 +54,7 @@ SUMMARIES = {
     "serve": "Run the service.",
     "simulate": "Record pages of a simulated device.",
     "study": "Answer a question about the device or its decoders in a table and a picture.",
+    "virtual-device": "Run a simulated device that looks like hardware: cameras, pulse generator, modulator.",
     "train": "Train a decoder on a recording.",
 }
 """What the overview says of a command, so that it need not be imported to be listed."""

@@ -166,7 +166,7 @@ class CameraSource(FrameSource):
         deadline = time.monotonic() + timeout_s
         with self._lock:
             index, symbols = self._page(page)
-            frames = self._persistent(index, deadline, lambda: self._attempt(index, symbols, deadline))
+            frames = self._persistent(index, deadline, self._attempt(index, symbols, deadline))
             pair = FramePair(*(self._cleaned(one, frame) for one, frame in enumerate(frames)))
             first, second = (frame.info for frame in frames)
             assert first is not None  # of complete frames
@@ -226,14 +226,22 @@ class CameraSource(FrameSource):
             return page, None
         return page, self.pages[page]
 
-    def _attempt(self, index: int, symbols: NDArray[np.uint8] | None, deadline: float) -> tuple[Frame, ...]:
-        modulator = self.modulator
+    def _attempt(
+        self, index: int, symbols: NDArray[np.uint8] | None, deadline: float
+    ) -> Callable[[], tuple[Frame, ...]]:
+        """What takes a pair of a page. A further attempt leaves the page as it stands, where it still does."""
+        modulator, shown = self.modulator, False
         if modulator is None or symbols is None:
-            return self._pairing.shot(deadline)
-        left = max(0.0, deadline - time.monotonic())
-        return self._pairing.shot(
-            deadline, lambda: modulator.show(symbols, self.levels, index, left), lambda: modulator.shows()
-        )
+            return lambda: self._pairing.shot(deadline)
+
+        def display() -> None:
+            nonlocal shown
+            if not (shown and modulator.shows()):
+                shown = False
+                modulator.show(symbols, self.levels, index, max(0.0, deadline - time.monotonic()))
+                shown = True
+
+        return lambda: self._pairing.shot(deadline, display, modulator.shows)
 
     def _persistent(self, index: int, deadline: float, attempt: Callable[[], tuple[Frame, ...]]) -> tuple[Frame, ...]:
         """A pair of one page: lost shots are repeated, and devices that have gone are waited for."""

@@ -102,7 +102,7 @@ def test_a_simulator_is_opened_by_name_with_settings(monkeypatch: pytest.MonkeyP
         ("simulator:bench?levels=many", "whole numbers"),
         ("simulator:bench?colour=red", "colour"),
         ("simulator:bench?seed=-1", "at least 0"),
-        ("camera:0", "camera extra"),
+        ("camera:0", "camera configuration 0"),
         ("tape:1", "recording:FILE"),
     ],
 )

@@ -1,0 +1,286 @@
+"""The TOML file that says how a device's cameras, trigger, modulator and shutters are wired: `camera:CONFIG.toml`."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+from urllib.parse import parse_qsl
+
+from pydantic import Field
+
+from lightpage.device.profile import Profile, TomlTable, load_profile, validate
+from lightpage.errors import InvalidInputError, ProfileError
+from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
+from lightpage.recording.pages import Pages
+from runtime.acquisition.camera_source import CameraSource, Exposures
+from runtime.acquisition.page_store import PageStore
+from runtime.acquisition.pairing import PairingSettings
+from runtime.cameras.camera import Camera
+from runtime.cameras.settings import CameraSettings
+from runtime.modulator.external import ExternalBeams, ExternalModulator
+from runtime.modulator.lookup_table import LookupTable
+from runtime.modulator.modulator import Beams, Modulator
+from runtime.modulator.operator import OperatorBeams
+from runtime.modulator.settings import ScreenSettings
+from runtime.modulator.shutters import Shutter, ShutterBeams
+from runtime.modulator.simulated import SimulatedModulator
+from runtime.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
+from runtime.trigger.software import SoftwareTrigger
+from runtime.trigger.trigger import Trigger
+
+Seconds = Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)]
+Frames = Annotated[int, Field(ge=1, le=256)]
+ROLES = ("in_phase", "quadrature")
+
+
+class CameraTable(CameraSettings):
+    """One camera, and how it sees the image."""
+
+    flip_x: bool = False
+    """It sees left and right the other way round, as behind one more mirror."""
+    flip_y: bool = False
+
+
+class PulseGeneratorTable(PulseGeneratorSettings):
+    """A pulse generator with one channel for each camera."""
+
+    kind: Literal["pulse_generator"]
+
+
+class SoftwareTriggerTable(TomlTable):
+    """The cameras are told over their own lines, one after the other."""
+
+    kind: Literal["software"]
+
+
+class ScreenTable(ScreenSettings):
+    """A modulator that is a monitor."""
+
+    kind: Literal["screen"]
+    lookup_table: Annotated[str, Field(min_length=1)] | None = None
+    """File of grey values; without one, 256 grey values are one wave."""
+
+
+class ExternalModulatorTable(TomlTable):
+    """The controller shows the pages, and says so over gRPC."""
+
+    kind: Literal["external"]
+
+
+class SimulatedTable(TomlTable):
+    """That of a simulated device."""
+
+    kind: Literal["simulated"]
+    address: Annotated[str, Field(min_length=1)]
+    """Its Unix socket; as all paths here, relative to the folder of this file."""
+
+
+class NoModulatorTable(TomlTable):
+    """Something else shows pages and knows nothing of shots: a page stands for as long as it is photographed."""
+
+    kind: Literal["none"] = "none"
+
+
+class ShutterTable(TomlTable):
+    """A shutter on a channel of the pulse generator."""
+
+    channel: Annotated[int, Field(ge=1, le=8)]
+    open_when: Literal["high", "low"] = "high"
+    settle_s: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.05
+
+
+class ShuttersTable(TomlTable):
+    """Shutters in both beams, on channels of the pulse generator."""
+
+    kind: Literal["shutters"]
+    signal: ShutterTable
+    reference: ShutterTable
+
+
+class ExternalBeamsTable(TomlTable):
+    """The controller moves the shutters, and says so over gRPC."""
+
+    kind: Literal["external"]
+    timeout_s: Seconds = 10.0
+
+
+class OperatorTable(TomlTable):
+    """Somebody blocks the beams by hand when `lightpage record` asks."""
+
+    kind: Literal["operator"] = "operator"
+
+
+class PairingTable(TomlTable):
+    """How strictly frames are told apart; see `PairingSettings`."""
+
+    tolerance_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = PairingSettings.tolerance_s
+    frame_s: Seconds = PairingSettings.frame_s
+    quiet_s: Seconds = PairingSettings.quiet_s
+    spacing_s: Seconds = PairingSettings.spacing_s
+    clock_drift: Annotated[float, Field(gt=0, le=0.01, allow_inf_nan=False)] = PairingSettings.clock_drift
+
+
+class ExposuresTable(TomlTable):
+    """How frames are taken; see `Exposures`."""
+
+    repeats: Annotated[int, Field(ge=0, le=100)] = Exposures.repeats
+    reference_frames: Frames = Exposures.reference_frames
+    dark_frames: Frames = Exposures.dark_frames
+
+
+class DeviceTable(TomlTable):
+    """The whole file.
+
+    Attributes:
+        profile: nominal device: a shipped name, or a file.
+        levels: M of the pages, where no page file says it.
+        pages: file of pages to show, or None: some are uploaded, or named with the source.
+        in_phase, quadrature: the cameras.
+        trigger: what fires them.
+        modulator: what shows the pages.
+        beams: what blocks signal and reference.
+        pairing, exposures: how frames are taken and told apart.
+    """
+
+    profile: str
+    levels: Annotated[int, Field(ge=MIN_LEVELS, le=MAX_LEVELS)] | None = None
+    pages: str | None = None
+    in_phase: CameraTable
+    quadrature: CameraTable
+    trigger: Annotated[PulseGeneratorTable | SoftwareTriggerTable, Field(discriminator="kind")]
+    modulator: Annotated[
+        ScreenTable | ExternalModulatorTable | SimulatedTable | NoModulatorTable, Field(discriminator="kind")
+    ] = NoModulatorTable()
+    beams: Annotated[
+        ShuttersTable | ExternalBeamsTable | SimulatedTable | OperatorTable, Field(discriminator="kind")
+    ] = OperatorTable()
+    pairing: PairingTable = PairingTable()
+    exposures: ExposuresTable = ExposuresTable()
+
+
+def load_device_table(path: Path) -> DeviceTable:
+    """Read and check the file.
+
+    Raises:
+        InvalidInputError: it cannot be read, or a key does not validate.
+    """
+    subject = f"camera configuration {path}"
+    try:
+        data = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InvalidInputError(subject, error, "a TOML file that can be read") from None
+    try:
+        return validate(DeviceTable, data, subject)
+    except ProfileError as error:
+        raise InvalidInputError(subject, error.got, "keys as docs/cameras.md explains them") from None
+
+
+@dataclass
+class _Builder:
+    """Makes the devices of a file, whose paths are relative to `folder`."""
+
+    table: DeviceTable
+    folder: Path
+    profile: Profile
+    ask: Callable[[str], None]
+
+    def cameras(self) -> tuple[Camera, Camera]:
+        """Both, not yet opened."""
+        tables = (self.table.in_phase, self.table.quadrature)
+        first, second = (self._camera(table, role) for table, role in zip(tables, ROLES, strict=True))
+        return first, second
+
+    def _camera(self, table: CameraTable, role: str) -> Camera:
+        settings = CameraSettings(**table.model_dump(exclude={"flip_x", "flip_y"}))
+        name = f"{role.replace('_', '-')} camera"
+        if settings.driver == "gentl":
+            raise InvalidInputError(f"{name}: driver", settings.driver, "aravis")
+        from runtime.cameras.aravis import AravisCamera
+
+        return AravisCamera(settings, self.profile.frame_shape, name)
+
+    def trigger(self, cameras: tuple[Camera, Camera]) -> Trigger:
+        """What fires the cameras."""
+        table = self.table.trigger
+        if isinstance(table, SoftwareTriggerTable):
+            return SoftwareTrigger(cameras)
+        settings = PulseGeneratorSettings(**table.model_dump(exclude={"kind"}))
+        if "://" not in settings.port:
+            settings = settings.model_copy(update={"port": str(self.folder / settings.port)})
+        return PulseGenerator(settings)
+
+    def modulator(self, levels: int) -> Modulator | None:
+        """What shows the pages."""
+        table = self.table.modulator
+        if isinstance(table, NoModulatorTable):
+            return None
+        if isinstance(table, ExternalModulatorTable):
+            return ExternalModulator()
+        if isinstance(table, SimulatedTable):
+            return SimulatedModulator(self.folder / table.address)
+        from runtime.modulator.screen import ScreenModulator
+
+        path = table.lookup_table
+        greys = LookupTable.linear(levels) if path is None else LookupTable.from_file(self.folder / path, levels)
+        settings = ScreenSettings(**table.model_dump(exclude={"kind", "lookup_table"}))
+        return ScreenModulator(settings, self.profile, greys)
+
+    def beams(self, trigger: Trigger) -> Beams:
+        """What blocks them."""
+        table = self.table.beams
+        if isinstance(table, OperatorTable):
+            return OperatorBeams(self.ask)
+        if isinstance(table, ExternalBeamsTable):
+            return ExternalBeams(table.timeout_s)
+        if isinstance(table, SimulatedTable):
+            return SimulatedModulator(self.folder / table.address)
+        if not isinstance(trigger, PulseGenerator):
+            raise InvalidInputError("beams", "shutters without a pulse generator", 'trigger kind = "pulse_generator"')
+        signal, reference = (
+            Shutter(shutter.channel, shutter.open_when, shutter.settle_s) for shutter in (table.signal, table.reference)
+        )
+        return ShutterBeams(trigger, signal, reference)
+
+
+def open_camera(rest: str) -> CameraSource:
+    """The source `camera:REST`, REST being `CONFIG.toml` or `CONFIG.toml?pages=PAGES.h5`. Nothing is connected yet.
+
+    Raises:
+        InvalidInputError: a configuration that does not validate, or pages for another device.
+    """
+    path_text, _, query = rest.partition("?")
+    asked = dict(parse_qsl(query, keep_blank_values=True))
+    path = Path(path_text)
+    table = load_device_table(path)
+    profile_path = path.parent / table.profile
+    profile = load_profile(profile_path if profile_path.is_file() else table.profile)
+    if set(asked) - {"pages"}:
+        raise InvalidInputError(f"source camera:{rest}", sorted(asked), "pages only")
+    named = asked.get("pages") or (None if table.pages is None else str(path.parent / table.pages))
+    store = PageStore(profile, None if named is None else Pages.open(Path(named)), table.levels)
+    try:
+        source: list[CameraSource] = []
+        builder = _Builder(table, path.parent, profile, lambda text: source[0].operator(text))
+        cameras = builder.cameras()
+        trigger = builder.trigger(cameras)
+        flips = tuple((each.flip_y, each.flip_x) for each in (table.in_phase, table.quadrature))
+        source.append(
+            CameraSource(
+                profile,
+                cameras,
+                trigger,
+                builder.modulator(store.levels or MAX_LEVELS),
+                builder.beams(trigger),
+                store,
+                PairingSettings(**table.pairing.model_dump()),
+                Exposures(**table.exposures.model_dump(), flips=(flips[0], flips[1])),
+                f"camera:{path_text}",
+            )
+        )
+    except BaseException:
+        store.close()
+        raise
+    return source[0]

@@ -1,0 +1,65 @@
+"""`lightpage virtual-device`: a simulated device as hardware, until it is told to stop."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import click
+
+from lightpage.cli.paths import OutputFolder
+from lightpage.device.profile import load_profile
+from lightpage.device.state import Device, load_device
+from runtime.commands.serve import stop_signals
+from runtime.virtual_device.device import VirtualDevice
+from runtime.virtual_device.namespace import enter, require
+
+_PRIVATE = "LIGHTPAGE_PRIVATE_NETWORK"
+
+
+@click.command(context_settings={"ignore_unknown_options": True})
+@click.option("--profile", "profile_name", default="bench", show_default=True, help="A shipped profile, or a file.")
+@click.option("--device", "device_file", type=click.Path(), help="True state of the device, TOML; realistic if absent.")
+@click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of that state.")
+@click.option("--out", required=True, type=OutputFolder(), help="Folder for port, socket and device.toml.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of noise and drift.")
+@click.option("--pixel-format", default="Mono8", show_default=True, help="Of both cameras.")
+@click.option("--black-level", default=0, show_default=True, type=click.IntRange(0, 1000), help="Counts in the dark.")
+@click.option("--hot-pixels", default=0, show_default=True, type=click.IntRange(0, 10_000), help="Of each camera.")
+@click.argument("command", nargs=-1, type=click.UNPROCESSED)
+def virtual_device(
+    profile_name: str,
+    device_file: str | None,
+    settings: tuple[str, ...],
+    out: Path,
+    seed: int,
+    pixel_format: str,
+    black_level: int,
+    hot_pixels: int,
+    command: tuple[str, ...],
+) -> None:
+    """Run a simulated device as hardware: two GigE cameras, a pulse generator on a serial port, a modulator.
+
+    Read it with `camera:FOLDER/device.toml`. Its cameras need a network of their own, so it runs in a private one, and
+    so does COMMAND, which is started there once the device is ready; the device ends with it. Without COMMAND a shell
+    is started.
+    """
+    if os.environ.get(_PRIVATE) != "1":
+        require()
+        argv = enter([sys.executable, "-m", "lightpage.cli.main", *sys.argv[1:]])
+        os.execvpe(argv[0], argv, {**os.environ, _PRIVATE: "1"})
+    out.mkdir(parents=True, exist_ok=True)
+    device = (load_device(device_file) if device_file else Device()).with_settings(list(settings))
+    with (
+        stop_signals(),
+        VirtualDevice(load_profile(profile_name), device, out, seed, pixel_format, black_level, hot_pixels) as running,
+    ):
+        click.echo(f"simulated device at camera:{running.config}")
+        status = os.spawnvp(os.P_WAIT, *_started(command or (os.environ.get("SHELL", "/bin/sh"),)))
+        running.check()
+    click.get_current_context().exit(status if status >= 0 else 128 - status)
+
+
+def _started(command: tuple[str, ...]) -> tuple[str, list[str]]:
+    return command[0], list(command)
