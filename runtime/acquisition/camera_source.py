@@ -85,7 +85,8 @@ class CameraSource(FrameSource):
     ) -> None:
         self.name, self.profile = name, profile
         self.frame_shape, self.page_shape = profile.frame_shape, profile.page_shape
-        self.modulator, self.beams = modulator, beams
+        self.modulator = modulator
+        self.beams: Beams = beams
         self.pages: PageStore = pages if pages is not None else PageStore(profile)
         self._cameras, self._trigger = cameras, trigger
         self._exposures = exposures or Exposures()

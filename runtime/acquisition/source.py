@@ -19,6 +19,7 @@ from lightpage.recording.layout import FrameInfo
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.page_store import PageStore
 from runtime.errors import LostShotError, SourceError
+from runtime.modulator.modulator import Beams, Modulator
 
 SHOT_S = 10.0
 """Usual time that a shot may take."""
@@ -66,6 +67,7 @@ class FrameSource(ABC):
         page_shape: (rows, columns) of its pages where it knows them, else None.
         profile: nominal device, where it knows it.
         pages: what its modulator shows, where it has one that shows what it is given.
+        modulator, beams: of a device that has them.
         operator: is asked to do by hand what the device cannot; returns once that is done.
         on_lost: is told of every lost shot and its page's number, of those too that a further shot made good.
     """
@@ -77,6 +79,8 @@ class FrameSource(ABC):
     page_shape: tuple[int, int] | None = None
     profile: Profile | None = None
     pages: PageStore | None = None
+    modulator: Modulator | None = None
+    beams: Beams | None = None
     operator: Callable[[str], None] = staticmethod(nobody)
     on_lost: Callable[[int, LostShotError], None] = staticmethod(lambda page, error: None)
 

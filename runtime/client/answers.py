@@ -111,3 +111,24 @@ def recalibrated(result: pb.RecalibrationResult) -> Recalibrated:
         pages_lost_before=result.pages_lost_before,
         image=image_of(result.image) if result.HasField("image") else None,
     )
+
+
+@dataclass(frozen=True)
+class DisplayOrder:
+    """What a controller is to show.
+
+    Attributes:
+        page: number of the page that the service waits for, None where it waits for none.
+        beams: (signal, reference) that are to be let through, None where it does not wait for them.
+    """
+
+    page: int | None
+    beams: tuple[bool, bool] | None
+
+
+def display_order(reply: pb.WatchDisplayReply) -> DisplayOrder:
+    """An order from its message."""
+    return DisplayOrder(
+        reply.page if reply.HasField("page") else None,
+        (reply.beams.signal, reply.beams.reference) if reply.HasField("beams") else None,
+    )

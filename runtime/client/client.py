@@ -14,9 +14,11 @@ from lightpage.errors import FrameError, LightpageError
 from lightpage.recording.reader import FramePair
 from runtime.client.answers import (
     Description,
+    DisplayOrder,
     ModelInfo,
     Recalibrated,
     RemoteData,
+    display_order,
     model_info,
     recalibrated,
     remote_data,
@@ -192,6 +194,62 @@ class LightpageClient:
             raise error_of(error, self.target) from None
         finally:
             call.cancel()
+
+    def upload_pages(self, symbols: NDArray[np.uint8], levels: int) -> int:
+        """Give the source's modulator pages [page, ny, nx] of M levels to show; returns the first one's number.
+
+        Raises:
+            SourceError: the source shows no pages that it is given.
+            PageError: another shape, or symbols beyond the levels.
+            InvalidInputError: other levels than the pages that are there.
+            LimitError: more than the service holds.
+        """
+        pages = np.ascontiguousarray(symbols, np.uint8)
+        pages = pages.reshape(-1, *pages.shape[-2:])
+
+        def parts() -> Iterator[pb.UploadPagesRequest]:
+            yield pb.UploadPagesRequest(levels=levels)
+            step = max(1, CHUNK_BYTES // max(1, pages[0].size)) if len(pages) else 1
+            for start in range(0, len(pages), step):
+                yield pb.UploadPagesRequest(symbols=pages[start : start + step].tobytes())
+
+        reply: pb.UploadPagesReply = self._unary(self._stub.UploadPages, parts())
+        return reply.first_page
+
+    def display_orders(self, timeout_s: float | None = None) -> Iterator[DisplayOrder]:
+        """What the service waits for a controller to show, at first and at every change, until the iterator is closed.
+
+        Raises:
+            SourceError: the source's device shows its pages, and moves its shutters, by itself.
+        """
+        call = self._stub.WatchDisplay(pb.WatchDisplayRequest(), timeout=timeout_s)
+        try:
+            for reply in call:
+                yield display_order(reply)
+        except grpc.RpcError as error:
+            raise error_of(error, self.target) from None
+        finally:
+            call.cancel()
+
+    def page_shown(self, page: int | None) -> None:
+        """Say which page is on display and has settled; None for none from now on.
+
+        Raises:
+            SourceError: the source's device shows its pages by itself.
+        """
+        if page is None:
+            self._unary(self._stub.ReportDisplay, pb.ReportDisplayRequest(withdrawn=True))
+        else:
+            self._unary(self._stub.ReportDisplay, pb.ReportDisplayRequest(page=page))
+
+    def beams_set(self, *, signal: bool, reference: bool) -> None:
+        """Say which beams are let through and have settled.
+
+        Raises:
+            SourceError: the source's device moves its shutters by itself.
+        """
+        beams = pb.Beams(signal=signal, reference=reference)
+        self._unary(self._stub.ReportDisplay, pb.ReportDisplayRequest(beams=beams))
 
     def recalibrate(
         self,

@@ -6,17 +6,21 @@ import logging
 import signal
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
 from lightpage.errors import BundleError, CalibrationError, InvalidInputError
+from lightpage.recording.pages import Pages
+from runtime.acquisition.page_store import PageStore
+from runtime.acquisition.source import FrameSource
 from runtime.acquisition.sources import open_source
 from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
+from runtime.errors import LostShotError, SourceError
 from runtime.recalibration.refit import refit
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
@@ -33,7 +37,12 @@ _log = logging.getLogger(__name__)
 
 @click.command()
 @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
-@click.option("--source", help="simulator:PROFILE, recording:FILE or camera:...; without it only sent frames decode.")
+@click.option(
+    "--source", help="simulator:PROFILE, recording:FILE, camera:CONFIG.toml; without it only sent frames decode."
+)
+@click.option(
+    "--pages", "pages_file", type=click.Path(path_type=Path), help="Pages that the source is to show, PAGES.h5."
+)
 @click.option("--address", default=ADDRESS, show_default=True, help="HOST:PORT to listen on; port 0 takes a free one.")
 @click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus figures on this port.")
 @click.option("--metrics-host", default="127.0.0.1", show_default=True, help="Where the figures are shown.")
@@ -54,6 +63,7 @@ _log = logging.getLogger(__name__)
 def serve(
     bundle: str,
     source: str | None,
+    pages_file: Path | None,
     address: str,
     metrics_port: int | None,
     metrics_host: str,
@@ -71,9 +81,11 @@ def serve(
         registry = ModelRegistry(base, tracker_for) if tracking else ModelRegistry(base)
         if models is not None:
             _resume(registry, models, threads)
-        pages = open_source(source) if source is not None else None
         metrics = ServiceMetrics()
-        try:
+        with ExitStack() as stack:
+            pages = None if source is None else stack.enter_context(_source(source, pages_file, base))
+            if pages is not None:
+                _take_dark_frames(pages)
             plane = DataPlane(registry, pages, models, metrics=metrics)
             with (
                 _shown(metrics, metrics_port, metrics_host),
@@ -83,9 +95,31 @@ def serve(
                 click.echo(f"serving {version} from {source_name} at {server.target}")
                 wait_for_stop()
                 click.echo("stopping")
-        finally:
-            if pages is not None:
-                pages.close()
+
+
+def _source(name: str, pages_file: Path | None, base: Decoder) -> FrameSource:
+    """The source, checked, with its pages to show.
+
+    Raises:
+        InvalidInputError: it is not there, or not for this device.
+    """
+    source = open_source(name)
+    try:
+        source.check_against(base.bundle.profile)
+        if pages_file is not None:
+            source.show_pages(PageStore(base.bundle.profile, Pages.open(pages_file)))
+    except BaseException:
+        source.close()
+        raise
+    return source
+
+
+def _take_dark_frames(source: FrameSource) -> None:
+    """Without them hot pixels stay as they are, and a page is read all the same."""
+    try:
+        source.dark_frames()
+    except (LostShotError, SourceError) as error:
+        _log.warning("no dark frames, so hot pixels are not mended: %s", error)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from lightpage.codec.page_codec import PageBytes
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.service.dataplane import Answer, ReadAnswer
+from runtime.service.display import Wanted
 from runtime.service.registry import Model
 from runtime.service.user_data import DataPage
 from runtime.wire.messages import DATA_LOSSES, FLOAT, image_message
@@ -94,6 +95,15 @@ def read_reply(read: ReadAnswer, request: pb.ReadPageRequest) -> pb.ReadPageRepl
         page=read.shot.page_index,
         written=b"" if written is None else written.tobytes(),
         pilot_mask=b"" if written is None else read.pilot_mask.astype(np.uint8).tobytes(),
+    )
+
+
+def wanted_message(wanted: Wanted) -> pb.WatchDisplayReply:
+    """What a controller is to show as its message."""
+    beams = wanted.beams
+    return pb.WatchDisplayReply(
+        page=wanted.page,
+        beams=None if beams is None else pb.Beams(signal=beams.signal, reference=beams.reference),
     )
 
 

@@ -13,9 +13,11 @@ import grpc
 
 from lightpage.errors import FrameError, InvalidInputError, LimitError
 from lightpage.page.symbols import MAX_LEVELS
+from runtime.modulator.beam_state import BeamState
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.rpc.replies import data_reply, decode_reply, model_message, read_reply, result_message
+from runtime.rpc.replies import data_reply, decode_reply, model_message, read_reply, result_message, wanted_message
+from runtime.rpc.uploads import uploaded_pages
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane, levels_for
 from runtime.service.recalibrator import Recalibrator, Step
@@ -126,6 +128,39 @@ class LightpageServicer(pb_grpc.LightpageServicer):
             with self._plane.ranges.held(caller), _stall_guard(context, limits.range_s):
                 for page in read_data(self._plane, request.first_page, request.pages, caller):
                     yield data_reply(page)
+
+    def UploadPages(
+        self, request_iterator: Iterator[pb.UploadPagesRequest], context: grpc.ServicerContext
+    ) -> pb.UploadPagesReply:
+        """Receive pages to show."""
+        with self._call("UploadPages", context):
+            shape = self._plane.registry.current.decoder.bundle.profile.page_shape
+            with _stall_guard(context, self._plane.limits.receive_s):
+                levels, symbols = uploaded_pages(request_iterator, shape)
+            first = self._plane.display.upload(symbols, levels)
+            return pb.UploadPagesReply(first_page=first, pages=len(symbols))
+
+    def WatchDisplay(
+        self, request: pb.WatchDisplayRequest, context: grpc.ServicerContext
+    ) -> Iterator[pb.WatchDisplayReply]:
+        """Tell a controller what to show."""
+        with self._call("WatchDisplay", context):
+            caller = _caller(context)
+            with self._plane.watches.held(caller):
+                for wanted in self._plane.display.wanted(caller):
+                    yield wanted_message(wanted)
+
+    def ReportDisplay(self, request: pb.ReportDisplayRequest, context: grpc.ServicerContext) -> pb.ReportDisplayReply:
+        """Hear from a controller what is shown."""
+        with self._call("ReportDisplay", context):
+            kind, display = request.WhichOneof("what"), self._plane.display
+            if kind is None:
+                raise InvalidInputError("report of the display", "nothing", "a page, its end, or beams")
+            if kind == "beams":
+                display.beams_set(BeamState(request.beams.signal, request.beams.reference))
+            else:
+                display.shown(request.page if kind == "page" else None)
+            return pb.ReportDisplayReply()
 
     def Recalibrate(
         self, request: pb.RecalibrateRequest, context: grpc.ServicerContext

@@ -21,6 +21,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
 from runtime.errors import LostPageError, SourceError
 from runtime.service.caller import Caller
+from runtime.service.display import Display
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.observation import Observer, Seen, observed
@@ -84,7 +85,10 @@ class DataPlane:
         self.receives = Slots(self.limits.concurrent_receives, "receives", self.limits.deadline_s)
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s)
+        self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s)
         self.metrics.in_service(registry.current.version)
+        if source is not None:
+            self.metrics.watch(source)
 
     @property
     def source(self) -> FrameSource:
@@ -96,6 +100,15 @@ class DataPlane:
         if self._source is None:
             raise SourceError("source", "none", "a service started with --source")
         return self._source
+
+    @property
+    def display(self) -> Display:
+        """The controller's side of the source.
+
+        Raises:
+            SourceError: this service has none.
+        """
+        return Display(self.source)
 
     @property
     def has_source(self) -> bool:

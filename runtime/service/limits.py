@@ -39,6 +39,9 @@ RANGE_PAGES = 4096
 RANGE_S = 3600.0
 """A range that is not read to its end by then is dropped, with a caller that does not take it."""
 
+CONCURRENT_WATCHES = 2
+"""Controllers that watch what is to be shown, each holding a thread: one, and one whose connection has been lost."""
+
 GRACE_S = 10.0
 """Time that calls in flight get when the service is told to stop."""
 
@@ -61,4 +64,5 @@ class Limits:
     concurrent_ranges: int = CONCURRENT_RANGES
     range_pages: int = RANGE_PAGES
     range_s: float = RANGE_S
+    concurrent_watches: int = CONCURRENT_WATCHES
     grace_s: float = GRACE_S

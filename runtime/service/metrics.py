@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.metrics_core import Metric
+from prometheus_client.registry import Collector
 
 from lightpage.codec.page_codec import Loss, PageBytes
+from runtime.acquisition.source import FrameSource
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import unconfirmed_page
 from runtime.errors import LostPageError, UnconfirmedPageError
@@ -82,10 +87,32 @@ class ServiceMetrics:
         if page.image is not None and page.image.searched:
             self.searches.labels(str(page.image.found).lower()).inc()
 
+    def watch(self, source: FrameSource) -> None:
+        """Show what the source counts, whenever somebody looks."""
+        self.registry.register(_SourceFigures(source))
+
     def in_service(self, version: str) -> None:
         """Say which model decodes now."""
         self.model.clear()
         self.model.labels(version).set(1)
+
+
+class _SourceFigures(Collector):
+    """What a source counts by itself."""
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source = source
+
+    def collect(self) -> Iterator[Metric]:
+        """The figures as they are now."""
+        shots = CounterMetricFamily("lightpage_shots", "Shots of the cameras, by how they ended.", labels=["outcome"])
+        for outcome, count in self._source.shots_by_outcome().items():
+            shots.add_metric([outcome], count)
+        yield shots
+        share = GaugeMetricFamily("lightpage_saturated_share", "Pixels at full scale, last frame.", labels=["camera"])
+        for camera, value in self._source.saturated_shares().items():
+            share.add_metric([camera], value)
+        yield share
 
 
 @dataclass

@@ -359,6 +359,56 @@ class ReadPageReply(_message.Message):
     pilot_mask: bytes
     def __init__(self, decoded: _Optional[_Union[DecodeReply, _Mapping]] = ..., page: _Optional[int] = ..., written: _Optional[bytes] = ..., pilot_mask: _Optional[bytes] = ...) -> None: ...
 
+class UploadPagesRequest(_message.Message):
+    __slots__ = ("levels", "symbols")
+    LEVELS_FIELD_NUMBER: _ClassVar[int]
+    SYMBOLS_FIELD_NUMBER: _ClassVar[int]
+    levels: int
+    symbols: bytes
+    def __init__(self, levels: _Optional[int] = ..., symbols: _Optional[bytes] = ...) -> None: ...
+
+class UploadPagesReply(_message.Message):
+    __slots__ = ("first_page", "pages")
+    FIRST_PAGE_FIELD_NUMBER: _ClassVar[int]
+    PAGES_FIELD_NUMBER: _ClassVar[int]
+    first_page: int
+    pages: int
+    def __init__(self, first_page: _Optional[int] = ..., pages: _Optional[int] = ...) -> None: ...
+
+class WatchDisplayRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class WatchDisplayReply(_message.Message):
+    __slots__ = ("page", "beams")
+    PAGE_FIELD_NUMBER: _ClassVar[int]
+    BEAMS_FIELD_NUMBER: _ClassVar[int]
+    page: int
+    beams: Beams
+    def __init__(self, page: _Optional[int] = ..., beams: _Optional[_Union[Beams, _Mapping]] = ...) -> None: ...
+
+class Beams(_message.Message):
+    __slots__ = ("signal", "reference")
+    SIGNAL_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_FIELD_NUMBER: _ClassVar[int]
+    signal: bool
+    reference: bool
+    def __init__(self, signal: _Optional[bool] = ..., reference: _Optional[bool] = ...) -> None: ...
+
+class ReportDisplayRequest(_message.Message):
+    __slots__ = ("page", "withdrawn", "beams")
+    PAGE_FIELD_NUMBER: _ClassVar[int]
+    WITHDRAWN_FIELD_NUMBER: _ClassVar[int]
+    BEAMS_FIELD_NUMBER: _ClassVar[int]
+    page: int
+    withdrawn: bool
+    beams: Beams
+    def __init__(self, page: _Optional[int] = ..., withdrawn: _Optional[bool] = ..., beams: _Optional[_Union[Beams, _Mapping]] = ...) -> None: ...
+
+class ReportDisplayReply(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
 class RecalibrateRequest(_message.Message):
     __slots__ = ("source", "recording", "recording_count")
     SOURCE_FIELD_NUMBER: _ClassVar[int]

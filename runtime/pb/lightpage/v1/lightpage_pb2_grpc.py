@@ -58,6 +58,21 @@ class LightpageStub:
                 request_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReadDataRequest.SerializeToString,
                 response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReadDataReply.FromString,
                 _registered_method=True)
+        self.UploadPages = channel.stream_unary(
+                '/lightpage.v1.Lightpage/UploadPages',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.UploadPagesRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.UploadPagesReply.FromString,
+                _registered_method=True)
+        self.WatchDisplay = channel.unary_stream(
+                '/lightpage.v1.Lightpage/WatchDisplay',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.WatchDisplayRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.WatchDisplayReply.FromString,
+                _registered_method=True)
+        self.ReportDisplay = channel.unary_unary(
+                '/lightpage.v1.Lightpage/ReportDisplay',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReportDisplayRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReportDisplayReply.FromString,
+                _registered_method=True)
         self.Recalibrate = channel.unary_stream(
                 '/lightpage.v1.Lightpage/Recalibrate',
                 request_serializer=lightpage_dot_v1_dot_lightpage__pb2.RecalibrateRequest.SerializeToString,
@@ -112,6 +127,29 @@ class LightpageServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def UploadPages(self, request_iterator, context):
+        """Give the source's modulator more pages to show, behind those that it has; all of the call or none. They are kept until
+        the service ends. ReadPage.page is a page's number.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def WatchDisplay(self, request, context):
+        """For a controller that shows pages, or moves shutters, by itself: what the service waits for, one message for each
+        change, until the caller leaves. FAILED_PRECONDITION where the source's device does this by itself.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ReportDisplay(self, request, context):
+        """The controller says what is on display now, or how the beams are now, once that has settled.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def Recalibrate(self, request, context):
         """Re-fit the device's geometry from pages with known symbols and put the new model in service. Progress messages come
         first, one result last. FAILED_PRECONDITION when the new model would not be better: the old one stays. ABORTED while
@@ -157,6 +195,21 @@ def add_LightpageServicer_to_server(servicer, server):
                     servicer.ReadData,
                     request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReadDataRequest.FromString,
                     response_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReadDataReply.SerializeToString,
+            ),
+            'UploadPages': grpc.stream_unary_rpc_method_handler(
+                    servicer.UploadPages,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.UploadPagesRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.UploadPagesReply.SerializeToString,
+            ),
+            'WatchDisplay': grpc.unary_stream_rpc_method_handler(
+                    servicer.WatchDisplay,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.WatchDisplayRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.WatchDisplayReply.SerializeToString,
+            ),
+            'ReportDisplay': grpc.unary_unary_rpc_method_handler(
+                    servicer.ReportDisplay,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReportDisplayRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReportDisplayReply.SerializeToString,
             ),
             'Recalibrate': grpc.unary_stream_rpc_method_handler(
                     servicer.Recalibrate,
@@ -285,6 +338,87 @@ class Lightpage:
             '/lightpage.v1.Lightpage/ReadData',
             lightpage_dot_v1_dot_lightpage__pb2.ReadDataRequest.SerializeToString,
             lightpage_dot_v1_dot_lightpage__pb2.ReadDataReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def UploadPages(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_unary(
+            request_iterator,
+            target,
+            '/lightpage.v1.Lightpage/UploadPages',
+            lightpage_dot_v1_dot_lightpage__pb2.UploadPagesRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.UploadPagesReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def WatchDisplay(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/WatchDisplay',
+            lightpage_dot_v1_dot_lightpage__pb2.WatchDisplayRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.WatchDisplayReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ReportDisplay(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/ReportDisplay',
+            lightpage_dot_v1_dot_lightpage__pb2.ReportDisplayRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.ReportDisplayReply.FromString,
             options,
             channel_credentials,
             insecure,

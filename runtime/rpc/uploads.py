@@ -1,0 +1,42 @@
+"""Puts the pages together that a caller sends in messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import InvalidInputError, LimitError, PageError
+from runtime.acquisition.page_store import UPLOADED_BYTES
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+
+
+def uploaded_pages(
+    messages: Iterator[pb.UploadPagesRequest], page_shape: tuple[int, int]
+) -> tuple[int, NDArray[np.uint8]]:
+    """Level count M and pages [page, ny, nx].
+
+    Raises:
+        InvalidInputError: messages in the wrong order.
+        PageError: parts of pages, or none.
+        LimitError: more than the service holds.
+    """
+    first = next(messages, None)
+    if first is None or first.WhichOneof("part") != "levels":
+        got = "no message" if first is None else first.WhichOneof("part") or "an empty message"
+        raise InvalidInputError("first message of UploadPages", got, "the level count")
+    size, parts, held = page_shape[0] * page_shape[1], list[NDArray[np.uint8]](), 0
+    for message in messages:
+        if message.WhichOneof("part") != "symbols":
+            raise InvalidInputError("message of UploadPages", "no symbols", "pages from there on")
+        content = np.frombuffer(message.symbols, np.uint8)
+        if not content.size or content.size % size:
+            raise PageError("uploaded pages", f"{content.size} symbols", f"whole pages of {size}")
+        held += content.size
+        if held > UPLOADED_BYTES:
+            raise LimitError("uploaded pages", f"at least {held} bytes", f"at most {UPLOADED_BYTES}")
+        parts.append(content.reshape(-1, *page_shape))
+    if not parts:
+        raise PageError("uploaded pages", "none", "at least one")
+    return first.levels, np.concatenate(parts)

@@ -1,0 +1,99 @@
+"""What a controller does for the source: it uploads pages, shows them, moves shutters, and says so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.acquisition.source import FrameSource
+from runtime.errors import SourceError
+from runtime.modulator.beam_state import BeamState
+from runtime.modulator.external import ExternalBeams, ExternalModulator
+from runtime.service.caller import Caller
+
+_POLL_S = 0.05
+"""How often is looked for something new to show."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the service waits for: a page on display, beams; None for nothing of the kind."""
+
+    page: int | None = None
+    beams: BeamState | None = None
+
+
+class Display:
+    """The controller's side of a source.
+
+    Args:
+        source: whose pages, modulator and beams.
+    """
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source = source
+        modulator, beams = source.modulator, source.beams
+        self._modulator = modulator if isinstance(modulator, ExternalModulator) else None
+        self._beams = beams if isinstance(beams, ExternalBeams) else None
+
+    def upload(self, symbols: NDArray[np.uint8], levels: int) -> int:
+        """Take in pages [page, ny, nx] of M levels; returns the first one's number.
+
+        Raises:
+            SourceError: the source shows no pages that it is given.
+            PageError, InvalidInputError, LimitError: see `PageStore.append`.
+        """
+        pages = self._source.pages
+        if pages is None:
+            expected = "a source with a modulator, or one that was started with pages"
+            raise SourceError(f"source {self._source.name}", "uploaded pages", expected)
+        return pages.append(symbols, levels)
+
+    def wanted(self, caller: Caller) -> Iterator[Wanted]:
+        """What is waited for, at first and at every change, as long as the caller stays.
+
+        Raises:
+            SourceError: the source does all by itself.
+            CallerLeft: the caller has gone.
+        """
+        if self._modulator is None and self._beams is None:
+            raise self._alone()
+        last: Wanted | None = None
+        while caller.seconds_left() > 0:
+            caller.check()
+            page = None if self._modulator is None else self._modulator.wanted(_POLL_S)
+            beams = None if self._beams is None else self._beams.wanted(_POLL_S if self._modulator is None else 0.0)
+            now = Wanted(page, beams)
+            if now != last:
+                last = now
+                yield now
+
+    def shown(self, page: int | None) -> None:
+        """A page is on display; None: none is.
+
+        Raises:
+            SourceError: the source shows its pages by itself.
+        """
+        if self._modulator is None:
+            raise self._alone()
+        if page is None:
+            self._modulator.withdrawn()
+        else:
+            self._modulator.shown(page)
+
+    def beams_set(self, state: BeamState) -> None:
+        """The beams are so now.
+
+        Raises:
+            SourceError: the source moves its shutters by itself.
+        """
+        if self._beams is None:
+            raise self._alone()
+        self._beams.beams_set(signal=state.signal, reference=state.reference)
+
+    def _alone(self) -> SourceError:
+        expected = 'a source whose modulator or beams have kind = "external"'
+        return SourceError(f"source {self._source.name}", "word from a controller", expected)
