@@ -14,7 +14,7 @@ IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo test test-long bench bench-speed bench-service bench-codec bench-image-search bench-decoders train-decoders results image check-image proto lint format clean
+.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service bench-codec bench-image-search bench-decoders train-decoders results image check-image proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -33,6 +33,11 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP)  ## run the whole main job on a simulated device, into out/demo
 	$(BIN)/lightpage demo --out out/demo
+
+HARDWARE := out/demo-hardware
+demo-hardware: $(STAMP)  ## the main job over fake cameras, real packets, a serial line: needs libaravis-0.8-0 and Linux
+	$(BIN)/lightpage virtual-device --out $(HARDWARE)/device -- \
+	    $(BIN)/lightpage demo --source camera:$(HARDWARE)/device/device.toml --out $(HARDWARE)
 
 PYTEST := $(ONE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 test: lint  ## lint, then every test but the long ones; prints the slowest

@@ -172,6 +172,19 @@ def ideal_device() -> Device:
     )
 
 
+def parse_device(text: str, source: str = "device") -> Device:
+    """Read a device state from TOML text; keys left out keep their realistic default.
+
+    Raises:
+        ProfileError: not TOML, or a key that does not validate.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ProfileError(source, f"text that is not TOML ({error})", "a TOML document") from None
+    return validate(Device, data, source)
+
+
 def load_device(path: str | Path) -> Device:
     """Load a device state from a TOML file; keys left out keep their realistic default.
 
@@ -179,10 +192,10 @@ def load_device(path: str | Path) -> Device:
         ProfileError: unreadable, not TOML, or a key that does not validate.
     """
     try:
-        data = tomllib.loads(Path(path).read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        text = Path(path).read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
         raise ProfileError(f"device file {path}", error, "a readable TOML file") from None
-    return validate(Device, data, f"device file {path}")
+    return parse_device(text, f"device file {path}")
 
 
 def draw_device(rng: np.random.Generator) -> Device:

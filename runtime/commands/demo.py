@@ -20,8 +20,9 @@ from runtime.demo.demo import DemoResult, run_demo
 @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
 @click.option("--out", default="out/demo", show_default=True, type=OutputFolder(), help="Folder.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of what is written.")
+@click.option("--source", "spec", help="A simulated device that runs as hardware, camera:FOLDER/device.toml.")
 @click.option("--json", "json_path", type=OutputFile(), help="Also write the figures to this file.")
-def demo(bundle: str, out: Path, seed: int, json_path: Path | None) -> None:
+def demo(bundle: str, out: Path, seed: int, spec: str | None, json_path: Path | None) -> None:
     """Store a picture on the simulated device and read it back, before a drift, after it and recalibrated.
 
     Writes to the folder --out: pages.h5 (what the modulator shows), demo.json, demo.png, and the picture as it was read
@@ -35,7 +36,7 @@ def demo(bundle: str, out: Path, seed: int, json_path: Path | None) -> None:
     except OSError as error:
         raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
     with percent_bar() as progress:
-        result = run_demo(bundle_path(bundle), out, seed, progress)
+        result = run_demo(bundle_path(bundle), out, seed, progress, spec)
     figures = result.to_json() | {"seconds": time.perf_counter() - start}
     write_json(out / "demo.json", figures)
     if json_path is not None:
@@ -69,5 +70,8 @@ def describe(result: DemoResult) -> str:
     found = result.recalibrated
     angle = "" if found.angle_deg is None else f", pipe angle {found.angle_deg:.3f} degree"
     lines.append(f"recalibrated with {found.pages_used} known pages in {found.seconds:.0f} s{angle}")
+    if result.shots:
+        told = ", ".join(f"{count} {outcome}" for outcome, count in sorted(result.shots.items()))
+        lines.append(f"shots of {result.source}: {told}")
     lines.append(f"* what a phase carries, counted in {AIR_LEVELS} levels; the pages have {result.code.levels}")
     return "\n".join(lines)

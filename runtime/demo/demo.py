@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +19,17 @@ from numpy.typing import NDArray
 from lightpage.codec.code import Code
 from lightpage.codec.volume import Volume, encode_volume
 from lightpage.codec.volume_file import Restored, VolumeFiles
+from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.information import achievable_rate
 from lightpage.progress import Progress
 from lightpage.recording.pages import Pages, PagesWriter
 from lightpage.recording.reader import FramePair
+from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.simulator import SimulatorSource
+from runtime.acquisition.source import FrameSource
+from runtime.acquisition.sources import open_source
 from runtime.bulk.coded_pages import AIR_LEVELS
 from runtime.client.answers import Recalibrated
 from runtime.client.client import LightpageClient
@@ -33,6 +37,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.demo.picture import picture
 from runtime.errors import LostPageError
+from runtime.modulator.simulated import SimulatedModulator
 from runtime.recalibration.refit import refit
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
@@ -140,12 +145,17 @@ class DemoResult:
     code: Code
     volume: Volume
     seed: int
+    source: str = ""
+    shots: dict[str, int] = field(default_factory=dict)
+    """Shots of the cameras by how they ended; empty without cameras."""
 
     def to_json(self) -> dict[str, Any]:
         """The figures under names that other programs read."""
         recalibrated = self.recalibrated
         return {
             "seed": self.seed,
+            "source": self.source,
+            "shots": self.shots,
             "pages": self.volume.pages,
             "levels": self.code.levels,
             "air_levels": AIR_LEVELS,
@@ -193,7 +203,36 @@ def drifted(device: Device, share: float = 1.0) -> Device:
     )
 
 
-def run_demo(bundle: Path, out: Path, seed: int, progress: Progress = lambda what, share: None) -> DemoResult:
+def simulated_device(spec: str | None, profile: Profile, pages: Path) -> tuple[FrameSource, Callable[[Device], None]]:
+    """A simulated device that shows these pages, and what lets it drift.
+
+    Args:
+        spec: ``camera:DEVICE.toml`` of a simulated device that runs as hardware; None for one in this process.
+        profile: nominal.
+        pages: file.
+
+    Raises:
+        InvalidInputError: a source that is no simulated device.
+    """
+    if spec is None:
+        simulator = SimulatorSource(profile, Device(), written=Pages.open(pages))
+        return simulator, simulator.set_device
+    source = open_source(spec)
+    modulator = source.modulator
+    if not isinstance(modulator, SimulatedModulator):
+        source.close()
+        raise InvalidInputError(f"source {spec}", "no simulated device", "one of `lightpage virtual-device`")
+    source.show_pages(PageStore(profile, Pages.open(pages)))
+    return source, modulator.drift
+
+
+def run_demo(
+    bundle: Path,
+    out: Path,
+    seed: int,
+    progress: Progress = lambda what, share: None,
+    spec: str | None = None,
+) -> DemoResult:
     """Write a picture and read it back in three states of the device, through a client of a service on this machine.
 
     Args:
@@ -201,6 +240,7 @@ def run_demo(bundle: Path, out: Path, seed: int, progress: Progress = lambda wha
         out: folder that exists, for the pages and the pictures.
         seed: of the volume's number and the damage: other pages are written.
         progress: told of every step, with the share of all that is done.
+        spec: see `simulated_device`.
 
     Raises:
         LightpageError: an unusable bundle, or a recalibration that the service refuses.
@@ -209,8 +249,8 @@ def run_demo(bundle: Path, out: Path, seed: int, progress: Progress = lambda wha
     decoder = Decoder.load(bundle)
     volume = write_pages(decoder, out / "pages.h5", seed)
     with ExitStack() as stack:
-        pages = stack.enter_context(Pages.open(out / "pages.h5"))
-        source = SimulatorSource(decoder.bundle.profile, Device(), written=pages)
+        source, drift = simulated_device(spec, decoder.bundle.profile, out / "pages.h5")
+        stack.enter_context(source)
         plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
         server = stack.enter_context(LightpageServer(plane, Recalibrator(plane, refit), "127.0.0.1:0"))
         client = stack.enter_context(LightpageClient(server.target))
@@ -225,7 +265,7 @@ def run_demo(bundle: Path, out: Path, seed: int, progress: Progress = lambda wha
             return read_picture(client, volume, out / f"{name.replace(' ', '-')}.pgm", name, told)
 
         fresh = read("as calibrated", 0.05, 0.3)
-        steps = drift_until_lost(client, source, lambda: progress("drift", 0.3))
+        steps = drift_until_lost(client, drift, lambda: progress("drift", 0.3))
         lost = read("after drift", 0.35, 0.6)
         recalibrated = client.recalibrate(
             pages=range(RECALIBRATION_PAGES),
@@ -234,7 +274,9 @@ def run_demo(bundle: Path, out: Path, seed: int, progress: Progress = lambda wha
         again = read("recalibrated", 0.75, 1.0)
     progress("done", 1.0)
     code = decoder.page_codec.code
-    return DemoResult((fresh, lost, again), steps, recalibrated, frames, symbols, code, volume, seed)
+    shots = dict(source.shots_by_outcome())
+    phases = (fresh, lost, again)
+    return DemoResult(phases, steps, recalibrated, frames, symbols, code, volume, seed, source.name, shots)
 
 
 def write_pages(decoder: Decoder, path: Path, seed: int) -> Volume:
@@ -267,13 +309,13 @@ def pgm(grey: NDArray[np.uint8]) -> bytes:
 
 
 def drift_until_lost(
-    client: LightpageClient, source: SimulatorSource, told: Callable[[], None]
+    client: LightpageClient, drift: Callable[[Device], None], told: Callable[[], None]
 ) -> tuple[DriftStep, ...]:
     """Let the device drift in steps, reading one page after each, until that page is lost."""
     steps: list[DriftStep] = []
     for share in DRIFT_STEPS:
         told()
-        source.set_device(drifted(Device(), share))
+        drift(drifted(Device(), share))
         try:
             page = client.read_page(0, user_data=True)
         except LostPageError as error:

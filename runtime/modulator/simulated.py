@@ -1,6 +1,7 @@
 """Modulator and shutters of a simulated device, over the Unix socket on which it listens.
 
-A message is a line of JSON, followed by the page's symbols where it shows one. Each is answered by a line of JSON, once
+A message is a line of JSON, followed by the page's symbols where it shows one. A third kind lets the device drift: it
+has the true state that it drifts to, as TOML. Each is answered by a line of JSON, once
 the page is on display or the shutters have moved; an answer with `error` says why not.
 """
 
@@ -14,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.device.profile import to_toml
+from lightpage.device.state import Device
 from runtime.errors import LostShotError, Reason
 
 ANSWER_S = 30.0
@@ -44,6 +47,14 @@ class SimulatedModulator:
     def let_through(self, *, signal: bool, reference: bool) -> None:
         """See `Beams`."""
         self._ask({"signal": signal, "reference": reference}, b"", ANSWER_S, Reason.BEAM_CONTROL_FAILED)
+
+    def drift(self, device: Device, timeout_s: float = ANSWER_S) -> None:
+        """Let the simulated device drift to another true state; the next page that is shown shows it.
+
+        Raises:
+            LostShotError: there is no device.
+        """
+        self._ask({"device": to_toml(device)}, b"", timeout_s, Reason.NOT_ON_DISPLAY)
 
     def close(self) -> None:
         """See `Modulator`."""

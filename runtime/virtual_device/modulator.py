@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from lightpage.device.state import parse_device
 from lightpage.errors import LightpageError, PageError
 from runtime.virtual_device.light import Light
 
@@ -85,6 +86,8 @@ class ModulatorSocket:
                     raise PageError("page to show", f"{len(content)} symbols", f"{shape}")
                 symbols = np.frombuffer(content, np.uint8).reshape(shape)
                 self._light.show(symbols, int(head["levels"]), int(head["page"]))
+            elif "device" in head:
+                self._light.set_device(parse_device(head["device"]))
             else:
                 self._light.let_through(signal=bool(head["signal"]), reference=bool(head["reference"]))
         except LightpageError as error:
