@@ -234,6 +234,14 @@ def test_a_display_that_is_not_there_is_named(profile: Profile, monkeypatch: pyt
         ScreenModulator(settings, profile, LookupTable.linear(LEVELS)).open(WAIT_S)
 
 
+def test_without_the_extra_it_is_named(profile: Profile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "xcffib.py").write_text("raise ModuleNotFoundError(\"No module named 'xcffib'\")")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")
+    modulator = ScreenModulator(settings_of(":0"), profile, LookupTable.linear(LEVELS))
+    with pytest.raises(SourceError, match=r"No module named 'xcffib', wanted the screen extra"):
+        modulator.open(WAIT_S)
+
+
 def test_a_display_without_a_name_is_that_of_the_environment(
     server: XServer, profile: Profile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
