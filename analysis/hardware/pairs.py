@@ -1,0 +1,297 @@
+"""Shots over the whole chain with faults of every kind: how many pairs are wrong, what is lost, and why.
+
+    python -m analysis.hardware.pairs --shots 2000 --json runs/pairs.json
+
+Fake cameras send real packets, the pulse generator is on a serial port; every page shows its own number. A pair is
+wrong if a frame shows another page than the one that was asked for. Runs in a private network.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
+from lightpage.device.profile import Profile, load_profile
+from lightpage.files import write_json
+from lightpage.progress import track
+from runtime.acquisition.camera_source import CameraSource, Exposures
+from runtime.acquisition.page_store import PageStore
+from runtime.acquisition.pairing import PairingSettings
+from runtime.cameras.aravis import AravisCamera
+from runtime.cameras.camera import Frame
+from runtime.cameras.settings import CameraSettings
+from runtime.errors import LostShotError, Reason
+from runtime.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
+from runtime.virtual_device.fake_camera import FakeCamera
+from runtime.virtual_device.namespace import ADDRESSES, enter, require
+from runtime.virtual_device.pulse_generator import PulseGeneratorEmulator
+from runtime.virtual_device.serial_port import Pty
+
+PRIVATE = "LIGHTPAGE_PRIVATE_NETWORK"
+SIDE_PX = 256
+FAULTS = (
+    "missed",
+    "both missed",
+    "late",
+    "both late",
+    "doubled",
+    "packets lost",
+    "leader lost",
+    "held",
+    "both held",
+    "restarted",
+)
+DELAYS_S = (0.05, 0.1, 0.3, 0.45, 0.55, 0.6)
+_CAPTURE_S = 5.0
+
+
+class HeldCamera(AravisCamera):
+    """A camera whose frames may be delivered later than they came."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.hold_s = 0.0
+        self._held: list[tuple[float, Frame]] = []
+
+    def frame(self, timeout_s: float) -> Frame | None:
+        """The next frame that is not held back any more."""
+        end = time.monotonic() + timeout_s
+        while True:
+            wait = 0.0 if self._held or timeout_s == 0 else min(0.002, max(0.0, end - time.monotonic()))
+            found = super().frame(wait)
+            if found is not None:
+                self._held.append((time.monotonic() + self.hold_s, found))
+            if self._held and self._held[0][0] <= time.monotonic():
+                return self._held.pop(0)[1]
+            if time.monotonic() >= end and found is None:
+                return None
+            if self._held:
+                time.sleep(0.001)
+
+
+@dataclass
+class Stage:
+    """The chain, the page on display, and what is to go wrong with the next shot."""
+
+    profile: Profile
+    folder: Path
+    page: int = 0
+    fault: str = ""
+    camera: int = 0
+    delay_s: float = 0.0
+    timers: list[threading.Timer] = field(default_factory=list)
+    name: str = "stage"
+
+    def __post_init__(self) -> None:
+        self.fakes = [
+            FakeCamera(address, f"CAM-{one}", self._picture(one), (SIDE_PX, SIDE_PX))
+            for one, address in enumerate(ADDRESSES)
+        ]
+        self.generator = PulseGeneratorEmulator({1: lambda: self._wire(0), 2: lambda: self._wire(1)})
+        self.port = Pty(self.generator.answer, self.folder / "pulse-generator")
+        self.port.plug()
+        self.cameras = tuple(
+            HeldCamera(
+                CameraSettings(serial=f"CAM-{one}", trigger_source="Line1", packet_bytes=1400, buffers=30),
+                (SIDE_PX, SIDE_PX),
+                f"camera {one}",
+            )
+            for one in (0, 1)
+        )
+
+    def close(self) -> None:
+        """Switch all of it off."""
+        for timer in self.timers:
+            timer.cancel()
+        self.port.unplug()
+        for camera in self.cameras:
+            camera.close()
+        for fake in self.fakes:
+            fake.close()
+
+    def show(self, symbols: NDArray[np.uint8], levels: int, page: int, timeout_s: float) -> None:
+        """See `Modulator`."""
+        self.page = page
+
+    def shows(self) -> bool:
+        """See `Modulator`."""
+        return True
+
+    def let_through(self, *, signal: bool, reference: bool) -> None:
+        """See `Beams`: there are none."""
+
+    def begin(self, fault: str, camera: int, delay_s: float) -> None:
+        """What goes wrong with the next shot."""
+        self.fault, self.camera, self.delay_s = fault, camera, delay_s
+        self.fakes[camera].lose({"packets lost": 0.03, "leader lost": 0.5}.get(fault, 0.0))
+        for one, held in enumerate(self.cameras):
+            held.hold_s = delay_s if fault == "both held" or (fault == "held" and one == camera) else 0.0
+        if fault == "restarted":
+            self.fakes[camera].close()
+            self.fakes[camera].start()
+
+    def end(self) -> None:
+        """From here on nothing goes wrong."""
+        self.fakes[self.camera].lose(0.0)
+        self.fault = ""
+        for held in self.cameras:
+            held.hold_s = 0.0
+
+    def _picture(self, which: int) -> Callable[[], NDArray[np.uint8]]:
+        def picture() -> NDArray[np.uint8]:
+            image = np.full((SIDE_PX, SIDE_PX), 40 + which, np.uint8)
+            image[0, :3] = [self.page & 255, self.page >> 8, which]
+            return image
+
+        return picture
+
+    def _wire(self, camera: int) -> None:
+        """The cable from the pulse generator to a camera."""
+        hit = camera == self.camera
+        edge = self.fakes[camera].edge
+        if self.fault == "both missed" or (self.fault == "missed" and hit):
+            return
+        if self.fault == "both late" or (self.fault == "late" and hit):
+            self._later(self.delay_s, edge)
+            return
+        edge()
+        if self.fault == "doubled" and hit:
+            self._later(0.03, edge)
+
+    def _later(self, seconds: float, edge: Callable[[], bool]) -> None:
+        timer = threading.Timer(seconds, edge)
+        timer.daemon = True
+        timer.start()
+        self.timers = [one for one in self.timers if one.is_alive()] + [timer]
+
+
+def source_of(stage: Stage, tolerance_s: float, repeats: int) -> CameraSource:
+    """The chain as a source of endless pages."""
+    profile = stage.profile
+    first, second = stage.cameras
+    pairing = PairingSettings(tolerance_s=tolerance_s, spacing_s=2.5 * tolerance_s + 0.01)
+    port = PulseGeneratorSettings(port=str(stage.folder / "pulse-generator"), fire="software")
+    store = PageStore(profile)
+    symbols = np.zeros((1, *profile.page_shape), np.uint8)
+    store.append(np.repeat(symbols, 2, axis=0), 2)
+    exposures = Exposures(repeats=repeats)
+    return CameraSource(
+        profile, (first, second), PulseGenerator(port), stage, stage, _Endless(store), pairing, exposures
+    )
+
+
+class _Endless(PageStore):
+    """Any page number is there."""
+
+    def __init__(self, like: PageStore) -> None:
+        self.__dict__.update(like.__dict__)
+
+    def __len__(self) -> int:
+        return 1 << 16
+
+    def __getitem__(self, page: int) -> NDArray[np.uint8]:
+        return super().__getitem__(0)
+
+
+def shoot(source: CameraSource, stage: Stage, shots: int, share: float, seed: int) -> dict[str, Any]:
+    """Take shots, a share of them with a fault; what became of them."""
+    rng = random.Random(seed)
+    injected: Counter[str] = Counter()
+    lost: dict[str, Counter[str]] = {}
+    wrong, taken, harmless, seconds = 0, 0, 0, []
+    for page in track(range(shots), "shots", total=shots):
+        fault = rng.choice(FAULTS) if rng.random() < share else ""
+        injected[fault or "none"] += 1
+        stage.begin(fault, rng.randrange(2), rng.choice(DELAYS_S))
+        begun = time.perf_counter()
+        try:
+            pair = source.shot(_CAPTURE_S, page).pair
+        except LostShotError as error:
+            lost.setdefault(fault or "none", Counter())[error.reason.value] += 1
+        else:
+            seconds.append(time.perf_counter() - begun)
+            seen = [int(frame[0, 0]) | int(frame[0, 1]) << 8 for frame in (pair.in_phase, pair.quadrature)]
+            wrong += seen != [page, page]
+            taken += 1
+            harmless += bool(fault)
+        finally:
+            stage.end()
+    named = {reason.value for reason in Reason}
+    unnamed = sum(count for of in lost.values() for reason, count in of.items() if reason not in named)
+    return {
+        "shots": shots,
+        "faults": shots - injected["none"],
+        "injected": dict(injected),
+        "taken": taken,
+        "taken_with_a_fault": harmless,
+        "wrong_pairs": wrong,
+        "lost": {fault: dict(reasons) for fault, reasons in sorted(lost.items())},
+        "lost_without_a_fault": sum(lost.get("none", Counter()).values()),
+        "lost_unnamed": unnamed,
+        "seconds_per_shot_median": float(np.median(seconds)) if seconds else None,
+        "outcomes": dict(source.shots_by_outcome()),
+    }
+
+
+@click.command()
+@click.option("--shots", default=2000, show_default=True, type=click.IntRange(1, 60_000), help="With faults.")
+@click.option("--clean-shots", default=500, show_default=True, type=click.IntRange(0, 60_000), help="Without faults.")
+@click.option("--faults", default=0.35, show_default=True, type=click.FloatRange(0, 1), help="Share with a fault.")
+@click.option("--tolerance", default=0.02, show_default=True, type=click.FloatRange(0.001, 0.5), help="Seconds.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def main(shots: int, clean_shots: int, faults: float, tolerance: float, seed: int, json_path: Path | None) -> None:
+    """Print wrong pairs, losses by fault and reason, and the price of the rule where nothing goes wrong."""
+    if os.environ.get(PRIVATE) != "1":
+        require()
+        argv = enter([sys.executable, "-m", "analysis.hardware.pairs", *sys.argv[1:]])
+        os.execvpe(argv[0], argv, {**os.environ, PRIVATE: "1"})
+    profile = load_profile("bench")
+    small = profile.model_copy(
+        update={"camera": profile.camera.model_copy(update={"rows_px": SIDE_PX, "columns_px": SIDE_PX})}
+    )
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
+        for name, count, share, repeats in (
+            ("with faults", shots, faults, 0),
+            ("without faults", clean_shots, 0.0, 0),
+            ("without faults, one shot repeated", clean_shots, 0.0, 1),
+        ):
+            if not count:
+                continue
+            stage = Stage(small, Path(folder))
+            try:
+                with source_of(stage, tolerance, repeats) as source:
+                    figures[name] = shoot(source, stage, count, share, seed)
+            finally:
+                stage.close()
+            found = figures[name]
+            click.echo(
+                f"{name}: {found['shots']} shots, {found['faults']} with a fault; {found['taken']} taken "
+                f"({found['taken_with_a_fault']} of them with a fault that did no harm), {found['wrong_pairs']} wrong; "
+                f"{found['lost_without_a_fault']} lost without a fault"
+            )
+            for fault, reasons in found["lost"].items():
+                told = ", ".join(f"{times} {reason}" for reason, times in sorted(reasons.items()))
+                click.echo(f"  {fault:<14} {found['injected'].get(fault, 0):>5}: lost {told}")
+    if json_path is not None:
+        write_json(json_path, figures)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, name="python -m analysis.hardware.pairs"))
