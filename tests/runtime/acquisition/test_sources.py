@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,7 @@ from lightpage.recording.reader import FramePair
 from runtime.acquisition.recording import RecordingSource
 from runtime.acquisition.simulator import SimulatorSource
 from runtime.acquisition.sources import open_source
+from runtime.errors import LostShotError, Reason
 from tests.runtime import toy
 
 
@@ -110,3 +114,50 @@ def test_what_is_no_source_is_refused_by_name(spec: str, named: str, monkeypatch
     monkeypatch.setattr("lightpage.simulator.simulator.Simulator", FakeSimulator)
     with pytest.raises(LightpageError, match=named):
         open_source(spec)
+
+
+@dataclass
+class VendorFrame:
+    number: int
+    pixels: np.ndarray
+    serial: str = "V1"
+    clock_s: float = 1.0
+    host_s: float = 2.0
+
+
+class VendorSdk:
+    def __init__(self, rest: str) -> None:
+        self.running, self.number = False, 0
+
+    def start(self) -> None:
+        self.running = True
+
+    def stop(self) -> None:
+        self.running = False
+
+    def take_pair(self, timeout_s: float) -> tuple[VendorFrame, VendorFrame] | None:
+        assert self.running
+        self.number += 1
+        frame = np.full((2, 2), self.number, np.uint8)
+        return None if self.number == 2 else (VendorFrame(self.number, frame), VendorFrame(self.number, frame + 1))
+
+
+def test_the_source_of_a_vendor_in_the_documents_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parents[3] / "docs" / "cameras.md").read_text("utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len(blocks) == 1
+    assert len(blocks[0].strip().splitlines()) <= 32
+    space: dict[str, object] = {"VendorSdk": VendorSdk}
+    exec(compile(blocks[0], "docs/cameras.md", "exec", dont_inherit=True), space)
+    point = EntryPoint("vendor", "vendor:VendorSource", "lightpage.sources")
+    monkeypatch.setattr(EntryPoint, "load", lambda self: space["VendorSource"])
+    with open_source("vendor:7", [point]) as source:
+        assert source.name == "vendor:7"
+        shot = source.shot()
+        assert shot.infos is not None
+        assert [info.frame_id for info in shot.infos] == [1, 1]
+        assert shot.pair.quadrature[0, 0] == 2
+        with pytest.raises(LostShotError) as raised:
+            source.shot()
+        assert raised.value.reason is Reason.MISSING_FRAME
+        assert source.references() is None
