@@ -1,4 +1,5 @@
-# The decoder as a service: `runtime` without torch, `deep` on top of it with torch, to train and export in the device.
+# The decoder as a service: `runtime` without torch, `camera` with the drivers of cameras and of a modulator on a monitor,
+# `deep` with torch, to train and export in the device.
 #
 #   docker build --target runtime -t lightpage:runtime .
 #   docker run --read-only --tmpfs /tmp -v bundles:/bundles -v state:/state -p 50051:50051 lightpage:runtime
@@ -55,6 +56,20 @@ HEALTHCHECK --interval=10s --timeout=5s --start-period=60s --retries=3 \
     CMD ["python", "-m", "runtime.commands.healthcheck"]
 ENTRYPOINT ["lightpage", "serve"]
 CMD ["--source", "simulator:bench", "--address", "0.0.0.0:50051"]
+
+FROM build AS build-camera
+RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
+    --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
+    --mount=type=bind,from=packages,target=/run/packages \
+    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[screen]'
+
+FROM runtime AS camera
+USER 0:0
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends libaravis-0.8-0 libxcb1 \
+    && rm -rf /var/lib/apt/lists/* /var/cache/apt/* /var/log/apt /var/log/dpkg.log
+COPY --from=build-camera /opt/lightpage /opt/lightpage
+USER 10001:10001
 
 FROM build AS build-deep
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \

@@ -109,7 +109,7 @@ results: $(STAMP)  ## write docs/results.md from analysis/results: RESULTS_ARGS=
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
 	$(BIN)/python proto/generate.py
 
-image:  ## build the container image (IMAGE_TARGET=runtime or deep)
+image:  ## build the container image (IMAGE_TARGET=runtime, camera or deep)
 	packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
 
 check-image:  ## start the image that buildah built, and see whether it keeps its promises
