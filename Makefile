@@ -14,7 +14,7 @@ IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service bench-codec bench-image-search bench-decoders train-decoders results image check-image proto lint format clean
+.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image check-image proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -98,6 +98,14 @@ bench-codec: $(STAMP)  ## user bytes on recorded pages, wrong bytes ever given o
 	$(BIN)/python -m analysis.codec.refit --recording runs/bench-codec/32e/known.h5 --bundle runs/bench-codec/32e/kept.zip
 	$(ONE_THREAD) $(BIN)/python -m analysis.codec.safety --json runs/bench-codec/safety.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.codec.speed --json runs/bench-codec/speed.json
+
+BENCH_HARDWARE := runs/bench-hardware
+bench-hardware: $(STAMP)  ## cameras, trigger, pairing: wrong pairs, losses, plugs, latency, over fake cameras, in half an hour
+	mkdir -p $(BENCH_HARDWARE)
+	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.scpi --queries 10000 --json $(BENCH_HARDWARE)/scpi.json
+	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.pairs --shots 2000 --json $(BENCH_HARDWARE)/pairs.json
+	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.plugs --times 30 --json $(BENCH_HARDWARE)/plugs.json
+	$(BIN)/python -m analysis.hardware.latency --pages 100 --json $(BENCH_HARDWARE)/latency.json
 
 bench-image-search: $(STAMP)  ## how the image is found, followed and confirmed: tables and a picture, in more than an hour
 	$(BIN)/python -m analysis.tracking.image_search --out runs/bench-image-search

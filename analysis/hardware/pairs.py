@@ -8,7 +8,6 @@ wrong if a frame shows another page than the one that was asked for. Runs in a p
 
 from __future__ import annotations
 
-import os
 import random
 import sys
 import tempfile
@@ -24,6 +23,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.hardware.private import in_private_network
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
@@ -38,11 +38,10 @@ from runtime.cameras.settings import CameraSettings
 from runtime.errors import LostShotError, Reason
 from runtime.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
 from runtime.virtual_device.fake_camera import FakeCamera
-from runtime.virtual_device.namespace import ADDRESSES, enter, require
+from runtime.virtual_device.namespace import ADDRESSES
 from runtime.virtual_device.pulse_generator import PulseGeneratorEmulator
 from runtime.virtual_device.serial_port import Pty
 
-PRIVATE = "LIGHTPAGE_PRIVATE_NETWORK"
 SIDE_PX = 256
 FAULTS = (
     "missed",
@@ -208,6 +207,13 @@ class _Endless(PageStore):
         return super().__getitem__(0)
 
 
+def small_cameras() -> Profile:
+    """The bench profile with cameras that are as quick as the chain around them."""
+    profile = load_profile("bench")
+    camera = profile.camera.model_copy(update={"rows_px": SIDE_PX, "columns_px": SIDE_PX})
+    return profile.model_copy(update={"camera": camera})
+
+
 def shoot(source: CameraSource, stage: Stage, shots: int, share: float, seed: int) -> dict[str, Any]:
     """Take shots, a share of them with a fault; what became of them."""
     rng = random.Random(seed)
@@ -257,14 +263,8 @@ def shoot(source: CameraSource, stage: Stage, shots: int, share: float, seed: in
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(shots: int, clean_shots: int, faults: float, tolerance: float, seed: int, json_path: Path | None) -> None:
     """Print wrong pairs, losses by fault and reason, and the price of the rule where nothing goes wrong."""
-    if os.environ.get(PRIVATE) != "1":
-        require()
-        argv = enter([sys.executable, "-m", "analysis.hardware.pairs", *sys.argv[1:]])
-        os.execvpe(argv[0], argv, {**os.environ, PRIVATE: "1"})
-    profile = load_profile("bench")
-    small = profile.model_copy(
-        update={"camera": profile.camera.model_copy(update={"rows_px": SIDE_PX, "columns_px": SIDE_PX})}
-    )
+    in_private_network("analysis.hardware.pairs")
+    small = small_cameras()
     figures: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
         for name, count, share, repeats in (

@@ -1,0 +1,103 @@
+"""Cameras and serial line are unplugged and plugged in again: how soon pages are read after that, and what is lost.
+
+    python -m analysis.hardware.plugs --times 30 --json runs/plugs.json
+
+A page that is asked for while something is unplugged waits for it, for as long as its caller does. Runs in a private
+network.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from analysis.hardware.pairs import Stage, small_cameras, source_of
+from analysis.hardware.private import in_private_network
+from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
+from lightpage.files import write_json
+from lightpage.progress import track
+from runtime.acquisition.camera_source import CameraSource
+from runtime.errors import LostShotError
+
+_AWAY_S = 1.0
+_PATIENCE_S = 30.0
+TOLERANCE_S = 0.03
+
+
+def unplugged(
+    source: CameraSource, stage: Stage, unplug: Callable[[], object], plug: Callable[[], object], times: int, what: str
+) -> dict[str, Any]:
+    """Unplug something so many times; pages are asked for all the while."""
+    back: list[float] = []
+    lost, wrong, page = 0, 0, 0
+    for _ in track(range(times), what, total=times):
+        source.shot(_PATIENCE_S, page)
+        plugged = [0.0]
+
+        def again(at: list[float] = plugged) -> None:
+            plug()
+            at[0] = time.monotonic()
+
+        unplug()
+        timer = threading.Timer(_AWAY_S, again)
+        timer.start()
+        page += 1
+        try:
+            pair = source.shot(_PATIENCE_S, page).pair
+        except LostShotError:
+            lost += 1
+        else:
+            seen = {int(frame[0, 0]) | int(frame[0, 1]) << 8 for frame in (pair.in_phase, pair.quadrature)}
+            wrong += seen != {page}
+            timer.join()
+            back.append(time.monotonic() - plugged[0])
+        timer.join()
+        page += 1
+    return {
+        "times": times,
+        "pages_lost": lost,
+        "wrong_pairs": wrong,
+        "back_s_median": sorted(back)[len(back) // 2] if back else None,
+        "back_s_longest": max(back, default=None),
+    }
+
+
+@click.command()
+@click.option("--times", default=30, show_default=True, type=click.IntRange(1, 10_000), help="Of each.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def main(times: int, json_path: Path | None) -> None:
+    """Print how soon a camera, and the serial line, are back in service, and the pages that were lost meanwhile."""
+    in_private_network("analysis.hardware.plugs")
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
+        stage = Stage(small_cameras(), Path(folder))
+        try:
+            with source_of(stage, TOLERANCE_S, 1) as source:
+                camera = stage.fakes[1]
+                for what, unplug, plug in (
+                    ("camera", camera.close, camera.start),
+                    ("serial line", stage.port.unplug, stage.port.plug),
+                ):
+                    found = figures[what] = unplugged(source, stage, unplug, plug, times, what)
+                    median, longest = found["back_s_median"], found["back_s_longest"]
+                    back = "never read again" if median is None else f"read after {median:.2f} s, {longest:.2f} at most"
+                    click.echo(
+                        f"{what} unplugged {times} times: {found['pages_lost']} pages lost, "
+                        f"{found['wrong_pairs']} wrong; plugged in, {back}"
+                    )
+        finally:
+            stage.close()
+    if json_path is not None:
+        write_json(json_path, figures)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, name="python -m analysis.hardware.plugs"))
