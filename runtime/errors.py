@@ -16,6 +16,10 @@ class StoppingError(LightpageError):
     """The service is being stopped and drops the work."""
 
 
+class WorkerError(LightpageError):
+    """A process that the service had started was killed, broke, or took too long; what it worked on is as before."""
+
+
 class CallerLeft(Exception):
     """The caller has gone away; the work is dropped."""
 

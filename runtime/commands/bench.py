@@ -16,7 +16,6 @@ from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.execution.cpus import available_cpus
-from runtime.recalibration.refit import refit
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
@@ -36,7 +35,7 @@ def bench(bundle: str, rounds: int, threads: int | None, json_path: Path | None)
     decoder = Decoder.load(bundle_path(bundle), threads)
     pair = decoder.bundle.golden.pair
     plane = DataPlane(ModelRegistry(decoder))
-    with LightpageServer(plane, Recalibrator(plane, refit, None)) as server, LightpageClient(server.target) as client:
+    with LightpageServer(plane, Recalibrator(plane)) as server, LightpageClient(server.target) as client:
         client.describe()
         ways: dict[str, Callable[[], object]] = {
             "inference": lambda: decoder.infer(pair),

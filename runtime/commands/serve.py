@@ -21,7 +21,6 @@ from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.errors import LostShotError, SourceError
-from runtime.recalibration.refit import refit
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.metrics import MetricsServer, ServiceMetrics
@@ -89,7 +88,7 @@ def serve(
             plane = DataPlane(registry, pages, models, metrics=metrics)
             with (
                 _shown(metrics, metrics_port, metrics_host),
-                LightpageServer(plane, Recalibrator(plane, refit, recordings), address) as server,
+                LightpageServer(plane, Recalibrator(plane, recordings=recordings), address) as server,
             ):
                 version, source_name = registry.current.version, pages.name if pages is not None else "no source"
                 click.echo(f"serving {version} from {source_name} at {server.target}")

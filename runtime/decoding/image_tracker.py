@@ -20,7 +20,7 @@ from runtime.decoding.drift_tables import BundleTables, DriftTables
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
 from runtime.decoding.image_search import BundleSearch, PageSearch
 from runtime.decoding.page import DecodedPage, ImagePosition, Inference, Timings
-from runtime.decoding.tracking import NoTracker, Tracker, confirmed
+from runtime.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
 from runtime.execution.twin import TWIN_THREADS, OnnxTwin
 
 Real = NDArray[np.float64]
@@ -156,14 +156,24 @@ class ImageTracker:
         model: reads drift from decoded phases.
         tables: applies it.
         search: finds an image that was lost, None where the bundle cannot.
+        memory: what another tracker of this device has learnt, None to start anew.
     """
 
-    def __init__(self, decoder: Decoder, model: DriftModel, tables: DriftTables, search: PageSearch | None) -> None:
+    def __init__(
+        self,
+        decoder: Decoder,
+        model: DriftModel,
+        tables: DriftTables,
+        search: PageSearch | None,
+        memory: TrackerMemory | None = None,
+    ) -> None:
         self._decoder, self._model, self._tables, self._search = decoder, model, tables, search
         start = np.diag([SEARCH_ERROR_PX, SEARCH_ERROR_PX, START_TILT, START_TILT]) ** 2
         self._lock = threading.Lock()
         """Guards the state; never held while anything is computed."""
         self._state = ImageState(np.zeros(4), start, decoder, {}, np.zeros(2), WALK**2)
+        if memory is not None:
+            self._state = self._remembered(memory)
 
     @property
     def state(self) -> ImageState:
@@ -176,6 +186,34 @@ class ImageTracker:
         """See `Tracker`."""
         x, y = map(float, self.state.drift[SHIFT])
         return x, y
+
+    def memory(self) -> TrackerMemory:
+        """See `Tracker`."""
+        state = self.state
+        numbers = {
+            "drift": state.drift,
+            "covariance": state.covariance,
+            "walk": state.walk,
+            "traced_tilt_rad": state.traced_tilt,
+            "jump_px": state.jump_px,
+        }
+        plain = {name: values.tolist() for name, values in numbers.items()}
+        return TrackerMemory.model_validate({**plain, "settled": state.settled, "share": state.share})
+
+    def _remembered(self, memory: TrackerMemory) -> ImageState:
+        """The state that another tracker was in."""
+        drift, traced = np.array(memory.drift), np.array(memory.traced_tilt_rad)
+        return ImageState(
+            drift=drift,
+            covariance=np.array(memory.covariance),
+            decoder=self._tables.traced(traced) if traced.any() else self._decoder,
+            table=self._tables.shifted(drift[SHIFT]),
+            traced_tilt=traced,
+            walk=np.array(memory.walk),
+            settled=memory.settled,
+            jump_px=np.array(memory.jump_px),
+            share=memory.share,
+        )
 
     def fork(self) -> ImageTracker:
         """See `Tracker`."""
@@ -337,8 +375,12 @@ class ImageTracker:
         return np.stack([np.zeros(2), last]) if np.abs(last).max() > NEARBY_PX else np.zeros((1, 2))
 
 
-def tracker_for(decoder: Decoder) -> Tracker:
+def tracker_for(decoder: Decoder, memory: TrackerMemory | None = None) -> Tracker:
     """The tracker that a bundle's decoder is run with, in service and in evaluation.
+
+    Args:
+        decoder: of the bundle.
+        memory: what another tracker of the same bundle has learnt, None to start anew.
 
     Raises:
         BundleError, CalibrationError: see `DriftModel.of_decoder`.
@@ -350,7 +392,7 @@ def tracker_for(decoder: Decoder) -> Tracker:
         search = BundleSearch(decoder, twin)
     else:
         _log.warning("%s: no field graph, so an image that is lost is not looked for", decoder.bundle.subject)
-    return ImageTracker(decoder, DriftModel.of_decoder(decoder, twin), BundleTables(decoder, twin), search)
+    return ImageTracker(decoder, DriftModel.of_decoder(decoder, twin), BundleTables(decoder, twin), search, memory)
 
 
 def _search_may_pay(check: PilotCheck, begun: ImageState) -> bool:

@@ -4,12 +4,38 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from pydantic import BaseModel, ConfigDict
+
 from lightpage.calibration.image_search import REACH_PX, FoundImage
 from lightpage.page.pilots import LEAST_CONFIRMED_SHARE, Pilots
 from lightpage.recording.reader import FramePair
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
 from runtime.errors import Reason, UnconfirmedPageError
+
+
+class TrackerMemory(BaseModel):
+    """What a tracker has learnt of a device, in plain numbers, so that another process can go on from there.
+
+    Attributes:
+        drift: shift x, y (camera pixels) and tilt x, y (radians) since calibration, [4].
+        covariance: of the drift of the next page about it, [4, 4].
+        walk: variance of the drift from one page to the next, [4].
+        traced_tilt_rad: tilt that the table was traced with, [2].
+        settled: whether a page was confirmed yet.
+        jump_px: shift of which it is not known whether the reference has come along, (x, y).
+        share: of the claimed information, what pilots lately confirmed.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    drift: tuple[float, float, float, float]
+    covariance: tuple[tuple[float, float, float, float], ...]
+    walk: tuple[float, float, float, float]
+    traced_tilt_rad: tuple[float, float]
+    settled: bool
+    jump_px: tuple[float, float]
+    share: float
 
 
 class Tracker(Protocol):
@@ -29,6 +55,9 @@ class Tracker(Protocol):
     @property
     def image_px(self) -> tuple[float, float]:
         """Where the image of the last page lay against calibration, (x, y), camera pixels."""
+
+    def memory(self) -> TrackerMemory | None:
+        """What it has learnt until now, for `tracker_for` in another process; None where it learns nothing."""
 
     def fork(self) -> Tracker:
         """Another one that has learnt the same, and learns on its own from there."""
@@ -59,6 +88,9 @@ class NoTracker:
     def image_px(self) -> tuple[float, float]:
         """Where calibration saw it."""
         return 0.0, 0.0
+
+    def memory(self) -> None:
+        """See `Tracker`."""
 
     def fork(self) -> NoTracker:
         """Itself: it learns nothing."""

@@ -38,7 +38,6 @@ from runtime.decoding.image_tracker import tracker_for
 from runtime.demo.picture import picture
 from runtime.errors import LostPageError
 from runtime.modulator.simulated import SimulatedModulator
-from runtime.recalibration.refit import refit
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
@@ -252,7 +251,7 @@ def run_demo(
         source, drift = simulated_device(spec, decoder.bundle.profile, out / "pages.h5")
         stack.enter_context(source)
         plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
-        server = stack.enter_context(LightpageServer(plane, Recalibrator(plane, refit), "127.0.0.1:0"))
+        server = stack.enter_context(LightpageServer(plane, Recalibrator(plane), "127.0.0.1:0"))
         client = stack.enter_context(LightpageClient(server.target))
         frames = source.shot(page=0).pair
         levels = decoder.page_codec.code.levels

@@ -30,6 +30,10 @@ DEADLINE_S = 60.0
 RECALIBRATION_PAGES = 16
 """Pages that one recalibration reads into memory."""
 
+RECALIBRATION_S = 300.0
+"""One recalibration in its own process. It takes some ten seconds on a bench device and idle cores; beside reads that
+leave it a tenth of one core, as its priority lets them, several times as long."""
+
 CONCURRENT_RANGES = 4
 """Ranges of pages being read for their bytes: each holds a thread for as long as its caller takes."""
 
@@ -61,6 +65,7 @@ class Limits:
     receive_s: float = RECEIVE_S
     deadline_s: float = DEADLINE_S
     recalibration_pages: int = RECALIBRATION_PAGES
+    recalibration_s: float = RECALIBRATION_S
     concurrent_ranges: int = CONCURRENT_RANGES
     range_pages: int = RANGE_PAGES
     range_s: float = RANGE_S

@@ -7,6 +7,7 @@ import queue
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,7 @@ from runtime.errors import CallerLeft, SourceError, StoppingError
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
 from runtime.recalibration.recalibration import next_version, recalibrate
+from runtime.recalibration.separate_process import recalibrate_apart
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import GRACE_S
@@ -55,11 +57,11 @@ class Recalibrator:
 
     Args:
         plane: whose model, source and limits.
-        fit: how to fit.
+        fit: how to fit, in this process; None for the real re-fit in a process of its own, at a low priority.
         recordings: folder whose recordings a caller may name, or None for none.
     """
 
-    def __init__(self, plane: DataPlane, fit: Refit, recordings: Path | None = None) -> None:
+    def __init__(self, plane: DataPlane, fit: Refit | None = None, recordings: Path | None = None) -> None:
         self._plane, self._fit, self._recordings = plane, fit, recordings
         self._busy = threading.Lock()
         """Held from the first page read to the swap; a second recalibration finds it taken and is turned away."""
@@ -76,10 +78,10 @@ class Recalibrator:
             SourceError: no source, a damaged one, or one that does not know what was written.
             InvalidInputError: no such pages, too few, or the same one twice.
         """
-        source = self._plane.source
+        source, slots = self._plane.source, self._plane.decodes
         self._check_count(len(pages) or count)
         expected: list[int | None] = list(pages) or [None] * count
-        return self._run(lambda heard: read_known(source, expected, heard), caller)
+        return self._run(lambda heard: read_known(source, expected, heard, lambda: slots.held(caller)), caller)
 
     def from_recording(self, name: str, count: int, caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
         """Recalibrate with the first `count` pages (0: all) of a recording in the recordings folder.
@@ -131,18 +133,21 @@ class Recalibrator:
         steps: queue.SimpleQueue[Step | RecalibrationOutcome | BaseException] = queue.SimpleQueue()
         left = threading.Event()
 
-        def progress(name: str, fraction: float) -> None:
+        def check() -> None:
             if self._stop.is_set():
                 raise StoppingError("recalibration", "a service that stops", "one that serves; nothing was changed")
             if left.is_set():
                 raise CallerLeft
+
+        def progress(name: str, fraction: float) -> None:
+            check()
             steps.put(Step(name, fraction))
 
         def work() -> None:
             try:
                 heard = partial(progress, "read the pages", 0.0)
                 heard()
-                result: RecalibrationOutcome | BaseException = self._work(read(heard), progress)
+                result: RecalibrationOutcome | BaseException = self._work(read(heard), progress, check)
             except BaseException as error:
                 result = error
             finally:
@@ -162,7 +167,7 @@ class Recalibrator:
         finally:
             left.set()
 
-    def _work(self, pages: KnownPages, progress: Progress) -> RecalibrationOutcome:
+    def _work(self, pages: KnownPages, progress: Progress, check: Callable[[], None]) -> RecalibrationOutcome:
         plane = self._plane
         model = plane.registry.current
         with own_fault():  # the pages are the service's own
@@ -172,7 +177,11 @@ class Recalibrator:
         version = next_version(model.version, [*(m.version for m in plane.registry.models), *store.versions()])
         path = store.path_of(version)
         # Judged against what is in service now: the model with what its tracker has learnt.
-        outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker)
+        if self._fit is None:
+            limit_s = plane.limits.recalibration_s
+            outcome = recalibrate_apart(model.decoder, model.tracker, pages, path, version, progress, check, limit_s)
+        else:
+            outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker)
         try:
             progress("put the new model in service", 1.0)
             plane.adopt(Decoder(Bundle.open(path), model.decoder.threads), expected=model)
@@ -236,24 +245,34 @@ def _nothing() -> None:
     """Nobody listens."""
 
 
-def read_known(source: FrameSource, pages: Sequence[int | None], heard: Callable[[], None] = _nothing) -> KnownPages:
+def read_known(
+    source: FrameSource,
+    pages: Sequence[int | None],
+    heard: Callable[[], None] = _nothing,
+    slot: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> KnownPages:
     """Pages of a source with their symbols.
 
     Args:
         source: where they come from.
         pages: their numbers, None for the next one.
         heard: called before each page; it may raise to stop.
+        slot: held while one page is photographed, or the references: whoever reads waits for one of them at most.
 
     Raises:
         PageError: no such page.
+        SlotsTakenError: no slot in time.
         SourceError: the source is damaged, or does not know what was written.
     """
     found = []
     with own_fault():
         for page in pages:
             heard()
-            found.append(source.shot(page=page))
-        references = source.references()
+            with slot():
+                found.append(source.shot(page=page))
+        heard()
+        with slot():
+            references = source.references()
     symbols = [read.symbols for read in found if read.symbols is not None]
     if len(symbols) != len(found):
         raise SourceError(f"pages of {source.name}", "unknown symbols", "pages whose symbols are known")

@@ -19,7 +19,7 @@ from lightpage.errors import (
     RecalibrationRefusedError,
 )
 from runtime import errors as service_errors
-from runtime.errors import CallerLeft, LostPageError, Reason, SlotsTakenError, SourceError, StoppingError
+from runtime.errors import CallerLeft, LostPageError, Reason, SlotsTakenError, SourceError, StoppingError, WorkerError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 DETAIL_KEY = "lightpage-error-bin"
@@ -33,6 +33,7 @@ _CODES: tuple[tuple[type[BaseException], grpc.StatusCode], ...] = (
     (BusyError, grpc.StatusCode.ABORTED),
     (SourceError, grpc.StatusCode.FAILED_PRECONDITION),
     (StoppingError, grpc.StatusCode.UNAVAILABLE),
+    (WorkerError, grpc.StatusCode.ABORTED),
     (BundleError, grpc.StatusCode.FAILED_PRECONDITION),
     (RecalibrationRefusedError, grpc.StatusCode.FAILED_PRECONDITION),
     (CalibrationError, grpc.StatusCode.FAILED_PRECONDITION),

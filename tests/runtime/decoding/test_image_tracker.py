@@ -16,7 +16,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
 from runtime.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageTracker
 from runtime.decoding.page import Inference
-from runtime.decoding.tracking import NoTracker
+from runtime.decoding.tracking import NoTracker, TrackerMemory
 from runtime.errors import Reason, UnconfirmedPageError
 from tests.runtime import toy
 from tests.runtime.decoding.test_image_drift import SLOPES
@@ -43,12 +43,13 @@ class FakeDevice:
     pilots: list[Pilots] = field(default_factory=list)
     held: Real = field(default_factory=lambda: np.zeros(4))
 
-    def tracker(self, search: bool = True) -> ImageTracker:
+    def tracker(self, search: bool = True, memory: TrackerMemory | None = None) -> ImageTracker:
         return ImageTracker(
             FakeDecoder(self, np.zeros(2)),  # type: ignore[arg-type]
             FakeModel(self),
             FakeTables(self),
             FakeSearch(self) if search else None,
+            memory,
         )
 
     def page(self, seed: int = 1) -> FramePair:
@@ -336,6 +337,24 @@ def test_a_fork_learns_on_its_own(device: FakeDevice) -> None:
     fork.decode(device.page(), 16)
     assert fork.state.drift[0] == pytest.approx(1.0, abs=1e-3)
     assert tracker.state.drift[0] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_what_was_learnt_goes_over_as_text_and_decodes_the_next_page_the_same(device: FakeDevice) -> None:
+    tracker = device.tracker()
+    tracker.decode(device.page(), 16)
+    device.drift = np.array([0.5, -0.3, 2 * RETRACE_RAD, 0.0])
+    for seed in range(2, 5):
+        tracker.decode(device.page(seed), 16)
+    assert tracker.state.traced_tilt.any()
+    other = device.tracker(memory=TrackerMemory.model_validate_json(tracker.memory().model_dump_json()))
+    assert other.memory() == tracker.memory()
+    assert np.array_equal(other.state.table["shift"], tracker.state.table["shift"])
+    device.decodes.clear()
+    for each in (tracker, other):
+        each.decode(device.page(5), 16)
+    half = len(device.decodes) // 2
+    assert np.array_equal(device.decodes[:half], device.decodes[half:])
+    assert other.memory() == tracker.memory()
 
 
 def test_pages_decoded_at_the_same_time_teach_once(device: FakeDevice) -> None:

@@ -1,0 +1,81 @@
+"""A recalibration's own process: `python -m runtime.recalibration.worker FOLDER`, started by `separate_process`."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+from lightpage.errors import LightpageError
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.image_tracker import tracker_for
+from runtime.decoding.tracking import NoTracker
+from runtime.recalibration.outcome import Refit
+from runtime.recalibration.recalibration import recalibrate
+from runtime.recalibration.refit import refit
+from runtime.recalibration.work import WorkFolder, told_step
+
+NICENESS = 10
+"""Beside a busy reader such a process gets a tenth of a core: reads hardly notice it, and it does not starve, as it
+would under SCHED_IDLE."""
+
+_PARENT_GONE = 3
+
+
+def work(folder: WorkFolder, fit: Refit = refit) -> None:
+    """Recalibrate as a folder says, tell each step on stdout, and leave the outcome or the error in the folder.
+
+    Args:
+        folder: filled by the parent.
+        fit: how to fit.
+    """
+    try:
+        bundle, pages, job = folder.read_task()
+        decoder = Decoder(bundle, job.threads)
+        tracker = NoTracker(decoder) if job.memory is None else tracker_for(decoder, job.memory)
+        outcome = recalibrate(decoder, pages, job.out, job.version, fit, _tell, tracker)
+    except LightpageError as error:
+        folder.write_error(error)
+    else:
+        folder.write_outcome(outcome)
+
+
+def yield_to_reads() -> None:
+    """Take what processor time reads leave, as far as the system lets a process ask for that."""
+    with suppress(OSError):
+        os.nice(NICENESS)
+    if hasattr(os, "SCHED_BATCH"):
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def end_with_parent(pipe: int) -> None:
+    """End this process as soon as the other end of `pipe` is closed, as it is when the parent ends or wants so.
+
+    It is read below Python's buffers, whose lock the interpreter would want at its own end. The kernel's own signal
+    for that (PR_SET_PDEATHSIG) comes when the thread ends that has started the process.
+    """
+
+    def watch() -> None:
+        while os.read(pipe, 1):
+            pass
+        os._exit(_PARENT_GONE)
+
+    threading.Thread(target=watch, name="lightpage-parent", daemon=True).start()
+
+
+def _tell(name: str, fraction: float) -> None:
+    print(told_step(name, fraction), flush=True)
+
+
+def main(folder: str) -> None:
+    """Work at low priority until done, or until the parent is gone."""
+    end_with_parent(sys.stdin.fileno())
+    yield_to_reads()
+    work(WorkFolder(Path(folder)))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
