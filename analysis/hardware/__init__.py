@@ -1,1 +1,1 @@
-"""How well drivers of hardware stand up to it, measured on simulated devices."""
+"""Measurements of the hardware side: cameras, trigger, pairing, the loop."""

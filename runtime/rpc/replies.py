@@ -34,7 +34,7 @@ def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
         pilot_trust=page.pilot_trust,
         claimed_bits=page.check.claimed_bits,
         confirmed_bits=page.check.confirmed_bits,
-        recalibration_due=page.check.recalibration_due,
+        recalibration_due=answer.recalibration_due,
         image=None if page.image is None else image_message(page.image),
         user_data=None if found is None else user_data_message(found),
         model_version=answer.model_version,

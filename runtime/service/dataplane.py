@@ -24,6 +24,7 @@ from runtime.service.caller import Caller
 from runtime.service.display import Display
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
+from runtime.service.monitor import Monitor
 from runtime.service.observation import Observer, Seen, observed
 from runtime.service.receiver import PairReceiver
 from runtime.service.registry import Model, ModelRegistry
@@ -33,13 +34,22 @@ from runtime.service.store import ModelStore
 
 @dataclass(frozen=True)
 class Answer:
-    """A decoded page with the model that decoded it, the seconds that it took, and user bytes if asked for."""
+    """A decoded page with the model that decoded it, the seconds that it took, and user bytes if asked for.
+
+    `monitor_due` is whether many pages together say that a recalibration is due.
+    """
 
     page: DecodedPage
     model_version: str
     receive_s: float
     total_s: float
     user_data: PageBytes | None = None
+    monitor_due: bool = False
+
+    @property
+    def recalibration_due(self) -> bool:
+        """Whether the device has changed since it was calibrated, as this page or many together show."""
+        return self.page.check.recalibration_due or self.monitor_due
 
 
 @dataclass(frozen=True)
@@ -61,6 +71,7 @@ class DataPlane:
         limits: what is accepted.
         metrics: what is counted.
         observers: are told of every page.
+        monitor: says by all pages whether a recalibration is due; it is told of every page first.
 
     Raises:
         InvalidInputError: the source is not for this device.
@@ -74,11 +85,13 @@ class DataPlane:
         limits: Limits | None = None,
         metrics: ServiceMetrics | None = None,
         observers: Sequence[Observer] = (),
+        monitor: Monitor | None = None,
     ) -> None:
         self.registry, self.store = registry, store
         self.limits = limits or Limits()
         self.metrics = metrics or ServiceMetrics()
-        self.observers = tuple(observers)
+        self.monitor = monitor
+        self.observers = tuple(observers) if monitor is None else (monitor, *observers)
         self._source = source
         if source is not None:
             _check_source(source, registry.current.decoder)
@@ -86,7 +99,7 @@ class DataPlane:
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s)
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s)
-        self.metrics.in_service(registry.current.version)
+        self._in_service(registry.current)
         if source is not None:
             self.metrics.watch(source)
 
@@ -192,7 +205,7 @@ class DataPlane:
                 with self._optics(user_data):
                     seen.page = page = self._decode(model, pair, levels, pilots, seen.subject, sure=sure)
                 seen.user_data = found = self._user_data(model, page) if user_data else None
-        return Answer(page, model.version, received - start, time.perf_counter() - start, found)
+        return Answer(page, model.version, received - start, time.perf_counter() - start, found, self._due)
 
     def read_page(
         self,
@@ -242,7 +255,7 @@ class DataPlane:
                 with own_fault(f"{seen.subject}: "), self._optics(user_data):
                     seen.page = decoded = self._decode(model, found.pair, levels, pilots, seen.subject)
                 seen.user_data = data = self._user_data(model, decoded, expected) if user_data else None
-        answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start, data)
+        answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start, data, self._due)
         return ReadAnswer(answer, found, mask)
 
     def _shot(self, source: FrameSource, page: int | None, caller: Caller, user_data: bool) -> Shot:
@@ -291,7 +304,16 @@ class DataPlane:
         path = model.decoder.bundle.path
         if self.store is not None:
             self.store.remember(path if path.parent == self.store.folder else None)
+        self._in_service(model)
+
+    def _in_service(self, model: Model) -> None:
         self.metrics.in_service(model.version)
+        if self.monitor is not None:
+            self.monitor.begin(model.version)
+
+    @property
+    def _due(self) -> bool:
+        return self.monitor is not None and self.monitor.due
 
     @staticmethod
     def _mask(found: Shot, decoder: Decoder) -> NDArray[np.bool_]:
@@ -310,7 +332,7 @@ class DataPlane:
         except LostPageError as error:
             self.metrics.lost(error, tells=sure)
             lost = error.about(subject)
-            lost.recalibration_due = lost.recalibration_due and sure
+            lost.recalibration_due = (lost.recalibration_due and sure) or self._due
             raise lost from None
         self.metrics.page(page, model.version)
         return page

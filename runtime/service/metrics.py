@@ -48,6 +48,9 @@ class ServiceMetrics:
         self.searches = Counter("lightpage_image_searches", "Pages searched for.", ["found"], registry=own)
         self.image = Gauge("lightpage_image_shift_px", "Of the last page since calibration.", ["axis"], registry=own)
         self.recalibrations = Counter("lightpage_recalibrations", "By their end.", ["result"], registry=own)
+        self.monitor_due = Gauge("lightpage_monitor_due", "1 where many pages say so.", registry=own)
+        self.monitor_signs = Gauge("lightpage_monitor_sign", "Smoothed over pages.", ["sign"], registry=own)
+        self.monitor_raised = Gauge("lightpage_monitor_sign_raised", "1 where beyond it.", ["sign"], registry=own)
         self.model = Gauge("lightpage_model_info", "1 for the model in service.", ["version"], registry=own)
 
     def page(self, page: DecodedPage, version: str) -> None:

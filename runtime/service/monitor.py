@@ -1,0 +1,354 @@
+"""Says whether the device has changed so far that a recalibration pays, from many pages and not from one."""
+
+from __future__ import annotations
+
+import logging
+import math
+import statistics
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import i0e
+
+from lightpage.codec.page_codec import Loss
+from lightpage.von_mises import mean_resultant
+from runtime.decoding.page import DecodedPage
+from runtime.errors import Reason
+from runtime.service.metrics import ServiceMetrics
+from runtime.service.observation import Observation
+
+_log = logging.getLogger(__name__)
+
+Figures = Mapping[str, float]
+"""What one page shows, by the names of signs."""
+
+_MAD_DEVIATIONS = 1.4826
+"""Standard deviations of a normal distribution in a median absolute deviation."""
+
+_MEDIAN_ERROR = 1.25
+"""Standard error of a median of many normal values over that of their mean."""
+
+_SYMBOLS = 4096
+"""Symbols by which a page's information is estimated: their mean is exact to a thousandth, and soon taken."""
+
+_OPTICAL = (Reason.PILOTS_DISAGREE, Reason.IMAGE_NOT_FOUND, Reason.TOO_FEW_PILOTS)
+"""Losses that say something of the device's calibration; a lost shot does not."""
+
+_UNREADABLE = (Loss.BODY, Loss.CHECKSUM)
+"""Likewise of user bytes: a page without a header of this code may have none."""
+
+
+@dataclass(frozen=True)
+class Sign:
+    """A figure of pages, and when it says that a recalibration is due.
+
+    The median of the last pages counts, so one odd page changes nothing. It must leave the baseline, the median of the
+    first pages of a model, by `raise_by` for the sign to be raised, and come back to within `clear_by` for it to be
+    taken back. Where pages differ much from one another, it must leave it by `deviations` of their noise at least.
+
+    Attributes:
+        name: of the figure.
+        window: pages whose median counts.
+        raise_by, clear_by: how far from the baseline, in the figure's unit.
+        rises: whether it is its rise that tells, and not its fall.
+        relative: whether `raise_by` and `clear_by` are shares of the baseline.
+        absolute: whether the baseline is 0 whatever the first pages show.
+        mean: whether the mean counts and not the median, as for shares of pages.
+        decides: whether it makes a recalibration due; otherwise it is shown alone.
+        deviations: standard errors of the median.
+    """
+
+    name: str
+    window: int
+    raise_by: float
+    clear_by: float
+    rises: bool = False
+    relative: bool = False
+    absolute: bool = False
+    mean: bool = False
+    decides: bool = True
+    deviations: float = 5.0
+
+
+MARGIN = Sign("margin_bits", window=7, raise_by=0.5, clear_by=0.3, relative=True)
+"""Information beyond what the page's code needs, by its corrected bits: what users lose when it is gone. Pages of a
+quiet bench device show 0.126 +- 0.019 bit. Half of it is six standard errors of the median away, and leaves the other
+half of the way to recalibrate in."""
+
+AIR = Sign("air_bits", window=15, raise_by=0.02, clear_by=0.01, relative=True)
+"""Information that a phase is claimed to carry, as far as the pilots bear it out: all that is known where bytes
+are not read. Few pilots tell it (one page in twenty of a quiet bench device shows 1% less), hence the long
+window; a page of the shipped code is lost at about 2%."""
+
+TRUST = Sign("trust", window=15, raise_by=0.15, clear_by=0.08)
+"""Share of the claimed concentration that the pilots bear out. A quiet bench device shows 0.97 +- 0.05, and 0.85 about
+where its margin is gone."""
+
+SHARE = Sign("share", window=7, raise_by=0.06, clear_by=0.03)
+"""Share of the claimed information that the pilots confirm: 1.01 +- 0.02 on a quiet bench device, 0.97 where its margin
+is gone, and 0.85 where a page by itself says that a recalibration is due."""
+
+UNREAD = Sign("unread", window=8, raise_by=0.45, clear_by=0.2, rises=True, absolute=True, mean=True)
+"""Share of pages that were lost to their optics, or whose bytes were. Four of eight are no accident: after a knock the
+alarm comes with the fourth page."""
+
+RESIDUAL = Sign("residual_rad", window=7, raise_by=0.03, clear_by=0.015, rises=True)
+"""Smooth phase error that was taken off each page. A quiet bench device shows 0.002 +- 0.001 rad; ten times that is a
+wavefront that the calibration does not know."""
+
+SHIFT = Sign("shift_px", window=5, raise_by=4.0, clear_by=3.0, rises=True, absolute=True)
+"""Distance of the image from where calibration saw it. It is followed, yet a search reaches 12 px: a third of that is
+left to a device's walk (0.9 px in a quiet week), the rest to a knock."""
+
+PISTON_WALK = Sign("piston_walk_rad", window=15, raise_by=0.6, clear_by=0.3, rises=True, decides=False)
+"""Step of the piston from page to page. It shows a restless interferometer, which no recalibration cures."""
+
+
+@dataclass(frozen=True)
+class MonitorSettings:
+    """When a recalibration is due.
+
+    Attributes:
+        baseline_pages: first pages of a model that say what is usual: as few as tell their median to a quarter of
+            their scatter, since the device goes on drifting meanwhile.
+        signs: what is followed.
+    """
+
+    baseline_pages: int = 20
+    signs: tuple[Sign, ...] = (MARGIN, AIR, TRUST, SHARE, UNREAD, RESIDUAL, SHIFT, PISTON_WALK)
+
+
+@dataclass(frozen=True)
+class SignState:
+    """How a sign stands.
+
+    Attributes:
+        name: of the sign.
+        value: what counts of the last pages, None before there are enough.
+        baseline: what is usual, None before it is known.
+        raise_at, clear_at: where the sign is raised and taken back, None before the baseline is known.
+        raised: whether it is.
+        decides: whether it makes a recalibration due.
+    """
+
+    name: str
+    value: float | None
+    baseline: float | None
+    raise_at: float | None
+    clear_at: float | None
+    raised: bool
+    decides: bool
+
+    def reason(self) -> str:
+        """Why it is raised, for people."""
+        value, baseline, limit = self.value or 0.0, self.baseline or 0.0, self.raise_at or 0.0
+        return f"{self.name} {value:.4g}, beyond {limit:.4g} (usual {baseline:.4g})"
+
+
+@dataclass(frozen=True)
+class MonitorState:
+    """How a device stands.
+
+    Attributes:
+        due: whether a recalibration is.
+        model_version: that the pages were decoded with.
+        pages: that were seen since it is in service.
+        signs: each sign.
+    """
+
+    due: bool
+    model_version: str
+    pages: int
+    signs: tuple[SignState, ...]
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is due; empty where it is not."""
+        return tuple(sign.reason() for sign in self.signs if sign.raised and sign.decides)
+
+
+@dataclass
+class _Followed:
+    """What is known of one figure since a model is in service."""
+
+    sign: Sign
+    baseline_pages: int
+    first: list[float] = field(default_factory=list)
+    last: deque[float] = field(default_factory=deque)
+    raised: bool = False
+    baseline: float | None = None
+    noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.last = deque(maxlen=self.sign.window)
+        if self.sign.absolute:
+            self.baseline = 0.0
+
+    def add(self, value: float) -> None:
+        self.last.append(value)
+        if self.baseline is None:
+            self.first.append(value)
+            if len(self.first) == self.baseline_pages:
+                self._settle()
+            return
+        now, sign = self.value, 1 if self.sign.rises else -1
+        if now is not None:
+            distance = sign * (now - self.baseline)
+            self.raised = distance > self._distance(self.sign.clear_by if self.raised else self.sign.raise_by)
+
+    def _settle(self) -> None:
+        self.baseline = statistics.median(self.first)
+        deviation = _MAD_DEVIATIONS * statistics.median(abs(value - self.baseline) for value in self.first)
+        self.noise = _MEDIAN_ERROR * deviation / math.sqrt(self.sign.window)
+
+    def _distance(self, by: float) -> float:
+        """How far from the baseline a threshold lies; `by` of the settings, and no nearer than noise allows."""
+        assert self.baseline is not None  # asked for behind it alone
+        least = self.sign.deviations * self.noise * by / self.sign.raise_by
+        return max(by * abs(self.baseline) if self.sign.relative else by, least)
+
+    @property
+    def value(self) -> float | None:
+        if len(self.last) < self.sign.window:
+            return None
+        return statistics.fmean(self.last) if self.sign.mean else statistics.median(self.last)
+
+    def state(self) -> SignState:
+        ends: list[float | None] = [None, None]
+        if self.baseline is not None:
+            way = 1 if self.sign.rises else -1
+            ends = [self.baseline + way * self._distance(by) for by in (self.sign.raise_by, self.sign.clear_by)]
+        return SignState(self.sign.name, self.value, self.baseline, ends[0], ends[1], self.raised, self.sign.decides)
+
+
+class PageFigures:
+    """What pages show, one after the other."""
+
+    def __init__(self) -> None:
+        self._piston: float | None = None
+
+    def of(self, observation: Observation) -> dict[str, float]:
+        """What a page says of the device; empty where it says nothing."""
+        if observation.lost is not None and not (observation.tells and observation.lost in _OPTICAL):
+            return {}
+        data, page = observation.user_data, observation.page
+        unreadable = data is not None and data.loss in _UNREADABLE
+        figures = {UNREAD.name: float(observation.lost is not None or unreadable)}
+        if data is not None and (data.loss is None or unreadable):
+            # of a page whose bytes are lost the margin is only claimed
+            figures[MARGIN.name] = min(0.0, data.margin_bits) if unreadable else data.margin_bits
+        if page is None or observation.lost is not None:
+            return figures
+        figures |= {
+            AIR.name: claimed_bits(page),
+            TRUST.name: page.pilot_trust,
+            SHARE.name: page.check.share,
+            RESIDUAL.name: observation.residual_rad() or 0.0,
+        }
+        if page.image is not None:
+            figures[SHIFT.name] = math.hypot(page.image.shift_x_px, page.image.shift_y_px)
+        if self._piston is not None:
+            figures[PISTON_WALK.name] = abs(math.remainder(page.piston_rad - self._piston, 2 * math.pi))
+        self._piston = page.piston_rad
+        return figures
+
+
+class Monitor:
+    """Follows the pages of the model in service, an `Observer`.
+
+    Args:
+        settings: when a recalibration is due.
+        metrics: where the signs are shown, None for nowhere.
+    """
+
+    def __init__(self, settings: MonitorSettings | None = None, metrics: ServiceMetrics | None = None) -> None:
+        self.settings, self._metrics = settings or MonitorSettings(), metrics
+        self._lock = threading.Lock()
+        """Guards all that follows; never held while listeners are told."""
+        self._listeners: list[Callable[[], None]] = []
+        self._begin("")
+
+    def _begin(self, version: str) -> None:
+        self._version, self._pages, self._due = version, 0, False
+        self._figures = PageFigures()
+        self._signs = [_Followed(sign, self.settings.baseline_pages) for sign in self.settings.signs]
+
+    def begin(self, version: str) -> None:
+        """Start anew with a model that is put in service; pages of others say nothing from now on."""
+        with self._lock:
+            self._begin(version)
+        self._show(self.state())
+
+    def listen(self, listener: Callable[[], None]) -> None:
+        """Call `listener`, from the thread of the page, whenever a recalibration has become due."""
+        with self._lock:
+            self._listeners.append(listener)
+
+    @property
+    def due(self) -> bool:
+        """Whether a recalibration is due."""
+        with self._lock:
+            return self._due
+
+    def state(self) -> MonitorState:
+        """How the device stands, with the reasons."""
+        with self._lock:
+            return MonitorState(self._due, self._version, self._pages, tuple(each.state() for each in self._signs))
+
+    def observe(self, observation: Observation) -> None:
+        """See `Observer`."""
+        with self._lock:
+            version = self._version or observation.model_version
+            if observation.model_version != version:
+                return
+            figures = self._figures.of(observation)
+        self.follow(version, figures)
+
+    def follow(self, version: str, figures: Figures) -> None:
+        """Take note of a page by its figures; an empty page says nothing.
+
+        Args:
+            version: of the model that decoded it; other pages than those of the model in service say nothing.
+            figures: by the names of signs.
+        """
+        with self._lock:
+            if not figures or (self._version and version != self._version):
+                return
+            self._version = version
+            self._pages += 1
+            for each in self._signs:
+                if (value := figures.get(each.sign.name)) is not None and math.isfinite(value):
+                    each.add(value)
+            before, self._due = self._due, any(each.raised and each.sign.decides for each in self._signs)
+            now, listeners = self._due, list(self._listeners)
+        state = self.state()
+        self._show(state)
+        if now and not before:
+            _log.warning("recalibration due: %s", "; ".join(state.reasons))
+            for listener in listeners:
+                listener()
+        elif before and not now:
+            _log.info("recalibration no longer due")
+
+    def _show(self, state: MonitorState) -> None:
+        if self._metrics is None:
+            return
+        self._metrics.monitor_due.set(state.due)
+        for sign in state.signs:
+            self._metrics.monitor_signs.labels(sign.name).set(math.nan if sign.value is None else sign.value)
+            self._metrics.monitor_raised.labels(sign.name).set(sign.raised)
+
+
+def claimed_bits(page: DecodedPage) -> float:
+    """Information that a symbol's phase carries by its concentration, however many its levels are, bits; mean of many.
+
+    log2 of the von Mises density over that of no knowledge, averaged over the density itself.
+    """
+    concentration = page.concentration.ravel()
+    kappa: NDArray[np.float64] = concentration[:: max(1, concentration.size // _SYMBOLS)].astype(np.float64)
+    nats = kappa * (mean_resultant(kappa) - 1) - np.log(i0e(kappa))
+    return float(nats.mean() / np.log(2))

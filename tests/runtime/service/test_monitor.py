@@ -1,0 +1,200 @@
+"""The monitor says that a recalibration is due by many pages, once, and takes it back only when it is well again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lightpage.codec.page_codec import Loss, PageBytes
+from runtime.bundle.bundle import Bundle
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.page import DecodedPage, ImagePosition
+from runtime.errors import Reason, UnconfirmedPageError
+from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane
+from runtime.service.metrics import ServiceMetrics
+from runtime.service.monitor import Monitor, MonitorSettings, PageFigures, claimed_bits
+from runtime.service.observation import Observation
+from runtime.service.registry import ModelRegistry
+from tests.runtime import toy
+
+MARGIN, NOISE = 0.126, 0.019
+"""Of a quiet bench device."""
+
+
+@pytest.fixture(scope="module")
+def page(toy_zip: Path) -> DecodedPage:
+    decoder = Decoder(Bundle.open(toy_zip), threads=1)
+    return decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
+
+
+def followed(monitor: Monitor, margins: np.ndarray | list[float], **others: float) -> list[bool]:
+    """Whether a recalibration is due after each page."""
+    due = []
+    for margin in margins:
+        monitor.follow("m", {"margin_bits": float(margin), "unread": float(margin < 0), **others})
+        due.append(monitor.due)
+    return due
+
+
+def quiet(count: int, seed: int = 1, level: float = MARGIN) -> np.ndarray:
+    return level + NOISE * np.random.default_rng(seed).standard_normal(count)
+
+
+def test_a_quiet_week_raises_nothing_and_one_odd_page_neither() -> None:
+    monitor, margins = Monitor(), quiet(2000)
+    margins[100::50] = -1.0
+    assert not any(followed(monitor, margins))
+    assert monitor.state().pages == 2000
+
+
+def test_a_dim_device_is_not_always_due() -> None:
+    for level in (0.03, 0.0):
+        margins = np.maximum(quiet(1000, 2, level), 0.001)
+        assert not any(followed(Monitor(), margins))
+
+
+def test_a_gradual_drift_is_told_before_the_margin_is_gone() -> None:
+    monitor, told = Monitor(), list[str]()
+    monitor.listen(lambda: told.append("due"))
+    followed(monitor, quiet(25))
+    loss = MARGIN * (np.arange(60) / 60) ** 2
+    due = followed(monitor, quiet(60, 3) - loss)
+    assert 30 < due.index(True) < 55
+    assert all(due[due.index(True) :])
+    assert told == ["due"]
+    assert monitor.state().reasons[0].startswith("margin_bits 0.0")
+
+
+def test_a_knock_is_told_within_a_few_pages() -> None:
+    monitor = Monitor()
+    followed(monitor, quiet(25))
+    assert followed(monitor, [-0.5] * 6).index(True) <= 3
+
+
+def test_a_device_that_reads_nothing_from_the_start_is_due() -> None:
+    assert followed(Monitor(), [-0.5] * 10).index(True) == 7
+
+
+def test_hysteresis_it_is_taken_back_only_well_within_the_threshold() -> None:
+    monitor = Monitor()
+    followed(monitor, [MARGIN] * 20)
+    (sign,) = [sign for sign in monitor.state().signs if sign.name == "margin_bits"]
+    assert (sign.raise_at, sign.clear_at) == (pytest.approx(0.5 * MARGIN), pytest.approx(0.7 * MARGIN))
+    assert not any(followed(monitor, [0.6 * MARGIN] * 20))
+    assert followed(monitor, [0.45 * MARGIN] * 10)[-1]
+    assert all(followed(monitor, [0.6 * MARGIN] * 20))
+    assert not followed(monitor, [0.8 * MARGIN] * 10)[-1]
+    assert monitor.state().reasons == ()
+
+
+def test_a_new_model_starts_anew_and_pages_of_the_old_one_say_nothing() -> None:
+    monitor = Monitor()
+    followed(monitor, [*quiet(25), *([-0.5] * 10)])
+    assert monitor.due
+    monitor.begin("m+r1")
+    assert (monitor.due, monitor.state().pages, monitor.state().model_version) == (False, 0, "m+r1")
+    followed(monitor, [-0.5] * 10)
+    assert monitor.state().pages == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "usual", "drifted"), [("trust", 0.97, 0.8), ("share", 1.0, 0.9), ("air_bits", 7, 6.8)]
+)
+def test_pilots_tell_where_no_bytes_are_read(name: str, usual: float, drifted: float) -> None:
+    monitor = Monitor()
+    for value in [usual] * 30 + [drifted] * 15:
+        monitor.follow("m", {name: value, "unread": 0.0})
+    assert monitor.due
+    assert monitor.state().reasons[0].startswith(name)
+
+
+def test_a_restless_piston_is_shown_and_asks_for_no_recalibration() -> None:
+    metrics = ServiceMetrics()
+    monitor = Monitor(metrics=metrics)
+    for step in [0.2] * 30 + [1.5] * 20:
+        monitor.follow("m", {"piston_walk_rad": step, "unread": 0.0})
+    assert not monitor.due
+    value = metrics.registry.get_sample_value
+    assert value("lightpage_monitor_sign_raised", {"sign": "piston_walk_rad"}) == 1
+    assert value("lightpage_monitor_sign", {"sign": "piston_walk_rad"}) == 1.5
+    assert value("lightpage_monitor_due") == 0
+
+
+def observation(page: DecodedPage | None, **changes: object) -> Observation:
+    return Observation(
+        **{
+            "subject": "p",
+            "page_index": 1,
+            "model_version": "m",
+            "time_s": 0.0,
+            "seconds": 0.1,
+            "page": page,
+            **changes,
+        }
+    )  # type: ignore[arg-type]
+
+
+def found(loss: Loss | None, margin: float) -> PageBytes:
+    return PageBytes(None, None if loss else b"x", None, loss, 1.0, 0, 1, 0, margin)
+
+
+def test_what_a_page_says_of_the_device(page: DecodedPage) -> None:
+    figures = PageFigures()
+    told = figures.of(observation(replace(page, piston_rad=3.0, image=ImagePosition(3.0, -4.0))))
+    assert told["shift_px"] == 5
+    assert told["share"] == page.check.share
+    assert told["air_bits"] == claimed_bits(page)
+    assert not {"margin_bits", "piston_walk_rad"} & told.keys()
+    told = figures.of(observation(replace(page, piston_rad=-3.0), user_data=found(None, 0.1)))
+    assert told["piston_walk_rad"] == pytest.approx(2 * math.pi - 6)
+    assert (told["margin_bits"], told["unread"]) == (0.1, 0)
+    told = figures.of(observation(page, user_data=found(Loss.BODY, 0.0)))
+    assert (told["margin_bits"], told["unread"]) == (0, 1)
+    told = figures.of(observation(page, user_data=found(Loss.HEADER, -0.3)))
+    assert "margin_bits" not in told
+    assert told["unread"] == 0
+    lost = observation(page, lost=Reason.PILOTS_DISAGREE)
+    assert figures.of(lost) == {"unread": 1}
+    assert figures.of(replace(lost, tells=False)) == {}
+    assert figures.of(observation(None, lost=Reason.MISSING_FRAME)) == {}
+
+
+def test_claimed_information_is_that_of_the_density() -> None:
+    """log2(kappa / 2 pi e) / 2 + log2 2 pi for a narrow one, 0 for none."""
+
+    class Claims:
+        concentration = np.full((10, 1000), 5000.0, np.float32)
+
+    narrow = Claims()
+    expected = np.log2(2 * np.pi) - np.log2(2 * np.pi * np.e / 5000) / 2
+    assert claimed_bits(narrow) == pytest.approx(expected, abs=1e-3)  # type: ignore[arg-type]
+    narrow.concentration = np.zeros((2, 2), np.float32)
+    assert claimed_bits(narrow) == 0  # type: ignore[arg-type]
+
+
+def test_answers_and_lost_pages_carry_it(toy_zip: Path) -> None:
+    decoder = Decoder(Bundle.open(toy_zip), threads=1)
+    settings = MonitorSettings(baseline_pages=3)
+    source, monitor = toy.ToySource(toy.ToyDevice()), Monitor(settings)
+    plane = DataPlane(ModelRegistry(decoder), source, monitor=monitor)
+    for _ in range(8):
+        assert not plane.read_page(None, None, Caller()).answer.recalibration_due
+    pair = source.shot(page=1).pair
+    source.device.offsets = (230.0, 20.0)
+    for _ in range(8):
+        with pytest.raises(UnconfirmedPageError) as caught:
+            plane.read_page(None, None, Caller())
+        assert caught.value.recalibration_due
+    assert monitor.due
+    source.device.offsets = toy.OFFSETS
+    answer = plane.decode(pair, 16, Caller())
+    assert not answer.page.check.recalibration_due
+    assert answer.recalibration_due
+    for _ in range(8):
+        answer = plane.read_page(None, None, Caller()).answer
+    assert not answer.recalibration_due
