@@ -12,6 +12,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,11 +26,23 @@ from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
 from runtime.acquisition.camera_source import CameraSource
-from runtime.errors import LostShotError
+from runtime.errors import LostShotError, SourceError
 
 _AWAY_S = 1.0
 _PATIENCE_S = 30.0
+_ATTEMPTS = 10
 TOLERANCE_S = 0.03
+
+
+def steady(source: CameraSource, page: int) -> None:
+    """Read a page, in some attempts: what is lost before anything is unplugged is not what is counted."""
+    for _ in range(_ATTEMPTS):
+        try:
+            source.shot(_PATIENCE_S, page)
+            return
+        except LostShotError:
+            continue
+    raise SourceError("chain", f"{_ATTEMPTS} lost shots in a row", "one that reads pages while all is plugged in")
 
 
 def unplugged(
@@ -37,9 +50,9 @@ def unplugged(
 ) -> dict[str, Any]:
     """Unplug something so many times; pages are asked for all the while."""
     back: list[float] = []
-    lost, wrong, page = 0, 0, 0
+    lost, wrong, page = Counter[str](), 0, 0
     for _ in track(range(times), what, total=times):
-        source.shot(_PATIENCE_S, page)
+        steady(source, page)
         plugged = [0.0]
 
         def again(at: list[float] = plugged) -> None:
@@ -52,8 +65,8 @@ def unplugged(
         page += 1
         try:
             pair = source.shot(_PATIENCE_S, page).pair
-        except LostShotError:
-            lost += 1
+        except LostShotError as error:
+            lost[error.reason.value] += 1
         else:
             seen = {int(frame[0, 0]) | int(frame[0, 1]) << 8 for frame in (pair.in_phase, pair.quadrature)}
             wrong += seen != {page}
@@ -63,7 +76,8 @@ def unplugged(
         page += 1
     return {
         "times": times,
-        "pages_lost": lost,
+        "pages_lost": lost.total(),
+        "losses": dict(lost),
         "wrong_pairs": wrong,
         "back_s_median": sorted(back)[len(back) // 2] if back else None,
         "back_s_longest": max(back, default=None),

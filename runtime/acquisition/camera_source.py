@@ -254,8 +254,9 @@ class CameraSource(FrameSource):
             except LostShotError as error:
                 self._outcomes[error.reason.value] += 1
                 self.on_lost(index, error)
+                # a camera that was switched off and on for a moment answers, and waits for no trigger
+                self._armed = self._armed and error.reason not in (*_GONE, Reason.MISSING_FRAME)
                 if error.reason in _GONE:
-                    self._armed = False
                     if time.monotonic() + _AGAIN_S < deadline:
                         time.sleep(_AGAIN_S)
                         continue

@@ -150,8 +150,10 @@ class Pairing:
                 raise LostShotError(
                     "page", "no longer on display", "there until both frames are in", Reason.NOT_ON_DISPLAY
                 )
-        except BaseException:
+        except BaseException as error:
             self._settled = False
+            if isinstance(error, LostShotError) and error.reason in (Reason.CAMERA_GONE, Reason.TRIGGER_GONE):
+                self._referenced_at = -float("inf")  # what comes back may be slower, or another one
             raise
         return taken.frames
 
