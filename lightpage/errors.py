@@ -35,6 +35,10 @@ class FrameError(InvalidInputError):
     """A camera frame of the wrong size, type or bit depth, or without usable light."""
 
 
+class FramesDisagreeError(FrameError):
+    """Two frames that contradict each other: swapped, of two shots, or of a device that is not as it was calibrated."""
+
+
 class PageError(InvalidInputError):
     """Symbols of the wrong shape, type or range."""
 

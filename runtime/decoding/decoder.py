@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.device.profile import Profile
-from lightpage.errors import BundleError, FrameError, InvalidInputError
+from lightpage.errors import BundleError, FrameError, FramesDisagreeError, InvalidInputError
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
 from lightpage.page.symbols import MAX_LEVELS, check_levels, symbol_phases
@@ -172,7 +172,8 @@ class Decoder:
 
         Raises:
             InvalidInputError: a table that does not fit.
-            FrameError: the frames contradict the homodyne equations beyond the bundle's limit.
+            FrameError: the frames contradict the homodyne equations beyond the bundle's limit (then it is a
+                `FramesDisagreeError`), or show no page.
         """
         table = table or {}
         self.graph.check(table)
@@ -182,10 +183,11 @@ class Decoder:
         p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
         limit = self.bundle.manifest.residual_limit
         if rest and limit is not None and not (residual := float(np.max(rest[0]))) <= limit:
+            seen = np.isfinite(residual)
             got = f"frames that contradict each other (residual {residual:.3g})"
-            raise FrameError(
+            raise (FramesDisagreeError if seen else FrameError)(
                 "frame pair",
-                got if np.isfinite(residual) else "no light of a page over the reference beam",
+                got if seen else "no light of a page over the reference beam",
                 f"an in-phase and a quadrature frame of one shot, not swapped, cameras and exposure as they were "
                 f"calibrated (residual up to {limit:.3g}; where frames are right, recalibrate)",
             )

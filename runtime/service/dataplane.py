@@ -241,7 +241,8 @@ class DataPlane:
                 found = self._shot(source, page, caller, user_data)
                 received = time.perf_counter()
                 seen.subject, seen.page_index = f"page {found.page_index} of {source.name}", found.page_index
-                seen.pair, seen.infos = found.pair, found.infos
+                seen.pair, seen.infos, seen.levels = found.pair, found.infos, source.levels
+                seen.symbols, seen.pilot_mask = found.symbols, found.pilot_mask
                 mask = self._mask(found, model.decoder)
                 levels = levels_for(model.decoder, levels, source.levels, user_data)
                 if user_data and not np.array_equal(mask, model.decoder.bundle.pilot_mask):

@@ -35,8 +35,9 @@ _MEDIAN_ERROR = 1.25
 _SYMBOLS = 4096
 """Symbols by which a page's information is estimated: their mean is exact to a thousandth, and soon taken."""
 
-_OPTICAL = (Reason.PILOTS_DISAGREE, Reason.IMAGE_NOT_FOUND, Reason.TOO_FEW_PILOTS)
-"""Losses that say something of the device's calibration; a lost shot does not."""
+_OPTICAL = (Reason.PILOTS_DISAGREE, Reason.IMAGE_NOT_FOUND, Reason.TOO_FEW_PILOTS, Reason.UNSPECIFIED)
+"""Losses that say something of the device's calibration, frames that contradict each other among them; a lost shot does
+not."""
 
 _UNREADABLE = (Loss.BODY, Loss.CHECKSUM)
 """Likewise of user bytes: a page without a header of this code may have none."""

@@ -10,14 +10,16 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lightpage.codec.page_codec import PageBytes
+from lightpage.errors import FramesDisagreeError
 from lightpage.metrics.information import own_information
 from lightpage.recording.layout import FrameInfo
 from lightpage.recording.reader import FramePair
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import unconfirmed_page
-from runtime.errors import LostPageError, Reason, UnconfirmedPageError
+from runtime.errors import LostPageError, Reason, SourceError, UnconfirmedPageError
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +42,9 @@ class Observation:
         infos: what the cameras said of them.
         page: what was decoded, of a page that its pilots do not confirm too; None where nothing was.
         user_data: its bytes, None where nobody asked for them.
+        levels: M of what was written, None where nobody knows.
+        symbols: what was written, uint8 [ny, nx], None where nobody knows.
+        pilot_mask: where its pilots are, bool [ny, nx], None for the model's usual positions.
     """
 
     subject: str
@@ -54,6 +59,9 @@ class Observation:
     infos: tuple[FrameInfo, FrameInfo] | None = None
     page: DecodedPage | None = None
     user_data: PageBytes | None = None
+    levels: int | None = None
+    symbols: NDArray[np.uint8] | None = None
+    pilot_mask: NDArray[np.bool_] | None = None
 
     @property
     def margin_bits(self) -> float | None:
@@ -95,6 +103,9 @@ class Seen:
     infos: tuple[FrameInfo, FrameInfo] | None = None
     page: DecodedPage | None = None
     user_data: PageBytes | None = None
+    levels: int | None = None
+    symbols: NDArray[np.uint8] | None = None
+    pilot_mask: NDArray[np.bool_] | None = None
     begun: float = field(default_factory=time.perf_counter)
 
 
@@ -102,7 +113,8 @@ class Seen:
 def observed(observers: Sequence[Observer], seen: Seen) -> Iterator[Seen]:
     """Tell the observers of a page that is read and decoded inside the block, given out or lost.
 
-    Other errors say nothing of a page. What an observer raises is logged: it costs nobody a page.
+    A page of the source whose frames contradict each other is told of as lost, with an unspecified reason. Other errors
+    say nothing of a page. What an observer raises is logged: it costs nobody a page.
     """
     try:
         yield seen
@@ -110,6 +122,10 @@ def observed(observers: Sequence[Observer], seen: Seen) -> Iterator[Seen]:
         if isinstance(error, UnconfirmedPageError):
             seen.page = unconfirmed_page(error)
         _tell(observers, seen, error.reason, str(error))
+        raise
+    except SourceError as error:
+        if isinstance(error.__cause__, FramesDisagreeError):
+            _tell(observers, seen, Reason.UNSPECIFIED, str(error))
         raise
     _tell(observers, seen, None, "")
 
@@ -130,6 +146,9 @@ def _tell(observers: Sequence[Observer], seen: Seen, lost: Reason | None, detail
         infos=seen.infos,
         page=seen.page,
         user_data=seen.user_data,
+        levels=seen.levels,
+        symbols=seen.symbols,
+        pilot_mask=seen.pilot_mask,
     )
     for observer in observers:
         try:

@@ -318,3 +318,4 @@ def _follow(
         yield step
         if isinstance(step, RecalibrationOutcome):
             return
+        caller.check()

@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lightpage.errors import FrameError
 from lightpage.page.pilots import Pilots
 from runtime.acquisition.source import SHOT_S, Shot
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
-from runtime.errors import LostShotError, Reason, UnconfirmedPageError
+from runtime.errors import LostShotError, Reason, SourceError, UnconfirmedPageError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
+from runtime.service.monitor import PageFigures
 from runtime.service.observation import Observation
 from runtime.service.registry import ModelRegistry
 from tests.runtime import toy
@@ -65,3 +67,17 @@ def test_pages_given_out_and_lost_are_observed(toy_zip: Path) -> None:
     assert len(broken.seen) == 3
     lost = plane.metrics.lost_pages.labels("MISSING_FRAME")._value.get()
     assert lost == 1
+
+
+def test_pages_of_the_source_whose_frames_contradict_each_other_are_observed_as_lost(toy_zip: Path) -> None:
+    notebook, source = Notebook(), toy.ToySource(toy.ToyDevice((180.0, 30.0)))
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), source, observers=[notebook])
+    with pytest.raises(SourceError, match="contradict"):
+        plane.read_page(0, None, Caller())
+    with pytest.raises(FrameError, match="contradict"):  # a caller's frames may be swapped
+        plane.decode(source.shot(page=1).pair, 16, Caller())
+    (seen,) = notebook.seen
+    assert (seen.lost, seen.page_index, seen.page) == (Reason.UNSPECIFIED, 0, None)
+    assert seen.pair is not None
+    assert "contradict" in seen.detail
+    assert PageFigures().of(seen) == {"unread": 1}
