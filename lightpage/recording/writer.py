@@ -222,6 +222,11 @@ class RecordingWriter:
                 self._file.create_dataset(key, data=data)
         self._file.flush()
 
+    def add_note(self, name: str, values: Mapping[str, str | float]) -> None:
+        """Keep remarks on the whole recording as attributes of the group `name`, where no decoder looks."""
+        self._file.require_group(name).attrs.update(values)
+        self._file.flush()
+
     def add_loss(self, loss: LostShot) -> None:
         """Note a shot that gave no page."""
         if LOSSES not in self._file:

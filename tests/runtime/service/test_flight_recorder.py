@@ -1,0 +1,214 @@
+"""Pages that went wrong are kept in a bounded ring that other programs open, and no read waits for the disk."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lightpage.codec.page_codec import Loss, PageBytes
+from lightpage.errors import InvalidInputError, LimitError
+from lightpage.recording.reader import Recording
+from runtime.bundle.bundle import Bundle
+from runtime.commands.evaluate import evaluate
+from runtime.decoding.decoder import Decoder
+from runtime.errors import LostShotError, Reason, UnconfirmedPageError
+from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane
+from runtime.service.file_ring import FileRing
+from runtime.service.flight_recorder import FlightRecorder, FlightSettings
+from runtime.service.metrics import ServiceMetrics
+from runtime.service.monitor import Monitor
+from runtime.service.observation import Observation
+from runtime.service.registry import ModelRegistry
+from tests.runtime import toy
+
+LOST = (230.0, 20.0)
+
+
+@pytest.fixture
+def registry(toy_zip: Path) -> ModelRegistry:
+    return ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1))
+
+
+def kept(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir())
+
+
+def count(metrics: ServiceMetrics, result: str) -> float:
+    return metrics.registry.get_sample_value("lightpage_flight_pages_total", {"result": result}) or 0.0
+
+
+def read_lost(plane: DataPlane, pages: int) -> None:
+    for _ in range(pages):
+        with suppress(UnconfirmedPageError):
+            plane.read_page(None, None, Caller())
+
+
+def test_a_lost_page_is_kept_with_why_and_evaluate_opens_it(
+    registry: ModelRegistry, tmp_path: Path, toy_zip: Path
+) -> None:
+    source = toy.ToySource(toy.ToyDevice())
+    with FlightRecorder(tmp_path / "flight", registry) as recorder:
+        plane = DataPlane(registry, source, observers=[recorder])
+        read_lost(plane, 2)
+        source.device.offsets = LOST
+        read_lost(plane, 1)
+    (path,) = kept(tmp_path / "flight")
+    assert path.name.startswith("page-2")
+    assert path.name.endswith("-PILOTS_DISAGREE.h5")
+    with Recording.open(path) as recording:
+        assert (recording.pages, recording.levels) == (1, 16)
+        assert np.array_equal(recording.symbols(0), toy.symbols_of(16, 2)[0])  # type: ignore[arg-type]
+        references = toy.ToyDevice().references()
+        assert np.array_equal(recording.references().in_phase, references.in_phase)
+    with h5py.File(path) as file:
+        note = dict(file["flight"].attrs)
+    assert note["reason"] == "PILOTS_DISAGREE"
+    assert note["subject"] == "page 2 of toy:device"
+    assert (note["model_version"], note["page_index"]) == ("toy-1", 2)
+    assert "bits a symbol confirmed" in note["detail"]
+    assert note["time_s"] > 1e9
+    told = CliRunner().invoke(evaluate, ["--bundle", str(toy_zip), "--recording", str(path)])
+    assert "pilots" in str(told.exception or told.output)
+
+
+@pytest.fixture
+def seen(registry: ModelRegistry) -> Observation:
+    pair = toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5)
+    page = registry.current.decoder.decode(pair, 16)
+    return Observation("page 1 of toy", 1, "toy-1", 1e9, 0.1, pair=pair, page=page)
+
+
+def with_bytes(seen: Observation, loss: Loss | None, margin: float) -> Observation:
+    return replace(seen, user_data=PageBytes(None, None if loss else b"x", None, loss, 1.0, 3, 4, 0, margin))
+
+
+def reasons(folder: Path) -> list[str]:
+    return [path.stem.partition("Z-")[2] or path.stem.rpartition("-")[2] for path in kept(folder)]
+
+
+def test_what_is_kept_and_what_not(registry: ModelRegistry, seen: Observation, tmp_path: Path) -> None:
+    monitor, metrics = Monitor(), ServiceMetrics()
+    with FlightRecorder(tmp_path, registry, monitor=monitor, metrics=metrics) as recorder:
+        wait = _waiter(recorder, metrics)
+        recorder.observe(seen)
+        recorder.observe(with_bytes(seen, None, 0.2))
+        recorder.observe(replace(seen, lost=Reason.MISSING_FRAME, pair=None, page=None))
+        wait(0)
+        recorder.observe(with_bytes(replace(seen, time_s=1e9 + 1), Loss.BODY, 0.0))
+        wait(1)
+        for step in (2, 3):
+            recorder.observe(with_bytes(replace(seen, time_s=1e9 + step), None, 0.01))
+        wait(2)  # one of the two
+        for _ in range(8):
+            monitor.follow("toy-1", {"unread": 1.0})
+        for step in (70, 71, 140):
+            recorder.observe(replace(seen, time_s=1e9 + step))
+        wait(4)
+    assert [name.split("-", 2)[2].removesuffix(".h5") for name in map(lambda p: p.name, kept(tmp_path))] == [
+        "BODY_LOST",
+        "LOW_MARGIN",
+        "RECALIBRATION_DUE",
+        "RECALIBRATION_DUE",
+    ]
+    with h5py.File(kept(tmp_path)[1]) as file:
+        assert file["flight"].attrs["margin_bits"] == 0.01
+
+
+def _waiter(recorder: FlightRecorder, metrics: ServiceMetrics) -> Callable[[int], None]:
+    from tests.runtime.rpc.test_service import wait_until
+
+    def wait(pages: int) -> None:
+        assert wait_until(lambda: recorder._waiting.empty() and count(metrics, "kept") == pages)
+
+    return wait
+
+
+def test_the_ring_is_bounded_and_goes_on_after_a_restart(registry: ModelRegistry, tmp_path: Path) -> None:
+    source = toy.ToySource(toy.ToyDevice(LOST))
+    (tmp_path / "mine.txt").write_text("stays")
+    (tmp_path / "page-x.h5.partial").write_text("cut off")
+    for _ in range(2):
+        with FlightRecorder(tmp_path, registry, FlightSettings(pages=3)) as recorder:
+            plane = DataPlane(registry, source, observers=[recorder])
+            for _ in range(2):
+                read_lost(plane, 1)
+    names = [path.name for path in kept(tmp_path)]
+    assert names[0] == "mine.txt"
+    assert len(names) == 4
+    indices = []
+    for path in kept(tmp_path)[1:]:
+        with h5py.File(path) as file:
+            indices.append(int(file["flight"].attrs["page_index"]))
+    assert indices == [1, 2, 3]
+
+
+def test_the_ring_is_bounded_in_bytes(tmp_path: Path) -> None:
+    ring = FileRing(tmp_path, 10, 250)
+    for second in range(4):
+        ring.add(second, "A", lambda path: path.write_bytes(bytes(100)) and None)
+    assert [path.name[:22] for path in ring.files()] == ["page-19700101T000002.0", "page-19700101T000003.0"]
+    same = ring.add(3, "A", lambda path: path.write_bytes(bytes(100)) and None)
+    assert same.name.endswith("-A-1.h5")
+    with pytest.raises(LimitError, match="at most 250"):
+        ring.add(9, "A", lambda path: path.write_bytes(bytes(300)) and None)
+    assert len(ring.files()) == 2
+
+
+def test_a_disk_that_takes_nothing_is_told_of_once_and_hurts_no_read(
+    registry: ModelRegistry, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    metrics, source = ServiceMetrics(), toy.ToySource(toy.ToyDevice(LOST))
+    folder = tmp_path / "flight"
+    with FlightRecorder(folder, registry, metrics=metrics) as recorder:
+        plane = DataPlane(registry, source, observers=[recorder], metrics=metrics)
+        folder.rmdir()
+        folder.write_text("no folder")
+        for _ in range(3):
+            read_lost(plane, 1)
+        source.device.offsets = toy.OFFSETS
+        plane.read_page(None, None, Caller())
+    assert count(metrics, "failed") + count(metrics, "dropped") == 3
+    assert [record.message for record in caplog.records if "flight recorder" in record.message] == [
+        next(record.message for record in caplog.records if "pages are not kept" in record.message)
+    ]
+
+
+def test_pages_are_dropped_where_the_disk_is_behind(
+    registry: ModelRegistry, seen: Observation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go, metrics = threading.Event(), ServiceMetrics()
+    monkeypatch.setattr(FileRing, "add", lambda *_: go.wait(10))
+    with FlightRecorder(tmp_path, registry, metrics=metrics) as recorder:
+        for _ in range(20):
+            recorder.observe(replace(seen, lost=Reason.PILOTS_DISAGREE))
+        assert count(metrics, "dropped") >= 15
+        go.set()
+    assert count(metrics, "dropped") + count(metrics, "kept") == 20
+
+
+def test_a_folder_that_cannot_be_made_is_refused(registry: ModelRegistry, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InvalidInputError, match="one that can be made"):
+        FlightRecorder(tmp_path / "file" / "folder", registry)
+
+
+def test_a_lost_shot_has_no_frames_to_keep(registry: ModelRegistry, tmp_path: Path) -> None:
+    class Losing(toy.ToySource):
+        def shot(self, timeout_s: float = 1.0, page: int | None = None) -> object:  # type: ignore[override]
+            raise LostShotError("page", "no frame", "two", Reason.MISSING_FRAME)
+
+    with FlightRecorder(tmp_path, registry) as recorder:
+        plane = DataPlane(registry, Losing(toy.ToyDevice()), observers=[recorder])
+        with pytest.raises(LostShotError):
+            plane.read_page(None, None, Caller())
+    assert os.listdir(tmp_path) == []
