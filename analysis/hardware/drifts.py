@@ -9,7 +9,6 @@ without a new simulation.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import click
 import numpy as np
 
 from analysis.hardware.drifting import DriftingSource, direction, moved
+from analysis.hardware.rows import Rows, append_row, kept_rows
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.device.state import Device
@@ -35,8 +35,6 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.monitor import Monitor, MonitorSettings, PageFigures
 from runtime.service.observation import Observation
 from runtime.service.registry import ModelRegistry
-
-Rows = list[dict[str, Any]]
 
 QUIET_BEFORE = 25
 """Pages of a drift before it begins: the monitor learns what is usual by 20."""
@@ -94,24 +92,6 @@ def read(
             return
 
 
-def kept_rows(path: Path) -> Rows:
-    """The rows of a file, one a line; what was cut off at its end is left out."""
-    rows: Rows = []
-    if path.exists():
-        for line in path.read_text().splitlines():
-            try:
-                rows.append(json.loads(line))
-            except ValueError:
-                break
-    return rows
-
-
-def appended(path: Path, row: dict[str, Any]) -> None:
-    """Add a row to a file."""
-    with path.open("a") as file:
-        file.write(json.dumps(row) + "\n")
-
-
 def drift_rows(decoder: Decoder, seed: int, path: Path) -> Rows:
     """The pages of one drift, from its file where it is whole."""
     rows = kept_rows(path)
@@ -121,7 +101,7 @@ def drift_rows(decoder: Decoder, seed: int, path: Path) -> Rows:
     rows, way = [], direction(seed) * MARGIN_UNITS / DRIFT_PAGES
     source = DriftingSource(decoder, lambda moment: moved(Device(), way * max(0.0, moment)), seed)
     pages = track(range(-QUIET_BEFORE, LONGEST + 1), f"drift {seed}")
-    read(decoder, source, rows, pages, lambda row: appended(path, row))
+    read(decoder, source, rows, pages, lambda row: append_row(path, row))
     return rows
 
 
@@ -131,7 +111,7 @@ def quiet_rows(decoder: Decoder, count: int, path: Path) -> Rows:
     source = DriftingSource(decoder, lambda moment: Device(), seed=99)
     source.skip(len(rows))
     pages = track(range(len(rows), count), "quiet", total=count, done=len(rows))
-    read(decoder, source, rows, pages, lambda row: appended(path, row))
+    read(decoder, source, rows, pages, lambda row: append_row(path, row))
     return rows[:count]
 
 

@@ -23,9 +23,12 @@ from runtime.decoding.image_tracker import tracker_for
 from runtime.errors import LostShotError, SourceError
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
+from runtime.service.flight_recorder import PAGES, FlightRecorder, FlightSettings
 from runtime.service.metrics import MetricsServer, ServiceMetrics
+from runtime.service.monitor import Monitor
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
+from runtime.service.self_calibration import SelfCalibration, SelfCalibrationSettings
 from runtime.service.store import ModelStore
 from runtime.wire.address import check_address
 
@@ -59,6 +62,26 @@ _log = logging.getLogger(__name__)
 )
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
+@click.option(
+    "--self-calibrate/--no-self-calibrate",
+    default=None,
+    help="Recalibrate when the monitor says so; by default where calibration pages are named.",
+)
+@click.option(
+    "--calibration-page",
+    "calibration_pages",
+    type=click.IntRange(0),
+    multiple=True,
+    help="Number of a page of the source whose symbols are known; repeat it. Without, the next two pages serve.",
+)
+@click.option(
+    "--flight-recorder",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder in which the frames of lost and weak pages are kept.",
+)
+@click.option(
+    "--flight-recorder-pages", default=PAGES, show_default=True, type=click.IntRange(1), help="Kept there at most."
+)
 def serve(
     bundle: str,
     source: str | None,
@@ -70,9 +93,17 @@ def serve(
     recordings: Path | None,
     threads: int | None,
     tracking: bool,
+    self_calibrate: bool | None,
+    calibration_pages: tuple[int, ...],
+    flight_recorder: Path | None,
+    flight_recorder_pages: int,
 ) -> None:
     """Run the service until SIGTERM or Ctrl-C; calls in flight are finished first."""
     check_address("--address", address, least_port=0)
+    self_calibrate = bool(calibration_pages) if self_calibrate is None else self_calibrate
+    if self_calibrate and source is None:
+        raise InvalidInputError("--self-calibrate", "no --source", "a source that shows known pages")
+    calibrating = SelfCalibrationSettings(calibration_pages)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     with stop_signals() as wait_for_stop:
         base = Decoder.load(bundle_path(bundle), threads)
@@ -81,19 +112,26 @@ def serve(
         if models is not None:
             _resume(registry, models, threads)
         metrics = ServiceMetrics()
+        monitor = Monitor(metrics=metrics)
         with ExitStack() as stack:
             pages = None if source is None else stack.enter_context(_source(source, pages_file, base))
             if pages is not None:
                 _take_dark_frames(pages)
-            plane = DataPlane(registry, pages, models, metrics=metrics)
-            with (
-                _shown(metrics, metrics_port, metrics_host),
-                LightpageServer(plane, Recalibrator(plane, recordings=recordings), address) as server,
-            ):
-                version, source_name = registry.current.version, pages.name if pages is not None else "no source"
-                click.echo(f"serving {version} from {source_name} at {server.target}")
-                wait_for_stop()
-                click.echo("stopping")
+            recorder = None
+            if flight_recorder is not None:
+                kept = FlightSettings(flight_recorder_pages)
+                recorder = stack.enter_context(FlightRecorder(flight_recorder, registry, kept, monitor, metrics))
+            observers = [] if recorder is None else [recorder]
+            plane = DataPlane(registry, pages, models, metrics=metrics, observers=observers, monitor=monitor)
+            stack.enter_context(_shown(metrics, metrics_port, metrics_host))
+            recalibrator = Recalibrator(plane, recordings=recordings)
+            server = stack.enter_context(LightpageServer(plane, recalibrator, address))
+            if self_calibrate:
+                stack.enter_context(SelfCalibration(plane, monitor, recalibrator, calibrating))
+            version, source_name = registry.current.version, pages.name if pages is not None else "no source"
+            click.echo(f"serving {version} from {source_name} at {server.target}")
+            wait_for_stop()
+            click.echo("stopping")
 
 
 def _source(name: str, pages_file: Path | None, base: Decoder) -> FrameSource:

@@ -1,0 +1,53 @@
+"""`lightpage serve` with what keeps a device calibrated: the flight recorder and self-calibration."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from lightpage.errors import InvalidInputError
+from lightpage.recording.reader import Recording
+from runtime.client.client import LightpageClient
+from runtime.commands.serve import serve
+from runtime.errors import UnconfirmedPageError
+from tests.runtime import toy
+from tests.runtime.commands.test_commands import Served
+
+
+def test_lost_pages_of_a_served_device_are_kept(toy_zip: Path, tmp_path: Path) -> None:
+    toy.write_toy_recording(tmp_path / "lost.h5", toy.ToyDevice((60.0, 170.0)), 16, 4)
+    served = Served(
+        *("--bundle", toy_zip, "--source", f"recording:{tmp_path / 'lost.h5'}"),
+        *("--calibration-page", "2", "--calibration-page", "3"),
+        *("--flight-recorder", tmp_path / "flight", "--flight-recorder-pages", "2"),
+    )
+    try:
+        with LightpageClient(served.target(), timeout_s=20) as client:
+            for page in range(3):
+                with pytest.raises(UnconfirmedPageError):
+                    client.read_page(page)
+        status, _, err = served.end(signal.SIGTERM)
+        assert status == 0, err
+    finally:
+        served.process.kill()
+        served.process.wait()
+    kept = sorted((tmp_path / "flight").iterdir())
+    assert len(kept) == 2
+    with Recording.open(kept[0]) as recording:
+        assert recording.pages == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (["--self-calibrate"], "a source that shows known pages"),
+        (["--calibration-page", "1", "--calibration-page", "2"], "a source that shows known pages"),
+        (["--source", "simulator:bench", "--calibration-page", "1"], "at least 2 that differ"),
+    ],
+)
+def test_self_calibration_that_cannot_work_is_refused_at_once(options: list[str], match: str) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        CliRunner().invoke(serve, options, standalone_mode=False, catch_exceptions=False)
