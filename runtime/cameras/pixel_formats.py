@@ -22,7 +22,7 @@ _Words = NDArray[np.uint64]
 
 _GROUP = 4
 """Pixels that are packed and unpacked together, in one 64-bit word, 16 bits for each."""
-_BLOCK = 1 << 14
+_BLOCK = 1 << 13
 """Groups at a time: what is worked on stays in the processor's cache."""
 
 
