@@ -102,6 +102,7 @@ bench-codec: $(STAMP)  ## user bytes on recorded pages, wrong bytes ever given o
 BENCH_HARDWARE := runs/bench-hardware
 bench-hardware: $(STAMP)  ## cameras, trigger, pairing: wrong pairs, losses, plugs, latency, over fake cameras, in half an hour
 	mkdir -p $(BENCH_HARDWARE)
+	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.cameras --json $(BENCH_HARDWARE)/cameras.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.scpi --queries 10000 --json $(BENCH_HARDWARE)/scpi.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.pairs --shots 2000 --json $(BENCH_HARDWARE)/pairs.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.plugs --times 30 --json $(BENCH_HARDWARE)/plugs.json

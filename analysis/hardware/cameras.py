@@ -1,0 +1,264 @@
+"""What a camera's driver delivers: to the byte, without old frames, how fast, and how it leaves other threads alone.
+
+    python -m analysis.hardware.cameras --json runs/cameras.json
+
+Fake cameras send real GigE Vision packets over loopback. Runs in a private network.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.hardware.private import in_private_network
+from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
+from lightpage.files import write_json
+from lightpage.progress import track
+from lightpage.recording.layout import frame_type
+from runtime.cameras.aravis import AravisCamera
+from runtime.cameras.camera import Frame
+from runtime.cameras.pixel_formats import bit_depth, pack, unpack
+from runtime.cameras.settings import CameraSettings
+from runtime.virtual_device.fake_camera import FakeCamera
+from runtime.virtual_device.namespace import ADDRESSES
+
+Counts = NDArray[np.unsignedinteger[Any]]
+
+FORMATS = ("Mono8", "Mono12", "Mono12p", "Mono12Packed")
+PACKETS_BYTES = (1400, 9000, 60_000)
+_SMALL = (256, 320)
+_FULL = (2048, 2048)
+_FRAME_S = 2.0
+_FREE_RUN_S = 0.004
+_LEFTOVERS = 5
+"""Frames of a free run that come before a trigger."""
+_TICK_S = 1e-3
+_PAGES = 5
+"""Different pages that are shown in turn."""
+_UNPACKED = 21
+"""Frames whose unpacking is timed, per format."""
+
+
+class Eye:
+    """What one fake camera sees."""
+
+    def __init__(self, image: Counts) -> None:
+        self.image = image
+
+    def look(self) -> Counts:
+        """The sensor as it is now."""
+        return self.image
+
+
+@contextmanager
+def cameras(
+    shape: tuple[int, int], pixel_format: str, packet_bytes: int, count: int = 2
+) -> Iterator[list[tuple[FakeCamera, AravisCamera, Eye]]]:
+    """Fake cameras with their drivers, armed for edges on a line."""
+    made: list[tuple[FakeCamera, AravisCamera, Eye]] = []
+    try:
+        for number, address in enumerate(ADDRESSES[:count]):
+            eye = Eye(np.zeros(shape, frame_type(bit_depth(pixel_format))))
+            settings = CameraSettings(
+                address=address, pixel_format=pixel_format, packet_bytes=packet_bytes, trigger_source="Line1"
+            )
+            made.append((FakeCamera(address, f"FAKE-{number}", eye.look, shape), AravisCamera(settings, shape), eye))
+        for _, camera, _ in made:
+            camera.arm()
+        yield made
+    finally:
+        for fake, camera, _ in made:
+            camera.close()
+            fake.close()
+
+
+def stale_frames(changes: int) -> dict[str, int]:
+    """Change from a free run to the trigger; a triggered frame that shows what was before its trigger is stale."""
+    stale = missing = 0
+    with cameras(_SMALL, "Mono8", 9000, 1) as ((fake, camera, eye),):
+        for change in track(range(changes), "free run to trigger", total=changes):
+            eye.image = np.zeros(_SMALL, np.uint8)
+            before = camera.statistics.completed
+            fake.run_freely(_FREE_RUN_S)
+            end = time.monotonic() + _FRAME_S
+            while camera.statistics.completed < before + _LEFTOVERS and time.monotonic() < end:
+                time.sleep(_FREE_RUN_S)
+            camera.arm()
+            number = change % 255 + 1
+            eye.image = np.full(_SMALL, number, np.uint8)
+            fired_s = time.time()  # the fake camera's clock is this machine's
+            fake.edge()
+            frame = camera.frame(_FRAME_S)
+            if frame is None or frame.pixels is None or frame.info is None:
+                missing += 1
+            else:
+                stale += bool((frame.pixels != number).any()) or frame.info.device_time_s < fired_s - _TICK_S
+            fake.check()
+    return {"changes": changes, "stale": stale, "missing": missing}
+
+
+def take(stage: list[tuple[FakeCamera, AravisCamera, Eye]]) -> list[Frame | None]:
+    """One edge to all cameras, and a frame of each."""
+    for fake, _, _ in stage:
+        fake.edge()
+    return [camera.frame(_FRAME_S) for _, camera, _ in stage]
+
+
+def equal_frames(pairs: int, pixel_format: str) -> dict[str, int]:
+    """Pairs of frames full of noise, compared with what was sent."""
+    random, depth = np.random.default_rng(0), bit_depth(pixel_format)
+    equal = incomplete = other = 0
+    with cameras(_SMALL, pixel_format, 9000) as stage:
+        for _ in track(range(pairs), pixel_format, total=pairs):
+            for _, _, eye in stage:
+                eye.image = random.integers(0, 2**depth, _SMALL, dtype=frame_type(depth))
+            for frame, (fake, _, eye) in zip(take(stage), stage, strict=True):
+                fake.check()
+                if frame is None or frame.pixels is None:
+                    incomplete += 1
+                elif (frame.pixels == eye.image).all():
+                    equal += 1
+                else:
+                    other += 1
+    return {"frames": 2 * pairs, "equal": equal, "other": other, "incomplete": incomplete}
+
+
+class Ticks:
+    """A thread that wants to run every millisecond, and how long it really took."""
+
+    def __init__(self) -> None:
+        self._stop = threading.Event()
+        self._ticks_s: list[float] = []
+        self._thread = threading.Thread(target=self._run, name="ticks", daemon=True)
+
+    def __enter__(self) -> Ticks:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        last = time.perf_counter()
+        while not self._stop.is_set():
+            time.sleep(_TICK_S)
+            now = time.perf_counter()
+            self._ticks_s.append(now - last)
+            last = now
+
+    def figures(self) -> dict[str, float]:
+        """Milliseconds."""
+        p50, p99, largest = 1e3 * np.quantile(self._ticks_s, [0.5, 0.99, 1.0])
+        return {"p50_ms": float(p50), "p99_ms": float(p99), "max_ms": float(largest)}
+
+
+def speed(shots: int, packet_bytes: int) -> dict[str, Any]:
+    """Shots in a row of two cameras at full size, and another thread's ticks meanwhile.
+
+    Every shot shows other pages than the last one, and is compared with them; that is not timed.
+    """
+    random = np.random.default_rng(0)
+    pages = [random.integers(0, 256, _FULL, dtype=np.uint8) for _ in range(_PAGES)]
+    with cameras(_FULL, "Mono8", packet_bytes) as stage:
+        take(stage)  # the first frame of a fake camera is late
+        equal, seconds = 0, 0.0
+        with Ticks() as ticks:
+            for shot in track(range(shots), f"packets of {packet_bytes} B", total=shots):
+                for number, (_, _, eye) in enumerate(stage):
+                    eye.image = pages[(shot + 2 * number) % _PAGES]
+                started = time.perf_counter()
+                frames = take(stage)
+                seconds += time.perf_counter() - started
+                equal += all(
+                    frame is not None and frame.pixels is not None and (frame.pixels == eye.image).all()
+                    for frame, (_, _, eye) in zip(frames, stage, strict=True)
+                )
+        return {
+            "packet_bytes": packet_bytes,
+            "shots": shots,
+            "equal": equal,
+            "equal_per_s": equal / seconds,
+            "tick": ticks.figures(),
+        }
+
+
+def idle_ticks(seconds: float) -> dict[str, float]:
+    """The ticks of a thread while nothing else is done."""
+    with Ticks() as ticks:
+        time.sleep(seconds)
+    return ticks.figures()
+
+
+def plain_unpack_12p(raw: NDArray[np.uint8]) -> Counts:
+    """Mono12p byte by byte, as anybody would write it first: what `unpack` is compared with."""
+    first, middle, last = raw.reshape(-1, 3).astype(np.uint16).T
+    counts = np.empty((first.size, 2), np.uint16)
+    counts[:, 0] = first | (middle & 15) << 8
+    counts[:, 1] = middle >> 4 | last << 4
+    return counts.reshape(_FULL)
+
+
+def unpacking(pixel_format: str, work: Callable[[NDArray[np.uint8]], Counts] | None = None) -> float:
+    """Milliseconds to unpack a frame at full size, median. The frames are kept, so each needs new memory."""
+    depth = bit_depth(pixel_format)
+    image = np.random.default_rng(0).integers(0, 2**depth, _FULL, dtype=frame_type(depth))
+    raw = pack(image, pixel_format)
+    taken, kept = [], []
+    for _ in range(_UNPACKED):
+        started = time.perf_counter()
+        kept.append(unpack(raw, _FULL, pixel_format) if work is None else work(raw))
+        taken.append(time.perf_counter() - started)
+    assert all((counts == image).all() for counts in kept)
+    return 1e3 * float(np.median(taken))
+
+
+def told(tick: dict[str, float]) -> str:
+    """Ticks for people."""
+    return f"tick of 1 ms: p50 {tick['p50_ms']:.2f}, p99 {tick['p99_ms']:.2f}, max {tick['max_ms']:.1f} ms"
+
+
+@click.command()
+@click.option("--changes", default=200, show_default=True, type=click.IntRange(1, 100_000), help="Free run to trigger.")
+@click.option("--pairs", default=100, show_default=True, type=click.IntRange(1, 100_000), help="Of each pixel format.")
+@click.option("--shots", default=60, show_default=True, type=click.IntRange(1, 100_000), help="Of each packet size.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def main(changes: int, pairs: int, shots: int, json_path: Path | None) -> None:
+    """Print stale frames, frames that are equal to the byte, shots per second, another thread's ticks, unpacking."""
+    in_private_network("analysis.hardware.cameras")
+    stale = stale_frames(changes)
+    click.echo(f"stale frames: {stale['stale']} after {changes} changes to the trigger, {stale['missing']} missing")
+    equal = {name: equal_frames(pairs, name) for name in FORMATS}
+    for name, found in equal.items():
+        click.echo(
+            f"{name}: {found['equal']} of {found['frames']} frames equal, {found['other']} different, "
+            f"{found['incomplete']} incomplete"
+        )
+    idle = idle_ticks(3.0)
+    click.echo(f"nothing to do: {told(idle)}")
+    speeds = [speed(shots, size) for size in PACKETS_BYTES]
+    for fast in speeds:
+        click.echo(
+            f"packets of {fast['packet_bytes']} B: {fast['equal_per_s']:.1f} shots/s, {fast['equal']} of {shots} "
+            f"equal, {told(fast['tick'])}"
+        )
+    unpack_ms = {name: unpacking(name) for name in FORMATS}
+    unpack_ms["Mono12p, plain"] = unpacking("Mono12p", plain_unpack_12p)
+    click.echo("unpacking 2048 x 2048: " + ", ".join(f"{name} {taken:.1f} ms" for name, taken in unpack_ms.items()))
+    if json_path is not None:
+        figures = {"stale": stale, "equal": equal, "idle_tick": idle, "speed": speeds, "unpack_ms": unpack_ms}
+        write_json(json_path, figures)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, name="python -m analysis.hardware.cameras"))
