@@ -55,6 +55,7 @@ ROOMS = (
     "runtime.wire",
     "runtime.client",
     "runtime.service",
+    "runtime.console",
     "runtime.rpc",
     "runtime.demo",
     "runtime.commands",

@@ -18,14 +18,17 @@ from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import FrameSource
 from runtime.acquisition.sources import open_source
 from runtime.bundle.shipped import DEFAULT, bundle_path
+from runtime.console.history import History
+from runtime.console.server import Console, ConsoleServer
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.errors import LostShotError, SourceError
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.flight_recorder import PAGES, FlightRecorder, FlightSettings
-from runtime.service.metrics import MetricsServer, ServiceMetrics
+from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
+from runtime.service.observation import Observer
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
 from runtime.service.self_calibration import SelfCalibration, SelfCalibrationSettings
@@ -46,7 +49,7 @@ _log = logging.getLogger(__name__)
     "--pages", "pages_file", type=click.Path(path_type=Path), help="Pages that the source is to show, PAGES.h5."
 )
 @click.option("--address", default=ADDRESS, show_default=True, help="HOST:PORT to listen on; port 0 takes a free one.")
-@click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus figures on this port.")
+@click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show metrics and console on this port.")
 @click.option("--metrics-host", default="127.0.0.1", show_default=True, help="Where the figures are shown.")
 @click.option(
     "--store",
@@ -121,15 +124,17 @@ def serve(
             if flight_recorder is not None:
                 kept = FlightSettings(flight_recorder_pages)
                 recorder = stack.enter_context(FlightRecorder(flight_recorder, registry, kept, monitor, metrics))
-            observers = [] if recorder is None else [recorder]
+            history = History()
+            observers: list[Observer] = [history] if recorder is None else [history, recorder]
             plane = DataPlane(registry, pages, models, metrics=metrics, observers=observers, monitor=monitor)
-            stack.enter_context(_shown(metrics, metrics_port, metrics_host))
+            source_name = pages.name if pages is not None else "no source"
+            console = Console(metrics, history, registry, monitor, source_name)
+            stack.enter_context(_shown(console, metrics_port, metrics_host))
             recalibrator = Recalibrator(plane, recordings=recordings)
             server = stack.enter_context(LightpageServer(plane, recalibrator, address))
             if self_calibrate:
                 stack.enter_context(SelfCalibration(plane, monitor, recalibrator, calibrating))
-            version, source_name = registry.current.version, pages.name if pages is not None else "no source"
-            click.echo(f"serving {version} from {source_name} at {server.target}")
+            click.echo(f"serving {registry.current.version} from {source_name} at {server.target}")
             wait_for_stop()
             click.echo("stopping")
 
@@ -202,16 +207,14 @@ def _resume(registry: ModelRegistry, store: ModelStore, threads: int | None) -> 
 
 
 @contextmanager
-def _shown(metrics: ServiceMetrics, port: int | None, host: str) -> Iterator[None]:
+def _shown(console: Console, port: int | None, host: str) -> Iterator[None]:
     if port is None:
         yield
         return
     try:
-        server = MetricsServer.start(metrics, port, host)
+        server = ConsoleServer(console, port, host)
     except OSError as error:
         raise InvalidInputError(f"--metrics-port {port}", error, "a free port of this machine") from None
-    click.echo(f"metrics at http://{host}:{server.port}/metrics")
-    try:
+    click.echo(f"metrics at http://{host}:{server.port}/metrics, console at http://{host}:{server.port}/")
+    with server:
         yield
-    finally:
-        server.close()

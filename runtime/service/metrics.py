@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
@@ -18,8 +17,7 @@ from runtime.decoding.tracking import unconfirmed_page
 from runtime.errors import LostPageError, UnconfirmedPageError
 
 if TYPE_CHECKING:
-    from threading import Thread
-    from wsgiref.simple_server import WSGIServer
+    pass
 
 _SECONDS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
@@ -117,31 +115,3 @@ class _SourceFigures(Collector):
         for camera, value in self._source.saturated_shares().items():
             share.add_metric([camera], value)
         yield share
-
-
-@dataclass
-class MetricsServer:
-    """The HTTP server that shows the figures; `close` ends it."""
-
-    server: WSGIServer
-    thread: Thread
-
-    @classmethod
-    def start(cls, metrics: ServiceMetrics, port: int, host: str = "127.0.0.1") -> MetricsServer:
-        """Show `metrics` at http://host:port/metrics; port 0 takes a free one.
-
-        Raises:
-            OSError: the port is taken.
-        """
-        return cls(*start_http_server(port, host, metrics.registry))
-
-    @property
-    def port(self) -> int:
-        """The port that it listens on."""
-        return int(self.server.server_port)
-
-    def close(self) -> None:
-        """Stop listening and wait for the thread."""
-        self.server.shutdown()
-        self.server.server_close()
-        self.thread.join()

@@ -1,0 +1,150 @@
+"""What the console shows of the last pages: their figures, the losses, and the last frames."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.recording.reader import FramePair
+from runtime.service.monitor import claimed_bits
+from runtime.service.observation import Observation
+
+PAGES = 5000
+"""Pages whose figures are kept."""
+
+
+@dataclass(frozen=True)
+class PageRow:
+    """The figures of one page; None where it does not show one.
+
+    Attributes:
+        time_s: seconds since 1970.
+        subject: for people.
+        page_index: its number in the source.
+        model_version: what decoded it.
+        seconds: that it took.
+        lost: why it was not given out, None where it was.
+        unread: why its bytes could not be read, None where they were, or nobody asked.
+        margin_bits: beyond what its code needs, a symbol.
+        air_bits: that a symbol is claimed to carry, as far as the pilots bear it out.
+        trust, share: what the pilots bear out of the concentration, and of the information.
+        shift_x_px, shift_y_px: of the image since calibration, camera pixels.
+        piston_rad: of the page.
+        residual_rad: smooth phase error that was taken off.
+        recalibration_due: whether the page by itself says so.
+    """
+
+    time_s: float
+    subject: str
+    page_index: int | None
+    model_version: str
+    seconds: float
+    lost: str | None
+    unread: str | None
+    margin_bits: float | None
+    air_bits: float | None
+    trust: float | None
+    share: float | None
+    shift_x_px: float | None
+    shift_y_px: float | None
+    piston_rad: float | None
+    residual_rad: float | None
+    recalibration_due: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures by name; None for what is not a number."""
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {name: _number(value) if isinstance(value, float) else value for name, value in values.items()}
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Pages lost for one reason: how many, and the last of them."""
+
+    reason: str
+    count: int
+    detail: str
+    time_s: float
+
+
+class History:
+    """Takes note of pages, an `Observer`. Its methods may be called from many threads."""
+
+    def __init__(self, pages: int = PAGES) -> None:
+        self._lock = threading.Lock()
+        self._rows: deque[PageRow] = deque(maxlen=pages)
+        self._losses: dict[str, Losses] = {}
+        self._pages = 0
+        self._pair: FramePair | None = None
+        self._confidence: NDArray[np.float32] | None = None
+        self._shown = 0
+        """Raised with each page whose pictures are new."""
+
+    def observe(self, observation: Observation) -> None:
+        """See `Observer`."""
+        row = _row(observation)
+        reason = row.lost or row.unread
+        with self._lock:
+            self._rows.append(row)
+            self._pages += 1
+            if reason is not None:
+                before = self._losses.get(reason)
+                count = 1 if before is None else before.count + 1
+                self._losses[reason] = Losses(reason, count, observation.detail or row.subject, row.time_s)
+            if observation.pair is not None:
+                self._pair, self._shown = observation.pair, self._shown + 1
+                self._confidence = None if observation.page is None else observation.page.confidence
+
+    @property
+    def pages(self) -> int:
+        """Pages so far."""
+        with self._lock:
+            return self._pages
+
+    def rows(self) -> list[PageRow]:
+        """The last pages, the oldest first."""
+        with self._lock:
+            return list(self._rows)
+
+    def losses(self) -> list[Losses]:
+        """Lost and unread pages by reason, the most frequent first."""
+        with self._lock:
+            return sorted(self._losses.values(), key=lambda one: -one.count)
+
+    def pictures(self) -> tuple[int, FramePair | None, NDArray[np.float32] | None]:
+        """Number of the last page with frames, its frames, and its confidence [ny, nx] if it was decoded."""
+        with self._lock:
+            return self._shown, self._pair, self._confidence
+
+
+def _row(observation: Observation) -> PageRow:
+    page, data = observation.page, observation.user_data
+    image = None if page is None else page.image
+    unread = None if data is None or data.loss is None else data.loss.value
+    return PageRow(
+        time_s=observation.time_s,
+        subject=observation.subject,
+        page_index=observation.page_index,
+        model_version=observation.model_version,
+        seconds=observation.seconds,
+        lost=None if observation.lost is None else observation.lost.value,
+        unread=unread,
+        margin_bits=observation.margin_bits,
+        air_bits=None if page is None else claimed_bits(page),
+        trust=None if page is None else page.pilot_trust,
+        share=None if page is None else page.check.share,
+        shift_x_px=None if image is None else image.shift_x_px,
+        shift_y_px=None if image is None else image.shift_y_px,
+        piston_rad=None if page is None else page.piston_rad,
+        residual_rad=observation.residual_rad(),
+        recalibration_due=page is not None and bool(page.check.recalibration_due),
+    )
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

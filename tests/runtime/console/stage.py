@@ -1,0 +1,58 @@
+"""A service of toy pages with a console beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from runtime.acquisition.source import SHOT_S, Shot
+from runtime.bundle.bundle import Bundle
+from runtime.console.history import History
+from runtime.console.server import Console, ConsoleServer
+from runtime.decoding.decoder import Decoder
+from runtime.errors import LostPageError, LostShotError, Reason
+from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane
+from runtime.service.metrics import ServiceMetrics
+from runtime.service.monitor import Monitor
+from runtime.service.registry import ModelRegistry
+from tests.runtime import toy
+
+
+class Losing(toy.ToySource):
+    """Every fifth page is a lost shot."""
+
+    def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
+        found = super().shot(timeout_s, page)
+        if found.page_index % 5 == 4:
+            raise LostShotError(f"page {found.page_index}", "no frame", "two frames", Reason.MISSING_FRAME)
+        return found
+
+
+@dataclass
+class Stage:
+    plane: DataPlane
+    history: History
+    console: Console
+    server: ConsoleServer
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server.port}"
+
+    def read(self, pages: int) -> None:
+        for _ in range(pages):
+            with suppress(LostPageError):
+                self.plane.read_page(None, None, Caller())
+
+
+@contextmanager
+def stage(bundle: Path) -> Iterator[Stage]:
+    history, monitor, metrics = History(), Monitor(), ServiceMetrics()
+    registry = ModelRegistry(Decoder(Bundle.open(bundle), threads=1))
+    plane = DataPlane(registry, Losing(toy.ToyDevice()), metrics=metrics, observers=[history], monitor=monitor)
+    console = Console(metrics, history, registry, monitor, "toy:device")
+    with ConsoleServer(console, 0) as server:
+        yield Stage(plane, history, console, server)

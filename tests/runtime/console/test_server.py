@@ -1,0 +1,119 @@
+"""The console says what the service sees, takes no orders, and is bounded."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lightpage.cli import main as cli_main
+from lightpage.cli.main import EXIT_ERROR, lightpage
+from runtime.console.history import History
+from runtime.console.pictures import SIDE_PX, confidence_png, frame_png
+from runtime.console.server import POINTS, RECENT, ConsoleServer
+from runtime.service.observation import Observation
+from tests.runtime.console.stage import stage
+
+
+def fetched(url: str, method: str = "GET") -> tuple[int, bytes, dict[str, str]]:
+    try:
+        with urlopen(Request(url, method=method), timeout=10) as reply:
+            return reply.status, reply.read(), dict(reply.headers)
+    except HTTPError as error:
+        with error:
+            return error.code, error.read(), dict(error.headers)
+
+
+def test_the_state_is_that_of_the_pages(toy_zip: Path) -> None:
+    with stage(toy_zip) as running:
+        _, empty, _ = fetched(f"{running.url}/state.json")
+        assert json.loads(empty)["condition"] == "no page yet"
+        assert fetched(f"{running.url}/frames/in_phase.png")[0] == 404
+        running.read(12)
+        status, content, headers = fetched(f"{running.url}/state.json")
+        assert status == 200
+        assert headers["Cache-Control"] == "no-store"
+        assert "default-src 'self'" in headers["Content-Security-Policy"]
+        state = json.loads(content)
+        assert (state["source"], state["pages"], len(state["recent"])) == ("toy:device", 12, 12)
+        assert [(loss["reason"], loss["count"]) for loss in state["losses"]] == [("MISSING_FRAME", 2)]
+        assert state["recent"][2]["lost"] == "MISSING_FRAME"
+        assert state["series"]["air_bits"][0] > 0
+        assert state["series"]["air_bits"][4] is None
+        assert [model["version"] for model in state["models"]] == ["toy-1"]
+        for name in ("frames/in_phase", "frames/quadrature", "confidence"):
+            status, picture, headers = fetched(f"{running.url}/{name}.png")
+            assert (status, headers["Content-Type"]) == (200, "image/png")
+            assert Image.open(io.BytesIO(picture)).size[0] >= 1
+        for path, kind in (("/", "text/html"), ("/console.js", "text/javascript"), ("/console.css", "text/css")):
+            status, content, headers = fetched(running.url + path)
+            assert (status, headers["Content-Type"].split(";")[0]) == (200, kind)
+            assert b"http://" not in content.replace(b"http://www.w3.org/2000/svg", b"")
+            assert b"https://" not in content
+
+
+def test_metrics_are_beside_it_and_nothing_takes_orders(toy_zip: Path) -> None:
+    with stage(toy_zip) as running:
+        with pytest.raises(OSError, match="in use"):
+            ConsoleServer(running.console, running.server.port)
+        assert b"lightpage_calls_in_flight" in fetched(f"{running.url}/metrics")[1]
+        for method in ("POST", "PUT", "DELETE"):
+            assert fetched(f"{running.url}/state.json", method)[0] == 405
+        for path in ("/nothing", "/static/console.js", "/../server.py", "//etc/passwd", "/frames/other.png"):
+            assert fetched(running.url + path)[0] == 404
+        status, content, headers = fetched(f"{running.url}/", "HEAD")
+        assert (status, content) == (200, b"")
+        assert int(headers["Content-Length"]) > 500
+
+
+def test_what_is_no_number_is_none_and_series_are_thinned(toy_zip: Path) -> None:
+    with stage(toy_zip) as running:
+        running.read(1)
+        row = running.history.rows()[0]
+        for number in range(3 * POINTS):
+            running.history._rows.append(
+                type(row)(**{**vars(row), "time_s": row.time_s + number, "piston_rad": math.nan, "trust": math.inf})
+            )
+        state = running.console.state()
+        assert len(state["series"]["time_s"]) <= POINTS + 1
+        assert state["series"]["time_s"][-1] == row.time_s + 3 * POINTS - 1
+        assert state["series"]["piston_rad"][-1] is None
+        assert len(state["recent"]) == RECENT
+        json.dumps(state, allow_nan=False)
+
+
+def test_the_history_is_bounded() -> None:
+    history = History(pages=3)
+    for number in range(5):
+        history.observe(Observation(f"page {number}", number, "toy-1", float(number), 0.1))
+    assert [row.page_index for row in history.rows()] == [2, 3, 4]
+    assert history.pages == 5
+
+
+def test_pictures_are_thinned_and_show_saturation() -> None:
+    frame = np.zeros((2000, 3000), np.uint16)
+    frame[::4, ::4] = 4095
+    picture = np.asarray(Image.open(io.BytesIO(frame_png(frame, 12))))
+    assert max(picture.shape) <= SIDE_PX
+    assert tuple(picture[0, 0]) == (230, 60, 30)
+    grid = np.asarray(Image.open(io.BytesIO(confidence_png(np.linspace(0, 1, 12).reshape(3, 4)))))
+    assert grid.shape == (3 * 80, 4 * 80, 3)
+    assert grid[-1, -1].sum() > grid[0, 0].sum()
+
+
+def test_the_command_finds_a_console_or_says_how_to_start_one(
+    toy_zip: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with stage(toy_zip) as running:
+        address = running.url.removeprefix("http://")
+        assert cli_main.run(lightpage, ["console", "--address", address, "--no-browser"]) == 0
+        assert capsys.readouterr().out.strip() == f"{running.url}/"
+    assert cli_main.run(lightpage, ["console", "--address", address, "--no-browser"]) == EXIT_ERROR
+    assert "--metrics-port" in capsys.readouterr().err
