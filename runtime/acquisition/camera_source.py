@@ -135,6 +135,7 @@ class CameraSource(FrameSource):
             depths = [camera.bit_depth for camera in self._cameras]
             if depths[0] != depths[1]:
                 raise SourceError(f"{self.name}: cameras", f"{depths[0]} and {depths[1]} bits", "the same for both")
+            self._pairing.forget()
             self._armed = self._was_armed = True
 
     def _arm(self, device: Camera | Trigger, reason: Reason) -> None:

@@ -123,6 +123,10 @@ class Pairing:
             channel.reference_s is not None and channel.opened == channel.camera.opened for channel in self._channels
         )
 
+    def forget(self) -> None:
+        """Synchronise before the next shot: a device that was set up anew may be slower, or another one."""
+        self._referenced_at = -float("inf")
+
     def shot(
         self, deadline: float, display: Callable[[], None] | None = None, displayed: Callable[[], bool] | None = None
     ) -> tuple[Frame, ...]:
@@ -153,7 +157,7 @@ class Pairing:
         except BaseException as error:
             self._settled = False
             if isinstance(error, LostShotError) and error.reason in (Reason.CAMERA_GONE, Reason.TRIGGER_GONE):
-                self._referenced_at = -float("inf")  # what comes back may be slower, or another one
+                self.forget()
             raise
         return taken.frames
 

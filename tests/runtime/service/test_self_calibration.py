@@ -114,7 +114,7 @@ def test_a_drifted_device_is_recalibrated_and_read_again(make: Make, caplog: pyt
     assert loop.version == "toy-1"
     loop.drift()
     assert wait_until(lambda: loop.version == "toy-1+r1")
-    assert loop.source.shown[-2:] == [100, 101]
+    assert [page for page in loop.source.shown if page >= 100] == [100, 101]  # reads may come between and behind
     assert wait_until(lambda: "toy-1+r1 in service" in caplog.text)
     assert not loop.monitor.due
     assert loop.monitor.state().model_version == "toy-1+r1"
