@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ Counts = NDArray[np.unsignedinteger[Any]]
 _log = logging.getLogger(__name__)
 
 _GONE = frozenset({Reason.CAMERA_GONE, Reason.TRIGGER_GONE})
+_MOST_REPEATS = 20
+"""Of a shot of reference or dark frames."""
 _AGAIN_S = 0.5
 """Between two attempts to reach a device that has gone."""
 
@@ -168,7 +171,9 @@ class CameraSource(FrameSource):
         deadline = time.monotonic() + timeout_s
         with self._lock:
             index, symbols = self._page(page)
-            frames = self._persistent(index, deadline, self._attempt(index, symbols, deadline))
+            frames = self._persistent(
+                f"page {index}", index, deadline, self._attempt(index, symbols, deadline), self._exposures.repeats
+            )
             pair = FramePair(*(self._cleaned(one, frame) for one, frame in enumerate(frames)))
             first, second = (frame.info for frame in frames)
             assert first is not None  # of complete frames
@@ -245,9 +250,10 @@ class CameraSource(FrameSource):
 
         return lambda: self._pairing.shot(deadline, display, modulator.shows)
 
-    def _persistent(self, index: int, deadline: float, attempt: Callable[[], tuple[Frame, ...]]) -> tuple[Frame, ...]:
+    def _persistent(
+        self, subject: str, index: int, deadline: float, attempt: Callable[[], tuple[Frame, ...]], repeats: int
+    ) -> tuple[Frame, ...]:
         """A pair of one page: lost shots are repeated, and devices that have gone are waited for."""
-        repeats = self._exposures.repeats
         while True:
             try:
                 self.arm()
@@ -264,7 +270,7 @@ class CameraSource(FrameSource):
                 elif repeats > 0 and time.monotonic() < deadline:
                     repeats -= 1
                     continue
-                raise error.about(f"page {index} of {self.name}") from None
+                raise error.about(f"{subject} of {self.name}") from None
             self._outcomes["TAKEN"] += 1
             return frames
 
@@ -288,7 +294,10 @@ class CameraSource(FrameSource):
         shots = []
         for _ in range(count):
             deadline = time.monotonic() + SHOT_S
-            shots.append(self._persistent(-1, deadline, lambda end=deadline: self._pairing.shot(end)))  # type: ignore[misc]
+            # nothing but the light has to stand still, so there is no reason to give up early
+            attempt = partial(self._pairing.shot, deadline)
+            taken = self._persistent("frames without a page", -1, deadline, attempt, _MOST_REPEATS)
+            shots.append(taken)
         return [np.stack([self._cleaned(one, frames[one]) for frames in shots]) for one in (0, 1)]
 
     @contextmanager

@@ -105,7 +105,8 @@ def test_a_page_is_read_end_to_end_with_a_missed_trigger_a_lost_packet_and_an_un
         assert decoded(0) > 0.9
         hardware.wire = missing
         assert decoded(1) > 0.9
-        assert source.shots_by_outcome() == {"TAKEN": 2, "MISSING_FRAME": 1}
+        assert source.shots_by_outcome()["TAKEN"] == 2
+        assert source.shots_by_outcome()["MISSING_FRAME"] >= 1
         hardware.wire = edge
 
         hardware.cameras[0].lose(0.3)
