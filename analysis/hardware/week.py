@@ -74,6 +74,9 @@ CALIBRATION_PAGES = (1_000_000, 1_000_001)
 WANTED_SHARE = 0.95
 """Of the AIR with the true table that a page should have."""
 
+WORTH = 0.004
+"""Share of the true table's AIR that an alarm must be about: half of what half of a page's margin is."""
+
 
 def state(moment: float, pages: int) -> Device:
     """The true device at a time of a week of `pages`, in pages: it was calibrated cold, at its beginning."""
@@ -266,9 +269,9 @@ def _during(rows: Rows) -> float | None:
 
 
 def false_alarms(rows: Rows, due: list[int]) -> int:
-    """Alarms where ten pages about them had lost less than a hundredth of what the true table gives."""
-    found: NDArray[np.float64] = np.array([row["air"] / row["true_air"] for row in rows])
-    return sum(float(np.median(found[max(0, page - 9) : page + 1])) > 0.99 for page in due)
+    """Alarms where the last ten pages had lost nothing worth a recalibration."""
+    share: NDArray[np.float64] = np.array([row["air"] / row["true_air"] for row in rows])
+    return sum(float(np.mean(share[max(0, page - 9) : page + 1])) > 1 - WORTH for page in due)
 
 
 @click.command()

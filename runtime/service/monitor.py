@@ -7,7 +7,7 @@ import math
 import statistics
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -47,9 +47,9 @@ _UNREADABLE = (Loss.BODY, Loss.CHECKSUM)
 class Sign:
     """A figure of pages, and when it says that a recalibration is due.
 
-    The median of the last pages counts, so one odd page changes nothing. It must leave the baseline, the median of the
-    first pages of a model, by `raise_by` for the sign to be raised, and come back to within `clear_by` for it to be
-    taken back. Where pages differ much from one another, it must leave it by `deviations` of their noise at least.
+    The median of the last pages counts, so one odd page changes nothing. It must leave the baseline, the best median
+    among the first pages of a model, by `raise_by` for the sign to be raised. To be taken back, it must come back to
+    within `clear_by`. Where pages differ much, it must leave it by `deviations` of their noise at least.
 
     Attributes:
         name: of the figure.
@@ -60,7 +60,7 @@ class Sign:
         absolute: whether the baseline is 0 whatever the first pages show.
         mean: whether the mean counts and not the median, as for shares of pages.
         decides: whether it makes a recalibration due; otherwise it is shown alone.
-        deviations: standard errors of the median.
+        deviations: standard errors of the median; the best of many medians lies up to two of them above the mean.
     """
 
     name: str
@@ -72,26 +72,27 @@ class Sign:
     absolute: bool = False
     mean: bool = False
     decides: bool = True
-    deviations: float = 5.0
+    deviations: float = 6.5
 
 
 MARGIN = Sign("margin_bits", window=7, raise_by=0.5, clear_by=0.3, relative=True)
 """Information beyond what the page's code needs, by its corrected bits: what users lose when it is gone. Pages of a
-quiet bench device show 0.126 +- 0.019 bit. Half of it is six standard errors of the median away, and leaves the other
+quiet bench device show 0.117 +- 0.019 bit. Half of it is six standard errors of the median away, and leaves the other
 half of the way to recalibrate in."""
 
-AIR = Sign("air_bits", window=15, raise_by=0.02, clear_by=0.01, relative=True)
-"""Information that a phase is claimed to carry, as far as the pilots bear it out: all that is known where bytes
-are not read. Few pilots tell it (one page in twenty of a quiet bench device shows 1% less), hence the long
-window; a page of the shipped code is lost at about 2%."""
+AIR = Sign("air_bits", window=35, raise_by=0.006, clear_by=0.003, relative=True)
+"""Information that a phase is claimed to carry, as far as the pilots bear it out: all that is known where bytes are not
+read. A quiet bench page shows 6.57 +- 0.05 bit, and 0.13 bit less where its margin is gone. Its 54 pilots tell that
+only together with those of many pages, hence the long window, and not always in time: read bytes where you can."""
 
-TRUST = Sign("trust", window=15, raise_by=0.15, clear_by=0.08)
-"""Share of the claimed concentration that the pilots bear out. A quiet bench device shows 0.97 +- 0.05, and 0.85 about
-where its margin is gone."""
+TRUST = Sign("trust", window=35, raise_by=0.05, clear_by=0.025)
+"""Share of the claimed concentration that the pilots bear out. Of a quiet bench device it is 0.97 +- 0.06, its median
+over 35 pages never below 0.97; where its margin is gone it is 0.88."""
 
-SHARE = Sign("share", window=7, raise_by=0.06, clear_by=0.03)
-"""Share of the claimed information that the pilots confirm: 1.01 +- 0.02 on a quiet bench device, 0.97 where its margin
-is gone, and 0.85 where a page by itself says that a recalibration is due."""
+SHARE = Sign("share", window=15, raise_by=0.045, clear_by=0.025)
+"""Share of the claimed information that the pilots confirm: 1.01 +- 0.02 on a quiet bench device, 0.98 where its margin
+is gone. It tells a large change sooner than the signs above; at 0.85 a page by itself says that a recalibration is due.
+"""
 
 UNREAD = Sign("unread", window=8, raise_by=0.45, clear_by=0.2, rises=True, absolute=True, mean=True)
 """Share of pages that were lost to their optics, or whose bytes were. Four of eight are no accident: after a knock the
@@ -114,8 +115,8 @@ class MonitorSettings:
     """When a recalibration is due.
 
     Attributes:
-        baseline_pages: first pages of a model that say what is usual: as few as tell their median to a quarter of
-            their scatter, since the device goes on drifting meanwhile.
+        baseline_pages: first pages of a model that say what is usual: few, since the device goes on drifting meanwhile,
+            yet as many as the longest window and some more.
         signs: what is followed.
     """
 
@@ -193,7 +194,7 @@ class _Followed:
         self.last.append(value)
         if self.baseline is None:
             self.first.append(value)
-            if len(self.first) == self.baseline_pages:
+            if len(self.first) == max(self.baseline_pages, self.sign.window):
                 self._settle()
             return
         now, sign = self.value, 1 if self.sign.rises else -1
@@ -202,9 +203,13 @@ class _Followed:
             self.raised = distance > self._distance(self.sign.clear_by if self.raised else self.sign.raise_by)
 
     def _settle(self) -> None:
-        self.baseline = statistics.median(self.first)
-        deviation = _MAD_DEVIATIONS * statistics.median(abs(value - self.baseline) for value in self.first)
-        self.noise = _MEDIAN_ERROR * deviation / math.sqrt(self.sign.window)
+        """Take the best window as usual, and the scatter from page to page as noise: both bear a drift meanwhile."""
+        window = self.sign.window
+        best = min if self.sign.rises else max
+        ends = range(window, len(self.first) + 1)
+        self.baseline = best(self._smoothed(self.first[end - window : end]) for end in ends)
+        steps = np.abs(np.diff(self.first))
+        self.noise = _MEDIAN_ERROR * _MAD_DEVIATIONS * float(np.median(steps)) / math.sqrt(2 * window)
 
     def _distance(self, by: float) -> float:
         """How far from the baseline a threshold lies; `by` of the settings, and no nearer than noise allows."""
@@ -214,9 +219,13 @@ class _Followed:
 
     @property
     def value(self) -> float | None:
+        """What counts of the last pages."""
         if len(self.last) < self.sign.window:
             return None
-        return statistics.fmean(self.last) if self.sign.mean else statistics.median(self.last)
+        return self._smoothed(self.last)
+
+    def _smoothed(self, values: Sequence[float]) -> float:
+        return statistics.fmean(values) if self.sign.mean else statistics.median(values)
 
     def state(self) -> SignState:
         ends: list[float | None] = [None, None]

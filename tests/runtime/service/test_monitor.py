@@ -107,7 +107,7 @@ def test_a_new_model_starts_anew_and_pages_of_the_old_one_say_nothing() -> None:
 )
 def test_pilots_tell_where_no_bytes_are_read(name: str, usual: float, drifted: float) -> None:
     monitor = Monitor()
-    for value in [usual] * 30 + [drifted] * 15:
+    for value in [usual] * 40 + [drifted] * 30:
         monitor.follow("m", {name: value, "unread": 0.0})
     assert monitor.due
     assert monitor.state().reasons[0].startswith(name)

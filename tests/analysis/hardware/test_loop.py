@@ -1,0 +1,95 @@
+"""What the measurements of the loop do with figures; the measurements themselves take hours and are no tests."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.hardware.drifting import UNITS, DriftingSource, TrueTable, direction, moved
+from analysis.hardware.drifts import alarms, judged
+from analysis.hardware.rows import append_row, kept_rows
+from analysis.hardware.week import KNOCK_DEG, figures_of, state
+from analysis.hardware.week_figure import draw
+from lightpage.device.state import Device
+from runtime.bundle.shipped import DEFAULT, bundle_path
+from runtime.decoding.decoder import Decoder
+
+
+def test_a_row_that_was_cut_off_is_measured_again(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    assert kept_rows(path) == []
+    for page in range(3):
+        append_row(path, {"page": page})
+    path.write_text(path.read_text() + '{"page": 3, "a')
+    assert [row["page"] for row in kept_rows(path)] == [0, 1, 2]
+    append_row(path, {"page": 3})
+    assert [json.loads(line)["page"] for line in path.read_text().splitlines()] == [0, 1, 2, 3]
+
+
+def test_every_part_of_the_geometry_drifts() -> None:
+    before, after = Device().model_dump(), moved(Device(), np.ones(len(UNITS))).model_dump()
+    changed = {f"{t}.{key}" for t in before for key in before[t] if before[t][key] != after[t][key]}
+    assert changed == set(UNITS)
+    geometry = {"geometry", "in_phase_camera", "quadrature_camera"}
+    assert {f"{t}.{key}" for t in geometry for key in before[t]} <= set(UNITS)
+    assert np.linalg.norm(direction(3)) == pytest.approx(1)
+    assert not np.allclose(direction(3), direction(4))
+
+
+def drift(page: int) -> dict[str, object]:
+    margin = 0.12 - 0.002 * max(0, page)
+    return {"page": page, "lost": "body" if margin <= 0 else "", "figures": {"margin_bits": margin, "unread": 0.0}}
+
+
+def test_the_alarm_is_held_against_the_first_page_whose_margin_is_gone() -> None:
+    rows = [drift(page) for page in range(-25, 70)]
+    told = judged(1, rows)
+    assert told["gone"] == 60
+    assert told["alarm"] == pytest.approx(34, abs=2)
+    assert told["pages_ahead"] == 60 - told["alarm"]
+    assert alarms(rows[:30]) == []
+    assert judged(1, rows[:30])["pages_ahead"] is None
+
+
+def row(page: int, **changes: object) -> dict[str, object]:
+    plain = {"page": page, "air": 6.6, "true_air": 6.6, "lost": "", "failed": False, "due": False, "during": False}
+    return {**plain, "ended": [], "restarted": False, "shift_px": [0.0, 0.1], **changes}
+
+
+def test_the_week_is_summed_up_and_drawn(tmp_path: Path) -> None:
+    rows = [row(page) for page in range(100)]
+    rows[20] = row(20, due=True)
+    rows[50] = row(50, air=1.0, lost="UnconfirmedPageError", shift_px=None)
+    rows[51] = row(51, air=1.0, lost="body", due=True, during=True)
+    rows[52] = row(52, air=6.0, due=True, during=True, ended=["RecalibrationRefusedError"])
+    rows[53] = row(53, during=True, ended=["done"])
+    told = figures_of(rows, 100)
+    assert told["share_of_pages_wanted"] == pytest.approx(0.97)
+    assert (told["recalibrations"], told["refused_or_failed"]) == (1, 1)
+    assert told["pages_from_knock_to_recalibrated"] == 3
+    assert (told["pages_lost"], told["pages_lost_but_for_the_knock"]) == (2, 0)
+    assert (told["alarms"], told["false_alarms"]) == (2, 1)
+    assert (told["failed_requests"], told["human_steps"], told["restarts"]) == (0, 0, 0)
+    draw(rows, tmp_path / "week.png", 50, 300.0)
+    assert (tmp_path / "week.png").stat().st_size > 10_000
+
+
+def test_a_week_begins_as_calibrated_and_is_knocked_in_its_middle() -> None:
+    assert state(0.0, 100) == Device()
+    before, after = state(49.999, 100), state(50.0, 100)
+    assert after.geometry.pipe_angle_deg - before.geometry.pipe_angle_deg == pytest.approx(KNOCK_DEG, abs=1e-4)
+
+
+def test_with_the_true_table_a_drifted_device_is_read_as_well_as_before() -> None:
+    """Takes its seconds: three pages of the bench device."""
+    decoder = Decoder.load(bundle_path(DEFAULT), threads=1)
+    source = DriftingSource(decoder, lambda moment: moved(Device(), moment * direction(1)), seed=1)
+    true_table, found = TrueTable(decoder), list[float]()
+    for moment in (0.0, 3.0):
+        source.moment = moment
+        found.append(true_table.air(source.truth(source.shot().page_index), source.levels))
+    assert found[1] > 0.98 * found[0]
+    assert source.shots == 2
