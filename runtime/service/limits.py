@@ -31,8 +31,8 @@ RECALIBRATION_PAGES = 16
 """Pages that one recalibration reads into memory."""
 
 RECALIBRATION_S = 300.0
-"""One recalibration in its own process. It takes some ten seconds on a bench device and idle cores; beside reads that
-leave it a tenth of one core, as its priority lets them, several times as long."""
+"""One recalibration in its own process. On two cores a bench device's takes 8 s beside an idle service, and 90 s beside
+reads without a pause on both cores, since its priority leaves it what they do not use and a tenth of a core."""
 
 CONCURRENT_RANGES = 4
 """Ranges of pages being read for their bytes: each holds a thread for as long as its caller takes."""
