@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Self
 
+from lightpage import errors as own_errors
 from lightpage.errors import BusyError, LightpageError
 
 
@@ -106,3 +107,11 @@ class UnconfirmedPageError(LostPageError):
         other = super().about(page)
         other.page = self.page
         return other
+
+
+ERRORS: dict[str, type[LightpageError]] = {
+    name: kind
+    for name, kind in {**vars(own_errors), **globals()}.items()
+    if isinstance(kind, type) and issubclass(kind, LightpageError)
+}
+"""Every error by its name, for one that another process has met."""

@@ -19,7 +19,6 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.hardware.private import in_private_network
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
@@ -30,7 +29,7 @@ from runtime.cameras.camera import Frame
 from runtime.cameras.pixel_formats import bit_depth, pack, unpack
 from runtime.cameras.settings import CameraSettings
 from runtime.virtual_device.fake_camera import FakeCamera
-from runtime.virtual_device.namespace import ADDRESSES
+from runtime.virtual_device.namespace import ADDRESSES, go_on_inside
 
 Counts = NDArray[np.unsignedinteger[Any]]
 
@@ -235,7 +234,7 @@ def told(tick: dict[str, float]) -> str:
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(changes: int, pairs: int, shots: int, json_path: Path | None) -> None:
     """Print stale frames, frames that are equal to the byte, shots per second, another thread's ticks, unpacking."""
-    in_private_network("analysis.hardware.cameras")
+    go_on_inside("analysis.hardware.cameras")
     stale = stale_frames(changes)
     click.echo(f"stale frames: {stale['stale']} after {changes} changes to the trigger, {stale['missing']} missing")
     equal = {name: equal_frames(pairs, name) for name in FORMATS}

@@ -17,7 +17,6 @@ from typing import Any
 import click
 import numpy as np
 
-from analysis.hardware.private import in_private_network
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
@@ -36,6 +35,7 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.registry import ModelRegistry
 from runtime.trigger.trigger import Trigger
 from runtime.virtual_device.device import VirtualDevice
+from runtime.virtual_device.namespace import go_on_inside
 
 
 class TimedTrigger:
@@ -94,7 +94,7 @@ def measure(pages: int, folder: Path) -> dict[str, Any]:
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(pages: int, json_path: Path | None) -> None:
     """Print the time from the trigger to a page's user bytes."""
-    in_private_network("analysis.hardware.latency")
+    go_on_inside("analysis.hardware.latency")
     with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
         found = measure(pages, Path(folder))
     given = f"{found['pages_lost']} pages lost, {found['pages_unread']} unread"

@@ -23,7 +23,6 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.hardware.private import in_private_network
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
@@ -38,7 +37,7 @@ from runtime.cameras.settings import CameraSettings
 from runtime.errors import LostShotError, Reason
 from runtime.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
 from runtime.virtual_device.fake_camera import FakeCamera
-from runtime.virtual_device.namespace import ADDRESSES
+from runtime.virtual_device.namespace import ADDRESSES, go_on_inside
 from runtime.virtual_device.pulse_generator import PulseGeneratorEmulator
 from runtime.virtual_device.serial_port import Pty
 
@@ -263,7 +262,7 @@ def shoot(source: CameraSource, stage: Stage, shots: int, share: float, seed: in
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(shots: int, clean_shots: int, faults: float, tolerance: float, seed: int, json_path: Path | None) -> None:
     """Print wrong pairs, losses by fault and reason, and the price of the rule where nothing goes wrong."""
-    in_private_network("analysis.hardware.pairs")
+    go_on_inside("analysis.hardware.pairs")
     small = small_cameras()
     figures: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:

@@ -20,13 +20,13 @@ from typing import Any
 import click
 
 from analysis.hardware.pairs import Stage, small_cameras, source_of
-from analysis.hardware.private import in_private_network
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
 from runtime.acquisition.camera_source import CameraSource
 from runtime.errors import LostShotError, SourceError
+from runtime.virtual_device.namespace import go_on_inside
 
 _AWAY_S = 1.0
 _PATIENCE_S = 30.0
@@ -89,7 +89,7 @@ def unplugged(
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(times: int, json_path: Path | None) -> None:
     """Print how soon a camera, and the serial line, are back in service, and the pages that were lost meanwhile."""
-    in_private_network("analysis.hardware.plugs")
+    go_on_inside("analysis.hardware.plugs")
     figures: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
         stage = Stage(small_cameras(), Path(folder))

@@ -15,15 +15,17 @@ from lightpage.device.profile import Profile, TomlTable, load_profile, validate
 from lightpage.errors import InvalidInputError, ProfileError
 from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.pages import Pages
-from runtime.acquisition.camera_source import CameraSource, Exposures
+from runtime.acquisition.camera_source import CameraSource, Exposures, View
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.pairing import PairingSettings
+from runtime.cameras.aravis import AravisCamera
 from runtime.cameras.camera import Camera
 from runtime.cameras.settings import CameraSettings
 from runtime.modulator.external import ExternalBeams, ExternalModulator
 from runtime.modulator.lookup_table import LookupTable
 from runtime.modulator.modulator import Beams, Modulator
 from runtime.modulator.operator import OperatorBeams
+from runtime.modulator.screen import ScreenModulator
 from runtime.modulator.settings import ScreenSettings
 from runtime.modulator.shutters import Shutter, ShutterBeams
 from runtime.modulator.simulated import SimulatedModulator
@@ -31,8 +33,6 @@ from runtime.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettin
 from runtime.trigger.software import SoftwareTrigger
 from runtime.trigger.trigger import Trigger
 
-Seconds = Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)]
-Frames = Annotated[int, Field(ge=1, le=256)]
 ROLES = ("in_phase", "quadrature")
 
 
@@ -84,51 +84,25 @@ class NoModulatorTable(TomlTable):
     kind: Literal["none"] = "none"
 
 
-class ShutterTable(TomlTable):
-    """A shutter on a channel of the pulse generator."""
-
-    channel: Annotated[int, Field(ge=1, le=8)]
-    open_when: Literal["high", "low"] = "high"
-    settle_s: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.05
-
-
 class ShuttersTable(TomlTable):
     """Shutters in both beams, on channels of the pulse generator."""
 
     kind: Literal["shutters"]
-    signal: ShutterTable
-    reference: ShutterTable
+    signal: Shutter
+    reference: Shutter
 
 
 class ExternalBeamsTable(TomlTable):
     """The controller moves the shutters, and says so over gRPC."""
 
     kind: Literal["external"]
-    timeout_s: Seconds = 10.0
+    timeout_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = 10.0
 
 
 class OperatorTable(TomlTable):
     """Somebody blocks the beams by hand when `lightpage record` asks."""
 
     kind: Literal["operator"] = "operator"
-
-
-class PairingTable(TomlTable):
-    """How strictly frames are told apart; see `PairingSettings`."""
-
-    tolerance_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = PairingSettings.tolerance_s
-    frame_s: Seconds = PairingSettings.frame_s
-    quiet_s: Seconds = PairingSettings.quiet_s
-    spacing_s: Seconds = PairingSettings.spacing_s
-    clock_drift: Annotated[float, Field(gt=0, le=0.01, allow_inf_nan=False)] = PairingSettings.clock_drift
-
-
-class ExposuresTable(TomlTable):
-    """How frames are taken; see `Exposures`."""
-
-    repeats: Annotated[int, Field(ge=0, le=100)] = Exposures.repeats
-    reference_frames: Frames = Exposures.reference_frames
-    dark_frames: Frames = Exposures.dark_frames
 
 
 class DeviceTable(TomlTable):
@@ -157,8 +131,8 @@ class DeviceTable(TomlTable):
     beams: Annotated[
         ShuttersTable | ExternalBeamsTable | SimulatedTable | OperatorTable, Field(discriminator="kind")
     ] = OperatorTable()
-    pairing: PairingTable = PairingTable()
-    exposures: ExposuresTable = ExposuresTable()
+    pairing: PairingSettings = PairingSettings()
+    exposures: Exposures = Exposures()
 
 
 def load_device_table(path: Path) -> DeviceTable:
@@ -194,23 +168,16 @@ class _Builder:
         return first, second
 
     def _camera(self, table: CameraTable, role: str) -> Camera:
-        settings = CameraSettings(**table.model_dump(exclude={"flip_x", "flip_y"}))
-        name = f"{role.replace('_', '-')} camera"
-        if settings.driver == "gentl":
-            raise InvalidInputError(f"{name}: driver", settings.driver, "aravis")
-        from runtime.cameras.aravis import AravisCamera
-
-        return AravisCamera(settings, self.profile.frame_shape, name)
+        return AravisCamera(table, self.profile.frame_shape, f"{role.replace('_', '-')} camera")
 
     def trigger(self, cameras: tuple[Camera, Camera]) -> Trigger:
         """What fires the cameras."""
         table = self.table.trigger
         if isinstance(table, SoftwareTriggerTable):
             return SoftwareTrigger(cameras)
-        settings = PulseGeneratorSettings(**table.model_dump(exclude={"kind"}))
-        if "://" not in settings.port:
-            settings = settings.model_copy(update={"port": str(self.folder / settings.port)})
-        return PulseGenerator(settings)
+        if "://" not in table.port:
+            table = table.model_copy(update={"port": str(self.folder / table.port)})
+        return PulseGenerator(table)
 
     def modulator(self, levels: int) -> Modulator | None:
         """What shows the pages."""
@@ -221,12 +188,9 @@ class _Builder:
             return ExternalModulator()
         if isinstance(table, SimulatedTable):
             return SimulatedModulator(self.folder / table.address)
-        from runtime.modulator.screen import ScreenModulator
-
         path = table.lookup_table
         greys = LookupTable.linear(levels) if path is None else LookupTable.from_file(self.folder / path, levels)
-        settings = ScreenSettings(**table.model_dump(exclude={"kind", "lookup_table"}))
-        return ScreenModulator(settings, self.profile, greys)
+        return ScreenModulator(table, self.profile, greys)
 
     def beams(self, trigger: Trigger) -> Beams:
         """What blocks them."""
@@ -239,10 +203,7 @@ class _Builder:
             return SimulatedModulator(self.folder / table.address)
         if not isinstance(trigger, PulseGenerator):
             raise InvalidInputError("beams", "shutters without a pulse generator", 'trigger kind = "pulse_generator"')
-        signal, reference = (
-            Shutter(shutter.channel, shutter.open_when, shutter.settle_s) for shutter in (table.signal, table.reference)
-        )
-        return ShutterBeams(trigger, signal, reference)
+        return ShutterBeams(trigger, table.signal, table.reference)
 
 
 def open_camera(rest: str) -> CameraSource:
@@ -266,7 +227,7 @@ def open_camera(rest: str) -> CameraSource:
         builder = _Builder(table, path.parent, profile, lambda text: source[0].operator(text))
         cameras = builder.cameras()
         trigger = builder.trigger(cameras)
-        flips = tuple((each.flip_y, each.flip_x) for each in (table.in_phase, table.quadrature))
+        views = [View(each.flip_x, each.flip_y) for each in (table.in_phase, table.quadrature)]
         source.append(
             CameraSource(
                 profile,
@@ -275,8 +236,9 @@ def open_camera(rest: str) -> CameraSource:
                 builder.modulator(store.levels or MAX_LEVELS),
                 builder.beams(trigger),
                 store,
-                PairingSettings(**table.pairing.model_dump()),
-                Exposures(**table.exposures.model_dump(), flips=(flips[0], flips[1])),
+                table.pairing,
+                table.exposures,
+                (views[0], views[1]),
                 f"camera:{path_text}",
             )
         )

@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from lightpage.device.profile import Profile
+from lightpage.device.profile import Profile, TomlTable
 from lightpage.errors import FrameError
 from lightpage.page.symbols import MAX_LEVELS
 from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
@@ -40,20 +41,34 @@ _AGAIN_S = 0.5
 """Between two attempts to reach a device that has gone."""
 
 
-@dataclass(frozen=True)
-class Exposures:
+class Exposures(TomlTable):
     """How frames are taken.
 
     Attributes:
         repeats: further shots of a page whose shot is lost, while it is on display.
         reference_frames, dark_frames: shots that make the mean of each.
-        flips: (vertical, horizontal) of each camera that sees a mirror image, for in-phase and quadrature.
     """
 
-    repeats: int = 1
-    reference_frames: int = 8
-    dark_frames: int = 8
-    flips: tuple[tuple[bool, bool], tuple[bool, bool]] = ((False, False), (False, False))
+    repeats: Annotated[int, Field(ge=0, le=100)] = 1
+    reference_frames: Annotated[int, Field(ge=1, le=256)] = 8
+    dark_frames: Annotated[int, Field(ge=1, le=256)] = 8
+
+
+@dataclass(frozen=True)
+class View:
+    """How a camera sees the image: mirrored or not, as behind one more mirror.
+
+    Attributes:
+        flip_x: left and right are the other way round.
+        flip_y: top and bottom are.
+    """
+
+    flip_x: bool = False
+    flip_y: bool = False
+
+    def upright(self, pixels: Counts) -> Counts:
+        """The frame [row, column] as the modulator has it."""
+        return np.ascontiguousarray(pixels[:: -1 if self.flip_y else 1, :: -1 if self.flip_x else 1])
 
 
 class CameraSource(FrameSource):
@@ -71,7 +86,11 @@ class CameraSource(FrameSource):
         pages: what the modulator shows.
         pairing: how strictly frames are told apart.
         exposures: how they are taken.
+        views: how each camera sees the image.
         name: for people.
+
+    Raises:
+        SourceError: the cameras' bit depths differ.
     """
 
     def __init__(
@@ -84,6 +103,7 @@ class CameraSource(FrameSource):
         pages: PageStore | None = None,
         pairing: PairingSettings | None = None,
         exposures: Exposures | None = None,
+        views: tuple[View, View] = (View(), View()),
         name: str = "camera",
     ) -> None:
         self.name, self.profile = name, profile
@@ -91,7 +111,11 @@ class CameraSource(FrameSource):
         self.modulator = modulator
         self.beams: Beams = beams
         self.pages: PageStore = pages if pages is not None else PageStore(profile)
-        self._cameras, self._trigger = cameras, trigger
+        self._cameras, self._trigger, self._views = cameras, trigger, views
+        depths = [camera.bit_depth for camera in cameras]
+        if depths[0] != depths[1]:
+            raise SourceError(f"{self.name}: cameras", f"{depths[0]} and {depths[1]} bits", "the same for both")
+        self.bit_depth = depths[0]
         self._exposures = exposures or Exposures()
         self._pairing = Pairing(cameras, trigger, pairing or PairingSettings())
         self._lock = threading.RLock()
@@ -104,14 +128,9 @@ class CameraSource(FrameSource):
         self._saturated: dict[str, float] = {}
 
     @property
-    def levels(self) -> int:  # type: ignore[override]
+    def levels(self) -> int:  # type: ignore[override]  # uploads may settle it
         """Level count of its pages; 256 before any page is known."""
         return self.pages.levels or MAX_LEVELS
-
-    @property
-    def bit_depth(self) -> int:  # type: ignore[override]
-        """Bits of a camera count."""
-        return self._cameras[0].bit_depth
 
     def show_pages(self, pages: PageStore) -> None:
         """See `FrameSource.show_pages`."""
@@ -135,9 +154,6 @@ class CameraSource(FrameSource):
             for camera in self._cameras:
                 self._arm(camera, Reason.CAMERA_GONE)
             self._arm(self._trigger, Reason.TRIGGER_GONE)
-            depths = [camera.bit_depth for camera in self._cameras]
-            if depths[0] != depths[1]:
-                raise SourceError(f"{self.name}: cameras", f"{depths[0]} and {depths[1]} bits", "the same for both")
             self._pairing.forget()
             self._armed = self._was_armed = True
 
@@ -283,8 +299,7 @@ class CameraSource(FrameSource):
             raise SourceError(f"{camera.name}: frame", f"{pixels.shape}", f"{self.frame_shape}")
         self._saturated[camera.name] = float(np.count_nonzero(pixels >= full_scale) / pixels.size)
         pixels = pixels.astype(frame_type(self.bit_depth), copy=False)
-        vertical, horizontal = self._exposures.flips[one]
-        pixels = np.ascontiguousarray(pixels[:: -1 if vertical else 1, :: -1 if horizontal else 1])
+        pixels = self._views[one].upright(pixels)
         if self._dark is None:
             return pixels
         return without_black(self._repairs[one](pixels), self._dark[one].black_level, self.bit_depth)

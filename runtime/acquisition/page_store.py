@@ -45,6 +45,12 @@ class PageStore:
         """M of all pages, None before it is known."""
         return self._levels
 
+    @property
+    def code(self) -> str | None:
+        """What the pages of the file hold, JSON text, or None."""
+        with self._lock:
+            return None if self._written is None else self._written.code
+
     def __len__(self) -> int:
         with self._lock:
             return self._in_file + len(self._uploaded)

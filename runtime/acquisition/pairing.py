@@ -22,10 +22,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated, Self
 
+from pydantic import Field, model_validator
+
+from lightpage.device.profile import TomlTable
 from lightpage.recording.layout import FrameInfo
 from runtime.cameras.camera import Camera, Frame, FrameStatus
-from runtime.errors import LostShotError, Reason, SourceError
+from runtime.errors import LostShotError, Reason
 from runtime.trigger.trigger import Trigger
 
 _GAPS = (0.0, 3.0, 7.0)
@@ -39,8 +43,7 @@ _FOLLOWING = 0.1
 """Share of an accepted shot's deviation by which the reference follows."""
 
 
-@dataclass(frozen=True)
-class PairingSettings:
+class PairingSettings(TomlTable):
     """How strictly frames are told apart.
 
     Attributes:
@@ -52,11 +55,17 @@ class PairingSettings:
         clock_drift: relative drift of a camera's clock against this machine's that is allowed for.
     """
 
-    tolerance_s: float = 0.02
-    frame_s: float = 0.5
-    quiet_s: float = 0.15
-    spacing_s: float = 0.06
-    clock_drift: float = 1e-4
+    tolerance_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.02
+    frame_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = 0.5
+    quiet_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 0.15
+    spacing_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 0.06
+    clock_drift: Annotated[float, Field(gt=0, le=0.01, allow_inf_nan=False)] = 1e-4
+
+    @model_validator(mode="after")
+    def _tells_shots_apart(self) -> Self:
+        if self.spacing_s < (least := 2.5 * self.tolerance_s):
+            raise ValueError(f"spacing_s is at least {least:g}, 2.5 tolerances")
+        return self
 
     @property
     def expires_s(self) -> float:
@@ -107,9 +116,6 @@ class Pairing:
     settings: PairingSettings = field(default_factory=PairingSettings)
 
     def __post_init__(self) -> None:
-        least = 2.5 * self.settings.tolerance_s
-        if self.settings.spacing_s < least:
-            raise SourceError("pairing: spacing_s", self.settings.spacing_s, f"at least {least:g}, 2.5 tolerances")
         self._channels = [_Channel(camera) for camera in self.cameras]
         self._referenced_at = -float("inf")
         self._next_at = -float("inf")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -15,10 +14,9 @@ class CameraSettings(BaseModel):
     """One camera: which, and every setting that a frame depends on.
 
     Attributes:
-        driver: ``aravis`` for GigE Vision and USB3 Vision; ``gentl`` for a maker's GenTL producer.
+        driver: ``aravis``, for GigE Vision and USB3 Vision.
         serial: number of the camera; either this or `address`.
         address: IP address or host name of a GigE camera.
-        producer: the producer's .cti file; for ``gentl`` alone.
         pixel_format: as GenICam names it.
         exposure_us: exposure time in microseconds.
         gain_db: gain in dB, in the camera's own steps where it knows no dB; None leaves it as it is.
@@ -33,10 +31,9 @@ class CameraSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    driver: Literal["aravis", "gentl"] = "aravis"
+    driver: Literal["aravis"] = "aravis"
     serial: str | None = Field(default=None, min_length=1)
     address: str | None = Field(default=None, min_length=1)
-    producer: Path | None = None
     pixel_format: str = "Mono8"
     exposure_us: float = Field(default=10_000.0, gt=0, allow_inf_nan=False)
     gain_db: float | None = Field(default=None, ge=0, allow_inf_nan=False)
@@ -60,8 +57,6 @@ class CameraSettings(BaseModel):
     def _one_camera(self) -> Self:
         if (self.serial is None) == (self.address is None):
             raise ValueError("give either serial or address")
-        if (self.driver == "gentl") != (self.producer is not None):
-            raise ValueError("driver gentl needs producer, and no other driver takes one")
         return self
 
     @property

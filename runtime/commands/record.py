@@ -71,7 +71,7 @@ def record(
         if not count:
             raise InvalidInputError("options", "neither --pages nor pages to show", "one of them")
         with source:
-            _record(source, profile, count, out, shot_seconds, dark, symbols, json_path)
+            _record(source, profile, count, out, shot_seconds, dark, json_path)
     finally:
         source.close()
 
@@ -83,17 +83,14 @@ def _record(
     out: Path,
     shot_seconds: float,
     dark: bool,
-    symbols: Path | None,
     json_path: Path | None,
 ) -> None:
+    """Record pages of a source that is armed; see `record`."""
     dark_frames = source.dark_frames() if dark else None
     references = source.references()
     if references is None:
         raise InvalidInputError(f"source {source.name}", "no reference frames", "a source that can block its signal")
-    code = None
-    if symbols is not None:
-        with Pages.open(symbols) as written:
-            code = written.code
+    code = None if source.pages is None else source.pages.code
     losses: list[LostShot] = []
     repeated = 0
     begun = time.perf_counter()
@@ -115,22 +112,21 @@ def _record(
             shot, attempts = _good_shot(source, index, shot_seconds)
             repeated += attempts - 1
             writer.append(shot.symbols, shot.pair, infos=shot.infos)
-    seconds = time.perf_counter() - begun
+    by_reason = Counter(loss.reason for loss in losses)
     figures = {
         "pages": count,
         "pages_recorded_now": count - first,
         "pages_repeated": repeated,
         "shots_lost": len(losses),
-        "losses": dict(Counter(loss.reason for loss in losses)),
+        "losses": dict(by_reason),
         "shots": dict(source.shots_by_outcome()),
         "saturated_shares": dict(source.saturated_shares()),
         "hot_pixels": None if dark_frames is None else [len(one.hot) for one in dark_frames],
         "black_levels": None if dark_frames is None else [one.black_level for one in dark_frames],
-        "seconds": seconds,
+        "seconds": time.perf_counter() - begun,
     }
     if json_path is not None:
         write_json(json_path, figures)
-    by_reason = Counter(loss.reason for loss in losses)
     told = ", ".join(f"{times} {reason}" for reason, times in sorted(by_reason.items()))
     click.echo(
         f"{out}: {count} pages of {source.levels} levels; {len(losses)} shots lost{f' ({told})' if told else ''}"

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
-import sys
+import signal
+import subprocess
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import click
@@ -11,11 +14,12 @@ import click
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, load_device
-from runtime.commands.serve import stop_signals
+from lightpage.errors import InvalidInputError
 from runtime.virtual_device.device import VirtualDevice
-from runtime.virtual_device.namespace import enter, require
+from runtime.virtual_device.namespace import go_on_inside
 
-_PRIVATE = "LIGHTPAGE_PRIVATE_NETWORK"
+_END_S = 10.0
+"""Time that the command gets to end once it has been told to."""
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
@@ -45,21 +49,35 @@ def virtual_device(
     so does COMMAND, which is started there once the device is ready; the device ends with it. Without COMMAND a shell
     is started.
     """
-    if os.environ.get(_PRIVATE) != "1":
-        require()
-        argv = enter([sys.executable, "-m", "lightpage.cli.main", *sys.argv[1:]])
-        os.execvpe(argv[0], argv, {**os.environ, _PRIVATE: "1"})
+    go_on_inside("lightpage.cli.main")
     out.mkdir(parents=True, exist_ok=True)
     device = (load_device(device_file) if device_file else Device()).with_settings(list(settings))
-    with (
-        stop_signals(),
-        VirtualDevice(load_profile(profile_name), device, out, seed, pixel_format, black_level, hot_pixels) as running,
-    ):
-        click.echo(f"simulated device at camera:{running.config}")
-        status = os.spawnvp(os.P_WAIT, *_started(command or (os.environ.get("SHELL", "/bin/sh"),)))
+    with VirtualDevice(load_profile(profile_name), device, out, seed, pixel_format, black_level, hot_pixels) as running:
+        click.echo(f"simulated device at camera:{running.config}", err=True)
+        status = _run(command or (os.environ.get("SHELL", "/bin/sh"),))
         running.check()
-    click.get_current_context().exit(status if status >= 0 else 128 - status)
+    click.get_current_context().exit(status)
 
 
-def _started(command: tuple[str, ...]) -> tuple[str, list[str]]:
-    return command[0], list(command)
+def _run(command: Sequence[str]) -> int:
+    """Run a command to its end, and return its exit status as shells have it; SIGTERM ends it too.
+
+    Raises:
+        InvalidInputError: there is no such command.
+    """
+    try:
+        process = subprocess.Popen(command)
+    except OSError as error:
+        raise InvalidInputError(f"command {command[0]}", error, "a command that can be started") from None
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the command by itself
+    try:
+        status = process.wait()
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if process.poll() is None:
+            process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(_END_S)
+            process.kill()
+            process.wait()
+    return status if status >= 0 else 128 - status

@@ -3,43 +3,31 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
+from pydantic import Field
+
+from lightpage.device.profile import TomlTable
 from lightpage.errors import InvalidInputError, LightpageError
 from runtime.errors import LostShotError, Reason
-from runtime.trigger.pulse_generator import PulseGenerator
+from runtime.trigger.pulse_generator import Channel, PulseGenerator
 
 _log = logging.getLogger(__name__)
 
-LONGEST_SETTLE_S = 10.0
 
-
-@dataclass(frozen=True)
-class Shutter:
-    """A shutter on a channel.
+class Shutter(TomlTable):
+    """A shutter on a channel of the pulse generator.
 
     Attributes:
-        channel: of the pulse generator, 1 is channel A; none that triggers a camera.
+        channel: 1 is channel A; none that triggers a camera.
         open_when: level at which it is open: ``high`` while the channel is on, ``low`` while it is off.
         settle_s: it has moved after this.
-
-    Raises:
-        InvalidInputError: a value is out of range.
     """
 
-    channel: int
+    channel: Channel
     open_when: Literal["high", "low"] = "high"
-    settle_s: float = 0.05
-
-    def __post_init__(self) -> None:
-        if self.open_when not in ("high", "low"):
-            raise InvalidInputError(f"shutter on channel {self.channel}: open_when", self.open_when, "high or low")
-        if not (math.isfinite(self.settle_s) and 0 <= self.settle_s <= LONGEST_SETTLE_S):
-            subject = f"shutter on channel {self.channel}: settle_s"
-            raise InvalidInputError(subject, self.settle_s, f"0 to {LONGEST_SETTLE_S:g} s")
+    settle_s: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.05
 
 
 class ShutterBeams:

@@ -10,23 +10,16 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
-from lightpage import errors as known_errors
 from lightpage.errors import LightpageError
 from lightpage.recording.reader import FramePair
-from runtime import errors as runtime_errors
 from runtime.bundle.bundle import Bundle, write_bundle
 from runtime.decoding.tracking import TrackerMemory
+from runtime.errors import ERRORS
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome
 
 _BUNDLE, _PAGES, _JOB, _RESULT = "bundle.zip", "pages.npz", "job.json", "result.json"
 
-_ERRORS: dict[str, type[LightpageError]] = {
-    name: kind
-    for module in (known_errors, runtime_errors)
-    for name, kind in vars(module).items()
-    if isinstance(kind, type) and issubclass(kind, LightpageError)
-}
 _OUTCOME = TypeAdapter(RecalibrationOutcome)
 
 
@@ -125,7 +118,7 @@ class WorkFolder:
         except FileNotFoundError:
             return None
         if (told := result.get("error")) is not None:
-            raise _ERRORS[told["kind"]](told["subject"], told["got"], told["expected"])
+            raise ERRORS[told["kind"]](told["subject"], told["got"], told["expected"])
         return _OUTCOME.validate_python(result["outcome"])
 
 

@@ -200,11 +200,14 @@ class DataPlane:
             levels = levels_for(model.decoder, levels, MAX_LEVELS, user_data)
             if user_data:
                 pilots = pilots or model.decoder.written_pilots(levels)
-            seen = Seen("frame pair", None, model.version, tells=sure, pair=pair)
+            subject = "frame pair"
+            seen = Seen(subject, None, model.version)
+            seen.note(tells=sure, pair=pair)
             with observed(self.observers, seen):
                 with self._optics(user_data):
-                    seen.page = page = self._decode(model, pair, levels, pilots, seen.subject, sure=sure)
-                seen.user_data = found = self._user_data(model, page) if user_data else None
+                    page = self._decode(model, pair, levels, pilots, subject, sure=sure)
+                found = self._user_data(model, page) if user_data else None
+                seen.note(page=page, user_data=found)
         return Answer(page, model.version, received - start, time.perf_counter() - start, found, self._due)
 
     def read_page(
@@ -240,9 +243,9 @@ class DataPlane:
             with observed(self.observers, seen):
                 found = self._shot(source, page, caller, user_data)
                 received = time.perf_counter()
-                seen.subject, seen.page_index = f"page {found.page_index} of {source.name}", found.page_index
-                seen.pair, seen.infos, seen.levels = found.pair, found.infos, source.levels
-                seen.symbols, seen.pilot_mask = found.symbols, found.pilot_mask
+                subject = f"page {found.page_index} of {source.name}"
+                seen.note(subject=subject, page_index=found.page_index, levels=source.levels)
+                seen.note(pair=found.pair, infos=found.infos, symbols=found.symbols, pilot_mask=found.pilot_mask)
                 mask = self._mask(found, model.decoder)
                 levels = levels_for(model.decoder, levels, source.levels, user_data)
                 if user_data and not np.array_equal(mask, model.decoder.bundle.pilot_mask):
@@ -253,9 +256,10 @@ class DataPlane:
                 else:
                     own = model.decoder
                     pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
-                with own_fault(f"{seen.subject}: "), self._optics(user_data):
-                    seen.page = decoded = self._decode(model, found.pair, levels, pilots, seen.subject)
-                seen.user_data = data = self._user_data(model, decoded, expected) if user_data else None
+                with own_fault(f"{subject}: "), self._optics(user_data):
+                    decoded = self._decode(model, found.pair, levels, pilots, subject)
+                data = self._user_data(model, decoded, expected) if user_data else None
+                seen.note(page=decoded, user_data=data)
         answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start, data, self._due)
         return ReadAnswer(answer, found, mask)
 

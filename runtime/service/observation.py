@@ -6,8 +6,8 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,22 +91,25 @@ class Observer(Protocol):
         """Take note of a page."""
 
 
-@dataclass
 class Seen:
-    """What becomes known of a page while it is read and decoded; the fields of `Observation`."""
+    """What becomes known of a page while it is read and decoded.
 
-    subject: str
-    page_index: int | None
-    model_version: str
-    tells: bool = True
-    pair: FramePair | None = None
-    infos: tuple[FrameInfo, FrameInfo] | None = None
-    page: DecodedPage | None = None
-    user_data: PageBytes | None = None
-    levels: int | None = None
-    symbols: NDArray[np.uint8] | None = None
-    pilot_mask: NDArray[np.bool_] | None = None
-    begun: float = field(default_factory=time.perf_counter)
+    Args:
+        subject, page_index, model_version: see `Observation`.
+    """
+
+    def __init__(self, subject: str, page_index: int | None, model_version: str) -> None:
+        self.observation = Observation(subject, page_index, model_version, time.time(), 0.0)
+        self._begun = time.perf_counter()
+
+    def note(self, **known: Any) -> None:
+        """Take in fields of `Observation`."""
+        self.observation = replace(self.observation, **known)
+
+    def ended(self, lost: Reason | None, detail: str) -> Observation:
+        """The observation of the page, which was given out or lost now."""
+        seconds = time.perf_counter() - self._begun
+        return replace(self.observation, time_s=time.time(), seconds=seconds, lost=lost, detail=detail)
 
 
 @contextmanager
@@ -120,7 +123,7 @@ def observed(observers: Sequence[Observer], seen: Seen) -> Iterator[Seen]:
         yield seen
     except LostPageError as error:
         if isinstance(error, UnconfirmedPageError):
-            seen.page = unconfirmed_page(error)
+            seen.note(page=unconfirmed_page(error))
         _tell(observers, seen, error.reason, str(error))
         raise
     except SourceError as error:
@@ -133,25 +136,9 @@ def observed(observers: Sequence[Observer], seen: Seen) -> Iterator[Seen]:
 def _tell(observers: Sequence[Observer], seen: Seen, lost: Reason | None, detail: str) -> None:
     if not observers:
         return
-    observation = Observation(
-        subject=seen.subject,
-        page_index=seen.page_index,
-        model_version=seen.model_version,
-        time_s=time.time(),
-        seconds=time.perf_counter() - seen.begun,
-        lost=lost,
-        detail=detail,
-        tells=seen.tells,
-        pair=seen.pair,
-        infos=seen.infos,
-        page=seen.page,
-        user_data=seen.user_data,
-        levels=seen.levels,
-        symbols=seen.symbols,
-        pilot_mask=seen.pilot_mask,
-    )
+    observation = seen.ended(lost, detail)
     for observer in observers:
         try:
             observer.observe(observation)
         except Exception:
-            _log.exception("%s could not take note of %s", type(observer).__name__, seen.subject)
+            _log.exception("%s could not take note of %s", type(observer).__name__, observation.subject)

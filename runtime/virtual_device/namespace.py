@@ -19,6 +19,8 @@ from collections.abc import Sequence
 
 from runtime.errors import SourceError
 
+INSIDE = "LIGHTPAGE_PRIVATE_NETWORK"
+"""Environment variable that is 1 in a private network."""
 ADDRESSES = ("127.0.0.1", "127.0.0.2")
 """Of the in-phase and the quadrature camera."""
 _SUBJECT = "private network"
@@ -43,10 +45,23 @@ def available() -> str | None:
 
 
 def enter(argv: Sequence[str]) -> list[str]:
-    """The command line that runs `argv` in a private network; it ends with whoever started it ends."""
+    """The command line that becomes `argv` in a private network: signals to its process reach `argv`."""
     user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
     inside = [sys.executable, "-m", "runtime.virtual_device.namespace", *argv]
-    return ["unshare", *user, "--net", "--fork", "--kill-child", "--", *inside]
+    return ["unshare", *user, "--net", "--", *inside]
+
+
+def go_on_inside(module: str) -> None:
+    """Become `python -m MODULE` with this process's arguments in a private network, unless this is one already.
+
+    Raises:
+        SourceError: the kernel forbids it.
+    """
+    if os.environ.get(INSIDE) == "1":
+        return
+    require()
+    argv = enter([sys.executable, "-m", module, *sys.argv[1:]])
+    os.execvpe(argv[0], argv, {**os.environ, INSIDE: "1"})
 
 
 def require() -> None:

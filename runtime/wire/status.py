@@ -7,7 +7,6 @@ from typing import Any
 
 import grpc
 
-from lightpage import errors
 from lightpage.errors import (
     BundleError,
     BusyError,
@@ -18,8 +17,16 @@ from lightpage.errors import (
     LostDataError,
     RecalibrationRefusedError,
 )
-from runtime import errors as service_errors
-from runtime.errors import CallerLeft, LostPageError, Reason, SlotsTakenError, SourceError, StoppingError, WorkerError
+from runtime.errors import (
+    ERRORS,
+    CallerLeft,
+    LostPageError,
+    Reason,
+    SlotsTakenError,
+    SourceError,
+    StoppingError,
+    WorkerError,
+)
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 DETAIL_KEY = "lightpage-error-bin"
@@ -40,12 +47,6 @@ _CODES: tuple[tuple[type[BaseException], grpc.StatusCode], ...] = (
     (CallerLeft, grpc.StatusCode.CANCELLED),
     (grpc.RpcError, grpc.StatusCode.CANCELLED),  # raised while reading a request whose sender has gone
 )
-
-_BY_NAME: dict[str, type[LightpageError]] = {
-    name: kind
-    for name, kind in {**vars(errors), **vars(service_errors)}.items()
-    if isinstance(kind, type) and issubclass(kind, LightpageError)
-}
 
 _REASONS: dict[Reason, Any] = {reason: pb.LossReason.Value(f"LOSS_REASON_{reason}") for reason in Reason}
 
@@ -96,7 +97,7 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
     for key, value in call.trailing_metadata() or ():
         if key == DETAIL_KEY:
             detail = pb.ErrorDetail.FromString(value)
-            kind, told = _BY_NAME.get(detail.kind, LightpageError), (detail.thing, detail.got, detail.wanted)
+            kind, told = ERRORS.get(detail.kind, LightpageError), (detail.thing, detail.got, detail.wanted)
             if issubclass(kind, LostPageError):
                 return kind(*told, _reason(detail.reason), detail.recalibration_due)
             return kind(*told)

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.own_network
 
 
 def test_figures_of_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "in_private_network", lambda module: None)  # the test is in one
+    monkeypatch.setattr(cameras, "go_on_inside", lambda module: None)  # the test is in one
     monkeypatch.setattr(cameras, "_FULL", (128, 128))
     arguments = f"--changes 3 --pairs 3 --shots 3 --json {tmp_path}/cameras.json"
     CliRunner().invoke(cameras.main, arguments.split(), standalone_mode=False, catch_exceptions=False)

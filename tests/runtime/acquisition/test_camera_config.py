@@ -39,7 +39,7 @@ def test_the_example_of_the_documents_is_a_whole_device() -> None:
     assert source.frame_shape == (3648, 5472)
     assert isinstance(source.modulator, ScreenModulator)
     assert isinstance(source.beams, ShutterBeams)
-    assert source._exposures.flips == ((False, False), (False, True))
+    assert [view.flip_x for view in source._views] == [False, True]
     source.pages.close()
 
 

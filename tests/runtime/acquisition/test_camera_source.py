@@ -13,7 +13,7 @@ from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError, LimitError, PageError
 from lightpage.recording.pages import Pages, PagesWriter
 from runtime.acquisition import page_store
-from runtime.acquisition.camera_source import CameraSource, Exposures
+from runtime.acquisition.camera_source import CameraSource, Exposures, View
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.pairing import PairingSettings
 from runtime.errors import LostShotError, Reason, SourceError
@@ -66,7 +66,9 @@ def pages_of(tmp_path: Path, count: int = 3) -> Path:
     return path
 
 
-def source_of(lab: Lab, pages: PageStore, **exposures: object) -> tuple[CameraSource, LabModulator]:
+def source_of(
+    lab: Lab, pages: PageStore, views: tuple[View, View] = (View(), View()), **exposures: int
+) -> tuple[CameraSource, LabModulator]:
     modulator = LabModulator(lab, toy.ToyDevice())
     source = CameraSource(
         toy.PROFILE,
@@ -76,7 +78,8 @@ def source_of(lab: Lab, pages: PageStore, **exposures: object) -> tuple[CameraSo
         modulator,
         pages,
         PAIRING,
-        Exposures(**exposures),  # type: ignore[arg-type]
+        Exposures(**exposures),
+        views,
         "camera:lab",
     )
     return source, modulator
@@ -191,7 +194,7 @@ def test_references_and_dark_frames_block_their_beams(tmp_path: Path) -> None:
 def test_mirrored_cameras_are_set_upright(tmp_path: Path) -> None:
     lab = Lab()
     pages = PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path)))
-    source, modulator = source_of(lab, pages, flips=((False, True), (True, False)))
+    source, modulator = source_of(lab, pages, (View(flip_x=True), View(flip_y=True)))
     with source:
         shot = source.shot(page=0)
         assert (shot.pair.in_phase == modulator.pair.in_phase[:, ::-1]).all()

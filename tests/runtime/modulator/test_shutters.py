@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from lightpage.errors import InvalidInputError
 from runtime.errors import LostShotError, Reason
@@ -15,7 +16,7 @@ from runtime.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettin
 from runtime.virtual_device.pulse_generator import PulseGeneratorEmulator
 from runtime.virtual_device.serial_port import Pty
 
-SIGNAL, REFERENCE = Shutter(3, "high", 0.01), Shutter(4, "low", 0.0)
+SIGNAL, REFERENCE = Shutter(channel=3, settle_s=0.01), Shutter(channel=4, open_when="low", settle_s=0.0)
 
 
 class Lab:
@@ -86,10 +87,10 @@ def test_a_generator_that_has_gone(lab: Lab) -> None:
 
 def test_what_makes_no_sense(lab: Lab) -> None:
     with pytest.raises(InvalidInputError, match="channel 3 for both"):
-        ShutterBeams(lab.generator, SIGNAL, Shutter(3))
-    with pytest.raises(InvalidInputError, match="settle_s"):
-        Shutter(3, "high", float("nan"))
-    with pytest.raises(InvalidInputError, match="open_when"):
-        Shutter(3, "up")  # type: ignore[arg-type]
+        ShutterBeams(lab.generator, SIGNAL, Shutter(channel=3))
+    with pytest.raises(ValidationError, match="settle_s"):
+        Shutter(channel=3, settle_s=float("nan"))
+    with pytest.raises(ValidationError, match="open_when"):
+        Shutter(channel=3, open_when="up")  # type: ignore[arg-type]
     with pytest.raises(InvalidInputError, match="cameras"):
-        ShutterBeams(lab.generator, Shutter(1), REFERENCE).let_through(signal=True, reference=True)
+        ShutterBeams(lab.generator, Shutter(channel=1), REFERENCE).let_through(signal=True, reference=True)

@@ -44,7 +44,7 @@ def external(lab: Lab) -> tuple[CameraSource, LabModulator]:
         PageStore(toy.PROFILE),
         PAIRING,
         Exposures(reference_frames=1),
-        "camera:lab",
+        name="camera:lab",
     )
     source.arm()
     return source, stage
