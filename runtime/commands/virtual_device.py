@@ -11,6 +11,7 @@ from pathlib import Path
 
 import click
 
+from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.paths import OutputFolder
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, load_device
@@ -50,13 +51,15 @@ def virtual_device(
     is started.
     """
     go_on_inside("lightpage.cli.main")
+    context = click.get_current_context()
+    context.meta[RESUME_KEY] = "the simulated device has ended, and its command with it"
     out.mkdir(parents=True, exist_ok=True)
     device = (load_device(device_file) if device_file else Device()).with_settings(list(settings))
     with VirtualDevice(load_profile(profile_name), device, out, seed, pixel_format, black_level, hot_pixels) as running:
         click.echo(f"simulated device at camera:{running.config}", err=True)
         status = _run(command or (os.environ.get("SHELL", "/bin/sh"),))
         running.check()
-    click.get_current_context().exit(status)
+    context.exit(status)
 
 
 def _run(command: Sequence[str]) -> int:
