@@ -61,7 +61,7 @@ FROM build AS build-camera
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[screen]'
+    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[camera,screen]'
 
 FROM runtime AS camera
 USER 0:0

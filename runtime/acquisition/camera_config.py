@@ -20,6 +20,7 @@ from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.pairing import PairingSettings
 from runtime.cameras.aravis import AravisCamera
 from runtime.cameras.camera import Camera
+from runtime.cameras.gentl import GenTLCamera
 from runtime.cameras.settings import CameraSettings
 from runtime.modulator.external import ExternalBeams, ExternalModulator
 from runtime.modulator.lookup_table import LookupTable
@@ -168,7 +169,11 @@ class _Builder:
         return first, second
 
     def _camera(self, table: CameraTable, role: str) -> Camera:
-        return AravisCamera(table, self.profile.frame_shape, f"{role.replace('_', '-')} camera")
+        role = f"{role.replace('_', '-')} camera"
+        if table.producer is None:
+            return AravisCamera(table, self.profile.frame_shape, role)
+        producer = str((self.folder / table.producer).resolve())
+        return GenTLCamera(table.model_copy(update={"producer": producer}), self.profile.frame_shape, role)
 
     def trigger(self, cameras: tuple[Camera, Camera]) -> Trigger:
         """What fires the cameras."""

@@ -19,16 +19,11 @@ from runtime.cameras.camera import Frame, FrameStatus
 from runtime.cameras.gige_network import receive_buffer_problem
 from runtime.cameras.pixel_formats import bit_depth, pixel_format, unpack
 from runtime.cameras.settings import CameraSettings
+from runtime.cameras.sfnc import MOST_DRAINING_S, QUIET_S, SIGN_OF_LIFE_S
 from runtime.errors import LostShotError, Reason, SourceError
 
 _log = logging.getLogger(__name__)
 
-_QUIET_S = 0.02
-"""No frame for so long after the start: those from before are out."""
-_MOST_DRAINING_S = 0.5
-"""A trigger that never rests is not waited for any longer."""
-_SIGN_OF_LIFE_S = 0.05
-"""A camera that sends no frame for so long is asked whether it is there."""
 _RECENTLY_S = 0.5
 """A camera that answered so lately is not asked again before a command: the driver waits for seconds for one that is
 gone, and asking takes time from the command."""
@@ -139,7 +134,7 @@ class AravisCamera:
         else:
             buffer = library("arv_stream_try_pop_buffer", stream)
         if buffer is None:
-            if connection.control_lost or (timeout_s >= _SIGN_OF_LIFE_S and connection.gone()):
+            if connection.control_lost or (timeout_s >= SIGN_OF_LIFE_S and connection.gone()):
                 raise self._lose("no answer")
             return None
         self._answered_at = time.monotonic()
@@ -206,9 +201,9 @@ class AravisCamera:
 
     def _drain(self) -> None:
         """Drop frames from before: those that a free run left would pass for triggered ones."""
-        library, give_up = aravis(), time.monotonic() + _MOST_DRAINING_S
+        library, give_up = aravis(), time.monotonic() + MOST_DRAINING_S
         while time.monotonic() < give_up:
-            buffer = library("arv_stream_timeout_pop_buffer", self._stream, int(1e6 * _QUIET_S))
+            buffer = library("arv_stream_timeout_pop_buffer", self._stream, int(1e6 * QUIET_S))
             if buffer is None:
                 return
             library("arv_stream_push_buffer", self._stream, buffer)

@@ -13,15 +13,18 @@ from runtime.cameras.aravis_library import RANGE_CHECK_ENABLE, SOCKET_BUFFER_AUT
 from runtime.cameras.gige_network import route_mtu
 from runtime.cameras.pixel_formats import pixel_format
 from runtime.cameras.settings import CameraSettings
+from runtime.cameras.sfnc import (
+    AUTOMATIC,
+    BLACK_LEVEL_TOLERANCE,
+    EXPOSURE_TOLERANCE,
+    FRAME_SELECTORS,
+    GAIN_TOLERANCE_DB,
+    OTHER_SELECTORS,
+    SWITCHED_OFF,
+    describe_region,
+    frame_numbers,
+)
 from runtime.errors import SourceError
-
-_SELECTORS = ("FrameStart", "FrameBurstStart")
-"""Triggers that start a frame, the better one first."""
-_OTHER_SELECTORS = ("AcquisitionStart", "AcquisitionEnd", "FrameEnd", "FrameActive", "ExposureStart", "LineStart")
-_EXPOSURE_TOLERANCE = 0.05
-"""Cameras expose for whole lines of the sensor."""
-_GAIN_TOLERANCE_DB = 0.1
-_BLACK_LEVEL_TOLERANCE = 0.5
 
 
 @dataclass
@@ -55,16 +58,16 @@ class AravisSetup:
         """Set all that a frame depends on but its trigger, which is switched off."""
         settings = self.settings
         self._do("set_range_check_policy", RANGE_CHECK_ENABLE)
-        for selector in (*_OTHER_SELECTORS, *_SELECTORS):
+        for selector in (*OTHER_SELECTORS, *FRAME_SELECTORS):
             if self._has_entry("TriggerSelector", selector):
                 self._set_string("TriggerSelector", selector)
                 self._set_string("TriggerMode", "Off")
         self._set_string("AcquisitionMode", "Continuous")
-        for feature in ("ChunkModeActive", "AcquisitionFrameRateEnable"):
+        for feature in SWITCHED_OFF:
             if self._has(feature):
                 with self._setting(feature, "off"):
                     self._do("set_boolean", feature.encode(), 0)
-        for feature in ("ExposureAuto", "GainAuto", "BlackLevelAuto"):
+        for feature in AUTOMATIC:
             if self._has(feature):
                 self._set_string(feature, "Off")
         rows, columns = self.frame_shape
@@ -116,7 +119,7 @@ class AravisSetup:
     def set_trigger(self) -> None:
         """Set the trigger; last of all, for some settings switch it off again."""
         settings = self.settings
-        selector = next((name for name in _SELECTORS if self._has_entry("TriggerSelector", name)), None)
+        selector = next((name for name in FRAME_SELECTORS if self._has_entry("TriggerSelector", name)), None)
         if selector is not None:
             self._set_string("TriggerSelector", selector)
         self._set_string("TriggerSource", settings.trigger_source)
@@ -143,17 +146,17 @@ class AravisSetup:
         with self._setting("region", self._region()):
             self._do("get_region", *map(byref, corners))
         x, y, columns, rows = (corner.value for corner in corners)
-        self._compare("region", _region(x, y, columns, rows), self._region())
+        self._compare("region", describe_region(x, y, columns, rows), self._region())
         if self.connection.is_gige:
             with self._setting("packet_bytes", self._packet_bytes):
                 got = self._do("gv_get_packet_size")
             self._compare("packet_bytes", got, self._packet_bytes)
         if settings.gain_db is not None:
-            self._check_number("gain_db", "get_gain", settings.gain_db, _GAIN_TOLERANCE_DB)
+            self._check_number("gain_db", "get_gain", settings.gain_db, GAIN_TOLERANCE_DB)
         if settings.black_level_counts is not None:
             level = settings.black_level_counts
-            self._check_number("black_level_counts", "get_black_level", level, _BLACK_LEVEL_TOLERANCE)
-        tolerance = _EXPOSURE_TOLERANCE * settings.exposure_us
+            self._check_number("black_level_counts", "get_black_level", level, BLACK_LEVEL_TOLERANCE)
+        tolerance = EXPOSURE_TOLERANCE * settings.exposure_us
         return 1e-6 * self._check_number("exposure_us", "get_exposure_time", settings.exposure_us, tolerance)
 
     @property
@@ -162,13 +165,9 @@ class AravisSetup:
         return self._packet_bytes
 
     def frame_numbers(self) -> int:
-        """The largest number of a frame: 16 bits of a GigE camera without extended block ids, else 64."""
-        if not self.connection.is_gige:
-            return 2**64 - 1
-        mode = b"Off"
-        if self._has("GevGVSPExtendedIDMode"):
-            mode = self._do("get_string", b"GevGVSPExtendedIDMode")
-        return 2**64 - 1 if mode == b"On" else 2**16 - 1
+        """See `sfnc.frame_numbers`."""
+        extended = self._has("GevGVSPExtendedIDMode") and self._do("get_string", b"GevGVSPExtendedIDMode") == b"On"
+        return frame_numbers(self.connection.is_gige, extended)
 
     def start(self) -> None:
         """Start the acquisition; from here on a trigger makes a frame."""
@@ -207,7 +206,7 @@ class AravisSetup:
 
     def _region(self) -> str:
         rows, columns = self.frame_shape
-        return _region(self.settings.offset_x_px, self.settings.offset_y_px, columns, rows)
+        return describe_region(self.settings.offset_x_px, self.settings.offset_y_px, columns, rows)
 
     @contextmanager
     def _setting(self, setting: str, expected: object) -> Iterator[None]:
@@ -218,7 +217,3 @@ class AravisSetup:
             if says_gone(error):
                 raise
             raise SourceError(f"{self.name}: {setting}", error.message, expected) from None
-
-
-def _region(x: int, y: int, columns: int, rows: int) -> str:
-    return f"{columns} x {rows} pixels at ({x}, {y})"

@@ -14,9 +14,11 @@ class CameraSettings(BaseModel):
     """One camera: which, and every setting that a frame depends on.
 
     Attributes:
-        driver: ``aravis``, for GigE Vision and USB3 Vision.
+        driver: ``aravis``, for GigE Vision and USB3 Vision; ``gentl``, for whatever the camera's maker has a GenTL
+            producer for.
+        producer: file of that producer, ``*.cti``.
         serial: number of the camera; either this or `address`.
-        address: IP address or host name of a GigE camera.
+        address: IP address or host name of a GigE camera; of ``aravis`` only.
         pixel_format: as GenICam names it.
         exposure_us: exposure time in microseconds.
         gain_db: gain in dB, in the camera's own steps where it knows no dB; None leaves it as it is.
@@ -25,13 +27,15 @@ class CameraSettings(BaseModel):
         offset_y_px: first row of it.
         trigger_source: where the trigger comes in, as the camera names it, e.g. ``Line0``; ``Software`` for a command.
         trigger_activation: which edge triggers, as the camera names it.
-        packet_bytes: size of a GigE packet, headers included; None for what camera and network agree on.
+        packet_bytes: size of a GigE packet, headers included; None for what camera and network agree on. A producer
+            chooses by itself.
         buffers: frames that may wait in this machine.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    driver: Literal["aravis"] = "aravis"
+    driver: Literal["aravis", "gentl"] = "aravis"
+    producer: str | None = Field(default=None, min_length=1)
     serial: str | None = Field(default=None, min_length=1)
     address: str | None = Field(default=None, min_length=1)
     pixel_format: str = "Mono8"
@@ -57,6 +61,18 @@ class CameraSettings(BaseModel):
     def _one_camera(self) -> Self:
         if (self.serial is None) == (self.address is None):
             raise ValueError("give either serial or address")
+        return self
+
+    @model_validator(mode="after")
+    def _of_its_driver(self) -> Self:
+        if self.driver == "aravis" and self.producer is not None:
+            raise ValueError('producer is for driver = "gentl"')
+        if self.driver == "gentl":
+            if self.producer is None:
+                raise ValueError('driver = "gentl" wants a producer')
+            for setting in ("address", "packet_bytes"):
+                if getattr(self, setting) is not None:
+                    raise ValueError(f'{setting} is for driver = "aravis"')
         return self
 
     @property

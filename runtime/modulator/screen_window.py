@@ -12,6 +12,7 @@ import threading
 from queue import Empty, SimpleQueue
 
 from runtime.errors import SourceError
+from runtime.helper_process import parent_link
 from runtime.modulator.screen_link import REQUEST, Answer
 from runtime.modulator.settings import ScreenSettings
 
@@ -25,7 +26,7 @@ Requests = SimpleQueue[tuple[int, bytes | None]]
 def main(settings_json: str) -> int:
     """Show what comes over the socket on stdin until its other end is closed."""
     settings = ScreenSettings.model_validate_json(settings_json)
-    link = socket.socket(fileno=os.dup(sys.stdin.fileno()))
+    link = parent_link()
     requests: Requests = SimpleQueue()
     arguments = (link, settings.rows_px * settings.columns_px, requests)
     threading.Thread(target=_receive, args=arguments, daemon=True).start()

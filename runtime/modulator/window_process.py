@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import socket
-import subprocess
-import sys
-import time
-
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.helper_process import HelperProcess
 from runtime.modulator.screen_link import REQUEST, Answer
 from runtime.modulator.settings import ScreenSettings
 
@@ -25,20 +21,11 @@ class WindowProcess:
     """
 
     def __init__(self, settings: ScreenSettings) -> None:
-        self._link, other = socket.socketpair()
-        self._received = b""
         self._number = 0
         self._opening: Answer | None = None
-        command = [sys.executable, "-m", "runtime.modulator.screen_window", settings.model_dump_json()]
-        with other:
-            try:
-                # In a session of its own: Ctrl-C is for the service, which then ends the window.
-                self._process = subprocess.Popen(
-                    command, stdin=other.fileno(), stdout=subprocess.DEVNULL, start_new_session=True
-                )
-            except OSError:
-                self._link.close()
-                raise
+        self._process = HelperProcess(
+            "runtime.modulator.screen_window", settings.model_dump_json(), subject="the process of its window"
+        )
 
     def opening(self, deadline: float) -> Answer:
         """Its word that the window is open, or why it cannot be.
@@ -60,39 +47,19 @@ class WindowProcess:
         """
         self._number += 1
         request = REQUEST.pack(image is not None, self._number)
-        self._link.settimeout(_left(deadline))
-        self._link.sendall(request if image is None else request + image.tobytes())
+        self._process.send(request if image is None else request + image.tobytes(), deadline)
         return self._answer(self._number, deadline)
 
     def ended(self) -> bool:
         """Whether it runs no more."""
-        return self._process.poll() is not None
+        return self._process.ended()
 
     def end(self) -> None:
         """End it, and with it the window."""
-        self._link.close()
-        self._process.kill()
-        self._process.wait()
+        self._process.end()
 
     def _answer(self, number: int, deadline: float) -> Answer:
-        while b"\n" not in self._received:
-            self._link.settimeout(_left(deadline))
-            if not (more := self._link.recv(65536)):
-                raise ConnectionError("the process of its window has ended")
-            self._received += more
-        line, _, self._received = self._received.partition(b"\n")
-        answer = Answer.from_line(line)
+        answer = Answer.from_line(self._process.line(deadline))
         if answer.number != number:
             raise ConnectionError(f"its window answers request {answer.number} for {number}")
         return answer
-
-
-def _left(deadline: float) -> float:
-    """Seconds until then.
-
-    Raises:
-        TimeoutError: it has passed.
-    """
-    if (left := deadline - time.monotonic()) <= 0:
-        raise TimeoutError
-    return left

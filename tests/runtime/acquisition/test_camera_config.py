@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,8 @@ import pytest
 from lightpage.errors import InvalidInputError, LightpageError
 from runtime.acquisition.camera_config import load_device_table, open_camera
 from runtime.acquisition.camera_source import CameraSource
+from runtime.cameras.aravis import AravisCamera
+from runtime.cameras.gentl import GenTLCamera
 from runtime.errors import SourceError
 from runtime.modulator.external import ExternalBeams, ExternalModulator
 from runtime.modulator.operator import OperatorBeams
@@ -54,6 +57,14 @@ def test_what_is_left_out_is_done_by_hand(tmp_path: Path) -> None:
     source.operator = asked.append
     source.beams.let_through(signal=False, reference=True)
     assert asked == ["Block the signal beam"]
+
+
+def test_a_camera_may_have_a_producer_beside_the_file(tmp_path: Path) -> None:
+    source = opened(tmp_path, PLAIN.replace('serial = "2"', 'serial = "2"\ndriver = "gentl"\nproducer = "maker.cti"'))
+    assert [type(camera) for camera in source._cameras] == [AravisCamera, GenTLCamera]
+    with pytest.raises(SourceError, match=re.escape(str(tmp_path / "maker.cti"))):
+        source._cameras[1].arm()
+    source.close()
 
 
 def test_a_controller_may_do_all_of_it(tmp_path: Path) -> None:

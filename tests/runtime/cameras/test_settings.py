@@ -20,7 +20,11 @@ from runtime.cameras.settings import CameraSettings
         ({"serial": "1", "exposure_us": float("inf")}, "exposure_us"),
         ({"serial": "1", "buffers": 1}, "buffers"),
         ({"serial": "1", "packet_bytes": 70_000}, "packet_bytes"),
-        ({"serial": "1", "driver": "gentl"}, "aravis"),
+        ({"serial": "1", "driver": "vendor"}, "aravis"),
+        ({"serial": "1", "driver": "gentl"}, "wants a producer"),
+        ({"serial": "1", "producer": "maker.cti"}, 'producer is for driver = "gentl"'),
+        ({"address": "10.0.0.1", "driver": "gentl", "producer": "maker.cti"}, "address is for"),
+        ({"serial": "1", "packet_bytes": 1400, "driver": "gentl", "producer": "maker.cti"}, "packet_bytes is for"),
         ({"serial": "1", "exposure_ms": 1}, "exposure_ms"),
     ],
 )

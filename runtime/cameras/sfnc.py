@@ -1,0 +1,32 @@
+"""What every GenICam camera is asked for, whichever driver asks; names are those of the SFNC."""
+
+from __future__ import annotations
+
+FRAME_SELECTORS = ("FrameStart", "FrameBurstStart")
+"""Triggers that start a frame, the better one first."""
+OTHER_SELECTORS = ("AcquisitionStart", "AcquisitionEnd", "FrameEnd", "FrameActive", "ExposureStart", "LineStart")
+SWITCHED_OFF = ("ChunkModeActive", "AcquisitionFrameRateEnable")
+AUTOMATIC = ("ExposureAuto", "GainAuto", "BlackLevelAuto")
+"""What a camera would change by itself."""
+
+EXPOSURE_TOLERANCE = 0.05
+"""Relative: cameras expose for whole lines of the sensor."""
+GAIN_TOLERANCE_DB = 0.1
+BLACK_LEVEL_TOLERANCE = 0.5
+
+QUIET_S = 0.02
+"""No frame for so long after the start: those from before are out."""
+MOST_DRAINING_S = 0.5
+"""A trigger that never rests is not waited for any longer."""
+SIGN_OF_LIFE_S = 0.05
+"""A camera that sends no frame for so long is asked whether it is there."""
+
+
+def describe_region(x: int, y: int, columns: int, rows: int) -> str:
+    """A region of interest, for people."""
+    return f"{columns} x {rows} pixels at ({x}, {y})"
+
+
+def frame_numbers(is_gige: bool, extended_ids: bool) -> int:
+    """The largest number of a frame: 16 bits of a GigE camera without extended block ids, else 64."""
+    return 2**16 - 1 if is_gige and not extended_ids else 2**64 - 1
