@@ -14,7 +14,7 @@ IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image check-image proto lint format clean
+.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image check-image check-camera-image proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -123,6 +123,10 @@ image:  ## build the container image (IMAGE_TARGET=runtime, camera or deep)
 
 check-image:  ## start the image that buildah built, and see whether it keeps its promises
 	packaging/check_image.sh $(IMAGE_TAG) $(BUNDLE)
+
+check-camera-image: $(STAMP)  ## the same with image `camera`, which then does the main job over the simulated device
+	LIGHTPAGE_CHECK_DEVICE=build/device $(BIN)/lightpage virtual-device --out build/device -- \
+	    packaging/check_image.sh lightpage:camera
 
 clean:  ## remove what was built and measured, and leave the environment
 	rm -rf build out .pytest_cache .mypy_cache .ruff_cache

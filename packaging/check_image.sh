@@ -6,7 +6,12 @@
 #
 # TAG: lightpage:runtime. BUNDLE: a file to serve from the volume /bundles, without a frame source, in place of what the
 # image serves by itself. Needs root, since it makes a mount namespace of its own.
+#
+# Environment:
+#   LIGHTPAGE_CHECK_DEVICE   folder of a running `lightpage virtual-device`, in whose network this is: the image then does
+#                            the main job over its cameras, serial line and modulator
 set -euo pipefail
+hardware="${LIGHTPAGE_CHECK_DEVICE:+$(realpath "$LIGHTPAGE_CHECK_DEVICE")}"
 [ -z "${2:-}" ] || [ "$1" = --inside ] || set -- "$1" "$(realpath "$2")"
 cd "$(dirname "$0")/.."
 
@@ -49,6 +54,12 @@ for volume in bundles state; do
   mount --types tmpfs -o uid=10001,gid=10001,mode=755 tmpfs "$root/$volume"
 done
 [ -z "$bundle" ] || install -m 644 "$bundle" "$root/bundles/$(basename "$bundle")"
+if [ -n "$hardware" ]; then # what `--device`, `--group-add` and `--network host` lend to a container
+  mkdir "$root/dev/pts" "$root/bundles/device"
+  mount --bind /dev/pts "$root/dev/pts"
+  mount --bind "$hardware" "$root/bundles/device"
+  chmod 666 "$hardware/modulator.sock" "$(realpath "$hardware/pulse-generator")"
+fi
 mount -o remount,bind,ro "$root"
 
 field() {
@@ -123,6 +134,11 @@ gone() {
 claim "is gone within 30 s of SIGTERM" gone
 claim "ended in order" wait "$service"
 claim "is not healthy afterwards" not probe
+
+if [ -n "$hardware" ]; then
+  main_job() { in_image lightpage demo --source camera:/bundles/device/device.toml --out /state/demo; }
+  claim "does the main job over cameras, a serial line and a modulator" main_job
+fi
 
 [ "$failures" = 0 ] || { echo "check_image: $failures of the claims about $tag failed" >&2; exit 1; }
 echo "check_image: $tag keeps its promises"

@@ -1,5 +1,8 @@
 """What a camera's driver delivers: to the byte, without old frames, how fast, and how it leaves other threads alone.
 
+Pairs a second over the whole chain are compared with the cameras alone, fired as fast as their frames come, and with
+pairing alone, over cameras that deliver in no time.
+
     python -m analysis.hardware.cameras --json runs/cameras.json
 
 Fake cameras send real GigE Vision packets over loopback. Runs in a private network.
@@ -10,8 +13,8 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +24,20 @@ from numpy.typing import NDArray
 
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
+from lightpage.device.profile import load_profile
 from lightpage.files import write_json
 from lightpage.progress import track
-from lightpage.recording.layout import frame_type
+from lightpage.recording.layout import FrameInfo, frame_type
+from runtime.acquisition.camera_source import CameraSource, Exposures
+from runtime.acquisition.pairing import PairingSettings
 from runtime.cameras.aravis import AravisCamera
-from runtime.cameras.camera import Frame
+from runtime.cameras.camera import Camera, Frame, FrameStatus
 from runtime.cameras.pixel_formats import bit_depth, pack, unpack
 from runtime.cameras.settings import CameraSettings
+from runtime.errors import LostShotError
+from runtime.modulator.operator import OperatorBeams
+from runtime.trigger.software import SoftwareTrigger
+from runtime.trigger.trigger import Trigger
 from runtime.virtual_device.fake_camera import FakeCamera
 from runtime.virtual_device.namespace import ADDRESSES, go_on_inside
 
@@ -35,6 +45,8 @@ Counts = NDArray[np.unsignedinteger[Any]]
 
 FORMATS = ("Mono8", "Mono12", "Mono12p", "Mono12Packed")
 PACKETS_BYTES = (1400, 9000, 60_000)
+TOLERANCES_S = (0.02, 0.01)
+"""Of the pairing; shots are 2.5 of them apart at least."""
 _SMALL = (256, 320)
 _FULL = (2048, 2048)
 _FRAME_S = 2.0
@@ -192,6 +204,95 @@ def speed(shots: int, packet_bytes: int) -> dict[str, Any]:
         }
 
 
+class InstantCamera:
+    """A camera that delivers a copy of its picture in no time: see `Camera`."""
+
+    name, frame_shape, bit_depth, frame_numbers, opened = "camera", _FULL, 8, 2**64 - 1, 1
+
+    def __init__(self, image: Counts) -> None:
+        self._image, self._number, self._ready = image, 0, list[Frame]()
+
+    def fire(self) -> None:
+        """Make a frame."""
+        self._number += 1
+        info = FrameInfo("INSTANT", self._number, time.monotonic(), time.time(), "Mono8")
+        self._ready.append(Frame(FrameStatus.COMPLETE, self._image.copy(), info))
+
+    def frame(self, timeout_s: float) -> Frame | None:
+        """The next one."""
+        return self._ready.pop(0) if self._ready else None
+
+    def arm(self) -> None:
+        """Nothing is to be done."""
+
+    disarm = close = arm
+
+
+class Edges:
+    """A trigger whose line goes to fake cameras: see `Trigger`."""
+
+    name = "edges"
+
+    def __init__(self, fakes: Sequence[FakeCamera]) -> None:
+        self._fakes = fakes
+
+    def fire(self) -> float:
+        """One edge to all."""
+        fired = time.monotonic()
+        for fake in self._fakes:
+            fake.edge()
+        return fired
+
+    def arm(self) -> None:
+        """Nothing is to be done."""
+
+    disarm = close = arm
+
+
+def pairs_per_s(cameras: tuple[Camera, Camera], trigger: Trigger, settings: PairingSettings, shots: int) -> float:
+    """Pairs a second from a source without a modulator, ready to be decoded; lost shots take their time too."""
+    profile = load_profile("bench")
+    camera = profile.camera.model_copy(update={"rows_px": _FULL[0], "columns_px": _FULL[1]})
+    profile = profile.model_copy(update={"camera": camera})
+    exposures = Exposures(repeats=0)
+    with CameraSource(
+        profile, cameras, trigger, None, OperatorBeams(click.echo), pairing=settings, exposures=exposures
+    ) as source:
+        source.shot()  # synchronises
+        taken, started = 0, time.perf_counter()
+        for _ in track(range(shots), "pairs", total=shots):
+            with suppress(LostShotError):
+                source.shot()
+                taken += 1
+        return taken / (time.perf_counter() - started)
+
+
+def chain(shots: int, packet_bytes: int, tolerance_s: float) -> dict[str, float]:
+    """Pairs a second over everything, over the slower of its two halves; one after the other, in one run."""
+    random = np.random.default_rng(0)
+    first, second = (random.integers(0, 200, _FULL, dtype=np.uint8) for _ in range(2))
+    settings = PairingSettings(tolerance_s=tolerance_s, spacing_s=2.5 * tolerance_s)
+    instant = (InstantCamera(first), InstantCamera(second))
+    pairing_alone = pairs_per_s(instant, SoftwareTrigger(instant), settings, shots)
+    with cameras(_FULL, "Mono8", packet_bytes) as stage:
+        for (_, _, eye), image in zip(stage, (first, second), strict=True):
+            eye.image = image
+        take(stage)  # the first frame of a fake camera is late
+        started = time.perf_counter()
+        whole = sum(all(frame is not None and frame.pixels is not None for frame in take(stage)) for _ in range(shots))
+        cameras_alone = whole / (time.perf_counter() - started)
+        pair = stage[0][1], stage[1][1]
+        together = pairs_per_s(pair, Edges([fake for fake, _, _ in stage]), settings, shots)
+    return {
+        "packet_bytes": packet_bytes,
+        "tolerance_s": tolerance_s,
+        "cameras_alone_per_s": cameras_alone,
+        "pairing_alone_per_s": pairing_alone,
+        "pairs_per_s": together,
+        "ratio": together / min(cameras_alone, pairing_alone),
+    }
+
+
 def idle_ticks(seconds: float) -> dict[str, float]:
     """The ticks of a thread while nothing else is done."""
     with Ticks() as ticks:
@@ -251,11 +352,25 @@ def main(changes: int, pairs: int, shots: int, json_path: Path | None) -> None:
             f"packets of {fast['packet_bytes']} B: {fast['equal_per_s']:.1f} shots/s, {fast['equal']} of {shots} "
             f"equal, {told(fast['tick'])}"
         )
+    chains = [chain(shots, size, tolerance) for size in PACKETS_BYTES for tolerance in TOLERANCES_S]
+    for each in chains:
+        click.echo(
+            f"pairs of 2048 x 2048, packets of {each['packet_bytes']} B, tolerance {1e3 * each['tolerance_s']:g} ms: "
+            f"{each['pairs_per_s']:.1f}/s; cameras alone {each['cameras_alone_per_s']:.1f}, pairing alone "
+            f"{each['pairing_alone_per_s']:.1f}; ratio {each['ratio']:.2f}"
+        )
     unpack_ms = {name: unpacking(name) for name in FORMATS}
     unpack_ms["Mono12p, plain"] = unpacking("Mono12p", plain_unpack_12p)
     click.echo("unpacking 2048 x 2048: " + ", ".join(f"{name} {taken:.1f} ms" for name, taken in unpack_ms.items()))
     if json_path is not None:
-        figures = {"stale": stale, "equal": equal, "idle_tick": idle, "speed": speeds, "unpack_ms": unpack_ms}
+        figures = {
+            "stale": stale,
+            "equal": equal,
+            "idle_tick": idle,
+            "speed": speeds,
+            "chain": chains,
+            "unpack_ms": unpack_ms,
+        }
         write_json(json_path, figures)
 
 

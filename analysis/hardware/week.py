@@ -234,16 +234,18 @@ def figures_of(rows: Rows, pages: int) -> dict[str, Any]:
     ends = [end for row in rows for end in row["ended"]]
     knock = int(KNOCK_SHARE * pages)
     after = [row["page"] for row in rows if row["page"] > knock and "done" in row["ended"]]
+    apart = np.array([knock <= row["page"] <= (after[0] if after else pages) for row in rows])
     due = [row["page"] for row, before in zip(rows[1:], rows, strict=False) if row["due"] and not before["due"]]
     return {
         "pages": len(rows),
         "share_of_pages_wanted": float(np.mean(share >= WANTED_SHARE)),
+        "share_of_pages_wanted_but_for_the_knock": float(np.mean(share[~apart] >= WANTED_SHARE)),
         "wanted_share_of_true_air": WANTED_SHARE,
         "air_mean": fmean(air),
         "true_air_mean": fmean(row["true_air"] for row in rows),
         "pages_lost": sum(bool(row["lost"]) for row in rows),
         "pages_lost_but_for_the_knock": sum(
-            bool(row["lost"]) for row in rows if not knock <= row["page"] <= (after[0] if after else pages)
+            bool(row["lost"]) for row, knocked in zip(rows, apart, strict=True) if not knocked
         ),
         "human_steps": 0,
         "restarts": sum(row["restarted"] for row in rows),

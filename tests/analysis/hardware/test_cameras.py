@@ -18,12 +18,18 @@ pytestmark = pytest.mark.own_network
 def test_figures_of_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cameras, "go_on_inside", lambda module: None)  # the test is in one
     monkeypatch.setattr(cameras, "_FULL", (128, 128))
+    monkeypatch.setattr(cameras, "PACKETS_BYTES", (1400, 9000))
+    monkeypatch.setattr(cameras, "TOLERANCES_S", (0.02,))
     arguments = f"--changes 3 --pairs 3 --shots 3 --json {tmp_path}/cameras.json"
     CliRunner().invoke(cameras.main, arguments.split(), standalone_mode=False, catch_exceptions=False)
     found: dict[str, Any] = json.loads((tmp_path / "cameras.json").read_text())
     assert found["stale"] == {"changes": 3, "stale": 0, "missing": 0}
     assert {name: one["equal"] for name, one in found["equal"].items()} == dict.fromkeys(cameras.FORMATS, 6)
-    assert [one["equal"] for one in found["speed"]] == [3, 3, 3]
+    assert [one["equal"] for one in found["speed"]] == [3, 3]
+    assert [one["packet_bytes"] for one in found["chain"]] == [1400, 9000]
+    for one in found["chain"]:
+        slower = min(one["cameras_alone_per_s"], one["pairing_alone_per_s"])
+        assert one["ratio"] == pytest.approx(one["pairs_per_s"] / slower)
     assert all(0 < one["tick"]["p50_ms"] <= one["tick"]["max_ms"] for one in found["speed"])
 
 
