@@ -47,11 +47,13 @@ class Exposures(TomlTable):
     Attributes:
         repeats: further shots of a page whose shot is lost, while it is on display.
         reference_frames, dark_frames: shots that make the mean of each.
+        shot_s: longest wait for one page, repeats included.
     """
 
     repeats: Annotated[int, Field(ge=0, le=100)] = 1
     reference_frames: Annotated[int, Field(ge=1, le=256)] = 8
     dark_frames: Annotated[int, Field(ge=1, le=256)] = 8
+    shot_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] = SHOT_S
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,7 @@ class CameraSource(FrameSource):
             raise SourceError(f"{self.name}: cameras", f"{depths[0]} and {depths[1]} bits", "the same for both")
         self.bit_depth = depths[0]
         self._exposures = exposures or Exposures()
+        self.shot_s = self._exposures.shot_s
         self._pairing = Pairing(cameras, trigger, pairing or PairingSettings())
         self._lock = threading.RLock()
         """Held while the devices are used: one shot at a time."""
@@ -308,7 +311,7 @@ class CameraSource(FrameSource):
         """Frames of both cameras [exposure, row, column], whatever is on display."""
         shots = []
         for _ in range(count):
-            deadline = time.monotonic() + SHOT_S
+            deadline = time.monotonic() + self.shot_s
             # nothing but the light has to stand still, so there is no reason to give up early
             attempt = partial(self._pairing.shot, deadline)
             taken = self._persistent("frames without a page", -1, deadline, attempt, _MOST_REPEATS)

@@ -64,6 +64,7 @@ class FrameSource(ABC):
         levels: level count of its pages.
         bit_depth: bits of a camera count.
         frame_shape: (rows, columns) of its frames.
+        shot_s: longest wait for a page where its caller does not give up before.
         page_shape: (rows, columns) of its pages where it knows them, else None.
         profile: nominal device, where it knows it.
         pages: what its modulator shows, where it has one that shows what it is given.
@@ -76,6 +77,7 @@ class FrameSource(ABC):
     levels: int
     bit_depth: int
     frame_shape: tuple[int, int]
+    shot_s: float = SHOT_S
     page_shape: tuple[int, int] | None = None
     profile: Profile | None = None
     pages: PageStore | None = None

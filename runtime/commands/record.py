@@ -28,6 +28,8 @@ from runtime.errors import LostPageError, LostShotError, SourceError
 
 ATTEMPTS = 5
 """Times that a page is read before the recording stops; the source repeats lost shots by itself within each."""
+_SHOT_S = 30.0
+"""Wait for a page: long enough for a plug that has slipped out."""
 
 
 @click.command()
@@ -36,7 +38,9 @@ ATTEMPTS = 5
 @click.option("--symbols", type=click.Path(path_type=Path), help="Pages to show, PAGES.h5, as `encode` makes them.")
 @click.option("--profile", "profile_name", metavar="P", help="Nominal device, where the source does not know it.")
 @click.option("--out", required=True, type=OutputFile(), help="The recording, R.h5.")
-@click.option("--shot-seconds", default=30.0, show_default=True, help="Longest wait for one page.")
+@click.option(
+    "--shot-seconds", type=click.FloatRange(0, min_open=True), help="Longest wait for one page, 30 s or the source's."
+)
 @click.option("--dark/--no-dark", default=True, show_default=True, help="Take dark frames first; mend hot pixels.")
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
@@ -46,7 +50,7 @@ def record(
     symbols: Path | None,
     profile_name: str | None,
     out: Path,
-    shot_seconds: float,
+    shot_seconds: float | None,
     dark: bool,
     force: bool,
     json_path: Path | None,
@@ -71,7 +75,8 @@ def record(
         if not count:
             raise InvalidInputError("options", "neither --pages nor pages to show", "one of them")
         with source:
-            _record(source, profile, count, out, shot_seconds, dark, json_path)
+            longest_s = max(_SHOT_S, source.shot_s) if shot_seconds is None else shot_seconds
+            _record(source, profile, count, out, longest_s, dark, json_path)
     finally:
         source.close()
 

@@ -253,7 +253,7 @@ def run_demo(
         plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
         server = stack.enter_context(LightpageServer(plane, Recalibrator(plane), "127.0.0.1:0"))
         client = stack.enter_context(LightpageClient(server.target))
-        frames = source.shot(page=0).pair
+        frames = source.shot(source.shot_s, 0).pair
         levels = decoder.page_codec.code.levels
         symbols = client.decode(frames, levels).symbols
 

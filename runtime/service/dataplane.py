@@ -16,7 +16,7 @@ from lightpage.errors import FrameError, InvalidInputError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import MAX_LEVELS
 from lightpage.recording.reader import FramePair
-from runtime.acquisition.source import SHOT_S, FrameSource, Shot, own_fault
+from runtime.acquisition.source import FrameSource, Shot, own_fault
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
 from runtime.errors import LostPageError, SourceError
@@ -267,7 +267,7 @@ class DataPlane:
         """A page of the source; a lost shot is counted."""
         try:
             with own_fault(), self._optics(user_data):
-                return source.shot(min(SHOT_S, caller.seconds_left()), page)
+                return source.shot(min(source.shot_s, caller.seconds_left()), page)
         except LostPageError as error:
             self.metrics.lost(error)
             raise

@@ -269,7 +269,7 @@ def read_known(
         for page in pages:
             heard()
             with slot():
-                found.append(source.shot(page=page))
+                found.append(source.shot(source.shot_s, page))
         heard()
         with slot():
             references = source.references()

@@ -152,6 +152,8 @@ address = "{_SOCKET}"
 tolerance_s = 0.03
 spacing_s = 0.08
 
+# A page's light is simulated while it waits to be shown: a second for a small device, minutes for a large one.
 [exposures]
 repeats = 3
+shot_s = 600
 """
