@@ -35,6 +35,14 @@ class FrameError(InvalidInputError):
     """A camera frame of the wrong size, type or bit depth, or without usable light."""
 
 
+class BlackFrameError(FrameError):
+    """A frame without light."""
+
+
+class SaturatedFrameError(FrameError):
+    """A frame of which too much is at full scale."""
+
+
 class FramesDisagreeError(FrameError):
     """Two frames that contradict each other: swapped, of two shots, or of a device that is not as it was calibrated."""
 
@@ -43,12 +51,20 @@ class PageError(InvalidInputError):
     """Symbols of the wrong shape, type or range."""
 
 
+class NoSuchPageError(PageError):
+    """The number of a page that is not there."""
+
+
 class LostDataError(LightpageError):
     """Bytes of a file could not be read back from its pages, nor restored from its parity pages."""
 
 
 class BundleError(LightpageError):
     """A bundle that is damaged, incomplete, foreign, or newer than this program."""
+
+
+class NoCodeError(BundleError):
+    """User bytes are wanted, and the bundle does not say how they are protected."""
 
 
 class CalibrationError(LightpageError):

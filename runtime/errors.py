@@ -6,11 +6,23 @@ from enum import StrEnum
 from typing import Self
 
 from lightpage import errors as own_errors
-from lightpage.errors import BusyError, LightpageError
+from lightpage.errors import BundleError, BusyError, InvalidInputError, LightpageError
 
 
 class SourceError(LightpageError):
     """The service's own source or recordings are missing, damaged or dark: nothing that the caller sent is wrong."""
+
+
+class NoSourceError(SourceError):
+    """The service has no source, or none that can do this."""
+
+
+class MalformedError(InvalidInputError):
+    """A message that cannot be parsed, or one of a stream that does not belong there."""
+
+
+class RequestIdError(InvalidInputError):
+    """A request id that was given with another request."""
 
 
 class StoppingError(LightpageError):
@@ -26,7 +38,40 @@ class CallerLeft(Exception):
 
 
 class SlotsTakenError(BusyError):
-    """The service does as much as it may at once, and did so until the caller's time was up."""
+    """The service does as much as it may at once, and did so until the caller's time was up.
+
+    Args:
+        subject, got, expected: see `LightpageError`.
+        retry_s: when to try again, seconds from now; None where that is of no use.
+    """
+
+    def __init__(self, subject: str, got: object, expected: object, retry_s: float | None = None) -> None:
+        super().__init__(subject, got, expected)
+        self.retry_s = retry_s
+
+
+class OverloadedError(SlotsTakenError):
+    """What the caller wants could not be done before its deadline, so it is not begun."""
+
+
+class StalledError(LightpageError):
+    """The caller sent nothing for too long."""
+
+
+class NoSuchJobError(LightpageError):
+    """There is no such job, or it ended long ago."""
+
+
+class OtherModelError(BusyError):
+    """Another model is in service than the caller expected; nothing was changed. `got` is its version."""
+
+
+class ModelExistsError(BundleError):
+    """The service has a model of this version already."""
+
+
+class StoreError(BundleError):
+    """The folder in which the service keeps its models is full, read-only, or gone; nothing was changed."""
 
 
 class Reason(StrEnum):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import FrameError
+from lightpage.errors import BlackFrameError, FrameError, SaturatedFrameError
 from lightpage.recording.layout import FramePair
 
 BLACK_FRACTION = 0.02
@@ -43,8 +43,10 @@ def check_light(name: str, frame: NDArray[np.integer[Any]], bit_depth: int) -> N
     if peak > full_scale:
         raise FrameError(name, f"a count of {peak}", f"at most {full_scale} ({bit_depth} bits)")
     if peak <= BLACK_FRACTION * full_scale:
-        raise FrameError(name, f"black: no count above {peak}", f"counts above {BLACK_FRACTION * full_scale:.0f}")
+        raise BlackFrameError(name, f"black: no count above {peak}", f"counts above {BLACK_FRACTION * full_scale:.0f}")
     if peak == full_scale:
         clipped = np.count_nonzero(frame == full_scale) / frame.size
         if clipped > SATURATED_FRACTION:
-            raise FrameError(name, f"saturated: {clipped:.1%} at full scale", f"at most {SATURATED_FRACTION:.0%}")
+            raise SaturatedFrameError(
+                name, f"saturated: {clipped:.1%} at full scale", f"at most {SATURATED_FRACTION:.0%}"
+            )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
-from lightpage.errors import InvalidInputError, LimitError, PageError
+from lightpage.errors import InvalidInputError, LimitError, NoSuchPageError
 from lightpage.page.symbols import check_levels, check_symbols
 from lightpage.recording.pages import Pages
 
@@ -70,7 +70,7 @@ class PageStore:
             count = self._in_file + len(self._uploaded)
             if not 0 <= page < count:
                 expected = f"0..{count - 1}" if count else "a page: none was given or uploaded"
-                raise PageError("page to show", page, expected)
+                raise NoSuchPageError("page to show", page, expected)
             if self._written is not None and page < len(self._written):
                 return self._written[page]
             return self._uploaded[page - self._in_file]

@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 
 from lightpage.device.profile import Profile
-from lightpage.errors import PageError, RecordingError
+from lightpage.errors import NoSuchPageError, RecordingError
 from lightpage.recording.reader import FramePair, Recording
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 from runtime.decoding.frames import narrow
@@ -45,7 +45,7 @@ class RecordingSource(FrameSource):
             if page is None:
                 page, self._next = self._next, (self._next + 1) % max(1, recording.pages)
             if not 0 <= page < recording.pages:
-                raise PageError(f"page of {self.name}", page, f"0..{recording.pages - 1}")
+                raise NoSuchPageError(f"page of {self.name}", page, f"0..{recording.pages - 1}")
             try:
                 pair, symbols = narrow(recording.frames(page), self.bit_depth), recording.symbols(page)
                 return Shot(pair, page, symbols, recording.pilots(), recording.frame_infos(page))

@@ -10,7 +10,7 @@ import numpy as np
 
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device, load_device
-from lightpage.errors import InvalidInputError, PageError
+from lightpage.errors import InvalidInputError, NoSuchPageError
 from lightpage.page.symbols import MAX_LEVELS, pilot_mask, random_symbols
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import FramePair
@@ -73,7 +73,7 @@ class SimulatorSource(FrameSource):
             if self.pages is not None:
                 symbols = self.pages[page]
             elif page < 0:
-                raise PageError(f"page of {self.name}", page, "a number of at least 0")
+                raise NoSuchPageError(f"page of {self.name}", page, "a number of at least 0")
             else:
                 rng = np.random.default_rng([self._seed, page])
                 symbols = random_symbols(self._simulator.profile, self.levels, 1, rng)[0]

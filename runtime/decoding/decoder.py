@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.device.profile import Profile
-from lightpage.errors import BundleError, FrameError, FramesDisagreeError, InvalidInputError
+from lightpage.errors import BundleError, FrameError, FramesDisagreeError, InvalidInputError, NoCodeError
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
 from lightpage.page.symbols import MAX_LEVELS, check_levels, symbol_phases
@@ -218,7 +218,7 @@ class Decoder:
         from lightpage.codec.page_codec import PageCodec
 
         if self.bundle.code is None:
-            raise BundleError(f"{self.bundle.subject}: code", "none", "one, as `lightpage code --out-bundle` adds it")
+            raise NoCodeError(f"{self.bundle.subject}: code", "none", "one, as `lightpage code --out-bundle` adds it")
         try:
             return PageCodec(self.bundle.code, self.bundle.pilot_mask)
         except InvalidInputError as error:

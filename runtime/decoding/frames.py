@@ -37,7 +37,7 @@ def named(subject: str) -> Iterator[None]:
     try:
         yield
     except FrameError as error:
-        raise FrameError(subject + error.subject, error.got, error.expected) from error
+        raise type(error)(subject + error.subject, error.got, error.expected) from error
 
 
 def _check_frame(name: str, frame: NDArray[Any], shape: tuple[int, int], dtype: str, bit_depth: int) -> None:

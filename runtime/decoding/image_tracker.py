@@ -215,6 +215,10 @@ class ImageTracker:
             share=memory.share,
         )
 
+    def anew(self) -> ImageTracker:
+        """See `Tracker`."""
+        return ImageTracker(self._decoder, self._model, self._tables, self._search)
+
     def fork(self) -> ImageTracker:
         """See `Tracker`."""
         other = ImageTracker(self._decoder, self._model, self._tables, self._search)

@@ -59,6 +59,9 @@ class Tracker(Protocol):
     def memory(self) -> TrackerMemory | None:
         """What it has learnt until now, for `tracker_for` in another process; None where it learns nothing."""
 
+    def anew(self) -> Tracker:
+        """Another one for the same bundle that has learnt nothing."""
+
     def fork(self) -> Tracker:
         """Another one that has learnt the same, and learns on its own from there."""
 
@@ -91,6 +94,10 @@ class NoTracker:
 
     def memory(self) -> None:
         """See `Tracker`."""
+
+    def anew(self) -> NoTracker:
+        """Itself: it learns nothing."""
+        return self
 
     def fork(self) -> NoTracker:
         """Itself: it learns nothing."""

@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.codec.page_codec import PageBytes
+from lightpage.recording.layout import FrameInfo
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.service.dataplane import Answer, ReadAnswer
 from runtime.service.display import Wanted
+from runtime.service.monitor import AIR, MARGIN, PISTON_WALK, RESIDUAL, SHARE, SHIFT, TRUST, UNREAD
 from runtime.service.registry import Model
 from runtime.service.user_data import DataPage
 from runtime.wire.messages import DATA_LOSSES, FLOAT, image_message
@@ -35,6 +37,7 @@ def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
         claimed_bits=page.check.claimed_bits,
         confirmed_bits=page.check.confirmed_bits,
         recalibration_due=answer.recalibration_due,
+        recalibration_reasons=_recalibration_reasons(answer),
         image=None if page.image is None else image_message(page.image),
         user_data=None if found is None else user_data_message(found),
         model_version=answer.model_version,
@@ -45,6 +48,23 @@ def decode_reply(answer: Answer, options: pb.DecodeOptions) -> pb.DecodeReply:
             total_s=answer.total_s,
         ),
     )
+
+
+_SIGNS = {
+    MARGIN.name: pb.RECALIBRATION_REASON_MARGIN,
+    AIR.name: pb.RECALIBRATION_REASON_INFORMATION,
+    TRUST.name: pb.RECALIBRATION_REASON_TRUST,
+    SHARE.name: pb.RECALIBRATION_REASON_PILOT_SHARE,
+    UNREAD.name: pb.RECALIBRATION_REASON_UNREAD,
+    RESIDUAL.name: pb.RECALIBRATION_REASON_RESIDUAL,
+    SHIFT.name: pb.RECALIBRATION_REASON_SHIFT,
+    PISTON_WALK.name: pb.RECALIBRATION_REASON_PISTON,
+}
+
+
+def _recalibration_reasons(answer: Answer) -> list[pb.RecalibrationReason]:
+    own = [pb.RECALIBRATION_REASON_PAGE] if answer.page.check.recalibration_due else []
+    return own + [_SIGNS.get(name, pb.RECALIBRATION_REASON_OTHER) for name in answer.monitor_signs]
 
 
 def _confidence_bytes(confidence: NDArray[np.float32], code: int) -> bytes:
@@ -90,11 +110,23 @@ def data_reply(page: DataPage) -> pb.ReadDataReply:
 def read_reply(read: ReadAnswer, request: pb.ReadPageRequest) -> pb.ReadPageReply:
     """A page read from the source as its message."""
     written = read.shot.symbols if request.want_written else None
+    decoded = decode_reply(read.answer, request.options)
+    decoded.correlation_id = request.correlation_id
     return pb.ReadPageReply(
-        decoded=decode_reply(read.answer, request.options),
+        decoded=decoded,
         page=read.shot.page_index,
         written=b"" if written is None else written.tobytes(),
         pilot_mask=b"" if written is None else read.pilot_mask.astype(np.uint8).tobytes(),
+        frames=[_camera_frame(info) for info in read.shot.infos or ()],
+    )
+
+
+def _camera_frame(info: FrameInfo) -> pb.CameraFrame:
+    return pb.CameraFrame(
+        serial=info.serial,
+        frame_id=info.frame_id,
+        device_time_s=info.device_time_s,
+        host_time_s=info.host_time_s,
     )
 
 

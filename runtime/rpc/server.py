@@ -1,59 +1,84 @@
-"""The server process: gRPC with health on an address, a graceful end, and nothing left behind."""
+"""The server: gRPC, its health and reflection on an address, a graceful end, and nothing left behind."""
 
 from __future__ import annotations
 
+import asyncio
+import threading
+from collections.abc import Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
-from typing import Self
+from typing import Any, Self, TypeVar
 
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
 
 from lightpage.errors import InvalidInputError
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.rpc.servicer import LightpageServicer
+from runtime.rpc.call import SERVICE, CallLog, Dispatcher, PlainCallLog
+from runtime.rpc.handlers import handlers
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.wire.address import check_free
 
-SERVICE: str = pb.DESCRIPTOR.services_by_name["Lightpage"].full_name
-
-_WATCHERS = 4
-"""Threads for health watchers, apart from those of the calls: watching must not take a decode's place."""
-
 _KEEPALIVE_MS = 30_000
 """A connection silent for so long is asked for a sign of life, so that a dead client's call ends."""
+_LAST_WORD_S = 0.1
+"""From NOT_SERVING to the end of those who watch: they hear it first."""
+_SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
+
+T = TypeVar("T")
+
+
+class _Health(health.aio.HealthServicer):  # type: ignore[misc,name-defined]  # without types
+    """Health whose watchers can be sent home."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._watchers: set[asyncio.Task[Any]] = set()
+
+    async def Watch(self, request: health_pb2.HealthCheckRequest, context: Any) -> None:
+        """See the protocol."""
+        task = asyncio.current_task()
+        assert task is not None  # calls run in tasks
+        self._watchers.add(task)
+        try:
+            await super().Watch(request, context)
+        finally:
+            self._watchers.discard(task)
+
+    def end_watches(self) -> None:
+        """End them."""
+        for task in self._watchers:
+            task.cancel()
 
 
 class LightpageServer:
     """A running service; use it in a `with` statement, or `start` and `stop` it.
 
+    Calls are taken on an event loop in a thread of its own, so that one that sends its frames slowly costs no thread.
+    What computes runs in threads.
+
     Args:
         plane: the service's logic.
         recalibrator: what recalibrates it.
         address: HOST:PORT; port 0 takes a free one.
+        log: is told how calls end.
+        more: further handlers.
     """
 
-    def __init__(self, plane: DataPlane, recalibrator: Recalibrator, address: str = "127.0.0.1:0") -> None:
-        limits = plane.limits
+    def __init__(
+        self,
+        plane: DataPlane,
+        recalibrator: Recalibrator,
+        address: str = "127.0.0.1:0",
+        log: CallLog | None = None,
+        more: Sequence[object] = (),
+    ) -> None:
         self._plane, self._recalibrator, self._address = plane, recalibrator, address
-        self._pool = ThreadPoolExecutor(limits.worker_threads, thread_name_prefix="lightpage-call")
-        self._health_pool = ThreadPoolExecutor(_WATCHERS, thread_name_prefix="lightpage-health")
-        self._health = health.HealthServicer(experimental_non_blocking=True, experimental_thread_pool=self._health_pool)
-        self._server = grpc.server(
-            self._pool,
-            maximum_concurrent_rpcs=limits.concurrent_calls,
-            options=(
-                ("grpc.max_receive_message_length", limits.message_bytes),
-                ("grpc.max_send_message_length", limits.reply_bytes),
-                ("grpc.so_reuseport", 0),  # a second server on the port is a mistake, not a helper
-                ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
-            ),
-        )
-        servicer = LightpageServicer(plane, recalibrator)
-        pb_grpc.add_LightpageServicer_to_server(servicer, self._server)  # type: ignore[no-untyped-call]
-        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+        self._handlers, self._log = (*more, *handlers(plane, recalibrator)), log or PlainCallLog()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, name="lightpage-rpc", daemon=True)
+        self._pool = ThreadPoolExecutor(plane.limits.concurrent_calls, thread_name_prefix="lightpage-call")
         self.port = 0
 
     def start(self) -> Self:
@@ -62,18 +87,16 @@ class LightpageServer:
         Raises:
             InvalidInputError: the address cannot be listened on.
         """
+        self._thread.start()
         try:
             check_free("address", self._address)
-            self.port = self._server.add_insecure_port(self._address)
-        except InvalidInputError:
-            self._close_pools()
+            self._await(self._open())
+        except BaseException as error:
+            self._close()
+            if isinstance(error, RuntimeError):
+                expected = "a free HOST:PORT of this machine"
+                raise InvalidInputError(f"address {self._address}", error, expected) from None
             raise
-        except RuntimeError as error:
-            self._close_pools()
-            raise InvalidInputError(f"address {self._address}", error, "a free HOST:PORT of this machine") from None
-        self._server.start()
-        for name in ("", SERVICE):
-            self._health.set(name, health_pb2.HealthCheckResponse.SERVING)
         return self
 
     @property
@@ -84,14 +107,22 @@ class LightpageServer:
         host = self._address.rpartition(":")[0]
         return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
 
+    def say_serving(self, serving: bool) -> None:
+        """Change what health checks hear."""
+        self._await(self._say(serving))
+
     def stop(self, grace_s: float | None = None) -> None:
-        """Say NOT_SERVING, take no new calls, let those in flight end within `grace_s`, then end the rest."""
-        self._health.enter_graceful_shutdown()
+        """Say NOT_SERVING, take no new calls, let those in flight end within `grace_s`, then end the rest.
+
+        Calls that only watch are ended at once.
+        """
+        if self._loop.is_closed():
+            return
         grace_s = self._plane.limits.grace_s if grace_s is None else grace_s
-        stopped = self._server.stop(grace_s)
+        stopped = asyncio.run_coroutine_threadsafe(self._stop(grace_s), self._loop)
         self._recalibrator.close(grace_s)
-        stopped.wait()
-        self._close_pools()
+        stopped.result()
+        self._close()
 
     def __enter__(self) -> Self:
         return self.start()
@@ -101,6 +132,49 @@ class LightpageServer:
     ) -> None:
         self.stop()
 
-    def _close_pools(self) -> None:
+    async def _open(self) -> None:
+        limits = self._plane.limits
+        self._server = grpc.aio.server(
+            options=(
+                ("grpc.max_receive_message_length", limits.message_bytes),
+                ("grpc.max_send_message_length", limits.reply_bytes),
+                ("grpc.so_reuseport", 0),  # a second server on the port is a mistake, not a helper
+                ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
+            )
+        )
+        self._dispatcher = Dispatcher(self._handlers, self._pool, limits, self._plane.metrics, self._log)
+        self._server.add_generic_rpc_handlers((self._dispatcher.rpc_handler(),))
+        self._health = _Health()
+        await self._say(False)
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+        names = (SERVICE.full_name, health.SERVICE_NAME, reflection.SERVICE_NAME)
+        reflection.enable_server_reflection(names, self._server)
+        self.port = self._server.add_insecure_port(self._address)
+        await self._server.start()
+        await self._say(True)
+
+    async def _say(self, serving: bool) -> None:
+        for name in ("", SERVICE.full_name):
+            await self._health.set(name, _SERVING if serving else _NOT_SERVING)
+
+    async def _stop(self, grace_s: float) -> None:
+        await self._health.enter_graceful_shutdown()
+        stopping = asyncio.ensure_future(self._server.stop(grace_s))
+        await asyncio.sleep(_LAST_WORD_S)
+        self._health.end_watches()
+        self._dispatcher.end_endless()
+        await stopping
+
+    def _await(self, work: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._loop.run_forever()
+        self._loop.run_until_complete(self._loop.shutdown_asyncgens())
+        self._loop.close()
+
+    def _close(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
         self._pool.shutdown(wait=False)
-        self._health_pool.shutdown(wait=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import AsyncIterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,8 @@ from runtime.acquisition.page_store import UPLOADED_BYTES
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 
-def uploaded_pages(
-    messages: Iterator[pb.UploadPagesRequest], page_shape: tuple[int, int]
+async def uploaded_pages(
+    messages: AsyncIterator[pb.UploadPagesRequest], page_shape: tuple[int, int]
 ) -> tuple[int, NDArray[np.uint8]]:
     """Level count M and pages [page, ny, nx].
 
@@ -22,12 +22,12 @@ def uploaded_pages(
         PageError: parts of pages, or none.
         LimitError: more than the service holds.
     """
-    first = next(messages, None)
+    first = await anext(messages, None)
     if first is None or first.WhichOneof("part") != "levels":
         got = "no message" if first is None else first.WhichOneof("part") or "an empty message"
         raise InvalidInputError("first message of UploadPages", got, "the level count")
     size, parts, held = page_shape[0] * page_shape[1], list[NDArray[np.uint8]](), 0
-    for message in messages:
+    async for message in messages:
         if message.WhichOneof("part") != "symbols":
             raise InvalidInputError("message of UploadPages", "no symbols", "pages from there on")
         content = np.frombuffer(message.symbols, np.uint8)

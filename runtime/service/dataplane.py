@@ -19,15 +19,16 @@ from lightpage.recording.reader import FramePair
 from runtime.acquisition.source import FrameSource, Shot, own_fault
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
-from runtime.errors import LostPageError, SourceError
+from runtime.errors import LostPageError, NoSourceError, SourceError
 from runtime.service.caller import Caller
 from runtime.service.display import Display
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.observation import Observer, Seen, observed
-from runtime.service.receiver import PairReceiver
+from runtime.service.receiver import PairReceiver, ReceiveBudget
 from runtime.service.registry import Model, ModelRegistry
+from runtime.service.replays import Replays
 from runtime.service.slots import Slots
 from runtime.service.store import ModelStore
 
@@ -36,7 +37,7 @@ from runtime.service.store import ModelStore
 class Answer:
     """A decoded page with the model that decoded it, the seconds that it took, and user bytes if asked for.
 
-    `monitor_due` is whether many pages together say that a recalibration is due.
+    `monitor_signs` names the signs by which many pages together say that a recalibration is due.
     """
 
     page: DecodedPage
@@ -44,12 +45,12 @@ class Answer:
     receive_s: float
     total_s: float
     user_data: PageBytes | None = None
-    monitor_due: bool = False
+    monitor_signs: tuple[str, ...] = ()
 
     @property
     def recalibration_due(self) -> bool:
         """Whether the device has changed since it was calibrated, as this page or many together show."""
-        return self.page.check.recalibration_due or self.monitor_due
+        return self.page.check.recalibration_due or bool(self.monitor_signs)
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,8 @@ class DataPlane:
         self._source = source
         if source is not None:
             _check_source(source, registry.current.decoder)
-        self.receives = Slots(self.limits.concurrent_receives, "receives", self.limits.deadline_s)
+        self.received = ReceiveBudget(self.limits.receive_bytes)
+        self.replays = Replays(self.limits.replay_s, self.limits.replay_bytes)
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s)
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s)
@@ -111,7 +113,7 @@ class DataPlane:
             SourceError: this service has none.
         """
         if self._source is None:
-            raise SourceError("source", "none", "a service started with --source")
+            raise NoSourceError("source", "none", "a service started with --source")
         return self._source
 
     @property
@@ -128,14 +130,18 @@ class DataPlane:
         """Whether `read_page` can work."""
         return self._source is not None
 
-    @contextmanager
-    def receiving(self, shape: tuple[int, int], dtype: str, bit_depth: int, caller: Caller) -> Iterator[PairReceiver]:
-        """A receiver for one pair, checked against the camera before a byte is allocated.
+    @property
+    def default_levels(self) -> int:
+        """The level count where a caller names none: that of the source's pages, or 256."""
+        return MAX_LEVELS if self._source is None else self._source.levels
+
+    def receiver(self, shape: tuple[int, int], dtype: str, bit_depth: int, caller: Caller) -> PairReceiver:
+        """A receiver for one pair, checked against the camera before a byte is allocated; to be closed.
 
         Raises:
             LimitError: the pair is larger than the service accepts.
             FrameError: not this device's size, type or bit depth.
-            SlotsTakenError: too many are being received until the caller's time is up.
+            OverloadedError: there is so much to decode that the caller's deadline would pass.
         """
         # Size first: a header may claim anything, and a limit is the service's, not the camera's.
         if 2 * shape[0] * shape[1] * np.dtype(dtype).itemsize > self.limits.pair_bytes:
@@ -148,8 +154,8 @@ class DataPlane:
                 f"{shape[0]}x{shape[1]} pixels, {dtype}, {bit_depth} bits",
                 f"{expected[0][0]}x{expected[0][1]} pixels, {expected[1]}, {expected[2]} bits",
             )
-        with self.receives.held(caller):
-            yield PairReceiver(shape, dtype, self.limits.pair_bytes)
+        self.decodes.check(caller)
+        return PairReceiver(shape, dtype, self.limits.pair_bytes, self.received)
 
     def check_user_data(self) -> None:
         """Check that the source's pages can be read for their bytes.
@@ -175,7 +181,7 @@ class DataPlane:
 
         Args:
             pair: both frames.
-            levels: M; None stands for 256, or for that of the model's code where user bytes are asked for.
+            levels: M; None stands for `default_levels`, or for that of the code where user bytes are asked for.
             caller: who waits; nothing is computed for one who has gone.
             pilots: known symbols where they differ from the device's pattern.
             start: when the call began, in `time.perf_counter` seconds.
@@ -193,11 +199,11 @@ class DataPlane:
         start = now if start is None else start
         received = now if received is None else received
         with self.decodes.held(caller):
-            caller.check()
+            began = time.perf_counter()
             # Taken once: a swap in the meantime changes the next request, not this one.
             model = self.registry.current
             sure = pilots is None
-            levels = levels_for(model.decoder, levels, MAX_LEVELS, user_data)
+            levels = levels_for(model.decoder, levels, self.default_levels, user_data)
             if user_data:
                 pilots = pilots or model.decoder.written_pilots(levels)
             subject = "frame pair"
@@ -205,10 +211,11 @@ class DataPlane:
             seen.note(tells=sure, pair=pair)
             with observed(self.observers, seen):
                 with self._optics(user_data):
-                    page = self._decode(model, pair, levels, pilots, subject, sure=sure)
+                    page = self._decode(model, caller, pair, levels, pilots, subject, sure=sure)
                 found = self._user_data(model, page) if user_data else None
                 seen.note(page=page, user_data=found)
-        return Answer(page, model.version, received - start, time.perf_counter() - start, found, self._due)
+            self.decodes.took(time.perf_counter() - began)
+        return Answer(page, model.version, received - start, time.perf_counter() - start, found, self._signs)
 
     def read_page(
         self,
@@ -237,7 +244,6 @@ class DataPlane:
         source = self.source
         # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
         with self.decodes.held(caller):
-            caller.check()
             model, begun = self.registry.current, time.perf_counter()
             seen = Seen(f"{'next page' if page is None else f'page {page}'} of {source.name}", page, model.version)
             with observed(self.observers, seen):
@@ -257,10 +263,11 @@ class DataPlane:
                     own = model.decoder
                     pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
                 with own_fault(f"{subject}: "), self._optics(user_data):
-                    decoded = self._decode(model, found.pair, levels, pilots, subject)
+                    decoded = self._decode(model, caller, found.pair, levels, pilots, subject)
                 data = self._user_data(model, decoded, expected) if user_data else None
                 seen.note(page=decoded, user_data=data)
-        answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start, data, self._due)
+            self.decodes.took(time.perf_counter() - begun)
+        answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start, data, self._signs)
         return ReadAnswer(answer, found, mask)
 
     def _shot(self, source: FrameSource, page: int | None, caller: Caller, user_data: bool) -> Shot:
@@ -320,12 +327,27 @@ class DataPlane:
     def _due(self) -> bool:
         return self.monitor is not None and self.monitor.due
 
+    @property
+    def _signs(self) -> tuple[str, ...]:
+        if self.monitor is None or not self.monitor.due:
+            return ()
+        raised = tuple(sign.name for sign in self.monitor.state().signs if sign.raised and sign.decides)
+        return raised or ("other",)
+
     @staticmethod
     def _mask(found: Shot, decoder: Decoder) -> NDArray[np.bool_]:
         return decoder.bundle.pilot_mask if found.pilot_mask is None else found.pilot_mask
 
     def _decode(
-        self, model: Model, pair: FramePair, levels: int, pilots: Pilots | None, subject: str, *, sure: bool = True
+        self,
+        model: Model,
+        caller: Caller,
+        pair: FramePair,
+        levels: int,
+        pilots: Pilots | None,
+        subject: str,
+        *,
+        sure: bool = True,
     ) -> DecodedPage:
         """Decode with a model that was taken once, and count the page, which an error calls `subject`.
 
@@ -333,7 +355,7 @@ class DataPlane:
         be wrong.
         """
         try:
-            page = model.tracker.decode(pair, levels, pilots)
+            page = model.tracker_for(caller).decode(pair, levels, pilots)
         except LostPageError as error:
             self.metrics.lost(error, tells=sure)
             lost = error.about(subject)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +11,6 @@ from runtime.acquisition.source import FrameSource
 from runtime.errors import SourceError
 from runtime.modulator.beam_state import BeamState
 from runtime.modulator.external import ExternalBeams, ExternalModulator
-from runtime.service.caller import Caller
-
-_POLL_S = 0.05
-"""How often is looked for something new to show."""
 
 
 @dataclass(frozen=True)
@@ -52,24 +47,18 @@ class Display:
             raise SourceError(f"source {self._source.name}", "uploaded pages", expected)
         return pages.append(symbols, levels)
 
-    def wanted(self, caller: Caller) -> Iterator[Wanted]:
-        """What is waited for, at first and at every change, as long as the caller stays.
+    def wanted(self) -> Wanted:
+        """What is waited for now.
 
         Raises:
             SourceError: the source does all by itself.
-            CallerLeft: the caller has gone.
         """
         if self._modulator is None and self._beams is None:
             raise self._alone()
-        last: Wanted | None = None
-        while caller.seconds_left() > 0:
-            caller.check()
-            page = None if self._modulator is None else self._modulator.wanted(_POLL_S)
-            beams = None if self._beams is None else self._beams.wanted(_POLL_S if self._modulator is None else 0.0)
-            now = Wanted(page, beams)
-            if now != last:
-                last = now
-                yield now
+        return Wanted(
+            None if self._modulator is None else self._modulator.wanted(),
+            None if self._beams is None else self._beams.wanted(),
+        )
 
     def shown(self, page: int | None) -> None:
         """A page is on display; None: none is.

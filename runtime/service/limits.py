@@ -9,20 +9,33 @@ from runtime.wire.sizes import CHUNK_BYTES, MESSAGE_BYTES, REPLY_BYTES
 PAIR_BYTES = 256 << 20
 """Both frames of a pair: three times a full-scale 20-megapixel pair of 16 bits."""
 
-CONCURRENT_RECEIVES = 8
-"""Frame pairs being received, each with its buffer: bounds memory, leaves room for slow senders."""
+RECEIVE_BYTES = 1 << 30
+"""Bytes of pairs that were received and are not yet decoded, of all callers together: bounds the memory."""
 
 CONCURRENT_DECODES = 2
 """Decodes at once: inference uses all cores, a second page fills the gaps around it, a third would only wait inside."""
 
-CONCURRENT_CALLS = 48
-"""Calls that hold a thread; beyond them the service answers RESOURCE_EXHAUSTED at once instead of queueing blindly."""
-
-WORKER_THREADS = 24
-"""Threads for calls: receives, decodes, a recalibration and small calls beside them."""
+CONCURRENT_CALLS = 192
+"""Calls at once; beyond them the service refuses at once. A call that waits for its turn holds a thread, and one that
+sends its frames does not."""
 
 RECEIVE_S = 30.0
-"""A client that has not sent its frames by then has stalled, and its buffer is given back."""
+"""A client that has not sent its frames by then is too slow, and its buffer is given back."""
+
+STALL_S = 5.0
+"""A client that sends nothing for so long in the middle of its frames has stalled."""
+
+REPLAY_S = 600.0
+"""An answer with a request id is kept for so long: a controller that lost its connection has time to come back."""
+
+REPLAY_BYTES = 64 << 20
+"""All such answers together: some 300 full-size pages of symbols and confidences."""
+
+MODEL_BYTES = 1 << 30
+"""An uploaded bundle: five times a full-size one."""
+
+JOBS_KEPT = 64
+"""Results of jobs that are kept."""
 
 DEADLINE_S = 60.0
 """Wait for a free slot where the caller set no deadline of its own."""
@@ -58,11 +71,15 @@ class Limits:
     chunk_bytes: int = CHUNK_BYTES
     pair_bytes: int = PAIR_BYTES
     reply_bytes: int = REPLY_BYTES
-    concurrent_receives: int = CONCURRENT_RECEIVES
+    receive_bytes: int = RECEIVE_BYTES
     concurrent_decodes: int = CONCURRENT_DECODES
     concurrent_calls: int = CONCURRENT_CALLS
-    worker_threads: int = WORKER_THREADS
     receive_s: float = RECEIVE_S
+    stall_s: float = STALL_S
+    replay_s: float = REPLAY_S
+    replay_bytes: int = REPLAY_BYTES
+    model_bytes: int = MODEL_BYTES
+    jobs_kept: int = JOBS_KEPT
     deadline_s: float = DEADLINE_S
     recalibration_pages: int = RECALIBRATION_PAGES
     recalibration_s: float = RECALIBRATION_S

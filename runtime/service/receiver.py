@@ -1,11 +1,54 @@
-"""Collects the chunks of one frame pair in a buffer of the right size, allocated once."""
+"""Collects the chunks of one frame pair in a buffer of the right size, allocated once, within a budget of memory."""
 
 from __future__ import annotations
+
+import threading
+from typing import Self
 
 import numpy as np
 
 from lightpage.errors import FrameError, LimitError
 from lightpage.recording.reader import FramePair
+from runtime.errors import OverloadedError
+
+_RETRY_S = 1.0
+
+
+class ReceiveBudget:
+    """Bytes that all callers together may have sent of pairs that are not yet decoded.
+
+    Only what has come counts: a caller who sends a header and no more takes nothing from the others.
+
+    Args:
+        size: bytes.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size, self._used = size, 0
+        self._lock = threading.Lock()
+
+    @property
+    def used(self) -> int:
+        """Bytes that are taken."""
+        with self._lock:
+            return self._used
+
+    def take(self, count: int) -> None:
+        """Take bytes.
+
+        Raises:
+            OverloadedError: they are not there.
+        """
+        with self._lock:
+            if self._used + count > self._size:
+                got, expected = f"{self._used} bytes", f"at most {self._size} with {count} more; try again later"
+                raise OverloadedError("frames that are being received", got, expected, retry_s=_RETRY_S)
+            self._used += count
+
+    def give_back(self, count: int) -> None:
+        """Give bytes back."""
+        with self._lock:
+            self._used -= count
 
 
 class PairReceiver:
@@ -15,36 +58,52 @@ class PairReceiver:
         shape: (rows, columns) of a frame.
         dtype: "uint8" or "uint16" (little-endian on the wire).
         max_bytes: most bytes of a pair.
+        budget: that it takes its bytes from until it is closed; None for none.
 
     Raises:
         LimitError: the pair would be larger than `max_bytes`; nothing is allocated then.
     """
 
-    def __init__(self, shape: tuple[int, int], dtype: str, max_bytes: int) -> None:
-        self._shape = shape
+    def __init__(self, shape: tuple[int, int], dtype: str, max_bytes: int, budget: ReceiveBudget | None = None) -> None:
+        self._shape, self._budget = shape, budget
         self._dtype = np.dtype(dtype).newbyteorder("<")
-        self._frame_bytes = shape[0] * shape[1] * self._dtype.itemsize
-        if 2 * self._frame_bytes > max_bytes:
-            raise LimitError("frame pair", f"{2 * self._frame_bytes} bytes", f"at most {max_bytes}")
-        self._buffer = np.empty(2 * self._frame_bytes, np.uint8)
+        self.size = 2 * shape[0] * shape[1] * self._dtype.itemsize
+        if self.size > max_bytes:
+            raise LimitError("frame pair", f"{self.size} bytes", f"at most {max_bytes}")
+        self._buffer: np.ndarray[tuple[int], np.dtype[np.uint8]] | None = None
         self._filled = 0
 
     @property
     def complete(self) -> bool:
         """Whether every pixel has come."""
-        return self._filled == self._buffer.size
+        return self._filled == self.size
 
     def add(self, chunk: bytes) -> None:
         """Take in the next bytes.
 
         Raises:
             FrameError: more bytes than the two frames have.
+            OverloadedError: more than the budget has.
         """
         end = self._filled + len(chunk)
-        if end > self._buffer.size:
-            raise FrameError("frame pair", f"at least {end} bytes", f"{self._buffer.size} bytes, as the header says")
+        if end > self.size:
+            raise FrameError("frame pair", f"at least {end} bytes", f"{self.size} bytes, as the header says")
+        if self._budget is not None:
+            self._budget.take(len(chunk))
+        if self._buffer is None:
+            self._buffer = np.empty(self.size, np.uint8)
         self._buffer[self._filled : end] = np.frombuffer(chunk, np.uint8)
         self._filled = end
+
+    def checked(self) -> Self:
+        """Itself, if every pixel has come.
+
+        Raises:
+            FrameError: bytes are missing.
+        """
+        if not self.complete:
+            raise FrameError("frame pair", f"{self._filled} bytes", f"{self.size} bytes, as the header says")
+        return self
 
     def pair(self) -> FramePair:
         """The two frames, views of the one buffer.
@@ -52,11 +111,17 @@ class PairReceiver:
         Raises:
             FrameError: bytes are missing.
         """
-        if not self.complete:
-            raise FrameError("frame pair", f"{self._filled} bytes", f"{self._buffer.size} bytes, as the header says")
+        self.checked()
+        assert self._buffer is not None  # of what is complete
         halves = self._buffer.reshape(2, -1)
         native = self._dtype.newbyteorder("=")
         in_phase, quadrature = (
             half.view(self._dtype).reshape(self._shape).astype(native, copy=False) for half in halves
         )
         return FramePair(in_phase, quadrature)
+
+    def close(self) -> None:
+        """Give back what it took from the budget."""
+        if self._budget is not None:
+            self._budget.give_back(self._filled)
+        self._filled, self._buffer = 0, None

@@ -5,10 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 from lightpage.errors import BundleError, RecalibrationRefusedError
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker, Tracker
+from runtime.service.caller import Caller
+from runtime.service.sessions import Sessions
 
 KEPT_MODELS = 4
 """Models held loaded, the current one included: enough to step back over a bad day, and a bound on the memory."""
@@ -29,10 +32,26 @@ def no_tracker(decoder: Decoder) -> Tracker:
 
 @dataclass(frozen=True)
 class Model:
-    """A loaded decoder with the tracker that belongs to it."""
+    """A loaded decoder with the trackers that belong to it.
+
+    Attributes:
+        decoder: of its bundle.
+        tracker: follows the pages of the service's own device.
+    """
 
     decoder: Decoder
     tracker: Tracker
+
+    @cached_property
+    def sessions(self) -> Sessions:
+        """Follow the pages that callers send."""
+        return Sessions(self.tracker.anew)
+
+    def tracker_for(self, caller: Caller) -> Tracker:
+        """What follows a caller's pages."""
+        if caller.stateless:
+            return self.tracker.anew()
+        return self.sessions.tracker(caller.session) if caller.session else self.tracker
 
     @property
     def version(self) -> str:

@@ -80,7 +80,7 @@ class SelfCalibration:
         self._interval_s, self._not_before = self._settings.least_s, -float("inf")
         self._wake, self._stopping = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="lightpage-self-calibration", daemon=True)
-        self._caller = Caller(is_here=lambda: not self._stopping.is_set())
+        self._caller = Caller()
         monitor.listen(self._wake.set)
 
     def start(self) -> Self:
@@ -91,6 +91,7 @@ class SelfCalibration:
     def stop(self, wait_s: float = GRACE_S) -> None:
         """Drop a recalibration that runs, and end the thread, which is waited for at most `wait_s`."""
         self._stopping.set()
+        self._caller.leave()
         self._wake.set()
         self._thread.join(wait_s)
         if self._thread.is_alive():

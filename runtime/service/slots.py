@@ -1,21 +1,37 @@
-"""How many may do a thing at once."""
+"""How many may do a thing at once: first come, first served, and nobody is let in who could not finish."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
-from runtime.errors import SlotsTakenError
+from runtime.errors import OverloadedError, SlotsTakenError
 from runtime.service.caller import Caller
 
-_POLL_S = 0.5
-"""Seconds from one look at whether a caller who waits is still there to the next."""
+MARGIN = 1.1
+"""Of the usual time: a call with less time left than this many times it is not begun."""
+
+_MEMORY = 0.2
+"""Weight of the last duration in the usual one."""
+
+
+@dataclass(eq=False)
+class _Ticket:
+    """A place in the queue."""
+
+    told: threading.Event = field(default_factory=threading.Event)
+    has_slot: bool = False
 
 
 class Slots:
-    """A bounded number of slots, for each of which callers wait as long as they may.
+    """A bounded number of slots, for which callers queue.
+
+    Where the usual time of what the slots are for is known, a caller is turned away who could not have it done in
+    time: at the end of a long queue before anything is spent on it, and at its head before work begins.
 
     Args:
         count: slots.
@@ -24,25 +40,77 @@ class Slots:
     """
 
     def __init__(self, count: int, what: str, deadline_s: float) -> None:
-        self._free, self._what, self._deadline_s = threading.BoundedSemaphore(count), what, deadline_s
+        self._count, self._what, self._deadline_s = count, what, deadline_s
+        self._lock = threading.Lock()
+        self._free = count
+        self._queue: deque[_Ticket] = deque()
+        self._usual_s = 0.0
+
+    @property
+    def queued(self) -> int:
+        """Callers that wait."""
+        with self._lock:
+            return len(self._queue)
+
+    @property
+    def busy(self) -> int:
+        """Slots that are taken."""
+        with self._lock:
+            return self._count - self._free
+
+    @property
+    def usual_s(self) -> float:
+        """What a slot is usually held for, seconds; 0 before anything was done."""
+        return self._usual_s
+
+    def expected_wait_s(self) -> float:
+        """How long whoever comes now will wait for a slot, seconds."""
+        with self._lock:
+            ahead = len(self._queue) + (0 if self._free else 1)
+        return self._usual_s * ahead / self._count
+
+    def check(self, caller: Caller) -> None:
+        """Turn a caller away for whom it would be too late, before anything is spent on the call.
+
+        Raises:
+            OverloadedError: the queue is too long, or the caller's deadline shorter than the work takes.
+        """
+        wait_s, left_s = self.expected_wait_s(), caller.seconds_left()
+        if wait_s + MARGIN * self._usual_s > left_s:
+            raise self._too_late(left_s, wait_s)
 
     def take(self, caller: Caller) -> None:
         """Take a slot, waiting as long as the caller does, but not for one who has gone.
 
         Raises:
+            OverloadedError: too little of the caller's time is left to do the work.
             SlotsTakenError: none until the caller's time is up.
             CallerLeft: the caller has gone.
         """
-        until = time.monotonic() + min(caller.seconds_left(), self._deadline_s)
-        while not self._free.acquire(timeout=min(_POLL_S, max(0.0, until - time.monotonic()))):
-            caller.check()
-            if time.monotonic() >= until:
-                expected = "a free one within the deadline; try again later"
-                raise SlotsTakenError(f"concurrent {self._what}", "all taken", expected)
+        caller.check()
+        ticket = _Ticket()
+        with self._lock:
+            if self._free:  # then nobody waits
+                self._free -= 1
+                ticket.has_slot = True
+            else:
+                self._queue.append(ticket)
+        if not ticket.has_slot:
+            self._wait(ticket, caller)
+        left_s = caller.seconds_left()
+        if MARGIN * self._usual_s > left_s:
+            self.give_back()
+            raise self._too_late(left_s, 0.0)
 
     def give_back(self) -> None:
-        """Give back a slot that was taken."""
-        self._free.release()
+        """Give back a slot that was taken: whoever has waited longest gets it."""
+        with self._lock:
+            if self._queue:
+                ticket = self._queue.popleft()
+                ticket.has_slot = True
+                ticket.told.set()
+            else:
+                self._free += 1
 
     @contextmanager
     def held(self, caller: Caller) -> Iterator[None]:
@@ -52,3 +120,50 @@ class Slots:
             yield
         finally:
             self.give_back()
+
+    @contextmanager
+    def held_at_once(self) -> Iterator[None]:
+        """Hold a slot without waiting for one.
+
+        Raises:
+            SlotsTakenError: there is none.
+        """
+        with self._lock:
+            if not self._free:
+                raise SlotsTakenError(self._what, "all taken", f"at most {self._count} at once", retry_s=1.0)
+            self._free -= 1
+        try:
+            yield
+        finally:
+            self.give_back()
+
+    def took(self, seconds: float) -> None:
+        """Learn from work that was done how long it usually takes."""
+        with self._lock:
+            self._usual_s += (_MEMORY if self._usual_s else 1.0) * (seconds - self._usual_s)
+
+    def _wait(self, ticket: _Ticket, caller: Caller) -> None:
+        until = time.monotonic() + min(caller.seconds_left(), self._deadline_s)
+        with caller.telling(ticket.told.set):
+            ticket.told.wait(max(0.0, until - time.monotonic()))
+        with self._lock:
+            if not ticket.has_slot:
+                self._queue.remove(ticket)
+        if not caller.is_here:
+            if ticket.has_slot:
+                self.give_back()
+            caller.check()
+        if not ticket.has_slot:
+            expected = "a free one within the deadline; try again later"
+            raise SlotsTakenError(f"concurrent {self._what}", "all taken", expected, retry_s=self.expected_wait_s())
+
+    def _too_late(self, left_s: float, wait_s: float) -> OverloadedError:
+        needed_s = wait_s + MARGIN * self._usual_s
+        alone = MARGIN * self._usual_s > left_s and not wait_s and not self.queued
+        told = f"{max(0.0, left_s):.2f} s until the deadline"
+        return OverloadedError(
+            f"concurrent {self._what}",
+            told,
+            f"at least {needed_s:.2f} s" + ("" if alone else f", {wait_s:.2f} s of it in the queue; try again later"),
+            retry_s=None if alone else max(self._usual_s / self._count, needed_s - max(0.0, left_s)),
+        )

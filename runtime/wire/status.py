@@ -6,47 +6,112 @@ import re
 from typing import Any
 
 import grpc
+from google.protobuf.any_pb2 import Any as AnyMessage
+from google.protobuf.duration_pb2 import Duration
+from google.rpc import error_details_pb2 as rpc_details
+from google.rpc import status_pb2 as rpc_status
 
 from lightpage.errors import (
+    BlackFrameError,
     BundleError,
     BusyError,
     CalibrationError,
+    FrameError,
+    FramesDisagreeError,
     InvalidInputError,
     LightpageError,
     LimitError,
     LostDataError,
+    NoCodeError,
+    NoSuchPageError,
     RecalibrationRefusedError,
+    SaturatedFrameError,
 )
 from runtime.errors import (
     ERRORS,
     CallerLeft,
     LostPageError,
+    LostShotError,
+    MalformedError,
+    ModelExistsError,
+    NoSourceError,
+    NoSuchJobError,
+    OtherModelError,
+    OverloadedError,
     Reason,
+    RequestIdError,
     SlotsTakenError,
     SourceError,
+    StalledError,
     StoppingError,
+    StoreError,
     WorkerError,
 )
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 DETAIL_KEY = "lightpage-error-bin"
+STATUS_KEY = "grpc-status-details-bin"
+DOMAIN = "lightpage"
 
-_CODES: tuple[tuple[type[BaseException], grpc.StatusCode], ...] = (
-    (InvalidInputError, grpc.StatusCode.INVALID_ARGUMENT),
-    (LimitError, grpc.StatusCode.RESOURCE_EXHAUSTED),
-    (LostPageError, grpc.StatusCode.DATA_LOSS),
-    (LostDataError, grpc.StatusCode.DATA_LOSS),
-    (SlotsTakenError, grpc.StatusCode.RESOURCE_EXHAUSTED),
-    (BusyError, grpc.StatusCode.ABORTED),
-    (SourceError, grpc.StatusCode.FAILED_PRECONDITION),
-    (StoppingError, grpc.StatusCode.UNAVAILABLE),
-    (WorkerError, grpc.StatusCode.ABORTED),
-    (BundleError, grpc.StatusCode.FAILED_PRECONDITION),
-    (RecalibrationRefusedError, grpc.StatusCode.FAILED_PRECONDITION),
-    (CalibrationError, grpc.StatusCode.FAILED_PRECONDITION),
-    (CallerLeft, grpc.StatusCode.CANCELLED),
-    (grpc.RpcError, grpc.StatusCode.CANCELLED),  # raised while reading a request whose sender has gone
+_Code = grpc.StatusCode
+_MEANINGS: tuple[tuple[type[BaseException], grpc.StatusCode, pb.ErrorReason], ...] = (
+    (MalformedError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_MALFORMED),
+    (RequestIdError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_REQUEST_ID),
+    (NoSuchPageError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_NO_SUCH_PAGE),
+    (BlackFrameError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_FRAME_BLACK),
+    (SaturatedFrameError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_FRAME_SATURATED),
+    (FramesDisagreeError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_FRAMES_DISAGREE),
+    (FrameError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_FRAME_FORMAT),
+    (InvalidInputError, _Code.INVALID_ARGUMENT, pb.ERROR_REASON_INVALID_VALUE),
+    (LimitError, _Code.RESOURCE_EXHAUSTED, pb.ERROR_REASON_TOO_LARGE),
+    (LostShotError, _Code.DATA_LOSS, pb.ERROR_REASON_SHOT_LOST),
+    (LostPageError, _Code.DATA_LOSS, pb.ERROR_REASON_PAGE_NOT_BELIEVED),
+    (LostDataError, _Code.DATA_LOSS, pb.ERROR_REASON_PAGE_NOT_BELIEVED),
+    (SlotsTakenError, _Code.RESOURCE_EXHAUSTED, pb.ERROR_REASON_OVERLOADED),
+    (OtherModelError, _Code.ABORTED, pb.ERROR_REASON_OTHER_MODEL),
+    (BusyError, _Code.ABORTED, pb.ERROR_REASON_RECALIBRATION_RUNS),
+    (NoSourceError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_NO_SOURCE),
+    (SourceError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_SOURCE_BROKEN),
+    (StoppingError, _Code.UNAVAILABLE, pb.ERROR_REASON_STOPPING),
+    (WorkerError, _Code.ABORTED, pb.ERROR_REASON_WORKER),
+    (ModelExistsError, _Code.ALREADY_EXISTS, pb.ERROR_REASON_MODEL),
+    (StoreError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_STORE),
+    (NoCodeError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_NO_CODE),
+    (BundleError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_MODEL),
+    (RecalibrationRefusedError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_RECALIBRATION_REFUSED),
+    (CalibrationError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_RECALIBRATION_REFUSED),
+    (NoSuchJobError, _Code.NOT_FOUND, pb.ERROR_REASON_NO_SUCH_JOB),
+    (StalledError, _Code.CANCELLED, pb.ERROR_REASON_STALLED),
+    (CallerLeft, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),
+    (grpc.RpcError, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),  # while reading from a sender who has gone
 )
+"""Of each error class its status and its reason; the first that fits counts."""
+
+_EARLIER_KINDS = frozenset(
+    [
+        "BundleError",
+        "BusyError",
+        "CalibrationError",
+        "FrameError",
+        "FramesDisagreeError",
+        "InvalidInputError",
+        "LightpageError",
+        "LimitError",
+        "LostDataError",
+        "LostPageError",
+        "LostShotError",
+        "PageError",
+        "ProfileError",
+        "RecalibrationRefusedError",
+        "RecordingError",
+        "SlotsTakenError",
+        "SourceError",
+        "StoppingError",
+        "UnconfirmedPageError",
+        "WorkerError",
+    ]
+)
+"""Classes that callers know who do not look at `exact_kind`."""
 
 _REASONS: dict[Reason, Any] = {reason: pb.LossReason.Value(f"LOSS_REASON_{reason}") for reason in Reason}
 
@@ -56,10 +121,22 @@ _FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")
 
 def status_of(error: BaseException) -> grpc.StatusCode:
     """The status code for an error; INTERNAL for what nobody foresaw."""
-    for kind, code in _CODES:
+    return _meaning(error)[0]
+
+
+def reason_of(error: BaseException) -> pb.ErrorReason:
+    """The reason that goes with the status."""
+    reason = _meaning(error)[1]
+    if reason == pb.ERROR_REASON_OVERLOADED and isinstance(error, OverloadedError) and error.retry_s is None:
+        return pb.ERROR_REASON_DEADLINE_TOO_SHORT
+    return reason
+
+
+def _meaning(error: BaseException) -> tuple[grpc.StatusCode, pb.ErrorReason]:
+    for kind, code, reason in _MEANINGS:
         if isinstance(error, kind):
-            return code
-    return grpc.StatusCode.INTERNAL
+            return code, reason
+    return grpc.StatusCode.INTERNAL, pb.ERROR_REASON_INTERNAL
 
 
 def without_folders(text: str) -> str:
@@ -70,37 +147,79 @@ def without_folders(text: str) -> str:
 def detail_of(error: LightpageError) -> pb.ErrorDetail:
     """A foreseen error as its message, files named without their folders."""
     subject, got, expected = (without_folders(text)[:1000] for text in (error.subject, error.got, error.expected))
-    detail = pb.ErrorDetail(kind=type(error).__name__, thing=subject, got=got, wanted=expected)
+    exact = type(error).__name__
+    kind = next(known.__name__ for known in type(error).__mro__ if known.__name__ in _EARLIER_KINDS)
+    detail = pb.ErrorDetail(kind=kind, thing=subject, got=got, wanted=expected)
+    if exact != kind:
+        detail.exact_kind = exact
     if isinstance(error, LostPageError):
         detail.reason = _REASONS[error.reason]
         detail.recalibration_due = error.recalibration_due
     return detail
 
 
-def abort(context: grpc.ServicerContext, error: BaseException) -> None:
-    """End the call with the status of `error`. Always raises, as `context.abort` does.
-
-    A foreseen error names files without their folders. An unforeseen one gives its class only: its text may hold
-    anything.
-    """
-    code = status_of(error)
+def told(error: BaseException) -> str:
+    """What a caller reads. An unforeseen error gives its class only: its text may hold anything."""
     if isinstance(error, LightpageError):
         detail = detail_of(error)
-        context.set_trailing_metadata(((DETAIL_KEY, detail.SerializeToString()),))
-        context.abort(code, f"{detail.thing}: got {detail.got}, wanted {detail.wanted}"[:2000])
-    context.abort(code, f"{type(error).__name__} in the service; its log says more")
+        return f"{detail.thing}: got {detail.got}, wanted {detail.wanted}"[:2000]
+    if isinstance(error, CallerLeft):
+        return "the caller has gone"
+    return f"{type(error).__name__} in the service; its log says more"
+
+
+def trailers(error: BaseException) -> tuple[tuple[str, bytes], ...]:
+    """The metadata that end a call beside its status: `ErrorDetail`, and google.rpc's details."""
+    code, reason = status_of(error), reason_of(error)
+    info = rpc_details.ErrorInfo(reason=pb.ErrorReason.Name(reason).removeprefix("ERROR_REASON_"), domain=DOMAIN)
+    details: list[Any] = [info]
+    own: list[tuple[str, bytes]] = []
+    if isinstance(error, LightpageError):
+        detail = detail_of(error)
+        own.append((DETAIL_KEY, detail.SerializeToString()))
+        if isinstance(error, LostPageError):
+            info.metadata["recalibration_due"] = "true" if error.recalibration_due else "false"
+            info.metadata["loss_reason"] = error.reason.value
+        elif isinstance(error, OtherModelError):
+            info.metadata["model_version"] = detail.got
+        if (job := getattr(error, "job", None)) is not None:
+            info.metadata["job"] = job
+        if (retry_s := getattr(error, "retry_s", None)) is not None:
+            delay = Duration()
+            delay.FromNanoseconds(int(1e9 * retry_s))
+            details.append(rpc_details.RetryInfo(retry_delay=delay))
+        if isinstance(error, InvalidInputError):
+            violation = rpc_details.BadRequest.FieldViolation(field=detail.thing, description=told(error))
+            details.append(rpc_details.BadRequest(field_violations=[violation]))
+    status = rpc_status.Status(code=code.value[0], message=told(error))
+    for each in details:
+        packed = AnyMessage()
+        packed.Pack(each)
+        status.details.append(packed)
+    return (*own, (STATUS_KEY, status.SerializeToString()))
+
+
+def refusal_of(error: BaseException) -> pb.Refusal:
+    """How a call would have ended, for one page of many; an unforeseen error tells its class only."""
+    code = status_of(error).value[0]
+    if isinstance(error, LightpageError):
+        return pb.Refusal(code=code, detail=detail_of(error), reason=reason_of(error))
+    detail = pb.ErrorDetail(kind="LightpageError", thing="service", got=told(error), wanted="an answer")
+    return pb.Refusal(code=code, detail=detail, reason=reason_of(error))
 
 
 def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
     """The error that the service at `target` meant, of the same class wherever it said which."""
     call: Any = rpc
+    retry_s: float | None = None
+    detail: pb.ErrorDetail | None = None
     for key, value in call.trailing_metadata() or ():
         if key == DETAIL_KEY:
             detail = pb.ErrorDetail.FromString(value)
-            kind, told = ERRORS.get(detail.kind, LightpageError), (detail.thing, detail.got, detail.wanted)
-            if issubclass(kind, LostPageError):
-                return kind(*told, _reason(detail.reason), detail.recalibration_due)
-            return kind(*told)
+        elif key == STATUS_KEY:
+            retry_s = _retry_s(value)
+    if detail is not None:
+        return error_from(detail, retry_s)
     code, text = call.code(), call.details() or "no details"
     subject = f"service at {target}"
     if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
@@ -108,6 +227,25 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
     if code == grpc.StatusCode.UNAVAILABLE:
         return LightpageError(subject, f"no connection ({text})", "a running Lightpage service at this address")
     return LightpageError(subject, f"{code.name}: {text}", "an answer")
+
+
+def error_from(detail: pb.ErrorDetail, retry_s: float | None = None) -> LightpageError:
+    """The error that a message stands for; of a class that this version does not know, the nearest one."""
+    kind = ERRORS.get(detail.exact_kind) or ERRORS.get(detail.kind, LightpageError)
+    parts = (detail.thing, detail.got, detail.wanted)
+    if issubclass(kind, LostPageError):
+        return kind(*parts, _reason(detail.reason), detail.recalibration_due)
+    if issubclass(kind, SlotsTakenError):
+        return kind(*parts, retry_s)
+    return kind(*parts)
+
+
+def _retry_s(value: bytes) -> float | None:
+    retry = rpc_details.RetryInfo()
+    for packed in rpc_status.Status.FromString(value).details:
+        if packed.Unpack(retry):
+            return float(1e-9 * retry.retry_delay.ToNanoseconds())
+    return None
 
 
 def _reason(code: pb.LossReason) -> Reason:

@@ -38,7 +38,8 @@ from runtime.errors import Reason, SourceError, StoppingError, UnconfirmedPageEr
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.recalibration.outcome import Refit, RefitResult
-from runtime.rpc.server import SERVICE, LightpageServer
+from runtime.rpc.call import SERVICE
+from runtime.rpc.server import LightpageServer
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits
@@ -303,7 +304,7 @@ def test_oversize_requests_are_refused_before_anything_is_allocated(start: Start
 
 
 def test_a_client_that_leaves_mid_call_leaves_nothing_behind(start: Start) -> None:
-    service = start(Limits(concurrent_receives=2))
+    service = start(Limits(receive_bytes=1 << 20))
     gone = threading.Event()
 
     def endless() -> Iterator[pb.DecodeFramesRequest]:
@@ -311,39 +312,45 @@ def test_a_client_that_leaves_mid_call_leaves_nothing_behind(start: Start) -> No
         yield pb.DecodeFramesRequest(chunk=bytes(100))
         gone.wait(20)
 
-    for _ in range(6):  # three times as many as there are slots
+    for _ in range(6):
         with grpc.insecure_channel(service.server.target) as channel:
             call = service.stub(channel).DecodeFrames.future(endless(), timeout=20)
             assert wait_until(lambda: service.count("lightpage_calls_in_flight") == 1)
             call.cancel()
         assert wait_until(lambda: service.count("lightpage_calls_in_flight") == 0)
     gone.set()
+    assert wait_until(lambda: service.plane.received.used == 0)
     assert (service.client.decode(a_page()[1], 16).symbols == a_page()[0]).all()
     assert service.count("lightpage_pages_total", model_version="toy-1") == 1
+    assert service.plane.received.used == 0
 
 
-def test_a_client_that_stalls_is_cut_off_and_gives_its_slot_back(start: Start) -> None:
-    service = start(Limits(concurrent_receives=1, receive_s=0.3))
+def test_clients_that_stall_cost_the_others_nothing_and_are_cut_off(start: Start) -> None:
+    service = start(Limits(stall_s=1.0))
     over = threading.Event()
 
     def stalling() -> Iterator[pb.DecodeFramesRequest]:
         yield pb.DecodeFramesRequest(header=header())
+        yield pb.DecodeFramesRequest(chunk=bytes(100))
         over.wait(20)
 
     with grpc.insecure_channel(service.server.target) as channel:
-        call = service.stub(channel).DecodeFrames.future(stalling(), timeout=20)
-        page = service.client.decode(a_page()[1], 16)  # waits for the one slot
-        assert (page.symbols == a_page()[0]).all()
-        with pytest.raises(grpc.RpcError) as error:
-            call.result()
-        assert error.value.code() == grpc.StatusCode.CANCELLED
+        calls = [service.stub(channel).DecodeFrames.future(stalling(), timeout=20) for _ in range(60)]
+        assert wait_until(lambda: service.count("lightpage_calls_in_flight") == 60)
+        assert (service.client.decode(a_page()[1], 16).symbols == a_page()[0]).all()
+        assert service.count("lightpage_calls_in_flight") == 60  # all of them are still there
+        for call in calls:
+            with pytest.raises(grpc.RpcError, match="within 1 s") as error:
+                call.result()
+            assert error.value.code() == grpc.StatusCode.CANCELLED
         over.set()
+    assert service.plane.received.used == 0
 
 
 def test_waiting_for_a_slot_is_not_stalling(start: Start) -> None:
-    service = start(Limits(concurrent_receives=1, receive_s=0.3))
-    service.plane.receives.take(Caller())
-    free = threading.Timer(0.8, service.plane.receives.give_back)
+    service = start(Limits(concurrent_decodes=1, receive_s=0.3, stall_s=0.3))
+    service.plane.decodes.take(Caller())
+    free = threading.Timer(0.8, service.plane.decodes.give_back)
     free.start()
     assert (service.client.decode(a_page()[1], 16).symbols == a_page()[0]).all()
     free.join(5)
@@ -484,10 +491,10 @@ def test_health_is_served_beside_the_service_and_ends_first(start: Start) -> Non
     service = start()
     with grpc.insecure_channel(service.server.target) as channel:
         stub = health_pb2_grpc.HealthStub(channel)
-        for name in ("", SERVICE):
+        for name in ("", SERVICE.full_name):
             answer = stub.Check(health_pb2.HealthCheckRequest(service=name), timeout=5)
             assert answer.status == health_pb2.HealthCheckResponse.SERVING
-        watch = stub.Watch(health_pb2.HealthCheckRequest(service=SERVICE), timeout=10)
+        watch = stub.Watch(health_pb2.HealthCheckRequest(service=SERVICE.full_name), timeout=10)
         assert next(watch).status == health_pb2.HealthCheckResponse.SERVING
         ending = threading.Thread(target=service.server.stop, args=(2.0,))
         ending.start()

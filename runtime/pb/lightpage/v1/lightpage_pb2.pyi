@@ -8,6 +8,13 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
+class ModelOrigin(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    MODEL_ORIGIN_UNSPECIFIED: _ClassVar[ModelOrigin]
+    MODEL_ORIGIN_GIVEN: _ClassVar[ModelOrigin]
+    MODEL_ORIGIN_RECALIBRATED: _ClassVar[ModelOrigin]
+    MODEL_ORIGIN_UPLOADED: _ClassVar[ModelOrigin]
+
 class PixelType(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     PIXEL_TYPE_UNSPECIFIED: _ClassVar[PixelType]
@@ -20,6 +27,26 @@ class ConfidenceFormat(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     CONFIDENCE_FORMAT_FLOAT32: _ClassVar[ConfidenceFormat]
     CONFIDENCE_FORMAT_UINT8: _ClassVar[ConfidenceFormat]
 
+class Tracking(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    TRACKING_UNSPECIFIED: _ClassVar[Tracking]
+    TRACKING_SESSION: _ClassVar[Tracking]
+    TRACKING_STATELESS: _ClassVar[Tracking]
+
+class RecalibrationReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    RECALIBRATION_REASON_UNSPECIFIED: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_PAGE: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_MARGIN: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_INFORMATION: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_TRUST: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_PILOT_SHARE: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_UNREAD: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_RESIDUAL: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_SHIFT: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_PISTON: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_OTHER: _ClassVar[RecalibrationReason]
+
 class DataLoss(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     DATA_LOSS_UNSPECIFIED: _ClassVar[DataLoss]
@@ -28,6 +55,46 @@ class DataLoss(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     DATA_LOSS_CODE: _ClassVar[DataLoss]
     DATA_LOSS_BODY: _ClassVar[DataLoss]
     DATA_LOSS_CHECKSUM: _ClassVar[DataLoss]
+
+class JobState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    JOB_STATE_UNSPECIFIED: _ClassVar[JobState]
+    JOB_STATE_RUNNING: _ClassVar[JobState]
+    JOB_STATE_DONE: _ClassVar[JobState]
+    JOB_STATE_REFUSED: _ClassVar[JobState]
+    JOB_STATE_FAILED: _ClassVar[JobState]
+    JOB_STATE_CANCELLED: _ClassVar[JobState]
+    JOB_STATE_INTERRUPTED: _ClassVar[JobState]
+
+class ErrorReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    ERROR_REASON_UNSPECIFIED: _ClassVar[ErrorReason]
+    ERROR_REASON_MALFORMED: _ClassVar[ErrorReason]
+    ERROR_REASON_INVALID_VALUE: _ClassVar[ErrorReason]
+    ERROR_REASON_FRAME_FORMAT: _ClassVar[ErrorReason]
+    ERROR_REASON_FRAME_BLACK: _ClassVar[ErrorReason]
+    ERROR_REASON_FRAME_SATURATED: _ClassVar[ErrorReason]
+    ERROR_REASON_FRAMES_DISAGREE: _ClassVar[ErrorReason]
+    ERROR_REASON_PAGE_NOT_BELIEVED: _ClassVar[ErrorReason]
+    ERROR_REASON_SHOT_LOST: _ClassVar[ErrorReason]
+    ERROR_REASON_NO_SUCH_PAGE: _ClassVar[ErrorReason]
+    ERROR_REASON_TOO_LARGE: _ClassVar[ErrorReason]
+    ERROR_REASON_OVERLOADED: _ClassVar[ErrorReason]
+    ERROR_REASON_DEADLINE_TOO_SHORT: _ClassVar[ErrorReason]
+    ERROR_REASON_STALLED: _ClassVar[ErrorReason]
+    ERROR_REASON_RECALIBRATION_RUNS: _ClassVar[ErrorReason]
+    ERROR_REASON_OTHER_MODEL: _ClassVar[ErrorReason]
+    ERROR_REASON_RECALIBRATION_REFUSED: _ClassVar[ErrorReason]
+    ERROR_REASON_NO_SOURCE: _ClassVar[ErrorReason]
+    ERROR_REASON_SOURCE_BROKEN: _ClassVar[ErrorReason]
+    ERROR_REASON_MODEL: _ClassVar[ErrorReason]
+    ERROR_REASON_NO_CODE: _ClassVar[ErrorReason]
+    ERROR_REASON_STORE: _ClassVar[ErrorReason]
+    ERROR_REASON_NO_SUCH_JOB: _ClassVar[ErrorReason]
+    ERROR_REASON_STOPPING: _ClassVar[ErrorReason]
+    ERROR_REASON_WORKER: _ClassVar[ErrorReason]
+    ERROR_REASON_REQUEST_ID: _ClassVar[ErrorReason]
+    ERROR_REASON_INTERNAL: _ClassVar[ErrorReason]
 
 class LossReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -46,18 +113,70 @@ class LossReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     LOSS_REASON_TRIGGER_REFUSED: _ClassVar[LossReason]
     LOSS_REASON_NOT_ON_DISPLAY: _ClassVar[LossReason]
     LOSS_REASON_BEAM_CONTROL_FAILED: _ClassVar[LossReason]
+MODEL_ORIGIN_UNSPECIFIED: ModelOrigin
+MODEL_ORIGIN_GIVEN: ModelOrigin
+MODEL_ORIGIN_RECALIBRATED: ModelOrigin
+MODEL_ORIGIN_UPLOADED: ModelOrigin
 PIXEL_TYPE_UNSPECIFIED: PixelType
 PIXEL_TYPE_UINT8: PixelType
 PIXEL_TYPE_UINT16: PixelType
 CONFIDENCE_FORMAT_UNSPECIFIED: ConfidenceFormat
 CONFIDENCE_FORMAT_FLOAT32: ConfidenceFormat
 CONFIDENCE_FORMAT_UINT8: ConfidenceFormat
+TRACKING_UNSPECIFIED: Tracking
+TRACKING_SESSION: Tracking
+TRACKING_STATELESS: Tracking
+RECALIBRATION_REASON_UNSPECIFIED: RecalibrationReason
+RECALIBRATION_REASON_PAGE: RecalibrationReason
+RECALIBRATION_REASON_MARGIN: RecalibrationReason
+RECALIBRATION_REASON_INFORMATION: RecalibrationReason
+RECALIBRATION_REASON_TRUST: RecalibrationReason
+RECALIBRATION_REASON_PILOT_SHARE: RecalibrationReason
+RECALIBRATION_REASON_UNREAD: RecalibrationReason
+RECALIBRATION_REASON_RESIDUAL: RecalibrationReason
+RECALIBRATION_REASON_SHIFT: RecalibrationReason
+RECALIBRATION_REASON_PISTON: RecalibrationReason
+RECALIBRATION_REASON_OTHER: RecalibrationReason
 DATA_LOSS_UNSPECIFIED: DataLoss
 DATA_LOSS_OPTICS: DataLoss
 DATA_LOSS_HEADER: DataLoss
 DATA_LOSS_CODE: DataLoss
 DATA_LOSS_BODY: DataLoss
 DATA_LOSS_CHECKSUM: DataLoss
+JOB_STATE_UNSPECIFIED: JobState
+JOB_STATE_RUNNING: JobState
+JOB_STATE_DONE: JobState
+JOB_STATE_REFUSED: JobState
+JOB_STATE_FAILED: JobState
+JOB_STATE_CANCELLED: JobState
+JOB_STATE_INTERRUPTED: JobState
+ERROR_REASON_UNSPECIFIED: ErrorReason
+ERROR_REASON_MALFORMED: ErrorReason
+ERROR_REASON_INVALID_VALUE: ErrorReason
+ERROR_REASON_FRAME_FORMAT: ErrorReason
+ERROR_REASON_FRAME_BLACK: ErrorReason
+ERROR_REASON_FRAME_SATURATED: ErrorReason
+ERROR_REASON_FRAMES_DISAGREE: ErrorReason
+ERROR_REASON_PAGE_NOT_BELIEVED: ErrorReason
+ERROR_REASON_SHOT_LOST: ErrorReason
+ERROR_REASON_NO_SUCH_PAGE: ErrorReason
+ERROR_REASON_TOO_LARGE: ErrorReason
+ERROR_REASON_OVERLOADED: ErrorReason
+ERROR_REASON_DEADLINE_TOO_SHORT: ErrorReason
+ERROR_REASON_STALLED: ErrorReason
+ERROR_REASON_RECALIBRATION_RUNS: ErrorReason
+ERROR_REASON_OTHER_MODEL: ErrorReason
+ERROR_REASON_RECALIBRATION_REFUSED: ErrorReason
+ERROR_REASON_NO_SOURCE: ErrorReason
+ERROR_REASON_SOURCE_BROKEN: ErrorReason
+ERROR_REASON_MODEL: ErrorReason
+ERROR_REASON_NO_CODE: ErrorReason
+ERROR_REASON_STORE: ErrorReason
+ERROR_REASON_NO_SUCH_JOB: ErrorReason
+ERROR_REASON_STOPPING: ErrorReason
+ERROR_REASON_WORKER: ErrorReason
+ERROR_REASON_REQUEST_ID: ErrorReason
+ERROR_REASON_INTERNAL: ErrorReason
 LOSS_REASON_UNSPECIFIED: LossReason
 LOSS_REASON_PILOTS_DISAGREE: LossReason
 LOSS_REASON_IMAGE_NOT_FOUND: LossReason
@@ -79,7 +198,7 @@ class DescribeRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class DescribeReply(_message.Message):
-    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml", "pilot_mask", "pilot_phases", "code_toml", "user_bytes_per_page")
+    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml", "pilot_mask", "pilot_phases", "code_toml", "user_bytes_per_page", "default_levels")
     SERVICE_VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -93,6 +212,7 @@ class DescribeReply(_message.Message):
     PILOT_PHASES_FIELD_NUMBER: _ClassVar[int]
     CODE_TOML_FIELD_NUMBER: _ClassVar[int]
     USER_BYTES_PER_PAGE_FIELD_NUMBER: _ClassVar[int]
+    DEFAULT_LEVELS_FIELD_NUMBER: _ClassVar[int]
     service_version: str
     model: Model
     camera: Camera
@@ -106,10 +226,11 @@ class DescribeReply(_message.Message):
     pilot_phases: _containers.RepeatedScalarFieldContainer[float]
     code_toml: str
     user_bytes_per_page: int
-    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ..., pilot_mask: _Optional[bytes] = ..., pilot_phases: _Optional[_Iterable[float]] = ..., code_toml: _Optional[str] = ..., user_bytes_per_page: _Optional[int] = ...) -> None: ...
+    default_levels: int
+    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ..., pilot_mask: _Optional[bytes] = ..., pilot_phases: _Optional[_Iterable[float]] = ..., code_toml: _Optional[str] = ..., user_bytes_per_page: _Optional[int] = ..., default_levels: _Optional[int] = ...) -> None: ...
 
 class Model(_message.Message):
-    __slots__ = ("name", "version", "created", "current", "metrics")
+    __slots__ = ("name", "version", "created", "current", "metrics", "pinned", "loaded", "origin")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -122,12 +243,18 @@ class Model(_message.Message):
     CREATED_FIELD_NUMBER: _ClassVar[int]
     CURRENT_FIELD_NUMBER: _ClassVar[int]
     METRICS_FIELD_NUMBER: _ClassVar[int]
+    PINNED_FIELD_NUMBER: _ClassVar[int]
+    LOADED_FIELD_NUMBER: _ClassVar[int]
+    ORIGIN_FIELD_NUMBER: _ClassVar[int]
     name: str
     version: str
     created: str
     current: bool
     metrics: _containers.ScalarMap[str, float]
-    def __init__(self, name: _Optional[str] = ..., version: _Optional[str] = ..., created: _Optional[str] = ..., current: _Optional[bool] = ..., metrics: _Optional[_Mapping[str, float]] = ...) -> None: ...
+    pinned: bool
+    loaded: bool
+    origin: ModelOrigin
+    def __init__(self, name: _Optional[str] = ..., version: _Optional[str] = ..., created: _Optional[str] = ..., current: _Optional[bool] = ..., metrics: _Optional[_Mapping[str, float]] = ..., pinned: _Optional[bool] = ..., loaded: _Optional[bool] = ..., origin: _Optional[_Union[ModelOrigin, str]] = ...) -> None: ...
 
 class Camera(_message.Message):
     __slots__ = ("rows_px", "columns_px", "bit_depth", "pixel_type")
@@ -150,30 +277,42 @@ class PageShape(_message.Message):
     def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ...) -> None: ...
 
 class Limits(_message.Message):
-    __slots__ = ("message_bytes", "chunk_bytes", "pair_bytes", "concurrent_decodes")
+    __slots__ = ("message_bytes", "chunk_bytes", "pair_bytes", "concurrent_decodes", "replay_s", "replay_bytes", "recalibration_pages", "model_bytes")
     MESSAGE_BYTES_FIELD_NUMBER: _ClassVar[int]
     CHUNK_BYTES_FIELD_NUMBER: _ClassVar[int]
     PAIR_BYTES_FIELD_NUMBER: _ClassVar[int]
     CONCURRENT_DECODES_FIELD_NUMBER: _ClassVar[int]
+    REPLAY_S_FIELD_NUMBER: _ClassVar[int]
+    REPLAY_BYTES_FIELD_NUMBER: _ClassVar[int]
+    RECALIBRATION_PAGES_FIELD_NUMBER: _ClassVar[int]
+    MODEL_BYTES_FIELD_NUMBER: _ClassVar[int]
     message_bytes: int
     chunk_bytes: int
     pair_bytes: int
     concurrent_decodes: int
-    def __init__(self, message_bytes: _Optional[int] = ..., chunk_bytes: _Optional[int] = ..., pair_bytes: _Optional[int] = ..., concurrent_decodes: _Optional[int] = ...) -> None: ...
+    replay_s: float
+    replay_bytes: int
+    recalibration_pages: int
+    model_bytes: int
+    def __init__(self, message_bytes: _Optional[int] = ..., chunk_bytes: _Optional[int] = ..., pair_bytes: _Optional[int] = ..., concurrent_decodes: _Optional[int] = ..., replay_s: _Optional[float] = ..., replay_bytes: _Optional[int] = ..., recalibration_pages: _Optional[int] = ..., model_bytes: _Optional[int] = ...) -> None: ...
 
 class DecodeOptions(_message.Message):
-    __slots__ = ("levels", "confidence_format", "want_concentration", "want_phase", "want_user_data")
+    __slots__ = ("levels", "confidence_format", "want_concentration", "want_phase", "want_user_data", "session", "tracking")
     LEVELS_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FORMAT_FIELD_NUMBER: _ClassVar[int]
     WANT_CONCENTRATION_FIELD_NUMBER: _ClassVar[int]
     WANT_PHASE_FIELD_NUMBER: _ClassVar[int]
     WANT_USER_DATA_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FIELD_NUMBER: _ClassVar[int]
+    TRACKING_FIELD_NUMBER: _ClassVar[int]
     levels: int
     confidence_format: ConfidenceFormat
     want_concentration: bool
     want_phase: bool
     want_user_data: bool
-    def __init__(self, levels: _Optional[int] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., want_concentration: _Optional[bool] = ..., want_phase: _Optional[bool] = ..., want_user_data: _Optional[bool] = ...) -> None: ...
+    session: str
+    tracking: Tracking
+    def __init__(self, levels: _Optional[int] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., want_concentration: _Optional[bool] = ..., want_phase: _Optional[bool] = ..., want_user_data: _Optional[bool] = ..., session: _Optional[str] = ..., tracking: _Optional[_Union[Tracking, str]] = ...) -> None: ...
 
 class Pilots(_message.Message):
     __slots__ = ("mask", "values", "levels")
@@ -186,20 +325,28 @@ class Pilots(_message.Message):
     def __init__(self, mask: _Optional[bytes] = ..., values: _Optional[bytes] = ..., levels: _Optional[int] = ...) -> None: ...
 
 class DecodeHeader(_message.Message):
-    __slots__ = ("rows_px", "columns_px", "pixel_type", "bit_depth", "options", "pilots")
+    __slots__ = ("rows_px", "columns_px", "pixel_type", "bit_depth", "options", "pilots", "frame_id", "captured_s", "correlation_id", "black_level")
     ROWS_PX_FIELD_NUMBER: _ClassVar[int]
     COLUMNS_PX_FIELD_NUMBER: _ClassVar[int]
     PIXEL_TYPE_FIELD_NUMBER: _ClassVar[int]
     BIT_DEPTH_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     PILOTS_FIELD_NUMBER: _ClassVar[int]
+    FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    CAPTURED_S_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    BLACK_LEVEL_FIELD_NUMBER: _ClassVar[int]
     rows_px: int
     columns_px: int
     pixel_type: PixelType
     bit_depth: int
     options: DecodeOptions
     pilots: Pilots
-    def __init__(self, rows_px: _Optional[int] = ..., columns_px: _Optional[int] = ..., pixel_type: _Optional[_Union[PixelType, str]] = ..., bit_depth: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., pilots: _Optional[_Union[Pilots, _Mapping]] = ...) -> None: ...
+    frame_id: int
+    captured_s: float
+    correlation_id: str
+    black_level: int
+    def __init__(self, rows_px: _Optional[int] = ..., columns_px: _Optional[int] = ..., pixel_type: _Optional[_Union[PixelType, str]] = ..., bit_depth: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., pilots: _Optional[_Union[Pilots, _Mapping]] = ..., frame_id: _Optional[int] = ..., captured_s: _Optional[float] = ..., correlation_id: _Optional[str] = ..., black_level: _Optional[int] = ...) -> None: ...
 
 class DecodeFramesRequest(_message.Message):
     __slots__ = ("header", "chunk")
@@ -210,7 +357,7 @@ class DecodeFramesRequest(_message.Message):
     def __init__(self, header: _Optional[_Union[DecodeHeader, _Mapping]] = ..., chunk: _Optional[bytes] = ...) -> None: ...
 
 class DecodeReply(_message.Message):
-    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings", "pilot_trust", "claimed_bits", "confirmed_bits", "recalibration_due", "image", "user_data")
+    __slots__ = ("rows", "columns", "levels", "symbols", "confidence", "confidence_format", "concentration", "phase", "piston_rad", "pilot_coherence", "model_version", "timings", "pilot_trust", "claimed_bits", "confirmed_bits", "recalibration_due", "image", "user_data", "frame_id", "captured_s", "correlation_id", "recalibration_reasons")
     ROWS_FIELD_NUMBER: _ClassVar[int]
     COLUMNS_FIELD_NUMBER: _ClassVar[int]
     LEVELS_FIELD_NUMBER: _ClassVar[int]
@@ -229,6 +376,10 @@ class DecodeReply(_message.Message):
     RECALIBRATION_DUE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     USER_DATA_FIELD_NUMBER: _ClassVar[int]
+    FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    CAPTURED_S_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    RECALIBRATION_REASONS_FIELD_NUMBER: _ClassVar[int]
     rows: int
     columns: int
     levels: int
@@ -247,7 +398,35 @@ class DecodeReply(_message.Message):
     recalibration_due: bool
     image: ImagePosition
     user_data: UserData
-    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ..., claimed_bits: _Optional[float] = ..., confirmed_bits: _Optional[float] = ..., recalibration_due: _Optional[bool] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ...) -> None: ...
+    frame_id: int
+    captured_s: float
+    correlation_id: str
+    recalibration_reasons: _containers.RepeatedScalarFieldContainer[RecalibrationReason]
+    def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ..., levels: _Optional[int] = ..., symbols: _Optional[bytes] = ..., confidence: _Optional[bytes] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., concentration: _Optional[bytes] = ..., phase: _Optional[bytes] = ..., piston_rad: _Optional[float] = ..., pilot_coherence: _Optional[float] = ..., model_version: _Optional[str] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., pilot_trust: _Optional[float] = ..., claimed_bits: _Optional[float] = ..., confirmed_bits: _Optional[float] = ..., recalibration_due: _Optional[bool] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., user_data: _Optional[_Union[UserData, _Mapping]] = ..., frame_id: _Optional[int] = ..., captured_s: _Optional[float] = ..., correlation_id: _Optional[str] = ..., recalibration_reasons: _Optional[_Iterable[_Union[RecalibrationReason, str]]] = ...) -> None: ...
+
+class DecodePagesReply(_message.Message):
+    __slots__ = ("decoded", "refused")
+    DECODED_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    decoded: DecodeReply
+    refused: Refusal
+    def __init__(self, decoded: _Optional[_Union[DecodeReply, _Mapping]] = ..., refused: _Optional[_Union[Refusal, _Mapping]] = ...) -> None: ...
+
+class Refusal(_message.Message):
+    __slots__ = ("code", "detail", "reason", "frame_id", "correlation_id", "page")
+    CODE_FIELD_NUMBER: _ClassVar[int]
+    DETAIL_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    PAGE_FIELD_NUMBER: _ClassVar[int]
+    code: int
+    detail: ErrorDetail
+    reason: ErrorReason
+    frame_id: int
+    correlation_id: str
+    page: int
+    def __init__(self, code: _Optional[int] = ..., detail: _Optional[_Union[ErrorDetail, _Mapping]] = ..., reason: _Optional[_Union[ErrorReason, str]] = ..., frame_id: _Optional[int] = ..., correlation_id: _Optional[str] = ..., page: _Optional[int] = ...) -> None: ...
 
 class UserData(_message.Message):
     __slots__ = ("data", "loss", "header", "data_pages", "parity_pages", "margin_bits", "corrected", "blocks", "failed_blocks", "iterations", "file_checksum")
@@ -338,26 +517,68 @@ class Timings(_message.Message):
     def __init__(self, receive_s: _Optional[float] = ..., decode_s: _Optional[float] = ..., inference_s: _Optional[float] = ..., total_s: _Optional[float] = ...) -> None: ...
 
 class ReadPageRequest(_message.Message):
-    __slots__ = ("page", "options", "want_written")
+    __slots__ = ("page", "options", "want_written", "request_id", "correlation_id")
     PAGE_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     WANT_WRITTEN_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
     page: int
     options: DecodeOptions
     want_written: bool
-    def __init__(self, page: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., want_written: _Optional[bool] = ...) -> None: ...
+    request_id: str
+    correlation_id: str
+    def __init__(self, page: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., want_written: _Optional[bool] = ..., request_id: _Optional[str] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+
+class ReadPagesRequest(_message.Message):
+    __slots__ = ("pages", "count", "options", "want_written", "correlation_id")
+    PAGES_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    OPTIONS_FIELD_NUMBER: _ClassVar[int]
+    WANT_WRITTEN_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    pages: _containers.RepeatedScalarFieldContainer[int]
+    count: int
+    options: DecodeOptions
+    want_written: bool
+    correlation_id: str
+    def __init__(self, pages: _Optional[_Iterable[int]] = ..., count: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., want_written: _Optional[bool] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+
+class ReadPagesReply(_message.Message):
+    __slots__ = ("read", "refused")
+    READ_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    read: ReadPageReply
+    refused: Refusal
+    def __init__(self, read: _Optional[_Union[ReadPageReply, _Mapping]] = ..., refused: _Optional[_Union[Refusal, _Mapping]] = ...) -> None: ...
 
 class ReadPageReply(_message.Message):
-    __slots__ = ("decoded", "page", "written", "pilot_mask")
+    __slots__ = ("decoded", "page", "written", "pilot_mask", "frames", "replayed")
     DECODED_FIELD_NUMBER: _ClassVar[int]
     PAGE_FIELD_NUMBER: _ClassVar[int]
     WRITTEN_FIELD_NUMBER: _ClassVar[int]
     PILOT_MASK_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    REPLAYED_FIELD_NUMBER: _ClassVar[int]
     decoded: DecodeReply
     page: int
     written: bytes
     pilot_mask: bytes
-    def __init__(self, decoded: _Optional[_Union[DecodeReply, _Mapping]] = ..., page: _Optional[int] = ..., written: _Optional[bytes] = ..., pilot_mask: _Optional[bytes] = ...) -> None: ...
+    frames: _containers.RepeatedCompositeFieldContainer[CameraFrame]
+    replayed: bool
+    def __init__(self, decoded: _Optional[_Union[DecodeReply, _Mapping]] = ..., page: _Optional[int] = ..., written: _Optional[bytes] = ..., pilot_mask: _Optional[bytes] = ..., frames: _Optional[_Iterable[_Union[CameraFrame, _Mapping]]] = ..., replayed: _Optional[bool] = ...) -> None: ...
+
+class CameraFrame(_message.Message):
+    __slots__ = ("serial", "frame_id", "device_time_s", "host_time_s")
+    SERIAL_FIELD_NUMBER: _ClassVar[int]
+    FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_S_FIELD_NUMBER: _ClassVar[int]
+    HOST_TIME_S_FIELD_NUMBER: _ClassVar[int]
+    serial: str
+    frame_id: int
+    device_time_s: float
+    host_time_s: float
+    def __init__(self, serial: _Optional[str] = ..., frame_id: _Optional[int] = ..., device_time_s: _Optional[float] = ..., host_time_s: _Optional[float] = ...) -> None: ...
 
 class UploadPagesRequest(_message.Message):
     __slots__ = ("levels", "symbols")
@@ -410,14 +631,116 @@ class ReportDisplayReply(_message.Message):
     def __init__(self) -> None: ...
 
 class RecalibrateRequest(_message.Message):
-    __slots__ = ("source", "recording", "recording_count")
+    __slots__ = ("source", "recording", "recording_count", "expected_version")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     RECORDING_FIELD_NUMBER: _ClassVar[int]
     RECORDING_COUNT_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_VERSION_FIELD_NUMBER: _ClassVar[int]
     source: SourcePages
     recording: str
     recording_count: int
-    def __init__(self, source: _Optional[_Union[SourcePages, _Mapping]] = ..., recording: _Optional[str] = ..., recording_count: _Optional[int] = ...) -> None: ...
+    expected_version: str
+    def __init__(self, source: _Optional[_Union[SourcePages, _Mapping]] = ..., recording: _Optional[str] = ..., recording_count: _Optional[int] = ..., expected_version: _Optional[str] = ...) -> None: ...
+
+class StartRecalibrationRequest(_message.Message):
+    __slots__ = ("source", "recording", "recording_count", "expected_version", "correlation_id")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    RECORDING_FIELD_NUMBER: _ClassVar[int]
+    RECORDING_COUNT_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    source: SourcePages
+    recording: str
+    recording_count: int
+    expected_version: str
+    correlation_id: str
+    def __init__(self, source: _Optional[_Union[SourcePages, _Mapping]] = ..., recording: _Optional[str] = ..., recording_count: _Optional[int] = ..., expected_version: _Optional[str] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+
+class RecalibrateFramesRequest(_message.Message):
+    __slots__ = ("header", "reference", "symbols", "chunk")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_FIELD_NUMBER: _ClassVar[int]
+    SYMBOLS_FIELD_NUMBER: _ClassVar[int]
+    CHUNK_FIELD_NUMBER: _ClassVar[int]
+    header: RecalibrateFramesHeader
+    reference: bytes
+    symbols: bytes
+    chunk: bytes
+    def __init__(self, header: _Optional[_Union[RecalibrateFramesHeader, _Mapping]] = ..., reference: _Optional[bytes] = ..., symbols: _Optional[bytes] = ..., chunk: _Optional[bytes] = ...) -> None: ...
+
+class RecalibrateFramesHeader(_message.Message):
+    __slots__ = ("rows_px", "columns_px", "pixel_type", "bit_depth", "black_level", "levels", "pages", "pilot_mask", "expected_version", "correlation_id")
+    ROWS_PX_FIELD_NUMBER: _ClassVar[int]
+    COLUMNS_PX_FIELD_NUMBER: _ClassVar[int]
+    PIXEL_TYPE_FIELD_NUMBER: _ClassVar[int]
+    BIT_DEPTH_FIELD_NUMBER: _ClassVar[int]
+    BLACK_LEVEL_FIELD_NUMBER: _ClassVar[int]
+    LEVELS_FIELD_NUMBER: _ClassVar[int]
+    PAGES_FIELD_NUMBER: _ClassVar[int]
+    PILOT_MASK_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    rows_px: int
+    columns_px: int
+    pixel_type: PixelType
+    bit_depth: int
+    black_level: int
+    levels: int
+    pages: int
+    pilot_mask: bytes
+    expected_version: str
+    correlation_id: str
+    def __init__(self, rows_px: _Optional[int] = ..., columns_px: _Optional[int] = ..., pixel_type: _Optional[_Union[PixelType, str]] = ..., bit_depth: _Optional[int] = ..., black_level: _Optional[int] = ..., levels: _Optional[int] = ..., pages: _Optional[int] = ..., pilot_mask: _Optional[bytes] = ..., expected_version: _Optional[str] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+
+class Job(_message.Message):
+    __slots__ = ("id", "state", "progress", "result", "refusal", "created_s", "ended_s", "correlation_id", "pages_of")
+    ID_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    PROGRESS_FIELD_NUMBER: _ClassVar[int]
+    RESULT_FIELD_NUMBER: _ClassVar[int]
+    REFUSAL_FIELD_NUMBER: _ClassVar[int]
+    CREATED_S_FIELD_NUMBER: _ClassVar[int]
+    ENDED_S_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    PAGES_OF_FIELD_NUMBER: _ClassVar[int]
+    id: str
+    state: JobState
+    progress: Progress
+    result: RecalibrationResult
+    refusal: Refusal
+    created_s: float
+    ended_s: float
+    correlation_id: str
+    pages_of: str
+    def __init__(self, id: _Optional[str] = ..., state: _Optional[_Union[JobState, str]] = ..., progress: _Optional[_Union[Progress, _Mapping]] = ..., result: _Optional[_Union[RecalibrationResult, _Mapping]] = ..., refusal: _Optional[_Union[Refusal, _Mapping]] = ..., created_s: _Optional[float] = ..., ended_s: _Optional[float] = ..., correlation_id: _Optional[str] = ..., pages_of: _Optional[str] = ...) -> None: ...
+
+class ListJobsRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class ListJobsReply(_message.Message):
+    __slots__ = ("jobs",)
+    JOBS_FIELD_NUMBER: _ClassVar[int]
+    jobs: _containers.RepeatedCompositeFieldContainer[Job]
+    def __init__(self, jobs: _Optional[_Iterable[_Union[Job, _Mapping]]] = ...) -> None: ...
+
+class GetJobRequest(_message.Message):
+    __slots__ = ("id",)
+    ID_FIELD_NUMBER: _ClassVar[int]
+    id: str
+    def __init__(self, id: _Optional[str] = ...) -> None: ...
+
+class WatchJobRequest(_message.Message):
+    __slots__ = ("id",)
+    ID_FIELD_NUMBER: _ClassVar[int]
+    id: str
+    def __init__(self, id: _Optional[str] = ...) -> None: ...
+
+class CancelJobRequest(_message.Message):
+    __slots__ = ("id",)
+    ID_FIELD_NUMBER: _ClassVar[int]
+    id: str
+    def __init__(self, id: _Optional[str] = ...) -> None: ...
 
 class SourcePages(_message.Message):
     __slots__ = ("count", "pages")
@@ -472,8 +795,12 @@ class RecalibrationResult(_message.Message):
     def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ..., pages_used: _Optional[int] = ..., pages_held_back: _Optional[int] = ..., air_before: _Optional[float] = ..., air_after: _Optional[float] = ..., angle_deg: _Optional[float] = ..., coherence_before: _Optional[float] = ..., coherence_after: _Optional[float] = ..., seconds: _Optional[float] = ..., pages_lost_before: _Optional[int] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ...) -> None: ...
 
 class RollbackRequest(_message.Message):
-    __slots__ = ()
-    def __init__(self) -> None: ...
+    __slots__ = ("expected_version", "correlation_id")
+    EXPECTED_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    expected_version: str
+    correlation_id: str
+    def __init__(self, expected_version: _Optional[str] = ..., correlation_id: _Optional[str] = ...) -> None: ...
 
 class RollbackReply(_message.Message):
     __slots__ = ("model_version", "previous_version")
@@ -483,9 +810,85 @@ class RollbackReply(_message.Message):
     previous_version: str
     def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ...) -> None: ...
 
+class RollForwardRequest(_message.Message):
+    __slots__ = ("expected_version", "correlation_id")
+    EXPECTED_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    expected_version: str
+    correlation_id: str
+    def __init__(self, expected_version: _Optional[str] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+
+class RollForwardReply(_message.Message):
+    __slots__ = ("model_version", "previous_version")
+    MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    PREVIOUS_VERSION_FIELD_NUMBER: _ClassVar[int]
+    model_version: str
+    previous_version: str
+    def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ...) -> None: ...
+
 class ListModelsRequest(_message.Message):
-    __slots__ = ()
-    def __init__(self) -> None: ...
+    __slots__ = ("stored",)
+    STORED_FIELD_NUMBER: _ClassVar[int]
+    stored: bool
+    def __init__(self, stored: _Optional[bool] = ...) -> None: ...
+
+class UploadModelRequest(_message.Message):
+    __slots__ = ("header", "chunk")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    CHUNK_FIELD_NUMBER: _ClassVar[int]
+    header: UploadModelHeader
+    chunk: bytes
+    def __init__(self, header: _Optional[_Union[UploadModelHeader, _Mapping]] = ..., chunk: _Optional[bytes] = ...) -> None: ...
+
+class UploadModelHeader(_message.Message):
+    __slots__ = ("bytes", "sha256", "correlation_id")
+    BYTES_FIELD_NUMBER: _ClassVar[int]
+    SHA256_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    bytes: int
+    sha256: bytes
+    correlation_id: str
+    def __init__(self, bytes: _Optional[int] = ..., sha256: _Optional[bytes] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+
+class UploadModelReply(_message.Message):
+    __slots__ = ("model",)
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    model: Model
+    def __init__(self, model: _Optional[_Union[Model, _Mapping]] = ...) -> None: ...
+
+class ActivateModelRequest(_message.Message):
+    __slots__ = ("version", "expected_version", "correlation_id")
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    version: str
+    expected_version: str
+    correlation_id: str
+    def __init__(self, version: _Optional[str] = ..., expected_version: _Optional[str] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+
+class ActivateModelReply(_message.Message):
+    __slots__ = ("model_version", "previous_version")
+    MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    PREVIOUS_VERSION_FIELD_NUMBER: _ClassVar[int]
+    model_version: str
+    previous_version: str
+    def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ...) -> None: ...
+
+class PinModelRequest(_message.Message):
+    __slots__ = ("version", "pinned", "correlation_id")
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    PINNED_FIELD_NUMBER: _ClassVar[int]
+    CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    version: str
+    pinned: bool
+    correlation_id: str
+    def __init__(self, version: _Optional[str] = ..., pinned: _Optional[bool] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+
+class PinModelReply(_message.Message):
+    __slots__ = ("model",)
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    model: Model
+    def __init__(self, model: _Optional[_Union[Model, _Mapping]] = ...) -> None: ...
 
 class ListModelsReply(_message.Message):
     __slots__ = ("models",)
@@ -494,17 +897,19 @@ class ListModelsReply(_message.Message):
     def __init__(self, models: _Optional[_Iterable[_Union[Model, _Mapping]]] = ...) -> None: ...
 
 class ErrorDetail(_message.Message):
-    __slots__ = ("kind", "thing", "got", "wanted", "reason", "recalibration_due")
+    __slots__ = ("kind", "thing", "got", "wanted", "reason", "recalibration_due", "exact_kind")
     KIND_FIELD_NUMBER: _ClassVar[int]
     THING_FIELD_NUMBER: _ClassVar[int]
     GOT_FIELD_NUMBER: _ClassVar[int]
     WANTED_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     RECALIBRATION_DUE_FIELD_NUMBER: _ClassVar[int]
+    EXACT_KIND_FIELD_NUMBER: _ClassVar[int]
     kind: str
     thing: str
     got: str
     wanted: str
     reason: LossReason
     recalibration_due: bool
-    def __init__(self, kind: _Optional[str] = ..., thing: _Optional[str] = ..., got: _Optional[str] = ..., wanted: _Optional[str] = ..., reason: _Optional[_Union[LossReason, str]] = ..., recalibration_due: _Optional[bool] = ...) -> None: ...
+    exact_kind: str
+    def __init__(self, kind: _Optional[str] = ..., thing: _Optional[str] = ..., got: _Optional[str] = ..., wanted: _Optional[str] = ..., reason: _Optional[_Union[LossReason, str]] = ..., recalibration_due: _Optional[bool] = ..., exact_kind: _Optional[str] = ...) -> None: ...

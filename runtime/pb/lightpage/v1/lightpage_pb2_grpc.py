@@ -27,8 +27,9 @@ if _version_not_supported:
 
 
 class LightpageStub:
-    """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
-    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
+    """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large (no RetryInfo), or the service has too
+    much to do to answer before the caller's deadline (RetryInfo says when to try again). ABORTED: the model in service is not
+    the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
     and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
     """
 
@@ -48,10 +49,20 @@ class LightpageStub:
                 request_serializer=lightpage_dot_v1_dot_lightpage__pb2.DecodeFramesRequest.SerializeToString,
                 response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.DecodeReply.FromString,
                 _registered_method=True)
+        self.DecodePages = channel.stream_stream(
+                '/lightpage.v1.Lightpage/DecodePages',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.DecodeFramesRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.DecodePagesReply.FromString,
+                _registered_method=True)
         self.ReadPage = channel.unary_unary(
                 '/lightpage.v1.Lightpage/ReadPage',
                 request_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPageRequest.SerializeToString,
                 response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPageReply.FromString,
+                _registered_method=True)
+        self.ReadPages = channel.unary_stream(
+                '/lightpage.v1.Lightpage/ReadPages',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPagesRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPagesReply.FromString,
                 _registered_method=True)
         self.ReadData = channel.unary_stream(
                 '/lightpage.v1.Lightpage/ReadData',
@@ -88,11 +99,62 @@ class LightpageStub:
                 request_serializer=lightpage_dot_v1_dot_lightpage__pb2.ListModelsRequest.SerializeToString,
                 response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ListModelsReply.FromString,
                 _registered_method=True)
+        self.RollForward = channel.unary_unary(
+                '/lightpage.v1.Lightpage/RollForward',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.RollForwardRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.RollForwardReply.FromString,
+                _registered_method=True)
+        self.UploadModel = channel.stream_unary(
+                '/lightpage.v1.Lightpage/UploadModel',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.UploadModelRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.UploadModelReply.FromString,
+                _registered_method=True)
+        self.ActivateModel = channel.unary_unary(
+                '/lightpage.v1.Lightpage/ActivateModel',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.ActivateModelRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ActivateModelReply.FromString,
+                _registered_method=True)
+        self.PinModel = channel.unary_unary(
+                '/lightpage.v1.Lightpage/PinModel',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.PinModelRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.PinModelReply.FromString,
+                _registered_method=True)
+        self.StartRecalibration = channel.unary_unary(
+                '/lightpage.v1.Lightpage/StartRecalibration',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.StartRecalibrationRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.Job.FromString,
+                _registered_method=True)
+        self.RecalibrateFrames = channel.stream_unary(
+                '/lightpage.v1.Lightpage/RecalibrateFrames',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.RecalibrateFramesRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.Job.FromString,
+                _registered_method=True)
+        self.ListJobs = channel.unary_unary(
+                '/lightpage.v1.Lightpage/ListJobs',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.ListJobsRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ListJobsReply.FromString,
+                _registered_method=True)
+        self.GetJob = channel.unary_unary(
+                '/lightpage.v1.Lightpage/GetJob',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.GetJobRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.Job.FromString,
+                _registered_method=True)
+        self.WatchJob = channel.unary_stream(
+                '/lightpage.v1.Lightpage/WatchJob',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.WatchJobRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.Job.FromString,
+                _registered_method=True)
+        self.CancelJob = channel.unary_unary(
+                '/lightpage.v1.Lightpage/CancelJob',
+                request_serializer=lightpage_dot_v1_dot_lightpage__pb2.CancelJobRequest.SerializeToString,
+                response_deserializer=lightpage_dot_v1_dot_lightpage__pb2.Job.FromString,
+                _registered_method=True)
 
 
 class LightpageServicer:
-    """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
-    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
+    """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large (no RetryInfo), or the service has too
+    much to do to answer before the caller's deadline (RetryInfo says when to try again). ABORTED: the model in service is not
+    the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
     and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
     """
 
@@ -111,8 +173,24 @@ class LightpageServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def DecodePages(self, request_iterator, context):
+        """Decode frame pairs, one after another, in one call: each is a header, then its chunks as in DecodeFrames. A reply for
+        each, in their order; a pair that is refused or lost ends nothing. At most two pairs are on their way at a time: the
+        service reads no further until the first is answered.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def ReadPage(self, request, context):
         """Read a page from the service's own source and decode it.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ReadPages(self, request, context):
+        """Read pages from the service's own source, one after another. A reply for each, in their order; a lost page ends nothing.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -160,7 +238,7 @@ class LightpageServicer:
         raise NotImplementedError('Method not implemented!')
 
     def Rollback(self, request, context):
-        """Go back to the model that was in service before the current one.
+        """Go back to the model that was in service before the current one, which stays: RollForward leads to it again.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -168,6 +246,78 @@ class LightpageServicer:
 
     def ListModels(self, request, context):
         """All models that can be served at once, the oldest first.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def RollForward(self, request, context):
+        """The opposite of Rollback: FAILED_PRECONDITION where there is no later model.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def UploadModel(self, request_iterator, context):
+        """Give the service a bundle: a header first, then the .zip in chunks. It is checked as at a start, its golden page
+        included, and kept in the store; it is not in service before ActivateModel. ALREADY_EXISTS: there is one of its version.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ActivateModel(self, request, context):
+        """Put a model of the store in service.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def PinModel(self, request, context):
+        """A pinned model is never deleted. While the model in service is pinned, the service does not recalibrate by itself.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def StartRecalibration(self, request, context):
+        """Start a recalibration and return at once. It goes on when the caller leaves; one runs at a time.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def RecalibrateFrames(self, request_iterator, context):
+        """The same with frames that the caller sends: a header, then reference frames (once), then for each page its pair and its
+        symbols. The job starts once all has come.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ListJobs(self, request, context):
+        """Jobs that run, and those that ended lately; the newest first. Results are kept across restarts.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def GetJob(self, request, context):
+        """NOT_FOUND: no such job, or one that ended long ago.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def WatchJob(self, request, context):
+        """The job now, and at each change, until it has ended. A caller that lost its connection watches again.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def CancelJob(self, request, context):
+        """Stop a job at its next step; returns it as it is then. One that has ended stays as it is.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -186,10 +336,20 @@ def add_LightpageServicer_to_server(servicer, server):
                     request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.DecodeFramesRequest.FromString,
                     response_serializer=lightpage_dot_v1_dot_lightpage__pb2.DecodeReply.SerializeToString,
             ),
+            'DecodePages': grpc.stream_stream_rpc_method_handler(
+                    servicer.DecodePages,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.DecodeFramesRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.DecodePagesReply.SerializeToString,
+            ),
             'ReadPage': grpc.unary_unary_rpc_method_handler(
                     servicer.ReadPage,
                     request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPageRequest.FromString,
                     response_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPageReply.SerializeToString,
+            ),
+            'ReadPages': grpc.unary_stream_rpc_method_handler(
+                    servicer.ReadPages,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPagesRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.ReadPagesReply.SerializeToString,
             ),
             'ReadData': grpc.unary_stream_rpc_method_handler(
                     servicer.ReadData,
@@ -226,6 +386,56 @@ def add_LightpageServicer_to_server(servicer, server):
                     request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ListModelsRequest.FromString,
                     response_serializer=lightpage_dot_v1_dot_lightpage__pb2.ListModelsReply.SerializeToString,
             ),
+            'RollForward': grpc.unary_unary_rpc_method_handler(
+                    servicer.RollForward,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.RollForwardRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.RollForwardReply.SerializeToString,
+            ),
+            'UploadModel': grpc.stream_unary_rpc_method_handler(
+                    servicer.UploadModel,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.UploadModelRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.UploadModelReply.SerializeToString,
+            ),
+            'ActivateModel': grpc.unary_unary_rpc_method_handler(
+                    servicer.ActivateModel,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ActivateModelRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.ActivateModelReply.SerializeToString,
+            ),
+            'PinModel': grpc.unary_unary_rpc_method_handler(
+                    servicer.PinModel,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.PinModelRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.PinModelReply.SerializeToString,
+            ),
+            'StartRecalibration': grpc.unary_unary_rpc_method_handler(
+                    servicer.StartRecalibration,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.StartRecalibrationRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.Job.SerializeToString,
+            ),
+            'RecalibrateFrames': grpc.stream_unary_rpc_method_handler(
+                    servicer.RecalibrateFrames,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.RecalibrateFramesRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.Job.SerializeToString,
+            ),
+            'ListJobs': grpc.unary_unary_rpc_method_handler(
+                    servicer.ListJobs,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.ListJobsRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.ListJobsReply.SerializeToString,
+            ),
+            'GetJob': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetJob,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.GetJobRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.Job.SerializeToString,
+            ),
+            'WatchJob': grpc.unary_stream_rpc_method_handler(
+                    servicer.WatchJob,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.WatchJobRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.Job.SerializeToString,
+            ),
+            'CancelJob': grpc.unary_unary_rpc_method_handler(
+                    servicer.CancelJob,
+                    request_deserializer=lightpage_dot_v1_dot_lightpage__pb2.CancelJobRequest.FromString,
+                    response_serializer=lightpage_dot_v1_dot_lightpage__pb2.Job.SerializeToString,
+            ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
             'lightpage.v1.Lightpage', rpc_method_handlers)
@@ -235,8 +445,9 @@ def add_LightpageServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class Lightpage:
-    """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large, or the service had no free slot until
-    the caller's deadline. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
+    """INVALID_ARGUMENT: what the caller sent is wrong. RESOURCE_EXHAUSTED: it is too large (no RetryInfo), or the service has too
+    much to do to answer before the caller's deadline (RetryInfo says when to try again). ABORTED: the model in service is not
+    the one that was expected, or another recalibration runs. FAILED_PRECONDITION: the service's own source or models do not allow it. DATA_LOSS: the page is lost,
     and nothing that the caller sent need be wrong; `ErrorDetail.reason` says why.
     """
 
@@ -295,6 +506,33 @@ class Lightpage:
             _registered_method=True)
 
     @staticmethod
+    def DecodePages(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_stream(
+            request_iterator,
+            target,
+            '/lightpage.v1.Lightpage/DecodePages',
+            lightpage_dot_v1_dot_lightpage__pb2.DecodeFramesRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.DecodePagesReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
     def ReadPage(request,
             target,
             options=(),
@@ -311,6 +549,33 @@ class Lightpage:
             '/lightpage.v1.Lightpage/ReadPage',
             lightpage_dot_v1_dot_lightpage__pb2.ReadPageRequest.SerializeToString,
             lightpage_dot_v1_dot_lightpage__pb2.ReadPageReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ReadPages(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/ReadPages',
+            lightpage_dot_v1_dot_lightpage__pb2.ReadPagesRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.ReadPagesReply.FromString,
             options,
             channel_credentials,
             insecure,
@@ -500,6 +765,276 @@ class Lightpage:
             '/lightpage.v1.Lightpage/ListModels',
             lightpage_dot_v1_dot_lightpage__pb2.ListModelsRequest.SerializeToString,
             lightpage_dot_v1_dot_lightpage__pb2.ListModelsReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RollForward(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/RollForward',
+            lightpage_dot_v1_dot_lightpage__pb2.RollForwardRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.RollForwardReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def UploadModel(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_unary(
+            request_iterator,
+            target,
+            '/lightpage.v1.Lightpage/UploadModel',
+            lightpage_dot_v1_dot_lightpage__pb2.UploadModelRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.UploadModelReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ActivateModel(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/ActivateModel',
+            lightpage_dot_v1_dot_lightpage__pb2.ActivateModelRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.ActivateModelReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def PinModel(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/PinModel',
+            lightpage_dot_v1_dot_lightpage__pb2.PinModelRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.PinModelReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def StartRecalibration(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/StartRecalibration',
+            lightpage_dot_v1_dot_lightpage__pb2.StartRecalibrationRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.Job.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RecalibrateFrames(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_unary(
+            request_iterator,
+            target,
+            '/lightpage.v1.Lightpage/RecalibrateFrames',
+            lightpage_dot_v1_dot_lightpage__pb2.RecalibrateFramesRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.Job.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ListJobs(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/ListJobs',
+            lightpage_dot_v1_dot_lightpage__pb2.ListJobsRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.ListJobsReply.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetJob(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/GetJob',
+            lightpage_dot_v1_dot_lightpage__pb2.GetJobRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.Job.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def WatchJob(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/WatchJob',
+            lightpage_dot_v1_dot_lightpage__pb2.WatchJobRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.Job.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def CancelJob(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/lightpage.v1.Lightpage/CancelJob',
+            lightpage_dot_v1_dot_lightpage__pb2.CancelJobRequest.SerializeToString,
+            lightpage_dot_v1_dot_lightpage__pb2.Job.FromString,
             options,
             channel_credentials,
             insecure,

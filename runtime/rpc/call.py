@@ -1,0 +1,240 @@
+"""One call from its first byte to its status: parsed, counted, handed to whoever answers it, and ended.
+
+A handler is a method named as the RPC, of one of the classes in this package. It takes the request, or an asynchronous
+iterator of requests, and the `Call`; it returns the reply, or is a generator of replies. A plain `def` runs in a thread
+and may block; an `async def` runs on the server's loop and must not.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import math
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Generator, Sequence
+from concurrent.futures import Executor, Future
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol, TypeVar
+
+import grpc
+from google.protobuf.message import DecodeError, Message
+
+from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.service.caller import Caller
+from runtime.service.limits import Limits
+from runtime.service.metrics import ServiceMetrics
+from runtime.wire.status import status_of, told, trailers
+
+SERVICE = pb.DESCRIPTOR.services_by_name["Lightpage"]
+
+ENDLESS = frozenset(["WatchDisplay", "WatchJob"])
+"""Calls that last as long as their callers like: they hold no thread, are no load, and end with the service."""
+
+T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class Call:
+    """What a handler knows of its call beside the request.
+
+    Attributes:
+        method: name of the RPC.
+        caller: who waits for the answer.
+        pool: threads for what blocks.
+        peer: address and connection that it came from.
+        correlation_id: the caller's own text for the log, empty where it gave none.
+    """
+
+    method: str
+    caller: Caller
+    pool: Executor
+    peer: str = ""
+    correlation_id: str = ""
+
+    async def in_thread(self, work: Callable[[], T]) -> T:
+        """Do in a thread what blocks or computes; when the call ends before, the work goes on by itself."""
+        return await asyncio.wrap_future(self.pool.submit(work))
+
+
+class CallLog(Protocol):
+    """Is told how calls end."""
+
+    def ended(self, call: Call, code: grpc.StatusCode, error: BaseException | None) -> None:
+        """A call has ended, well where `error` is None."""
+
+
+class PlainCallLog:
+    """Logs what nobody foresaw."""
+
+    def ended(self, call: Call, code: grpc.StatusCode, error: BaseException | None) -> None:
+        """See `CallLog`."""
+        if code is grpc.StatusCode.INTERNAL:
+            _log.error("%s failed", call.method, exc_info=error)
+
+
+class Dispatcher:
+    """Hands calls to their handlers. Lives on one event loop.
+
+    Args:
+        handlers: objects whose methods answer; of two with the same method the first counts.
+        pool: threads for handlers that block, as many as there may be calls.
+        limits: of the service.
+        metrics: what is counted.
+        log: is told how calls end.
+    """
+
+    def __init__(
+        self, handlers: Sequence[object], pool: Executor, limits: Limits, metrics: ServiceMetrics, log: CallLog
+    ) -> None:
+        self._handlers, self._pool, self._limits = tuple(handlers), pool, limits
+        self._metrics, self._log = metrics, log
+        self._active = 0
+        self._endless: set[asyncio.Task[Any]] = set()
+        self._longest_s = {"ReadData": limits.range_s, "ReadPages": limits.range_s}
+
+    def rpc_handler(self) -> grpc.GenericRpcHandler[Any, Any]:
+        """All RPCs of the service that have a handler, for the server.
+
+        Messages come as bytes: the library answers those that it cannot parse with INTERNAL and a traceback, and keeps
+        20 kB of each.
+        """
+        methods = {}
+        for method in SERVICE.methods:
+            handler = next((found for one in self._handlers if (found := getattr(one, method.name, None))), None)
+            if handler is None:
+                continue
+            parse = getattr(pb, method.input_type.name).FromString
+            made = {
+                (False, False): (grpc.unary_unary_rpc_method_handler, self._unary),
+                (True, False): (grpc.stream_unary_rpc_method_handler, self._unary),
+                (False, True): (grpc.unary_stream_rpc_method_handler, self._stream),
+                (True, True): (grpc.stream_stream_rpc_method_handler, self._stream),
+            }
+            make, serve = made[method.client_streaming, method.server_streaming]
+            serving = partial(serve, method.name, handler, parse, method.client_streaming)
+            methods[method.name] = make(serving, None, getattr(pb, method.output_type.name).SerializeToString)
+        return grpc.method_handlers_generic_handler(SERVICE.full_name, methods)
+
+    def end_endless(self) -> None:
+        """End the calls that would not end by themselves."""
+        for task in self._endless:
+            task.cancel()
+
+    async def _unary(
+        self, name: str, handler: Callable[..., Any], parse: Callable[[bytes], Any], many: bool, data: Any, context: Any
+    ) -> Any:
+        async with self._call(name, context) as call:
+            request = self._messages(data, parse, call) if many else _parsed(parse, data, call)
+            if inspect.iscoroutinefunction(handler):
+                return await handler(request, call)
+            return await asyncio.wrap_future(self._pool.submit(handler, request, call))
+
+    async def _stream(
+        self, name: str, handler: Callable[..., Any], parse: Callable[[bytes], Any], many: bool, data: Any, context: Any
+    ) -> AsyncIterator[Any]:
+        async with self._call(name, context) as call:
+            request = self._messages(data, parse, call) if many else _parsed(parse, data, call)
+            if inspect.isasyncgenfunction(handler):
+                replies: AsyncGenerator[Any, None] = handler(request, call)
+            else:
+                replies = self._stepped(handler(request, call), call)
+            longest_s = self._longest_s.get(name)
+            try:
+                async with asyncio.timeout(longest_s):
+                    async for reply in replies:
+                        yield reply
+            except TimeoutError:
+                raise StalledError(f"answer of {name}", f"not taken within {longest_s} s", "a faster reader") from None
+            finally:
+                await replies.aclose()
+
+    async def _stepped(self, replies: Generator[Any, None, None], call: Call) -> AsyncGenerator[Any, None]:
+        """The replies of a generator that blocks, each made in a thread."""
+        end = object()
+        step: Future[Any] | None = None
+        try:
+            while True:
+                step = self._pool.submit(next, replies, end)
+                reply = await asyncio.wrap_future(step)
+                if reply is end:
+                    return
+                yield reply
+        finally:
+            call.caller.leave()  # so that a step that waits for something ends
+            if step is not None:
+                step.add_done_callback(lambda _: replies.close())  # one that is at work cannot be closed
+
+    async def _messages(
+        self, data: AsyncIterator[bytes], parse: Callable[[bytes], Any], call: Call
+    ) -> AsyncIterator[Any]:
+        """The messages of a stream; the sender may pause between two of them for a limited time."""
+        while True:
+            try:
+                async with asyncio.timeout(self._limits.stall_s):
+                    message = await anext(data)
+            except StopAsyncIteration:
+                return
+            except TimeoutError:
+                expected = f"the next message within {self._limits.stall_s:g} s"
+                raise StalledError(f"stream of {call.method}", "nothing", expected) from None
+            yield _parsed(parse, message, call)
+
+    @asynccontextmanager
+    async def _call(self, name: str, context: Any) -> AsyncIterator[Call]:
+        """Admit a call, count it, and turn what it raises into its status."""
+        call = Call(name, Caller(partial(_seconds_left, context)), self._pool, context.peer())
+        task = asyncio.current_task()
+        assert task is not None  # calls run in tasks
+        counted = name not in ENDLESS
+        self._active += counted
+        if not counted:
+            self._endless.add(task)
+        self._metrics.in_flight.inc()
+        try:
+            if counted and self._active > self._limits.concurrent_calls:
+                got, expected = f"{self._active - 1} at once", f"at most {self._limits.concurrent_calls}"
+                raise OverloadedError("calls", got, f"{expected}; try again later", retry_s=1.0)
+            yield call
+            self._ended(call, grpc.StatusCode.OK, None)
+        except (asyncio.CancelledError, GeneratorExit) as left:
+            self._ended(call, _code_of_leaving(context), left)
+            raise
+        except Exception as error:
+            code = _code_of_leaving(context) if isinstance(error, CallerLeft) else status_of(error)
+            self._ended(call, code, error)
+            await context.abort(code, told(error), trailers(error))
+        finally:
+            call.caller.leave()
+            self._active -= counted
+            self._endless.discard(task)
+
+    def _ended(self, call: Call, code: grpc.StatusCode, error: BaseException | None) -> None:
+        """Count a call, before its caller hears of its end."""
+        self._metrics.in_flight.dec()
+        self._metrics.calls.labels(call.method, code.name).inc()
+        self._log.ended(call, code, error)
+
+
+def _parsed(parse: Callable[[bytes], Any], data: bytes, call: Call) -> Any:
+    try:
+        message: Message = parse(data)
+    except DecodeError as error:
+        raise MalformedError(f"message of {call.method}", str(error), "one that can be parsed") from None
+    call.correlation_id = getattr(message, "correlation_id", "") or call.correlation_id
+    return message
+
+
+def _seconds_left(context: Any) -> float:
+    left = context.time_remaining()
+    return math.inf if left is None else float(left)
+
+
+def _code_of_leaving(context: Any) -> grpc.StatusCode:
+    """A call that is cut off ran out of time, or its caller has gone."""
+    late = _seconds_left(context) <= 0
+    return grpc.StatusCode.DEADLINE_EXCEEDED if late else grpc.StatusCode.CANCELLED

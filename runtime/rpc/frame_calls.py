@@ -1,0 +1,228 @@
+"""Frame pairs that callers send: DecodeFrames, DecodePages."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Awaitable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from lightpage.errors import InvalidInputError, LightpageError, LimitError
+from lightpage.page.pilots import Pilots
+from lightpage.recording.black_level import without_black
+from lightpage.recording.layout import FramePair, frame_type
+from runtime.errors import MalformedError, StalledError
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.rpc.call import Call
+from runtime.rpc.replies import decode_reply
+from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane, levels_for
+from runtime.service.receiver import PairReceiver
+from runtime.wire.messages import check_options, pilots_of, pixel_type
+from runtime.wire.status import refusal_of
+
+_ON_THEIR_WAY = 2
+"""Pairs of one DecodePages that are received or decoded at a time: one is decoded while the next one comes."""
+
+
+@dataclass
+class _Received:
+    """A pair that has come.
+
+    Attributes:
+        header: of it.
+        receiver: that holds it, to be closed once it is decoded.
+        start, received: when its header and its last byte came, `time.perf_counter` seconds.
+    """
+
+    header: pb.DecodeHeader
+    receiver: PairReceiver
+    start: float
+    received: float
+
+
+class _Counted:
+    """Messages of a stream, and the bytes of frames that they brought."""
+
+    def __init__(self, requests: AsyncIterator[pb.DecodeFramesRequest]) -> None:
+        self._requests, self.bytes = requests, 0
+
+    def __aiter__(self) -> _Counted:
+        return self
+
+    async def __anext__(self) -> pb.DecodeFramesRequest:
+        message = await anext(self._requests)
+        self.bytes += len(message.chunk)
+        return message
+
+
+class FrameCalls:
+    """Handlers of the calls that send frames.
+
+    Args:
+        plane: decodes.
+    """
+
+    def __init__(self, plane: DataPlane) -> None:
+        self._plane = plane
+
+    async def DecodeFrames(self, requests: AsyncIterator[pb.DecodeFramesRequest], call: Call) -> pb.DecodeReply:
+        """Receive a frame pair and decode it."""
+        header = _header(await anext(requests, None), call)
+        received = await self._receive(header, requests, call)
+        async for part in requests:
+            try:
+                received.receiver.add(self._chunk(part))  # says that it is too much
+            except BaseException:
+                received.receiver.close()
+                raise
+        return await call.in_thread(partial(self._decode, received, call))
+
+    async def DecodePages(
+        self, requests: AsyncIterator[pb.DecodeFramesRequest], call: Call
+    ) -> AsyncIterator[pb.DecodePagesReply]:
+        """Receive frame pairs, one after another, and decode each while the next one comes."""
+        pending: asyncio.Queue[asyncio.Future[pb.DecodePagesReply] | None] = asyncio.Queue()
+        room = asyncio.Semaphore(_ON_THEIR_WAY)
+
+        async def receive() -> None:
+            try:
+                async for message in requests:
+                    await room.acquire()
+                    outcome = await self._begin(_header(message, call), requests, call)
+                    pending.put_nowait(asyncio.ensure_future(outcome))
+            finally:
+                pending.put_nowait(None)
+
+        receiving = asyncio.ensure_future(receive())
+        try:
+            while (work := await pending.get()) is not None:
+                yield await work
+                room.release()
+            await receiving
+        finally:
+            receiving.cancel()
+
+    async def _begin(
+        self, header: pb.DecodeHeader, requests: AsyncIterator[pb.DecodeFramesRequest], call: Call
+    ) -> Awaitable[pb.DecodePagesReply]:
+        """Receive a pair of many, and begin to decode it. One that is refused is read to its end: others follow."""
+        counted = _Counted(requests)
+        try:
+            received = await self._receive(header, counted, call)
+        except (MalformedError, StalledError):
+            raise  # where the next pair would begin is not known
+        except LightpageError as error:
+            await self._skip(header, counted, error)
+            return _refused(error, header)
+        return call.in_thread(partial(self._outcome, received, call))
+
+    async def _skip(self, header: pb.DecodeHeader, requests: _Counted, error: LightpageError) -> None:
+        """Drop what is left of a pair."""
+        size = 2 * header.rows_px * header.columns_px * np.dtype(pixel_type(header.pixel_type)).itemsize
+        if size > self._plane.limits.pair_bytes:
+            raise error
+        while requests.bytes < size and (part := await anext(requests, None)) is not None:
+            self._chunk(part)
+
+    async def _receive(
+        self, header: pb.DecodeHeader, requests: AsyncIterator[pb.DecodeFramesRequest], call: Call
+    ) -> _Received:
+        """Take in the chunks of a pair, as soon as its header is known to be right and there will be time for it."""
+        start, limit_s = time.perf_counter(), self._plane.limits.receive_s
+        check_options(header.options)
+        _check_black(header)
+        self._pilots(header)
+        shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
+        receiver = self._plane.receiver(shape, dtype, header.bit_depth, _caller(header, call))
+        try:
+            async with asyncio.timeout(limit_s):
+                while not receiver.complete and (part := await anext(requests, None)) is not None:
+                    receiver.add(self._chunk(part))
+            return _Received(header, receiver.checked(), start, time.perf_counter())
+        except TimeoutError:
+            receiver.close()
+            raise StalledError("frame pair", f"not all of it within {limit_s:g} s", "faster frames") from None
+        except BaseException:
+            receiver.close()
+            raise
+
+    def _chunk(self, part: pb.DecodeFramesRequest) -> bytes:
+        if part.WhichOneof("part") != "chunk":
+            got = "a second header" if part.HasField("header") else "an empty message"
+            raise MalformedError("message of a frame pair", got, "chunks from there on")
+        chunk, limit = part.chunk, self._plane.limits.chunk_bytes
+        if len(chunk) > limit:
+            raise LimitError("chunk", f"{len(chunk)} bytes", f"at most {limit}")
+        return chunk
+
+    def _outcome(self, received: _Received, call: Call) -> pb.DecodePagesReply:
+        try:
+            return pb.DecodePagesReply(decoded=self._decode(received, call))
+        except Exception as error:
+            return _refusal(error, received.header)
+
+    def _pilots(self, header: pb.DecodeHeader) -> Pilots | None:
+        """The caller's own pilots."""
+        options, decoder = header.options, self._plane.registry.current.decoder
+        levels = levels_for(decoder, options.levels or None, self._plane.default_levels, options.want_user_data)
+        if not header.HasField("pilots"):
+            return None
+        return pilots_of(header.pilots, decoder.bundle.profile.page_shape, levels)
+
+    def _decode(self, received: _Received, call: Call) -> pb.DecodeReply:
+        """Decode a pair that was received, and let go of it."""
+        header, options = received.header, received.header.options
+        try:
+            caller = _caller(header, call)
+            levels, user_data = options.levels or None, options.want_user_data
+            pilots = self._pilots(header)
+            pair = _without_black(received.receiver.pair(), header)
+            answer = self._plane.decode(
+                pair, levels, caller, pilots, user_data=user_data, start=received.start, received=received.received
+            )
+        finally:
+            received.receiver.close()
+        reply = decode_reply(answer, options)
+        reply.frame_id, reply.captured_s = header.frame_id, header.captured_s
+        reply.correlation_id = header.correlation_id
+        return reply
+
+
+async def _refused(error: Exception, header: pb.DecodeHeader) -> pb.DecodePagesReply:
+    return _refusal(error, header)
+
+
+def _refusal(error: Exception, header: pb.DecodeHeader) -> pb.DecodePagesReply:
+    refused = refusal_of(error)
+    refused.frame_id, refused.correlation_id = header.frame_id, header.correlation_id
+    return pb.DecodePagesReply(refused=refused)
+
+
+def _header(first: pb.DecodeFramesRequest | None, call: Call) -> pb.DecodeHeader:
+    if first is None or first.WhichOneof("part") != "header":
+        raise MalformedError(f"first message of {call.method}", "no header", "a header, then chunks")
+    call.correlation_id = first.header.correlation_id or call.correlation_id
+    return first.header
+
+
+def _caller(header: pb.DecodeHeader, call: Call) -> Caller:
+    """The caller, whose pages without a session of their own are those of its connection."""
+    caller = call.caller
+    caller.session = header.options.session or f"connection {call.peer}"
+    caller.stateless = header.options.tracking == pb.TRACKING_STATELESS
+    return caller
+
+
+def _check_black(header: pb.DecodeHeader) -> None:
+    if header.black_level and header.black_level >= (most := 1 << header.bit_depth):
+        raise InvalidInputError("black_level", header.black_level, f"less than {most}")
+
+
+def _without_black(pair: FramePair, header: pb.DecodeHeader) -> FramePair:
+    level, bits = header.black_level, header.bit_depth
+    frames = (np.asarray(frame, frame_type(bits)) for frame in (pair.in_phase, pair.quadrature))
+    return FramePair(*(without_black(frame, level, bits) for frame in frames)) if level else pair

@@ -1,0 +1,102 @@
+"""Pages of the service's own source: ReadPage, ReadPages, ReadData."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from lightpage.errors import InvalidInputError, LimitError
+from runtime.errors import CallerLeft, SlotsTakenError
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.rpc.call import Call
+from runtime.rpc.replies import data_reply, read_reply
+from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane
+from runtime.service.user_data import read_data
+from runtime.wire.messages import check_options
+from runtime.wire.status import refusal_of
+
+_MOST_PAGES = 1 << 32
+"""Of a source: their numbers travel in 32 bits."""
+
+
+class PageCalls:
+    """Handlers of the calls that read pages.
+
+    Args:
+        plane: reads and decodes.
+    """
+
+    def __init__(self, plane: DataPlane) -> None:
+        self._plane = plane
+
+    def ReadPage(self, request: pb.ReadPageRequest, call: Call) -> pb.ReadPageReply:
+        """Read a page from the source and decode it; with a request id at most once."""
+        check_options(request.options)
+        caller = _caller(request.options, call.caller)
+        if not request.request_id:
+            return self._read(request, caller)
+        limit_s = self._plane.limits.deadline_s
+
+        def work() -> bytes:
+            # The answer is wanted even where its caller leaves meanwhile, and asks again.
+            until = time.monotonic() + limit_s
+            detached = Caller(lambda: until - time.monotonic(), caller.session, caller.stateless)
+            return self._read(request, detached).SerializeToString()
+
+        same = pb.ReadPageRequest()
+        same.CopyFrom(request)
+        same.correlation_id = ""
+        asked = same.SerializeToString(deterministic=True)
+        answer, replayed = self._plane.replays.once(request.request_id, asked, caller, work)
+        reply = pb.ReadPageReply.FromString(answer)
+        reply.replayed, reply.decoded.correlation_id = replayed, request.correlation_id
+        return reply
+
+    def ReadPages(self, request: pb.ReadPagesRequest, call: Call) -> Iterator[pb.ReadPagesReply]:
+        """Read several pages; a lost one ends nothing."""
+        check_options(request.options)
+        self._check_count("pages to read", len(request.pages) or request.count)
+        caller = _caller(request.options, call.caller)
+        numbers: list[int | None] = list(request.pages) or [None] * request.count
+        with self._plane.ranges.held(caller):
+            for number in numbers:
+                one = pb.ReadPageRequest(options=request.options, want_written=request.want_written)
+                one.correlation_id = request.correlation_id
+                if number is not None:
+                    one.page = number
+                try:
+                    yield pb.ReadPagesReply(read=self._read(one, caller))
+                except (CallerLeft, SlotsTakenError):
+                    raise
+                except Exception as error:
+                    refused = refusal_of(error)
+                    refused.page, refused.correlation_id = number or 0, request.correlation_id
+                    yield pb.ReadPagesReply(refused=refused)
+
+    def ReadData(self, request: pb.ReadDataRequest, call: Call) -> Iterator[pb.ReadDataReply]:
+        """Read the bytes of a range of pages."""
+        self._check_count("pages to read", request.pages)
+        if request.first_page + request.pages > _MOST_PAGES:
+            raise InvalidInputError("first page to read", request.first_page, f"less than {_MOST_PAGES} with all")
+        with self._plane.ranges.held(call.caller):
+            for page in read_data(self._plane, request.first_page, request.pages, call.caller):
+                yield data_reply(page)
+
+    def _read(self, request: pb.ReadPageRequest, caller: Caller) -> pb.ReadPageReply:
+        page, options = request.page if request.HasField("page") else None, request.options
+        read = self._plane.read_page(page, options.levels or None, caller, user_data=options.want_user_data)
+        return read_reply(read, request)
+
+    def _check_count(self, subject: str, count: int) -> None:
+        most = self._plane.limits.range_pages
+        if count < 1:
+            raise InvalidInputError(subject, count, "at least 1")
+        if count > most:
+            raise LimitError(subject, count, f"at most {most}")
+
+
+def _caller(options: pb.DecodeOptions, caller: Caller) -> Caller:
+    """The caller with its session; without one, the pages are those of the device."""
+    caller.session, caller.stateless = options.session, options.tracking == pb.TRACKING_STATELESS
+    return caller
