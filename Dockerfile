@@ -51,7 +51,7 @@ ENV PATH=/opt/lightpage/bin:$PATH \
 USER 10001:10001
 WORKDIR /state
 VOLUME ["/bundles", "/state"]
-EXPOSE 50051
+EXPOSE 50051 50052
 HEALTHCHECK --interval=10s --timeout=5s --start-period=60s --retries=3 \
     CMD ["python", "-m", "runtime.commands.healthcheck"]
 ENTRYPOINT ["lightpage", "serve"]

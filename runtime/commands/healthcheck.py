@@ -9,25 +9,22 @@ import click
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-DEFAULT_TARGET = "127.0.0.1:50051"
+DEFAULT_TARGET = "127.0.0.1:50052"
 
 
 def is_serving(target: str, *, service: str = "", timeout_s: float = 3.0) -> tuple[bool, str]:
     """Ask `target` (HOST:PORT) for the health of `service`, "" being the server as a whole.
 
     Returns whether it serves, and one line that says what was heard. An unreachable, silent or unknowing server is not
-    healthy; it raises nothing, since to find that out is the question. One that turns calls away since it is full
-    serves: to restart it would lose what it works on. `Watch` is asked for its first answer, as the service keeps
-    threads for it that no decode takes.
+    healthy; it raises nothing, since to find that out is the question.
     Source: the gRPC health checking protocol, grpc.health.v1.
     """
     with grpc.insecure_channel(target, options=[("grpc.enable_http_proxy", 0)]) as channel:
         stub = health_pb2_grpc.HealthStub(channel)
         try:
-            response = next(iter(stub.Watch(health_pb2.HealthCheckRequest(service=service), timeout=timeout_s)))
+            response = stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=timeout_s)
         except grpc.RpcError as error:
-            full = error.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
-            return full, f"{target}: {error.code().name}: {error.details()}"
+            return False, f"{target}: {error.code().name}: {error.details()}"
     status = health_pb2.HealthCheckResponse.ServingStatus.Name(response.status)
     return response.status == health_pb2.HealthCheckResponse.SERVING, f"{target}: {status}"
 

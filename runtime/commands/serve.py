@@ -23,6 +23,7 @@ from runtime.console.server import Console, ConsoleServer
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.errors import LostShotError, SourceError
+from runtime.rpc.health_server import HealthServer, next_port
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.flight_recorder import PAGES, FlightRecorder, FlightSettings
@@ -49,6 +50,10 @@ _log = logging.getLogger(__name__)
     "--pages", "pages_file", type=click.Path(path_type=Path), help="Pages that the source is to show, PAGES.h5."
 )
 @click.option("--address", default=ADDRESS, show_default=True, help="HOST:PORT to listen on; port 0 takes a free one.")
+@click.option(
+    "--health-address",
+    help="HOST:PORT of health checks, answered by a process of their own; by default the next port. off: none.",
+)
 @click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show metrics and console on this port.")
 @click.option("--metrics-host", default="127.0.0.1", show_default=True, help="Where the figures are shown.")
 @click.option(
@@ -90,6 +95,7 @@ def serve(
     source: str | None,
     pages_file: Path | None,
     address: str,
+    health_address: str | None,
     metrics_port: int | None,
     metrics_host: str,
     store: Path | None,
@@ -131,7 +137,11 @@ def serve(
             console = Console(metrics, history, registry, monitor, source_name)
             stack.enter_context(_shown(console, metrics_port, metrics_host))
             recalibrator = Recalibrator(plane, recordings=recordings)
-            server = stack.enter_context(LightpageServer(plane, recalibrator, address))
+            server = LightpageServer(plane, recalibrator, address)
+            if health_address != "off":  # entered first: it says NOT_SERVING until the last call has ended
+                health = stack.enter_context(HealthServer(health_address or next_port(address), server.health))
+                click.echo(f"health checks at {health.target}")
+            stack.enter_context(server)
             if self_calibrate:
                 stack.enter_context(SelfCalibration(plane, monitor, recalibrator, calibrating))
             click.echo(f"serving {registry.current.version} from {source_name} at {server.target}")

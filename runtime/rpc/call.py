@@ -21,7 +21,7 @@ from typing import Any, Protocol, TypeVar
 import grpc
 from google.protobuf.message import DecodeError, Message
 
-from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError
+from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.service.caller import Caller
 from runtime.service.limits import Limits
@@ -95,6 +95,7 @@ class Dispatcher:
         self._metrics, self._log = metrics, log
         self._active = 0
         self._endless: set[asyncio.Task[Any]] = set()
+        self._ending = False
         self._longest_s = {"ReadData": limits.range_s, "ReadPages": limits.range_s}
 
     def rpc_handler(self) -> grpc.GenericRpcHandler[Any, Any]:
@@ -121,7 +122,8 @@ class Dispatcher:
         return grpc.method_handlers_generic_handler(SERVICE.full_name, methods)
 
     def end_endless(self) -> None:
-        """End the calls that would not end by themselves."""
+        """End the calls that would not end by themselves: the service stops."""
+        self._ending = True
         for task in self._endless:
             task.cancel()
 
@@ -202,6 +204,11 @@ class Dispatcher:
             yield call
             self._ended(call, grpc.StatusCode.OK, None)
         except (asyncio.CancelledError, GeneratorExit) as left:
+            if self._ending and task in self._endless and isinstance(left, asyncio.CancelledError):
+                task.uncancel()
+                error = StoppingError(f"call {name}", "a service that stops", "one that serves; call again")
+                self._ended(call, status_of(error), error)
+                await context.abort(status_of(error), told(error), trailers(error))
             self._ended(call, _code_of_leaving(context), left)
             raise
         except Exception as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections.abc import Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,9 +25,12 @@ _KEEPALIVE_MS = 30_000
 """A connection silent for so long is asked for a sign of life, so that a dead client's call ends."""
 _LAST_WORD_S = 0.1
 """From NOT_SERVING to the end of those who watch: they hear it first."""
+_LOOK_S = 2.0
 _SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
 
 T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
 
 
 class _Health(health.aio.HealthServicer):  # type: ignore[misc,name-defined]  # without types
@@ -35,6 +39,7 @@ class _Health(health.aio.HealthServicer):  # type: ignore[misc,name-defined]  # 
     def __init__(self) -> None:
         super().__init__()
         self._watchers: set[asyncio.Task[Any]] = set()
+        self._ending = False
 
     async def Watch(self, request: health_pb2.HealthCheckRequest, context: Any) -> None:
         """See the protocol."""
@@ -43,11 +48,17 @@ class _Health(health.aio.HealthServicer):  # type: ignore[misc,name-defined]  # 
         self._watchers.add(task)
         try:
             await super().Watch(request, context)
+        except asyncio.CancelledError:
+            if not self._ending:
+                raise
+            task.uncancel()
+            await context.abort(grpc.StatusCode.UNAVAILABLE, "the service stops")
         finally:
             self._watchers.discard(task)
 
     def end_watches(self) -> None:
         """End them."""
+        self._ending = True
         for task in self._watchers:
             task.cancel()
 
@@ -79,6 +90,8 @@ class LightpageServer:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, name="lightpage-rpc", daemon=True)
         self._pool = ThreadPoolExecutor(plane.limits.concurrent_calls, thread_name_prefix="lightpage-call")
+        self._names = ("", SERVICE.full_name)
+        self._serving = self._stopping = self._started = False
         self.port = 0
 
     def start(self) -> Self:
@@ -107,9 +120,15 @@ class LightpageServer:
         host = self._address.rpartition(":")[0]
         return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
 
-    def say_serving(self, serving: bool) -> None:
-        """Change what health checks hear."""
-        self._await(self._say(serving))
+    def health(self) -> dict[str, bool]:
+        """Whether the service as a whole, and by its name, serves now; health checks of this server say the same.
+
+        Raises:
+            TimeoutError: its loop does not answer.
+        """
+        if self._loop.is_closed() or not self._started:
+            return dict.fromkeys(self._names, False)
+        return asyncio.run_coroutine_threadsafe(self._look(), self._loop).result(_LOOK_S)
 
     def stop(self, grace_s: float | None = None) -> None:
         """Say NOT_SERVING, take no new calls, let those in flight end within `grace_s`, then end the rest.
@@ -152,12 +171,22 @@ class LightpageServer:
         self.port = self._server.add_insecure_port(self._address)
         await self._server.start()
         await self._say(True)
+        self._started = True
 
     async def _say(self, serving: bool) -> None:
-        for name in ("", SERVICE.full_name):
+        self._serving = serving
+        for name in self._names:
             await self._health.set(name, _SERVING if serving else _NOT_SERVING)
 
+    async def _look(self) -> dict[str, bool]:
+        trouble = self._plane.heart.trouble()
+        if bool(trouble) == self._serving and not self._stopping:
+            _log.error("not serving: %s", trouble) if trouble else _log.warning("serving again")
+            await self._say(not trouble)
+        return dict.fromkeys(self._names, self._serving and not self._stopping)
+
     async def _stop(self, grace_s: float) -> None:
+        self._stopping = True
         await self._health.enter_graceful_shutdown()
         stopping = asyncio.ensure_future(self._server.stop(grace_s))
         await asyncio.sleep(_LAST_WORD_S)

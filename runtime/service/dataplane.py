@@ -22,6 +22,7 @@ from runtime.decoding.page import DecodedPage
 from runtime.errors import LostPageError, NoSourceError, SourceError
 from runtime.service.caller import Caller
 from runtime.service.display import Display
+from runtime.service.heart import Heart
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
@@ -97,6 +98,7 @@ class DataPlane:
         if source is not None:
             _check_source(source, registry.current.decoder)
         self.received = ReceiveBudget(self.limits.receive_bytes)
+        self.heart = Heart(self.limits.decode_s)
         self.replays = Replays(self.limits.replay_s, self.limits.replay_bytes)
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s)
@@ -355,7 +357,8 @@ class DataPlane:
         be wrong.
         """
         try:
-            page = model.tracker_for(caller).decode(pair, levels, pilots)
+            with self.heart.at_work():
+                page = model.tracker_for(caller).decode(pair, levels, pilots)
         except LostPageError as error:
             self.metrics.lost(error, tells=sure)
             lost = error.about(subject)

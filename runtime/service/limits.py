@@ -37,6 +37,9 @@ MODEL_BYTES = 1 << 30
 JOBS_KEPT = 64
 """Results of jobs that are kept."""
 
+DECODE_S = 120.0
+"""A decode that takes longer has hung, and health checks fail: three times a full-size page by waves on two cores."""
+
 DEADLINE_S = 60.0
 """Wait for a free slot where the caller set no deadline of its own."""
 
@@ -80,6 +83,7 @@ class Limits:
     replay_bytes: int = REPLAY_BYTES
     model_bytes: int = MODEL_BYTES
     jobs_kept: int = JOBS_KEPT
+    decode_s: float = DECODE_S
     deadline_s: float = DEADLINE_S
     recalibration_pages: int = RECALIBRATION_PAGES
     recalibration_s: float = RECALIBRATION_S

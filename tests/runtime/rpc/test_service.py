@@ -37,87 +37,20 @@ from runtime.decoding.tracking import NoTracker
 from runtime.errors import Reason, SourceError, StoppingError, UnconfirmedPageError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.recalibration.outcome import Refit, RefitResult
+from runtime.recalibration.outcome import RefitResult
 from runtime.rpc.call import SERVICE
 from runtime.rpc.server import LightpageServer
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits
 from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import KEPT_MODELS, ModelRegistry, TrackerFactory, no_tracker
-from runtime.service.store import ModelStore
+from runtime.service.registry import KEPT_MODELS, ModelRegistry
 from runtime.wire.messages import KnownPilots
 from runtime.wire.status import without_folders
 from tests.runtime import toy
+from tests.runtime.rpc.stage import Running, Start, a_page, wait_until
 
 DRIFTED = (150.0, 62.0)
-
-
-@dataclass
-class Running:
-    """A service with all its parts in reach."""
-
-    plane: DataPlane
-    recalibrator: Recalibrator
-    server: LightpageServer
-    source: toy.ToySource
-    client: LightpageClient
-
-    @property
-    def device(self) -> toy.ToyDevice:
-        return self.source.device
-
-    def count(self, name: str, **labels: str) -> float:
-        """What the service's metrics say."""
-        return self.plane.metrics.registry.get_sample_value(name, labels) or 0.0
-
-    def stub(self, channel: grpc.Channel) -> pb_grpc.LightpageStub:
-        return pb_grpc.LightpageStub(channel)
-
-
-Start = Callable[..., Running]
-
-
-@pytest.fixture
-def start(toy_zip: Path, tmp_path: Path) -> Iterator[Start]:
-    """Starts services on free loopback ports and ends them."""
-    running: list[Running] = []
-
-    def begin(
-        limits: Limits | None = None,
-        fit: Refit = toy.fit_references,
-        bundle: Path = toy_zip,
-        store: Path | None = None,
-        tracker: TrackerFactory = no_tracker,
-    ) -> Running:
-        source = toy.ToySource(toy.ToyDevice())
-        registry = ModelRegistry(Decoder(Bundle.open(bundle), threads=1), tracker)
-        models = ModelStore(store, registry.current.decoder.bundle) if store is not None else None
-        plane = DataPlane(registry, source, models, limits)
-        recalibrator = Recalibrator(plane, fit, tmp_path)
-        server = LightpageServer(plane, recalibrator).start()
-        client = LightpageClient(server.target, timeout_s=20)
-        running.append(Running(plane, recalibrator, server, source, client))
-        return running[-1]
-
-    yield begin
-    for service in running:
-        service.client.close()
-        service.server.stop(0.5)
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        if condition():
-            return True
-        time.sleep(0.01)
-    return condition()
-
-
-def a_page(levels: int = 16, seed: int = 3) -> tuple[np.ndarray, FramePair]:
-    symbols = toy.symbols_of(levels, seed)[0]
-    return symbols, toy.ToyDevice(seed=seed).page(symbols, levels, 0.7)
 
 
 def test_the_service_describes_itself(start: Start) -> None:

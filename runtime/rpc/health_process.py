@@ -1,0 +1,59 @@
+"""A process that answers health checks: ``python -m runtime.rpc.health_process HOST:PORT``, a socket on its stdin.
+
+The service writes a line of JSON every half second: names of services, and whether each serves. Where no line comes any
+more, nothing serves, whatever the service still holds. The process is idle, so it answers at once where the service is
+busy with decoding. It ends when the socket's other end does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import sys
+
+import grpc
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+
+from runtime.helper_process import parent_link
+
+SILENCE_S = 3.0
+"""A service that says nothing for so long has stopped."""
+
+_STATUS = {True: health_pb2.HealthCheckResponse.SERVING, False: health_pb2.HealthCheckResponse.NOT_SERVING}
+
+
+async def serve(address: str, link: socket.socket) -> None:
+    """Answer health checks at an address until the link is closed; says first at which port, or why not."""
+    reader, writer = await asyncio.open_connection(sock=link)
+    server = grpc.aio.server(options=(("grpc.so_reuseport", 0),))
+    servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]  # without types
+    health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
+    await servicer.set("", _STATUS[False])
+    try:
+        port = server.add_insecure_port(address)
+        await server.start()
+    except RuntimeError as error:
+        writer.write(json.dumps({"error": str(error)}).encode() + b"\n")
+        await writer.drain()
+        return
+    writer.write(json.dumps({"port": port}).encode() + b"\n")
+    await writer.drain()
+    names = {""}
+    while True:
+        try:
+            line = await asyncio.wait_for(reader.readline(), SILENCE_S)
+        except TimeoutError:
+            states = dict.fromkeys(names, False)
+        else:
+            if not line:
+                break
+            states = json.loads(line)
+        names |= states.keys()
+        for name, serves in states.items():
+            await servicer.set(name, _STATUS[bool(serves)])
+    await server.stop(None)
+
+
+if __name__ == "__main__":
+    asyncio.run(serve(sys.argv[1], parent_link()))

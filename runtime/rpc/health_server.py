@@ -1,0 +1,108 @@
+"""Health checks on an address of their own, answered by a process that does nothing else."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Self
+
+from lightpage.errors import InvalidInputError
+from runtime.helper_process import HelperProcess
+from runtime.wire.address import check_address, check_free
+
+_PROCESS = "runtime.rpc.health_process"
+_BEAT_S = 0.5
+_START_S = 20.0
+_SEND_S = 2.0
+
+_log = logging.getLogger(__name__)
+
+
+def next_port(address: str) -> str:
+    """Where health checks are answered for a service at `address`: the next port, a free one for port 0."""
+    if address.startswith("unix:"):
+        return f"{address}.health"
+    host, _, port = address.rpartition(":")
+    return f"{host}:{int(port) + 1 if 0 < int(port) < 65535 else 0}"
+
+
+class HealthServer:
+    """Runs the process and tells it how the service fares; use it in a `with` statement.
+
+    Args:
+        address: HOST:PORT; port 0 takes a free one.
+        states: called twice a second: each service by name, and whether it serves. Where it hangs, nothing does.
+    """
+
+    def __init__(self, address: str, states: Callable[[], Mapping[str, bool]]) -> None:
+        check_address("health address", address, least_port=0)
+        self._address, self._states = address, states
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="lightpage-heartbeat", daemon=True)
+        self._process: HelperProcess | None = None
+        self.port = 0
+
+    @property
+    def target(self) -> str:
+        """Where it is asked on this machine."""
+        if self._address.startswith("unix:"):
+            return self._address
+        host = self._address.rpartition(":")[0]
+        return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
+
+    def start(self) -> Self:
+        """Answer health checks.
+
+        Raises:
+            InvalidInputError: the address cannot be listened on.
+        """
+        subject = f"health address {self._address}"
+        check_free("health address", self._address)
+        try:
+            self._process = HelperProcess(_PROCESS, self._address, subject="the process of health checks")
+            answer = json.loads(self._process.line(time.monotonic() + _START_S))
+        except (OSError, ValueError) as error:
+            self.stop()
+            raise InvalidInputError(subject, error, "a process that can be started") from None
+        if "port" not in answer:
+            self.stop()
+            raise InvalidInputError(subject, answer.get("error"), "a free HOST:PORT of this machine")
+        self.port = answer["port"]
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Answer no more."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(2 * _SEND_S)
+        if self._process is not None:
+            self._process.end(1.0)
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _beat(self) -> None:
+        assert self._process is not None  # it was started
+        while True:
+            try:
+                line = json.dumps(dict(self._states())).encode() + b"\n"
+            except Exception:
+                _log.exception("health checks: the service does not say how it fares")
+            else:
+                try:
+                    self._process.send(line, time.monotonic() + _SEND_S)
+                except OSError as error:
+                    _log.error("health checks: %s", error or "their process does not listen")
+                    return
+            if self._stop.wait(_BEAT_S):
+                return
