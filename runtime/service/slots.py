@@ -77,7 +77,7 @@ class Slots:
         """
         wait_s, left_s = self.expected_wait_s(), caller.seconds_left()
         if wait_s + MARGIN * self._usual_s > left_s:
-            raise self._too_late(left_s, wait_s)
+            raise self._too_late(left_s, wait_s, in_queue=wait_s > 0)
 
     def take(self, caller: Caller) -> None:
         """Take a slot, waiting as long as the caller does, but not for one who has gone.
@@ -95,12 +95,12 @@ class Slots:
                 ticket.has_slot = True
             else:
                 self._queue.append(ticket)
-        if not ticket.has_slot:
+        if queues := not ticket.has_slot:
             self._wait(ticket, caller)
         left_s = caller.seconds_left()
         if MARGIN * self._usual_s > left_s:
             self.give_back()
-            raise self._too_late(left_s, 0.0)
+            raise self._too_late(left_s, 0.0, in_queue=queues)
 
     def give_back(self) -> None:
         """Give back a slot that was taken: whoever has waited longest gets it."""
@@ -157,13 +157,11 @@ class Slots:
             expected = "a free one within the deadline; try again later"
             raise SlotsTakenError(f"concurrent {self._what}", "all taken", expected, retry_s=self.expected_wait_s())
 
-    def _too_late(self, left_s: float, wait_s: float) -> OverloadedError:
-        needed_s = wait_s + MARGIN * self._usual_s
-        alone = MARGIN * self._usual_s > left_s and not wait_s and not self.queued
-        told = f"{max(0.0, left_s):.2f} s until the deadline"
-        return OverloadedError(
-            f"concurrent {self._what}",
-            told,
-            f"at least {needed_s:.2f} s" + ("" if alone else f", {wait_s:.2f} s of it in the queue; try again later"),
-            retry_s=None if alone else max(self._usual_s / self._count, needed_s - max(0.0, left_s)),
-        )
+    def _too_late(self, left_s: float, wait_s: float, *, in_queue: bool) -> OverloadedError:
+        """The error of a caller who comes too late; without a queue, coming again with that deadline is of no use."""
+        needed_s, left_s = wait_s + MARGIN * self._usual_s, max(0.0, left_s)
+        subject, told = f"concurrent {self._what}", f"{left_s:.2f} s until the deadline"
+        if not in_queue:
+            return OverloadedError(subject, told, f"at least {needed_s:.2f} s")
+        expected = f"at least {needed_s:.2f} s, {wait_s:.2f} s of it in the queue; try again later"
+        return OverloadedError(subject, told, expected, max(self._usual_s / self._count, needed_s - left_s))
