@@ -1,0 +1,1 @@
+"""The service under load, faults and attack, measured from outside: a process of its own, over real connections."""
