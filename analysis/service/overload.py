@@ -108,9 +108,7 @@ def overload(
 
         for number, _ in enumerate(until(begun + seconds, 1 / rate)):
             pending.append(methods[number % _CONNECTIONS].future(iter(requests), timeout=deadline_s))
-            pending[-1].add_done_callback(
-                lambda call: call.code() is grpc.StatusCode.OK and last.append(time.monotonic())
-            )
+            pending[-1].add_done_callback(answered)
         for call in pending:
             try:
                 call.result()
