@@ -81,7 +81,7 @@ class HealthServer:
         if self._thread.is_alive():
             self._thread.join(2 * _SEND_S)
         if self._process is not None:
-            self._process.end(1.0)
+            self._process.end()
 
     def __enter__(self) -> Self:
         return self.start()
