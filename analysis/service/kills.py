@@ -3,7 +3,7 @@
     python -m analysis.service.kills --kills 100 --out FOLDER --json FILE
 
 A service with a store recalibrates itself from a recording, or changes between its models, and is killed at a random
-moment. The next one must start; the model that it serves must be the last one that a caller heard of, or the one that was
+moment. The next one must start; the model that it serves must be the last that a caller heard of, or the one that was
 asked for and not yet heard of; it must read a page right; and nothing half-written may be left in the store or in the
 temporary folder.
 """

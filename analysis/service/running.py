@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import resource
 import signal
@@ -11,7 +12,7 @@ import tempfile
 import threading
 import time
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -36,10 +37,11 @@ class RunningService:
 
     Args:
         arguments: of the command, beside addresses.
+        environment: variables that it has beside those of this process.
     """
 
-    def __init__(self, *arguments: str) -> None:
-        self._arguments = arguments
+    def __init__(self, *arguments: str, environment: Mapping[str, str] | None = None) -> None:
+        self._arguments, self._environment = arguments, {**os.environ, **(environment or {})}
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115  # closed with the service
         self.process: subprocess.Popen[str] | None = None
         self.target = self.health = self._metrics = ""
@@ -58,6 +60,7 @@ class RunningService:
             stdout=subprocess.PIPE,
             stderr=self._log,
             stdin=subprocess.DEVNULL,
+            env=self._environment,
             text=True,
         )
         timer = threading.Timer(START_S, self.process.kill)
@@ -124,7 +127,7 @@ class RunningService:
             return -signal.SIGKILL
 
     def __enter__(self) -> Self:
-        return self.start()
+        return self if self.process is not None else self.start()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
