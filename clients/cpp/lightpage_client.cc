@@ -11,6 +11,7 @@ namespace {
 using std::chrono::milliseconds;
 
 constexpr int kReplyBytes = 64 << 20;  // the service's largest reply
+constexpr std::size_t kChunkBytes = 1 << 20;
 constexpr milliseconds kFirstPause{100}, kLongestPause{1000};  // between attempts where the service does not answer
 
 std::shared_ptr<grpc::Channel> open_channel(const std::string& target) {
@@ -123,7 +124,7 @@ v1::DescribeReply Client::describe(Deadline deadline) {
 v1::DecodeReply Client::decode(const v1::DecodeHeader& header, const void* pixels, std::size_t bytes,
                                Deadline deadline, std::size_t chunk_bytes) {
   const char* const data = static_cast<const char*>(pixels);
-  const std::size_t step = std::max<std::size_t>(chunk_bytes, 1);
+  const std::size_t step = chunk_bytes == 0 ? kChunkBytes : chunk_bytes;
   return retried(deadline, unavailable, [&] {
     grpc::ClientContext context;
     context.set_deadline(deadline);

@@ -4,8 +4,8 @@
 //   const auto deadline = lightpage::in(std::chrono::seconds(60));
 //   lightpage::v1::DescribeReply service = client.describe(deadline);
 //
-// Every call ends by its deadline, and throws lightpage::Error where it does not end well. A service that has too much to
-// do says when to come back: the call then waits and asks again, as long as the deadline allows. Calls that may be
+// Every call ends by its deadline, and throws lightpage::Error where it does not end well. A service that has too much
+// to do says when to come back: the call then waits and asks again, as long as the deadline allows. Calls that may be
 // repeated do the same where the service does not answer at all.
 //
 // A Client may be used by several threads at once.
@@ -65,12 +65,12 @@ class Client {
   v1::DescribeReply describe(Deadline deadline);
 
   // Decode a frame pair. `pixels` are the in-phase frame and, behind it, the quadrature frame: rows first, one byte a
-  // pixel, or two, little-endian. They are sent in chunks of at most `chunk_bytes` (DescribeReply.limits).
+  // pixel, or two, little-endian. They are sent in chunks of at most `chunk_bytes` (DescribeReply.limits; 0 for 1 MiB).
   v1::DecodeReply decode(const v1::DecodeHeader& header, const void* pixels, std::size_t bytes, Deadline deadline,
-                         std::size_t chunk_bytes = 1 << 20);
+                         std::size_t chunk_bytes = 0);
 
-  // Read a page of the service's own source. With a `request_id` at most one shot is taken: an answer that does not come
-  // within `attempt`, or is lost with the connection, is asked for again. Without one nothing is repeated.
+  // Read a page of the service's own source. With a `request_id` at most one shot is taken: an answer that does not
+  // come within `attempt`, or is lost with the connection, is asked for again. Without one, a lost answer is lost.
   v1::ReadPageReply read_page(const v1::ReadPageRequest& request, Deadline deadline,
                               Duration attempt = std::chrono::seconds(10));
 

@@ -1,8 +1,12 @@
 // What a controller does with a Lightpage service, as a command line program; `usage` says how.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
 #include <fstream>
 #include <iostream>
 #include <iterator>
 #include <map>
+#include <sstream>
 #include <string>
 #include <vector>
 
@@ -18,7 +22,8 @@ namespace v1 = lightpage::v1;
 constexpr char kUsage[] = R"(usage: lightpage_example [--target HOST:PORT] [--timeout SECONDS] COMMAND ...
   describe                                       what the service is
   decode FRAMES.raw --out FILE [--levels M]      decode the pixels of both frames, in-phase first; FILE gets the symbols
-  read PAGE --request-id ID [--out FILE]         read a page of the service's source; asked again, take no second shot
+  read PAGE --request-id ID [--out FILE] [--attempt SECONDS]
+                                                 read a page of the source, once for each ID
   recalibrate --pages N [--cancel-after SECONDS] start a recalibration and follow it
   watch JOB                                      follow a recalibration
 Exit status: 0 done; 1 a job that did not end well; 2 an error, which one line explains; 64 a wrong command line.
@@ -59,19 +64,20 @@ struct Arguments {
   }
 };
 
+double number(const std::string& text, double most) {
+  std::istringstream stream(text);
+  double value = 0;
+  if (!(stream >> value) || !stream.eof() || value < 0 || value > most) throw UsageError();
+  return value;
+}
+
 std::uint32_t whole(const std::string& text) {
-  std::size_t used = 0;
-  const unsigned long value = std::stoul(text, &used);
-  if (used != text.size() || value > UINT32_MAX) throw UsageError();
+  const double value = number(text, UINT32_MAX);
+  if (value != std::floor(value)) throw UsageError();
   return static_cast<std::uint32_t>(value);
 }
 
-double seconds(const std::string& text) {
-  std::size_t used = 0;
-  const double value = std::stod(text, &used);
-  if (used != text.size() || value < 0) throw UsageError();
-  return value;
-}
+Duration seconds(const std::string& text) { return Duration(number(text, 1e6)); }
 
 std::string read_file(const std::string& path) {
   std::ifstream file(path, std::ios::binary);
@@ -126,7 +132,7 @@ int read(Client& client, const Arguments& given, Deadline deadline) {
   v1::ReadPageRequest request;
   request.set_page(whole(given.word(1)));
   request.set_request_id(given.option("request-id"));
-  const v1::ReadPageReply reply = client.read_page(request, deadline);
+  const v1::ReadPageReply reply = client.read_page(request, deadline, seconds(given.option("attempt", "10")));
   if (given.options.count("out") != 0) write_file(given.option("out"), reply.decoded().symbols());
   std::cout << "page " << reply.page() << (reply.replayed() ? ", the answer of an earlier call" : "") << "\n";
   tell_page(reply.decoded());
@@ -134,7 +140,10 @@ int read(Client& client, const Arguments& given, Deadline deadline) {
 }
 
 void tell_job(const v1::Job& job) {
-  std::cout << "job " << job.id() << " " << v1::JobState_Name(job.state()).substr(sizeof("JOB_STATE_") - 1);
+  std::string state = v1::JobState_Name(job.state());  // empty where this program is older than the state
+  const std::string prefix = "JOB_STATE_";
+  if (state.rfind(prefix, 0) == 0) state.erase(0, prefix.size());
+  std::cout << "job " << job.id() << " " << state;
   if (job.state() == v1::JOB_STATE_RUNNING) {
     std::cout << ": " << job.progress().step() << " " << static_cast<int>(100 * job.progress().fraction()) << "%";
   } else if (job.has_result()) {
@@ -157,7 +166,7 @@ int recalibrate(Client& client, const Arguments& given, Deadline deadline) {
   const v1::Job job = client.start_recalibration(request, deadline);
   if (given.options.count("cancel-after") == 0) return watch(client, job.id(), deadline);
   try {
-    return watch(client, job.id(), std::min(deadline, lightpage::in(Duration(seconds(given.option("cancel-after"))))));
+    return watch(client, job.id(), std::min(deadline, lightpage::in(seconds(given.option("cancel-after")))));
   } catch (const lightpage::Error& error) {
     if (error.code != grpc::StatusCode::DEADLINE_EXCEEDED) throw;
   }
@@ -181,7 +190,7 @@ void tell_error(const lightpage::Error& error) {
 
 int run(const Arguments& given) {
   const std::string command = given.word(0);
-  const Deadline deadline = lightpage::in(Duration(seconds(given.option("timeout", "60"))));
+  const Deadline deadline = lightpage::in(seconds(given.option("timeout", "60")));
   Client client(given.option("target", "127.0.0.1:50051"));
   if (command == "describe") return describe(client, deadline);
   if (command == "decode") return decode(client, given, deadline);
@@ -197,7 +206,6 @@ int main(int count, char** values) {
   try {
     return run(Arguments(count, values));
   } catch (const UsageError&) {
-  } catch (const std::logic_error&) {  // a number that is none
   } catch (const lightpage::Error& error) {
     tell_error(error);
     return 2;

@@ -94,7 +94,7 @@ def test_it_says_what_the_service_does_not_like(program: Path, target: str, tmp_
     swapped = raw(tmp_path / "swapped.raw", pair.quadrature, pair.in_phase)
     done = run(program, target, "decode", swapped, "--out", tmp_path / "symbols", "--levels", 16)
     assert (done.returncode, done.stdout) == (2, "")
-    assert "reason FRAMES_DISAGREE, FrameError" in done.stderr
+    assert "reason FRAMES_DISAGREE, FramesDisagreeError" in done.stderr
     done = run(program, target, "decode", swapped, "--out", tmp_path / "symbols", "--levels", 999)
     assert "reason INVALID_VALUE, PageError, field levels" in done.stderr
     short = raw(tmp_path / "short.raw", pair.in_phase)
@@ -236,22 +236,27 @@ def test_a_watch_goes_on_after_a_lost_connection(program: Path) -> None:
 
 
 class Forgetful(pb_grpc.LightpageServicer):
-    """Takes a page at once; the first answers are lost on their way."""
+    """Takes a page at once; the first two answers are lost on their way, or late where there is a delay."""
 
-    def __init__(self) -> None:
+    def __init__(self, delay_s: float = 0.0) -> None:
+        self.delay_s = delay_s
         self.asked: list[str] = []
 
     def ReadPage(self, request: pb.ReadPageRequest, context: grpc.ServicerContext) -> pb.ReadPageReply:
         self.asked.append(request.request_id)
         if len(self.asked) < 3:
-            context.abort(grpc.StatusCode.UNAVAILABLE, "the connection broke")
+            if self.delay_s:
+                time.sleep(self.delay_s)
+            else:
+                context.abort(grpc.StatusCode.UNAVAILABLE, "the connection broke")
         return pb.ReadPageReply(page=request.page, replayed=True)
 
 
-def test_a_page_whose_answer_was_lost_is_asked_for_again_by_the_same_id(program: Path) -> None:
-    servicer = Forgetful()
+@pytest.mark.parametrize("delay_s", [0.0, 2.0])
+def test_a_page_whose_answer_is_lost_or_late_is_asked_for_again_by_the_same_id(program: Path, delay_s: float) -> None:
+    servicer = Forgetful(delay_s)
     with served(servicer) as target:
-        done = run(program, target, "read", 7, "--request-id", "mine")
+        done = run(program, target, "read", 7, "--request-id", "mine", "--attempt", 0.7)
     assert done.returncode == 0, done.stderr
     assert servicer.asked == ["mine"] * 3
     assert done.stdout.startswith("page 7, the answer of an earlier call\n")
