@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from lightpage.errors import LightpageError
     from lightpage.metrics.measures import PageMeasures, measure
     from lightpage.page.pilots import Pilots
-    from lightpage.recording.reader import FramePair, Recording, RecordingWriter
+    from lightpage.recording.frame_pair import FramePair
+    from lightpage.recording.reader import Recording, RecordingWriter
     from lightpage.simulator.simulator import Simulator
 
 # A caller's own stubs of `lightpage/v1/lightpage.proto`, made by plain protoc, lie in a folder `lightpage/v1` too.
@@ -23,7 +24,7 @@ __path__ = extend_path(__path__, __name__)
 
 _HOMES = {
     "Device": "lightpage.device.state",
-    "FramePair": "lightpage.recording.reader",
+    "FramePair": "lightpage.recording.frame_pair",
     "LightpageError": "lightpage.errors",
     "PageMeasures": "lightpage.metrics.measures",
     "Pilots": "lightpage.page.pilots",

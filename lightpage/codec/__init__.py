@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from lightpage.codec.ldpc.code import LdpcCode
     from lightpage.codec.ldpc.decoder import decode
     from lightpage.codec.mapping import bit_information, bit_llrs, decide_in_coset, to_levels
-    from lightpage.codec.page_codec import PageBytes, PageCodec
+    from lightpage.codec.page_bytes import PageBytes
+    from lightpage.codec.page_codec import PageCodec
 
 _HOMES = {
     "Code": "lightpage.codec.code",
     "LdpcCode": "lightpage.codec.ldpc.code",
-    "PageBytes": "lightpage.codec.page_codec",
+    "PageBytes": "lightpage.codec.page_bytes",
     "PageCodec": "lightpage.codec.page_codec",
     "bit_information": "lightpage.codec.mapping",
     "bit_llrs": "lightpage.codec.mapping",

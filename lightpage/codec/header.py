@@ -7,7 +7,6 @@ believed: the body's CRC-32C covers the header's fields too.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -17,10 +16,11 @@ from lightpage.codec.checksum import crc16
 from lightpage.codec.ldpc.code import Bits, LdpcCode
 from lightpage.codec.ldpc.decoder import decode
 from lightpage.codec.mapping import bit_llrs, level_bits, to_levels
+from lightpage.codec.page_bytes import VERSION as VERSION
+from lightpage.codec.page_bytes import Header as Header
 from lightpage.codec.random_bits import random_bytes
 from lightpage.errors import InvalidInputError
 
-VERSION = 1
 MOST_PAGES = 1 << 24
 MOST_BYTES = (1 << 40) - 1
 """Of a volume."""
@@ -32,36 +32,6 @@ levels none are so much coarser, and one third are."""
 _FEW_LEVELS = 4
 _COARSER = 8
 _SCRAMBLER_SEED = 0x4C50_4844
-
-
-@dataclass(frozen=True)
-class Header:
-    """The fields of a page's header.
-
-    Attributes:
-        code_id: `Code.id` of the body.
-        volume: a number that tells files on one medium apart, 32 bits.
-        page: number of the page in its volume, 24 bits.
-        volume_bytes: user bytes of the whole volume, 40 bits.
-        version: of this layout.
-    """
-
-    code_id: int
-    volume: int
-    page: int
-    volume_bytes: int
-    version: int = VERSION
-
-    def fields(self) -> bytes:
-        """Big-endian: version 1 byte, code id 2, volume 4, page 3, volume bytes 5."""
-        return struct.pack(">BHI", self.version, self.code_id, self.volume) + (
-            self.page.to_bytes(3, "big") + self.volume_bytes.to_bytes(5, "big")
-        )
-
-    def to_bytes(self) -> bytes:
-        """Fields and their CRC-16."""
-        fields = self.fields()
-        return fields + crc16(fields).to_bytes(2, "big")
 
 
 def parse_header(data: bytes) -> Header | None:

@@ -6,8 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
@@ -15,94 +13,21 @@ from numpy.typing import NDArray
 
 from lightpage.codec.checksum import CRC32C_BYTES, crc32c
 from lightpage.codec.code import Code
-from lightpage.codec.header import Header, decode_header, encode_headers, header_symbols
+from lightpage.codec.header import decode_header, encode_headers, header_symbols
 from lightpage.codec.ldpc.code import MOST_INFORMATION_BITS, Bits, LdpcCode
 from lightpage.codec.ldpc.decoder import decode
 from lightpage.codec.mapping import bit_information, bit_llrs, decide_in_coset, to_levels
+from lightpage.codec.page_bytes import FILE_BYTES, Header
+from lightpage.codec.page_bytes import LOSSES as LOSSES
+from lightpage.codec.page_bytes import FileFacts as FileFacts
+from lightpage.codec.page_bytes import Loss as Loss
+from lightpage.codec.page_bytes import PageBytes as PageBytes
 from lightpage.codec.random_bits import random_bytes, random_order
 from lightpage.codec.reed_solomon import LONGEST_WORD, SYMBOL_BITS, parity, repair
 from lightpage.errors import InvalidInputError, PageError
 
 _INTERLEAVER_SEED = 0x4C50_494C
 _FILLING_SEED = 0x4C50_464C
-_FILE_BYTES = 2 + CRC32C_BYTES
-"""Before the user bytes: data and parity pages of a group, one byte each, and the checksum of the whole file."""
-
-
-class Loss(StrEnum):
-    """Why a page gives no bytes."""
-
-    OPTICS = "optics"
-    """It could not be decoded into symbols."""
-    HEADER = "header"
-    """Its header could not be read, and it is not the page that was expected."""
-    CODE = "code"
-    """Its header names another code."""
-    BODY = "body"
-    """Its blocks did not converge, and the rest could not be mended."""
-    CHECKSUM = "checksum"
-    """Its blocks converged, and the checksum does not hold all the same."""
-
-
-LOSSES = {
-    Loss.OPTICS: "it was not decoded into symbols",
-    Loss.HEADER: "its header cannot be read",
-    Loss.CODE: "its header names another code",
-    Loss.BODY: "its code does not converge",
-    Loss.CHECKSUM: "its checksum does not hold",
-}
-"""Losses for people."""
-
-
-@dataclass(frozen=True)
-class FileFacts:
-    """What every page says of the file that it belongs to.
-
-    Attributes:
-        data_pages, parity_pages: k and m of a group, 0 to 255.
-        checksum: CRC-32C of the whole file.
-    """
-
-    data_pages: int
-    parity_pages: int
-    checksum: int
-
-    def to_bytes(self) -> bytes:
-        """As they stand on the page."""
-        return bytes([self.data_pages, self.parity_pages]) + self.checksum.to_bytes(CRC32C_BYTES, "big")
-
-    @classmethod
-    def parse(cls, data: bytes) -> FileFacts:
-        """What `to_bytes` has made."""
-        return cls(data[0], data[1], int.from_bytes(data[2:_FILE_BYTES], "big"))
-
-
-@dataclass(frozen=True)
-class PageBytes:
-    """What a page gave.
-
-    Attributes:
-        header: as it stands on the page; to be believed only where there is data. None where it could not be read.
-        data: user bytes, None where the page is lost: nothing that fails its checksum is given out.
-        file: what it says of its file, None where the page is lost.
-        loss: why there is no data, None where there is.
-        iterations: mean of the LDPC blocks.
-        failed_blocks: LDPC blocks that did not converge.
-        blocks: all of them.
-        corrected: Reed-Solomon symbols that were mended.
-        margin_bits: information of a symbol's coded bits beyond what the code needs, bits; negative where the page
-            should be lost. Of a lost page, by what its confidences claim, and at most 0.
-    """
-
-    header: Header | None
-    data: bytes | None
-    file: FileFacts | None
-    loss: Loss | None
-    iterations: float
-    failed_blocks: int
-    blocks: int
-    corrected: int
-    margin_bits: float
 
 
 class PageCodec:
@@ -142,7 +67,7 @@ class PageCodec:
         self._data_symbols = self._total_bits // SYMBOL_BITS - parity_symbols if code.corrections else 0
         data_bits = SYMBOL_BITS * self._data_symbols if code.corrections else self._total_bits
         self._bytes = data_bits // 8
-        self.user_bytes = self._bytes - _FILE_BYTES - CRC32C_BYTES
+        self.user_bytes = self._bytes - FILE_BYTES - CRC32C_BYTES
         if self.user_bytes < 1:
             raise small
 
@@ -179,8 +104,8 @@ class PageCodec:
         if pilots.shape != (int(np.count_nonzero(self.pilots)),):
             raise PageError("pilot levels", f"shape {pilots.shape}", f"({np.count_nonzero(self.pilots)},)")
         body = np.zeros((len(headers), self._bytes), np.uint8)
-        body[:, :_FILE_BYTES] = np.frombuffer(file.to_bytes(), np.uint8)
-        body[:, _FILE_BYTES:-CRC32C_BYTES] = data
+        body[:, :FILE_BYTES] = np.frombuffer(file.to_bytes(), np.uint8)
+        body[:, FILE_BYTES:-CRC32C_BYTES] = data
         for row, header in zip(body, headers, strict=True):
             check = crc32c(header.fields() + row[:-CRC32C_BYTES].tobytes())
             row[-CRC32C_BYTES:] = np.frombuffer(check.to_bytes(CRC32C_BYTES, "big"), np.uint8)
@@ -238,8 +163,8 @@ class PageCodec:
                 # the code words are right where the checksum holds, but for what Reed-Solomon has mended
                 information = bit_information(blocks, found.sent)
                 margin = self.code.coded_bits * (information - self.code.needed_information)
-                data = body[_FILE_BYTES:-CRC32C_BYTES].tobytes()
-                file = FileFacts.parse(body[:_FILE_BYTES].tobytes())
+                data = body[FILE_BYTES:-CRC32C_BYTES].tobytes()
+                file = FileFacts.parse(body[:FILE_BYTES].tobytes())
                 margin = min(margin, 0.0) if failed else margin
                 return PageBytes(candidate, data, file, None, iterations, failed, self.blocks, corrected, margin)
         if header is None and not failed:

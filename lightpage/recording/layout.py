@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import RecordingError
+from lightpage.recording.frame_pair import FramePair as FramePair
 
 FORMAT = "lightpage-recording"
 VERSION = 1
@@ -34,14 +35,6 @@ SHOT_DATA = {
 DARK = ("cameras/dark_in_phase", "cameras/dark_quadrature")
 HOT = ("cameras/hot_in_phase", "cameras/hot_quadrature")
 LOSSES = "cameras/losses"
-
-
-@dataclass(frozen=True)
-class FramePair:
-    """The two frames of one page, camera counts [row, column]."""
-
-    in_phase: NDArray[np.integer[Any]]
-    quadrature: NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True)

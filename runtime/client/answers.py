@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.page_codec import PageBytes
-from runtime.decoding.page import ImagePosition
+from lightpage.codec.page_bytes import PageBytes
+from runtime.decoding.image_position import ImagePosition
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.wire.messages import image_of, user_data_of
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, LightpageError
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.client.answers import (
     Description,
     DisplayOrder,
@@ -26,9 +26,10 @@ from runtime.client.answers import (
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.wire.address import check_address
+from runtime.wire.channel import open_channel
 from runtime.wire.messages import PIXEL_CODES, PIXEL_TYPES, KnownPilots, pilots_message
 from runtime.wire.pages import RemotePage, remote_page
-from runtime.wire.sizes import CHUNK_BYTES, REPLY_BYTES
+from runtime.wire.sizes import CHUNK_BYTES
 from runtime.wire.status import error_of
 
 CALL_S = 60.0
@@ -54,13 +55,7 @@ class LightpageClient:
     def __init__(self, target: str, timeout_s: float = CALL_S) -> None:
         check_address("target", target)
         self.target, self._timeout = target, timeout_s
-        self._channel = grpc.insecure_channel(
-            target,
-            options=(
-                ("grpc.max_receive_message_length", REPLY_BYTES),
-                ("grpc.enable_http_proxy", 0),  # the device is on the local network
-            ),
-        )
+        self._channel = open_channel(target)
         self._stub = pb_grpc.LightpageStub(self._channel)  # type: ignore[no-untyped-call]
         self._description: Description | None = None
 

@@ -9,6 +9,8 @@ import click
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
+from runtime.wire.channel import open_channel
+
 DEFAULT_TARGET = "127.0.0.1:50052"
 
 
@@ -19,7 +21,7 @@ def is_serving(target: str, *, service: str = "", timeout_s: float = 3.0) -> tup
     healthy; it raises nothing, since to find that out is the question.
     Source: the gRPC health checking protocol, grpc.health.v1.
     """
-    with grpc.insecure_channel(target, options=[("grpc.enable_http_proxy", 0)]) as channel:
+    with open_channel(target) as channel:
         stub = health_pb2_grpc.HealthStub(channel)
         try:
             response = stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=timeout_s)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.page.pilots import PilotCheck
+from runtime.decoding.image_position import ImagePosition as ImagePosition
 
 
 @dataclass(frozen=True)
@@ -45,26 +46,6 @@ class Timings:
     def total_s(self) -> float:
         """All of it."""
         return self.check_s + self.inference_s + self.decision_s + self.search_s
-
-
-@dataclass(frozen=True)
-class ImagePosition:
-    """Where the image of a page lay on the cameras.
-
-    Attributes:
-        shift_x_px, shift_y_px: against where calibration saw it, camera pixels, on both cameras.
-        tilt_x_rad, tilt_y_rad: of the signal against the reference since calibration, radians at the right and lower
-            edge of the page's image.
-        searched: whether it was looked for.
-        found: whether the search found it; False where none was made.
-    """
-
-    shift_x_px: float
-    shift_y_px: float
-    tilt_x_rad: float = 0.0
-    tilt_y_rad: float = 0.0
-    searched: bool = False
-    found: bool = False
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from runtime.rpc.replies import decode_reply
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane, levels_for
 from runtime.service.receiver import PairReceiver
-from runtime.wire.messages import check_options, pilots_of, pixel_type
+from runtime.wire.messages import pixel_type
+from runtime.wire.requests import check_options, pilots_of
 from runtime.wire.status import refusal_of
 
 _ON_THEIR_WAY = 2

@@ -13,7 +13,7 @@ from runtime.rpc.replies import data_reply, read_reply
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.user_data import read_data
-from runtime.wire.messages import check_options
+from runtime.wire.requests import check_options
 from runtime.wire.status import refusal_of
 
 _MOST_PAGES = 1 << 32

@@ -7,18 +7,14 @@ from dataclasses import asdict, dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.header import Header
-from lightpage.codec.page_codec import FileFacts, Loss, PageBytes
+from lightpage.codec.page_bytes import FileFacts, Header, Loss, PageBytes
 from lightpage.errors import InvalidInputError, PageError
-from lightpage.page.pilots import Pilots
-from lightpage.page.symbols import check_levels, symbol_phases
-from runtime.decoding.page import ImagePosition
+from runtime.decoding.image_position import ImagePosition
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 PIXEL_TYPES = {pb.PIXEL_TYPE_UINT8: "uint8", pb.PIXEL_TYPE_UINT16: "uint16"}
 PIXEL_CODES = {name: code for code, name in PIXEL_TYPES.items()}
 
-_CONFIDENCE_FORMATS = (pb.CONFIDENCE_FORMAT_UNSPECIFIED, pb.CONFIDENCE_FORMAT_FLOAT32, pb.CONFIDENCE_FORMAT_UINT8)
 DATA_LOSSES: dict[Loss | None, pb.DataLoss] = {
     None: pb.DATA_LOSS_UNSPECIFIED,
     Loss.OPTICS: pb.DATA_LOSS_OPTICS,
@@ -42,25 +38,6 @@ def pixel_type(code: pb.PixelType) -> str:
     return PIXEL_TYPES[code]
 
 
-def pilots_of(message: pb.Pilots, page_shape: tuple[int, int], levels: int) -> Pilots:
-    """Pilots that a caller sent.
-
-    Raises:
-        PageError: sizes that do not fit the page, or levels out of range.
-    """
-    flags = np.frombuffer(message.mask, np.uint8)
-    values = np.frombuffer(message.values, np.uint8)
-    if flags.size and int(flags.max()) > 1:
-        raise PageError("pilots", f"a flag of {flags.max()}", "flags of 0 or 1")
-    if flags.size != page_shape[0] * page_shape[1] or np.count_nonzero(flags) != values.size:
-        got = f"{flags.size} flags, {np.count_nonzero(flags)} of them set, and {values.size} values"
-        raise PageError("pilots", got, f"{page_shape[0] * page_shape[1]} flags and one value a set flag")
-    levels = message.levels or levels
-    if values.size and int(values.max()) >= levels:
-        raise PageError("pilots", f"level {values.max()}", f"0..{levels - 1}")
-    return Pilots(flags.reshape(page_shape) != 0, symbol_phases(values, levels))
-
-
 @dataclass(frozen=True)
 class KnownPilots:
     """Pilots that a caller knows: bool mask [ny, nx], a page of symbols [ny, nx], and their level count."""
@@ -80,20 +57,6 @@ def pilots_message(pilots: KnownPilots) -> pb.Pilots:
         raise PageError("pilots", f"mask {pilots.mask.shape}, page {pilots.symbols.shape}", "two equal shapes")
     values = pilots.symbols[pilots.mask].tobytes()
     return pb.Pilots(mask=pilots.mask.astype(np.uint8).tobytes(), values=values, levels=pilots.levels)
-
-
-def check_options(options: pb.DecodeOptions) -> None:
-    """Check what a caller asks for, before a frame is received or a page is read for it.
-
-    Raises:
-        PageError: an impossible level count; 0 stands for the default.
-        InvalidInputError: an unknown format of confidences.
-    """
-    if options.levels:
-        check_levels(options.levels)
-    if options.confidence_format not in _CONFIDENCE_FORMATS:
-        expected = "CONFIDENCE_FORMAT_FLOAT32 or CONFIDENCE_FORMAT_UINT8"
-        raise InvalidInputError("confidence_format", options.confidence_format, expected)
 
 
 def user_data_of(message: pb.UserData) -> PageBytes:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.page_codec import PageBytes
+from lightpage.codec.page_bytes import PageBytes
 from lightpage.errors import LightpageError
-from runtime.decoding.page import ImagePosition
+from runtime.decoding.image_position import ImagePosition
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.wire.messages import FLOAT, image_of, user_data_of
 

@@ -1,0 +1,10 @@
+"""A client of the Lightpage service: `LightpageClient("HOST:PORT")`. Its errors are of the classes in `errors`."""
+
+from lightpage_client import errors
+from lightpage_client.lightpage.errors import LightpageError
+from lightpage_client.lightpage.recording.frame_pair import FramePair
+from lightpage_client.runtime.client.client import LightpageClient
+from lightpage_client.runtime.wire.messages import KnownPilots
+from lightpage_client.runtime.wire.pages import RemotePage
+
+__all__ = ["FramePair", "KnownPilots", "LightpageClient", "LightpageError", "RemotePage", "errors"]

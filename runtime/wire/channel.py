@@ -1,0 +1,49 @@
+"""The connection to a service, one way for all who call it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import grpc
+
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.wire.sizes import REPLY_BYTES
+
+REPEATABLE = ("Describe", "ListModels", "ListJobs", "GetJob", "WatchJob", "WatchDisplay")
+"""Calls that change nothing: gRPC repeats them by itself where the service did not answer."""
+
+RECONNECT_MS = 100, 1000
+"""Between two attempts to connect, at first and at most: a service that is back is found within about a second."""
+
+CONNECT_MS = 2000
+"""An attempt to connect may take so long; gRPC's option is named for the pause, and means this. A service whose cores
+are all at work takes its time to answer, and a host that is being switched on drops what it is sent."""
+
+
+def open_channel(target: str) -> grpc.Channel:
+    """A channel to `target` (HOST:PORT); it connects at the first call, and again whenever the connection was lost."""
+    first_ms, most_ms = RECONNECT_MS
+    options: tuple[tuple[str, Any], ...] = (
+        ("grpc.max_receive_message_length", REPLY_BYTES),
+        ("grpc.enable_http_proxy", 0),  # the device is on the local network
+        ("grpc.initial_reconnect_backoff_ms", first_ms),
+        ("grpc.max_reconnect_backoff_ms", most_ms),
+        ("grpc.min_reconnect_backoff_ms", CONNECT_MS),
+        ("grpc.service_config", _service_config()),
+    )
+    return grpc.insecure_channel(target, options=options)
+
+
+def _service_config() -> str:
+    """Five attempts within about two seconds, for calls that change nothing."""
+    service = pb.DESCRIPTOR.services_by_name["Lightpage"].full_name
+    policy = {
+        "maxAttempts": 5,
+        "initialBackoff": "0.1s",
+        "maxBackoff": "1s",
+        "backoffMultiplier": 2,
+        "retryableStatusCodes": ["UNAVAILABLE"],
+    }
+    names = [{"service": service, "method": method} for method in REPEATABLE]
+    return json.dumps({"methodConfig": [{"name": names, "retryPolicy": policy}]})
