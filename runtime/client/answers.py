@@ -164,7 +164,7 @@ def job_info(job: pb.Job) -> JobInfo:
     name = pb.JobState.Name(job.state).removeprefix("JOB_STATE_") if job.state in pb.JobState.values() else ""
     return JobInfo(
         id=job.id,
-        state=JobState(name) if name in JobState else JobState.UNKNOWN,
+        state=JobState[name] if name in JobState.__members__ else JobState.UNKNOWN,
         step=job.progress.step,
         fraction=job.progress.fraction,
         created_s=job.created_s,

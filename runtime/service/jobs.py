@@ -210,7 +210,7 @@ class Jobs:
         try:
             replace_text(self._path, json.dumps({"format": _FORMAT, "version": _VERSION, "jobs": entries}), "jobs")
         except InvalidInputError as error:
-            _log.warning("recalibration: its record is lost at a restart: %s", error)
+            _log.warning("jobs: a restart will know less of them: %s", error)
 
 
 def _new_id() -> str:
