@@ -267,8 +267,8 @@ class LightpageClient:
     ) -> Recalibrated:
         """Recalibrate with pages of the source (`pages`, or the next `count`) or with a recording on the server.
 
-        Of a recording the first `count` pages are used, all of them where it is 0. `expected_version` must be in service;
-        empty stands for any. The recalibration is dropped when the call ends early; see `start_recalibration`.
+        Of a recording the first `count` pages are used, all of them where it is 0. `expected_version` must be in
+        service; empty stands for any. The recalibration is dropped when the call ends early: see `start_recalibration`.
 
         Raises:
             RecalibrationRefusedError: the new model would not be better; the old one stays.
