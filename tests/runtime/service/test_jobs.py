@@ -154,7 +154,8 @@ def test_a_damaged_record_is_set_aside_with_a_warning(
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert jobs.all() == []
     assert (tmp_path / DAMAGED).read_bytes() == content
-    assert Jobs(tmp_path).job(ended(jobs)).state == pb.JOB_STATE_DONE
+    done = ended(jobs)
+    assert Jobs(tmp_path).job(done).state == pb.JOB_STATE_DONE
 
 
 def test_a_record_that_cannot_even_be_set_aside_stops_nothing(tmp_path: Path) -> None:
@@ -219,7 +220,7 @@ def test_the_end_of_the_service_interrupts_the_job_and_the_next_start_knows(make
         recalibrator.start(recalibrator.source_pages(2))
     found = make(store=tmp_path)[1].jobs.job(job.id)
     assert (found.state, found.correlation_id) == (pb.JOB_STATE_INTERRUPTED, "night")
-    assert found.progress.step == "wait"
+    assert found.refusal.detail.kind == "StoppingError"
 
 
 def test_a_job_that_waits_for_a_slot_is_cancelled_at_once(make: Make) -> None:
