@@ -214,7 +214,7 @@ def test_an_ended_job_is_watched_in_one_message_and_an_unknown_one_is_not_found(
     assert list(service.client.watch_job(end.id, 20)) == [end]
     for call in (service.client.job, service.client.cancel_job, lambda id_: list(service.client.watch_job(id_, 5))):
         with pytest.raises(NoSuchJobError):
-            call("no-such-job")  # type: ignore[operator]
+            call("no-such-job")
     with pytest.raises(grpc.RpcError) as caught:
         service.stub().GetJob(pb.GetJobRequest(), timeout=20)
     assert caught.value.code() == grpc.StatusCode.NOT_FOUND
@@ -335,7 +335,7 @@ def test_what_fails_later_fails_the_job_and_what_is_known_at_once_the_call(start
         ({"recording": "../short.h5"}, InvalidInputError),
     ):
         with pytest.raises(kind):
-            service.client.start_recalibration(**options)  # type: ignore[arg-type]
+            service.client.start_recalibration(**options)
     with pytest.raises(grpc.RpcError) as caught:
         service.stub().StartRecalibration(pb.StartRecalibrationRequest(), timeout=20)
     assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
@@ -612,7 +612,7 @@ def test_the_client_refuses_what_it_cannot_send(start: Start) -> None:
         (
             KnownPages(pages.pairs, (pages.symbols[0], pages.symbols[1] + np.uint16(300)), 16, pages.references),
             PageError,
-        ),  # type: ignore[arg-type]
+        ),
         (KnownPages(pages.pairs, (pages.symbols[0], pages.symbols[1] * 1.0), 16, pages.references), PageError),  # type: ignore[arg-type]
     ):
         with pytest.raises(kind):
