@@ -52,6 +52,10 @@ _AGAIN_S = 0.5
 """From a lost connection to the next try."""
 
 
+_RECONNECT_MS = 5000
+"""Longest pause between two tries to connect again, where the library's own grows to two minutes."""
+
+
 class LightpageClient:
     """Talks to the service at `target` (HOST:PORT). Use it in a `with` statement, or `close` it.
 
@@ -70,6 +74,7 @@ class LightpageClient:
             options=(
                 ("grpc.max_receive_message_length", REPLY_BYTES),
                 ("grpc.enable_http_proxy", 0),  # the device is on the local network
+                ("grpc.max_reconnect_backoff_ms", _RECONNECT_MS),
             ),
         )
         self._stub = pb_grpc.LightpageStub(self._channel)  # type: ignore[no-untyped-call]

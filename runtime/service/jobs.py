@@ -160,6 +160,8 @@ class Jobs:
                 told = logging.INFO if unforeseen is None else logging.ERROR
                 _log.log(told, "recalibration: job %s ended: %s", running.id, end, exc_info=unforeseen)
             self._write([*earlier, ended][-self._kept :])
+        except Exception:  # whoever works on the job must hear of its end whatever its record says
+            _log.exception("jobs: the end of job %s is not noted", running.id)
         finally:
             with self._lock:
                 self._jobs, self._running = [*earlier, ended][-self._kept :], None

@@ -99,7 +99,7 @@ def test_a_recording_here_is_sent(start: Start, tmp_path: Path, capsys: pytest.C
     assert run(*sending, "--detach") == 0
     job = capsys.readouterr().out.strip()
     with LightpageClient(server.target) as client:
-        assert [one.id for one in client.jobs()][0] == job
+        assert client.jobs()[0].id == job
         assert {one.pages_of for one in client.jobs()} == {"frames"}
 
 
