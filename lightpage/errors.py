@@ -76,7 +76,13 @@ class RecalibrationRefusedError(LightpageError):
 
 
 class BusyError(LightpageError):
-    """The resource is taken by another call; try again later."""
+    """The resource is taken by another call; try again later.
+
+    Attributes:
+        job: id of the recalibration that has taken it, where it is one.
+    """
+
+    job: str | None = None
 
 
 class LimitError(LightpageError):

@@ -58,6 +58,10 @@ class StalledError(LightpageError):
     """The caller sent nothing for too long."""
 
 
+class JobCancelledError(LightpageError):
+    """Somebody cancelled the job; nothing was changed."""
+
+
 class NoSuchJobError(LightpageError):
     """There is no such job, or it ended long ago."""
 

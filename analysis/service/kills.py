@@ -101,7 +101,7 @@ class Killed:
                 def ask() -> None:
                     try:
                         if recalibrating:
-                            heard.append(client.recalibrate(count=2).version)
+                            heard.append(client.recalibrate(count=2).model_version)
                         while not recalibrating:
                             asked.append(chance.choice(versions))
                             heard.append(client.activate_model(asked[-1])[0])

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.codec.page_bytes import PageBytes
+from lightpage.errors import LightpageError
 from runtime.decoding.image_position import ImagePosition
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.wire.messages import image_of, user_data_of
+from runtime.wire.status import error_from
 
 
 @dataclass(frozen=True)
@@ -110,6 +113,66 @@ def recalibrated(result: pb.RecalibrationResult) -> Recalibrated:
         seconds=result.seconds,
         pages_lost_before=result.pages_lost_before,
         image=image_of(result.image) if result.HasField("image") else None,
+    )
+
+
+class JobState(StrEnum):
+    """How a job stands."""
+
+    RUNNING = "RUNNING"
+    DONE = "DONE"
+    REFUSED = "REFUSED"
+    """The new model would not be better; the old one stays."""
+    FAILED = "FAILED"
+    CANCELLED = "CANCELLED"
+    INTERRUPTED = "INTERRUPTED"
+    """The service ended while it ran; nothing was changed."""
+    UNKNOWN = "UNKNOWN"
+    """Of a service that is newer than this client."""
+
+
+@dataclass(frozen=True)
+class JobInfo:
+    """A recalibration as a job of the service.
+
+    Attributes:
+        id: by which the service knows it.
+        state: how it stands.
+        step, fraction: what is, or was last, being done, and how far all of it is, 0..1.
+        created_s: when it began, seconds since 1970.
+        pages_of: where its pages came from, for people.
+        ended_s: when it ended, None while it runs.
+        result: of a job that is done.
+        error: why one that has ended is not done.
+        correlation_id: the text of whoever started it.
+    """
+
+    id: str
+    state: JobState
+    step: str
+    fraction: float
+    created_s: float
+    pages_of: str
+    ended_s: float | None = None
+    result: Recalibrated | None = None
+    error: LightpageError | None = None
+    correlation_id: str = ""
+
+
+def job_info(job: pb.Job) -> JobInfo:
+    """A job from its message."""
+    name = pb.JobState.Name(job.state).removeprefix("JOB_STATE_") if job.state in pb.JobState.values() else ""
+    return JobInfo(
+        id=job.id,
+        state=JobState[name] if name in JobState.__members__ else JobState.UNKNOWN,
+        step=job.progress.step,
+        fraction=job.progress.fraction,
+        created_s=job.created_s,
+        pages_of=job.pages_of,
+        ended_s=job.ended_s or None,
+        result=recalibrated(job.result) if job.HasField("result") else None,
+        error=error_from(job.refusal.detail) if job.HasField("refusal") else None,
+        correlation_id=job.correlation_id,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Any, Self
@@ -10,15 +11,18 @@ import grpc
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import FrameError, LightpageError
+from lightpage.errors import FrameError, InvalidInputError, LightpageError, PageError
+from lightpage.page.symbols import MAX_LEVELS
 from lightpage.recording.frame_pair import FramePair
 from runtime.client.answers import (
     Description,
     DisplayOrder,
+    JobInfo,
     ModelInfo,
     Recalibrated,
     RemoteData,
     display_order,
+    job_info,
     model_info,
     recalibrated,
     remote_data,
@@ -30,7 +34,7 @@ from runtime.wire.channel import open_channel
 from runtime.wire.messages import PIXEL_CODES, PIXEL_TYPES, KnownPilots, pilots_message
 from runtime.wire.pages import RemotePage, remote_page
 from runtime.wire.sizes import CHUNK_BYTES
-from runtime.wire.status import error_of
+from runtime.wire.status import error_of, is_lost_connection
 
 CALL_S = 60.0
 """Deadline of a call where none is given."""
@@ -40,6 +44,13 @@ DATA_S = 600.0
 
 RECALIBRATION_S = 600.0
 """Deadline of a recalibration where none is given."""
+
+
+_WATCH_S = 60.0
+"""A watch that hears nothing for so long begins anew: a network that swallows everything tells nobody."""
+
+_AGAIN_S = 0.5
+"""From a lost connection to the next try."""
 
 
 class LightpageClient:
@@ -127,14 +138,7 @@ class LightpageClient:
         """
         if bit_depth is None:
             bit_depth = (self._description or self.describe()).bit_depth
-        frames = [np.asarray(pair.in_phase), np.asarray(pair.quadrature)]
-        for name, frame in zip(("in-phase frame", "quadrature frame"), frames, strict=True):
-            if frame.dtype.name not in PIXEL_CODES or frame.ndim != 2 or frame.shape != frames[0].shape:
-                raise FrameError(
-                    name, f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the other"
-                )
-        if frames[0].dtype != frames[1].dtype:
-            raise FrameError("quadrature frame", f"type {frames[1].dtype}", f"type {frames[0].dtype}, as in-phase")
+        frames = _sent_frames(pair)
         header = pb.DecodeHeader(
             rows_px=frames[0].shape[0],
             columns_px=frames[0].shape[1],
@@ -254,21 +258,25 @@ class LightpageClient:
         recording: str | None = None,
         progress: Callable[[str, float], None] = lambda step, fraction: None,
         timeout_s: float = RECALIBRATION_S,
+        expected_version: str = "",
     ) -> Recalibrated:
         """Recalibrate with pages of the source (`pages`, or the next `count`) or with a recording on the server.
 
-        Of a recording the first `count` pages are used, all of them where it is 0.
+        Of a recording the first `count` pages are used, all of them where it is 0. `expected_version` must be in
+        service; empty stands for any. The recalibration is dropped when the call ends early: see `start_recalibration`.
 
         Raises:
             RecalibrationRefusedError: the new model would not be better; the old one stays.
-            BusyError: another recalibration runs.
+            BusyError: another recalibration runs; its `job` says which.
+            OtherModelError: another model is in service than was expected.
+            JobCancelledError: somebody has cancelled it.
             LimitError: more pages than the service takes.
             InvalidInputError: no such pages or recording, too few pages, the same one twice, or unknown symbols.
             SourceError: the service has no source or recordings, or damaged ones, or no symbols of its own pages.
             StoppingError: the service is being stopped.
             BundleError: the new model cannot be written or noted; the old one stays.
         """
-        request = pb.RecalibrateRequest()
+        request = pb.RecalibrateRequest(expected_version=expected_version)
         if recording is not None:
             request.recording, request.recording_count = recording, count
         else:
@@ -289,6 +297,162 @@ class LightpageClient:
             raise LightpageError(f"service at {self.target}", "an end without a result", "a recalibration's result")
         return result
 
+    def start_recalibration(
+        self,
+        *,
+        count: int = 0,
+        pages: Sequence[int] = (),
+        recording: str | None = None,
+        expected_version: str = "",
+        correlation_id: str = "",
+    ) -> JobInfo:
+        """Start a recalibration and return at once; it goes on by itself, see `watch_job`.
+
+        Args:
+            count: how many of the source's next pages, or of the recording's first ones.
+            pages: which pages of the source.
+            recording: its name in the service's recordings folder.
+            expected_version: that must be in service; empty for any.
+            correlation_id: a text that the job carries.
+
+        Raises:
+            BusyError: another recalibration runs; its `job` says which.
+            OtherModelError: another model is in service than was expected.
+            LimitError: more pages than the service takes.
+            InvalidInputError: no such recording.
+            SourceError: the service has no source or recordings.
+        """
+        request = pb.StartRecalibrationRequest(expected_version=expected_version, correlation_id=correlation_id)
+        if recording is not None:
+            request.recording, request.recording_count = recording, count
+        else:
+            request.source.CopyFrom(pb.SourcePages(count=count, pages=pages))
+        return job_info(self._unary(self._stub.StartRecalibration, request))
+
+    def recalibrate_frames(
+        self,
+        pairs: Sequence[FramePair],
+        symbols: Sequence[NDArray[np.uint8]],
+        references: FramePair,
+        *,
+        levels: int,
+        bit_depth: int | None = None,
+        black_level: int = 0,
+        pilot_mask: NDArray[np.bool_] | None = None,
+        expected_version: str = "",
+        correlation_id: str = "",
+        timeout_s: float = DATA_S,
+    ) -> JobInfo:
+        """Send pages with known symbols and start a recalibration with them, which goes on by itself.
+
+        Args:
+            pairs: frame pairs, one a page.
+            symbols: what was written, [ny, nx], one a page.
+            references: reference-only frames taken with them.
+            levels: M of the symbols.
+            bit_depth: bits of a camera count; by default those of the service's camera.
+            black_level: counts that the cameras add to every pixel.
+            pilot_mask: where the pilots are, [ny, nx]; None for the device's own.
+            expected_version: that must be in service; empty for any.
+            correlation_id: a text that the job carries.
+            timeout_s: for sending it all.
+
+        Raises:
+            FrameError: frames that cannot be sent, or that the service refuses.
+            PageError: symbols or pilots that do not fit the page, or an impossible level count.
+            BusyError: another recalibration runs; its `job` says which.
+            OtherModelError: another model is in service than was expected.
+            LimitError: more pages than the service takes.
+            InvalidInputError: too few pages, the same one twice, or not as many symbols as pairs.
+        """
+        if len(pairs) != len(symbols):
+            got = f"{len(pairs)} frame pairs and {len(symbols)} pages of symbols"
+            raise InvalidInputError("pages to recalibrate with", got, "as many of both")
+        first = _sent_frames(references, "reference: ")
+        header = pb.RecalibrateFramesHeader(
+            rows_px=first[0].shape[0],
+            columns_px=first[0].shape[1],
+            pixel_type=PIXEL_CODES[first[0].dtype.name],
+            bit_depth=(self._description or self.describe()).bit_depth if bit_depth is None else bit_depth,
+            black_level=black_level,
+            levels=levels,
+            pages=len(pairs),
+            pilot_mask=b"" if pilot_mask is None else np.asarray(pilot_mask, bool).astype(np.uint8).tobytes(),
+            expected_version=expected_version,
+            correlation_id=correlation_id,
+        )
+        pages = [
+            (_sent_frames(pair, f"known page {number}: "), _sent_symbols(page, f"known page {number}: symbols"))
+            for number, (pair, page) in enumerate(zip(pairs, symbols, strict=True))
+        ]
+        for number, (frames, _) in enumerate(pages):
+            if (frames[0].shape, frames[0].dtype) != (first[0].shape, first[0].dtype):
+                got, expected = (f"{one.dtype} {one.shape}" for one in (frames[0], first[0]))
+                raise FrameError(f"known page {number}: frames", got, f"{expected}, as the reference frames")
+
+        def parts() -> Iterator[pb.RecalibrateFramesRequest]:
+            yield pb.RecalibrateFramesRequest(header=header)
+            for chunk in _chunks(first):
+                yield pb.RecalibrateFramesRequest(reference=chunk)
+            for frames, page in pages:
+                yield pb.RecalibrateFramesRequest(symbols=page)
+                for chunk in _chunks(frames):
+                    yield pb.RecalibrateFramesRequest(chunk=chunk)
+
+        return job_info(self._unary(self._stub.RecalibrateFrames, parts(), timeout_s))
+
+    def jobs(self) -> list[JobInfo]:
+        """Jobs that run, and those that ended lately, the newest first.
+
+        Raises:
+            LightpageError: no answer.
+        """
+        reply: pb.ListJobsReply = self._unary(self._stub.ListJobs, pb.ListJobsRequest())
+        return [job_info(job) for job in reply.jobs]
+
+    def job(self, job_id: str) -> JobInfo:
+        """A job as it is now.
+
+        Raises:
+            NoSuchJobError: there is no such job, or it ended long ago.
+        """
+        return job_info(self._unary(self._stub.GetJob, pb.GetJobRequest(id=job_id)))
+
+    def watch_job(self, job_id: str, timeout_s: float = RECALIBRATION_S) -> Iterator[JobInfo]:
+        """A job as it is now, and at each change, until it has ended.
+
+        A connection that is lost on the way, or a service that starts again, is waited for.
+
+        Raises:
+            NoSuchJobError: there is no such job, or it ended long ago.
+            LightpageError: no answer at all, or the job has not ended within `timeout_s`; it goes on.
+        """
+        until, last = time.monotonic() + timeout_s, None
+        while True:
+            left_s = until - time.monotonic()
+            call = self._stub.WatchJob(pb.WatchJobRequest(id=job_id), timeout=max(0.0, min(left_s, _WATCH_S)))
+            try:
+                for job in call:
+                    if job != last:
+                        last = job
+                        yield job_info(job)
+                    if job.state != pb.JOB_STATE_RUNNING:
+                        return
+            except grpc.RpcError as error:
+                if last is None or time.monotonic() >= until or not is_lost_connection(error):
+                    raise error_of(error, self.target) from None
+            finally:
+                call.cancel()
+            time.sleep(max(0.0, min(_AGAIN_S, until - time.monotonic())))
+
+    def cancel_job(self, job_id: str) -> JobInfo:
+        """Have a job end at its next step; returns it as it is then. One that has ended stays as it is.
+
+        Raises:
+            NoSuchJobError: there is no such job, or it ended long ago.
+        """
+        return job_info(self._unary(self._stub.CancelJob, pb.CancelJobRequest(id=job_id)))
+
     def rollback(self) -> tuple[str, str]:
         """Go back to the model before; returns the versions (now current, dropped).
 
@@ -307,19 +471,46 @@ class LightpageClient:
         reply: pb.ListModelsReply = self._unary(self._stub.ListModels, pb.ListModelsRequest())
         return [model_info(model) for model in reply.models]
 
-    def _unary(self, method: Callable[..., Any], request: object) -> Any:
+    def _unary(self, method: Callable[..., Any], request: object, timeout_s: float | None = None) -> Any:
         try:
-            return method(request, timeout=self._timeout)
+            return method(request, timeout=self._timeout if timeout_s is None else timeout_s)
         except grpc.RpcError as error:
             raise error_of(error, self.target) from None
 
 
 def _parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> Iterator[pb.DecodeFramesRequest]:
     yield pb.DecodeFramesRequest(header=header)
+    for chunk in _chunks(frames):
+        yield pb.DecodeFramesRequest(chunk=chunk)
+
+
+def _chunks(frames: Sequence[NDArray[np.integer]]) -> Iterator[bytes]:
     for frame in frames:
         data = np.ascontiguousarray(frame, frame.dtype.newbyteorder("<")).view(np.uint8).reshape(-1)
         for start in range(0, data.size, CHUNK_BYTES):
-            yield pb.DecodeFramesRequest(chunk=data[start : start + CHUNK_BYTES].tobytes())
+            yield data[start : start + CHUNK_BYTES].tobytes()
+
+
+def _sent_frames(pair: FramePair, subject: str = "") -> list[NDArray[np.integer]]:
+    """Both frames, in-phase first, if they can be sent."""
+    frames = [np.asarray(pair.in_phase), np.asarray(pair.quadrature)]
+    for name, frame in zip(("in-phase frame", "quadrature frame"), frames, strict=True):
+        if frame.dtype.name not in PIXEL_CODES or frame.ndim != 2 or frame.shape != frames[0].shape:
+            got, expected = f"{frame.dtype} {frame.shape}", "uint8 or uint16, rows and columns, as the other"
+            raise FrameError(subject + name, got, expected)
+    if frames[0].dtype != frames[1].dtype:
+        expected = f"type {frames[0].dtype}, as in-phase"
+        raise FrameError(f"{subject}quadrature frame", f"type {frames[1].dtype}", expected)
+    return frames
+
+
+def _sent_symbols(page: NDArray[np.uint8], subject: str) -> bytes:
+    symbols = np.asarray(page)
+    if symbols.dtype.kind not in "ui" or (
+        symbols.size and not 0 <= int(symbols.min()) <= int(symbols.max()) < MAX_LEVELS
+    ):
+        raise PageError(subject, f"{symbols.dtype}", f"whole numbers from 0 to {MAX_LEVELS - 1}")
+    return symbols.astype(np.uint8).tobytes()
 
 
 def _options(levels: int, concentration: bool, phase: bool, quantised: bool, user_data: bool) -> pb.DecodeOptions:

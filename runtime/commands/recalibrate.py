@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import click
@@ -11,14 +12,14 @@ from lightpage.calibration.known_pages import first_lit_pages
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.cli.progress_bar import percent_bar
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.files import write_json
-from lightpage.progress import warn
+from lightpage.progress import Progress, warn
 from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.manifest import check_version
 from runtime.bundle.shipped import bundle_path
-from runtime.client.answers import Recalibrated
+from runtime.client.answers import JobInfo, Recalibrated
 from runtime.client.client import RECALIBRATION_S, LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.recalibration.known_pages import KnownPages
@@ -33,7 +34,10 @@ DEFAULT_PAGES = 2
 
 @click.command()
 @click.option("--bundle", help="Offline: the bundle to start from, a path or a shipped name.")
-@click.option("--recording", help="Pages with known symbols: a file, or with --target a name in the service's folder.")
+@click.option(
+    "--recording",
+    help="Pages with known symbols: a file, or with --target and without --send a name in the service's folder.",
+)
 @click.option("--out", type=NewPath(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
 @click.option("--target", metavar="HOST:PORT", help="Recalibrate this running service instead of a bundle.")
 @click.option("--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(2), help="Known pages to use.")
@@ -45,6 +49,8 @@ DEFAULT_PAGES = 2
     help="With --target: seconds to wait for the result.",
 )
 @click.option("--version", help="Offline: version of the new bundle; by default the next one.")
+@click.option("--send", is_flag=True, help="With --target: --recording is a file here, whose frames are sent.")
+@click.option("--detach", is_flag=True, help="With --target: print the job's id and leave it to itself.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the result to this file.")
 def recalibrate(
     bundle: str | None,
@@ -54,19 +60,34 @@ def recalibrate(
     pages: int,
     timeout_s: float | None,
     version: str | None,
+    send: bool,
+    detach: bool,
     json_path: Path | None,
 ) -> None:
     """Re-fit the geometry of a drifted device from known pages, keep it only if it decodes better.
 
     Offline with --bundle, --recording and --out; over the endpoint with --target, from the service's source or, with
-    --recording, from a file in its recordings folder.
+    --recording, from a file in its recordings folder, or with --send from a file here. The recalibration of a service
+    ends with this command, unless it is told to --detach; `lightpage jobs` then tells how it goes.
     """
     start = time.perf_counter()
     if target is not None:
         if bundle or out or version is not None:
             raise InvalidInputError("--target", "with --bundle, --out or --version", "either a service or a bundle")
-        result: RecalibrationOutcome | Recalibrated = _remote(target, recording, pages, timeout_s)
+        if send and recording is None:
+            raise InvalidInputError("--send", "without --recording", "a file whose frames are sent")
+        wait_s = RECALIBRATION_S if timeout_s is None else timeout_s
+        if detach:
+            with LightpageClient(target) as client:
+                job = _start(client, recording, pages, send, wait_s)
+            if json_path is not None:
+                write_json(json_path, {"job": job.id})
+            click.echo(job.id)
+            return
+        result: RecalibrationOutcome | Recalibrated = _remote(target, recording, pages, send, wait_s)
     else:
+        if send or detach:
+            raise InvalidInputError("--send" if send else "--detach", "without --target", "a service")
         if timeout_s is not None:
             raise InvalidInputError("--timeout", "without --target", "a service to wait for")
         if not (bundle and recording and out):
@@ -77,7 +98,7 @@ def recalibrate(
     data = summary(result, time.perf_counter() - start)
     if json_path is not None:
         write_json(json_path, data)
-    click.echo("\n".join(f"{name:<20} {value}" for name, value in data.items() if value is not None))
+    click.echo(table(data))
 
 
 def summary(result: RecalibrationOutcome | Recalibrated, seconds: float) -> dict[str, str | float | None]:
@@ -100,10 +121,55 @@ def summary(result: RecalibrationOutcome | Recalibrated, seconds: float) -> dict
     }
 
 
-def _remote(target: str, recording: str | None, pages: int, timeout_s: float | None) -> Recalibrated:
-    timeout_s = RECALIBRATION_S if timeout_s is None else timeout_s
+def table(data: dict[str, str | float | None]) -> str:
+    """The result for people."""
+    return "\n".join(f"{name:<20} {value}" for name, value in data.items() if value is not None)
+
+
+def _remote(target: str, recording: str | None, pages: int, send: bool, timeout_s: float) -> Recalibrated:
     with LightpageClient(target) as client, percent_bar() as progress:
-        return client.recalibrate(count=pages, recording=recording, progress=progress, timeout_s=timeout_s)
+        if not send:
+            return client.recalibrate(count=pages, recording=recording, progress=progress, timeout_s=timeout_s)
+        until = time.monotonic() + timeout_s
+        job = _start(client, recording, pages, send, timeout_s)
+        try:
+            return watched(client, job.id, progress, until - time.monotonic())
+        except BaseException:
+            with suppress(LightpageError):
+                client.cancel_job(job.id)  # one that has ended stays as it is
+            raise
+
+
+def watched(client: LightpageClient, job_id: str, progress: Progress, timeout_s: float) -> Recalibrated:
+    """Follow a job to its end.
+
+    Raises:
+        LightpageError: it is not done, and why.
+    """
+    for job in client.watch_job(job_id, timeout_s):
+        progress(job.step, job.fraction)
+        if job.error is not None:
+            raise job.error
+        if job.result is not None:
+            return job.result
+    raise LightpageError(f"job {job_id}", "an end without a result", "a recalibration's result")
+
+
+def _start(client: LightpageClient, recording: str | None, pages: int, send: bool, timeout_s: float) -> JobInfo:
+    if not send or recording is None:
+        return client.start_recalibration(count=pages, recording=recording)
+    with Recording.open(recording) as file:
+        known, bit_depth = read_recorded(file, first_lit_pages(file, pages, warn)), file.bit_depth
+    assert known.references is not None  # of a recording
+    return client.recalibrate_frames(
+        known.pairs,
+        known.symbols,
+        known.references,
+        levels=known.levels,
+        bit_depth=bit_depth,
+        pilot_mask=known.pilot_mask,
+        timeout_s=timeout_s,
+    )
 
 
 def _offline(bundle: str, recording: str, out: Path, pages: int, version: str | None) -> RecalibrationOutcome:

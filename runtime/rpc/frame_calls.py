@@ -135,7 +135,7 @@ class FrameCalls:
         """Take in the chunks of a pair, as soon as its header is known to be right and there will be time for it."""
         start, limit_s = time.perf_counter(), self._plane.limits.receive_s
         check_options(header.options)
-        _check_black(header)
+        check_black(header)
         self._pilots(header)
         shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
         receiver = self._plane.receiver(shape, dtype, header.bit_depth, _caller(header, call))
@@ -218,7 +218,12 @@ def _caller(header: pb.DecodeHeader, call: Call) -> Caller:
     return caller
 
 
-def _check_black(header: pb.DecodeHeader) -> None:
+def check_black(header: pb.DecodeHeader | pb.RecalibrateFramesHeader) -> None:
+    """Check the black level of a header.
+
+    Raises:
+        InvalidInputError: it lies beyond the counts.
+    """
     if header.black_level and header.black_level >= (most := 1 << header.bit_depth):
         raise InvalidInputError("black_level", header.black_level, f"less than {most}")
 

@@ -26,7 +26,7 @@ def handlers(plane: DataPlane, recalibrator: Recalibrator) -> tuple[object, ...]
         PageCalls(plane),
         DisplayCalls(plane),
         ModelCalls(plane),
-        JobCalls(recalibrator),
+        JobCalls(plane, recalibrator),
     )
 
 

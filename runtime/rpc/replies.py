@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from lightpage.codec.page_codec import PageBytes
 from lightpage.recording.layout import FrameInfo
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.service.dataplane import Answer, ReadAnswer
 from runtime.service.display import Wanted
 from runtime.service.monitor import AIR, MARGIN, PISTON_WALK, RESIDUAL, SHARE, SHIFT, TRUST, UNREAD
@@ -145,22 +144,4 @@ def model_message(model: Model, current: bool) -> pb.Model:
     numbers = {k: float(v) for k, v in manifest.metrics.items() if isinstance(v, int | float)}
     return pb.Model(
         name=manifest.name, version=manifest.version, created=manifest.created, current=current, metrics=numbers
-    )
-
-
-def result_message(outcome: RecalibrationOutcome) -> pb.RecalibrationResult:
-    """A recalibration's outcome as its message."""
-    return pb.RecalibrationResult(
-        model_version=outcome.version,
-        previous_version=outcome.previous_version,
-        pages_used=outcome.pages_used,
-        pages_held_back=outcome.pages_held_back,
-        air_before=outcome.air_before,
-        air_after=outcome.air_after,
-        angle_deg=outcome.report.angle_deg,
-        coherence_before=outcome.report.coherence_before,
-        coherence_after=outcome.report.coherence_after,
-        seconds=outcome.seconds,
-        pages_lost_before=outcome.pages_lost_before,
-        image=None if outcome.report.image is None else image_message(outcome.report.image),
     )

@@ -137,13 +137,12 @@ class DataPlane:
         """The level count where a caller names none: that of the source's pages, or 256."""
         return MAX_LEVELS if self._source is None else self._source.levels
 
-    def receiver(self, shape: tuple[int, int], dtype: str, bit_depth: int, caller: Caller) -> PairReceiver:
-        """A receiver for one pair, checked against the camera before a byte is allocated; to be closed.
+    def check_format(self, shape: tuple[int, int], dtype: str, bit_depth: int) -> None:
+        """Check what a caller says of frames against the camera, before a byte is allocated for them.
 
         Raises:
             LimitError: the pair is larger than the service accepts.
             FrameError: not this device's size, type or bit depth.
-            OverloadedError: there is so much to decode that the caller's deadline would pass.
         """
         # Size first: a header may claim anything, and a limit is the service's, not the camera's.
         if 2 * shape[0] * shape[1] * np.dtype(dtype).itemsize > self.limits.pair_bytes:
@@ -156,6 +155,15 @@ class DataPlane:
                 f"{shape[0]}x{shape[1]} pixels, {dtype}, {bit_depth} bits",
                 f"{expected[0][0]}x{expected[0][1]} pixels, {expected[1]}, {expected[2]} bits",
             )
+
+    def receiver(self, shape: tuple[int, int], dtype: str, bit_depth: int, caller: Caller) -> PairReceiver:
+        """A receiver for one pair, to be closed; see `check_format`.
+
+        Raises:
+            LimitError, FrameError: see `check_format`.
+            OverloadedError: there is so much to decode that the caller's deadline would pass.
+        """
+        self.check_format(shape, dtype, bit_depth)
         self.decodes.check(caller)
         return PairReceiver(shape, dtype, self.limits.pair_bytes, self.received)
 

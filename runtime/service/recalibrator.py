@@ -1,4 +1,4 @@
-"""Runs one recalibration at a time beside the decoding, reports its progress, and puts the result in service."""
+"""Runs one recalibration at a time beside the decoding, as a job, and puts the result in service."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 
 from lightpage.errors import (
-    BusyError,
     InvalidInputError,
     LimitError,
     PageError,
@@ -28,14 +27,17 @@ from runtime.bundle.archive import check_name
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
-from runtime.errors import CallerLeft, SourceError, StoppingError
+from runtime.errors import CallerLeft, JobCancelledError, OtherModelError, SourceError, StoppingError
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
 from runtime.recalibration.recalibration import next_version, recalibrate
 from runtime.recalibration.separate_process import recalibrate_apart
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
+from runtime.service.jobs import Jobs, RunningJob
 from runtime.service.limits import GRACE_S
+from runtime.service.registry import Model
 from runtime.service.store import ModelStore
 
 _log = logging.getLogger(__name__)
@@ -52,58 +54,146 @@ class Step:
     fraction: float
 
 
+def _nothing() -> None:
+    """Nobody listens."""
+
+
+@dataclass(frozen=True)
+class PagesToUse:
+    """Pages to recalibrate with, not read yet.
+
+    Attributes:
+        of: where they come from, for people.
+        read: reads them on behalf of a caller, and calls what it is given before each.
+        own: whether they are the service's own: then it is not the caller's fault if they are dark or damaged.
+        release: called once they are not needed any more, also where the job does not begin.
+    """
+
+    of: str
+    read: Callable[[Callable[[], None], Caller], KnownPages]
+    own: bool = True
+    release: Callable[[], None] = _nothing
+
+
 class Recalibrator:
-    """Recalibrates the model in service. Its iterators begin with their first step, and end the work when closed.
+    """Recalibrates the model in service, each time as a job of which one runs at a time.
+
+    A job is followed by whoever iterates over its steps, and ends with the iterator; or it is started, and goes on by
+    itself. Iterators begin with their first step.
 
     Args:
-        plane: whose model, source and limits.
+        plane: whose model, source, store and limits.
         fit: how to fit, in this process; None for the real re-fit in a process of its own, at a low priority.
         recordings: folder whose recordings a caller may name, or None for none.
+
+    Attributes:
+        jobs: that run or have ended; kept in the store's folder where there is a store.
     """
 
     def __init__(self, plane: DataPlane, fit: Refit | None = None, recordings: Path | None = None) -> None:
         self._plane, self._fit, self._recordings = plane, fit, recordings
-        self._busy = threading.Lock()
-        """Held from the first page read to the swap; a second recalibration finds it taken and is turned away."""
+        folder = None if plane.store is None else plane.store.folder
+        self.jobs = Jobs(folder, plane.limits.jobs_kept, plane.registry.current.version)
         self._stop = threading.Event()
         self._temporary: tempfile.TemporaryDirectory[str] | None = None
 
-    def from_source(self, count: int, pages: Sequence[int], caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
-        """Recalibrate with `pages` of the source, or with its next `count`; yields steps, then the outcome.
+    def source_pages(self, count: int, pages: Sequence[int] = ()) -> PagesToUse:
+        """`pages` of the source, or its next `count`.
 
         Raises:
-            BusyError: another recalibration runs.
             LimitError: more pages than the service takes.
-            RecalibrationRefusedError: the new model would not be better; the old one stays.
-            SourceError: no source, a damaged one, or one that does not know what was written.
-            InvalidInputError: no such pages, too few, or the same one twice.
+            SourceError: there is no source.
         """
         source, slots = self._plane.source, self._plane.decodes
-        self._check_count(len(pages) or count)
+        self.check_count(len(pages) or count)
         expected: list[int | None] = list(pages) or [None] * count
-        return self._run(lambda heard: read_known(source, expected, heard, lambda: slots.held(caller)), caller)
+        return PagesToUse(
+            "source", lambda heard, caller: read_known(source, expected, heard, lambda: slots.held(caller))
+        )
 
-    def from_recording(self, name: str, count: int, caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
-        """Recalibrate with the first `count` pages (0: all) of a recording in the recordings folder.
+    def recorded_pages(self, name: str, count: int) -> PagesToUse:
+        """The first `count` pages (0: all) of a recording in the recordings folder.
 
-        Yields and raises as `from_source`, and `RecordingError` for another device's recording or too short a one,
-        `PageError` for one without symbols; one that is damaged or dark is the service's fault, as a source is.
+        Raises:
+            LimitError: more pages than the service takes.
+            SourceError: there is no recordings folder.
+            InvalidInputError: no such file in it.
         """
         path = self._path(name)
-        self._check_count(count)
+        self.check_count(count)
 
-        def read(heard: Callable[[], None]) -> KnownPages:
+        def read(heard: Callable[[], None], caller: Caller) -> KnownPages:
             with own_fault():
                 opened = Recording.open(path)
             with opened as recording:
                 check_recording(self._plane.registry.current.decoder, recording)
                 if recording.pages < count:
                     raise RecordingError(f"recording {name}", f"{recording.pages} pages", f"at least {count}")
-                self._check_count(count or recording.pages)
+                self.check_count(count or recording.pages)
                 with own_fault():
                     return read_recorded(recording, range(count or recording.pages), heard)
 
-        return self._run(read, caller)
+        return PagesToUse(f"recording {name}", read)
+
+    def sent_pages(self, pages: KnownPages, release: Callable[[], None] = _nothing) -> PagesToUse:
+        """Pages whose frames a caller has sent, checked.
+
+        Args:
+            pages: all of them; those without light are left out.
+            release: see `PagesToUse`.
+
+        Raises:
+            InvalidInputError: too few pages, or the same one twice.
+            FrameError: a bad frame, or too few pages with light.
+            PageError: symbols of the wrong shape or range.
+        """
+        decoder = self._plane.registry.current.decoder
+        lit = pages.lit(decoder.bundle.manifest.camera_bit_depth)
+        lit.check(decoder)
+        return PagesToUse("frames", lambda heard, caller: lit, own=False, release=release)
+
+    def from_source(self, count: int, pages: Sequence[int], caller: Caller) -> Iterator[Step | RecalibrationOutcome]:
+        """Recalibrate with `pages` of the source, or with its next `count`; see `follow`."""
+        return self.follow(self.source_pages(count, pages), caller)
+
+    def follow(
+        self, pages: PagesToUse, caller: Caller, expected_version: str = "", correlation_id: str = ""
+    ) -> Iterator[Step | RecalibrationOutcome]:
+        """Begin a job and follow it: yields its steps, then its outcome. One who stops iterating stops the job.
+
+        Raises:
+            BusyError: another recalibration runs.
+            OtherModelError: another model than `expected_version` is in service; empty stands for any.
+            RecalibrationRefusedError: the new model would not be better; the old one stays.
+            SourceError: a source that is damaged, or does not know what was written; a damaged or dark recording.
+            RecordingError: another device's recording, or too short a one.
+            PageError: no such page, or a recording without symbols.
+            InvalidInputError: too few pages, or the same one twice.
+            JobCancelledError: somebody has cancelled the job.
+        """
+        steps: queue.SimpleQueue[Step | RecalibrationOutcome | BaseException] = queue.SimpleQueue()
+        running = self._begin(pages, Caller(caller.seconds_left), steps.put, expected_version, correlation_id)
+        try:
+            yield from _follow(steps, caller)
+        finally:
+            running.caller.leave()
+
+    def start(self, pages: PagesToUse, expected_version: str = "", correlation_id: str = "") -> pb.Job:
+        """Start a job that goes on by itself; returns it as it begins.
+
+        Raises:
+            BusyError: another one runs.
+            OtherModelError: another model is in service than `expected_version`; empty stands for any.
+            StoppingError: the service is being stopped.
+        """
+        return self.jobs.job(self._begin(pages, Caller(), lambda _: None, expected_version, correlation_id).id)
+
+    def check_start(self, expected_version: str = "") -> None:
+        """See whether a job may begin now; raises as `start` would."""
+        if self._stop.is_set():
+            raise StoppingError("recalibration", "a service that stops", "one that serves; nothing was changed")
+        self.jobs.check_free()
+        _check_version(self._plane.registry.current, expected_version)
 
     def close(self, wait_s: float = GRACE_S) -> None:
         """Stop a running recalibration at its next step, which is waited for at most `wait_s`; drop temporary bundles.
@@ -111,66 +201,80 @@ class Recalibrator:
         One that takes longer changes nothing any more; its temporary bundles are dropped when the process ends.
         """
         self._stop.set()
-        if not self._busy.acquire(timeout=wait_s):
+        if not self.jobs.wait_idle(wait_s):
             _log.warning("recalibration: not stopped after %.1f s, left to itself", wait_s)
-            return
+        elif self._temporary is not None:
+            self._temporary.cleanup()
+            self._temporary = None
+
+    def _begin(
+        self,
+        pages: PagesToUse,
+        caller: Caller,
+        tell: Callable[[Step | RecalibrationOutcome | BaseException], None],
+        expected_version: str = "",
+        correlation_id: str = "",
+    ) -> RunningJob:
+        """Begin a job in a thread of its own; `tell` is told of its steps, and of its outcome or error."""
         try:
-            if self._temporary is not None:
-                self._temporary.cleanup()
-                self._temporary = None
-        finally:
-            self._busy.release()
+            self.check_start(expected_version)
+            running = self.jobs.begin(pages.of, caller, correlation_id)
+            try:
+                work = partial(self._run, running, pages, expected_version, tell)
+                threading.Thread(target=work, name="lightpage-recalibration", daemon=True).start()
+            except BaseException as error:
+                self.jobs.end(running, error)
+                raise
+        except BaseException:
+            pages.release()
+            raise
+        return running
 
     def _run(
-        self, read: Callable[[Callable[[], None]], KnownPages], caller: Caller
-    ) -> Iterator[Step | RecalibrationOutcome]:
-        """Work in a thread of its own; one who stops iterating stops it at its next step.
-
-        `read` reads the pages, and calls what it is given before each.
-        """
-        if not self._busy.acquire(blocking=False):
-            raise BusyError("recalibration", "one that is running", "one at a time; try again when it has ended")
-        steps: queue.SimpleQueue[Step | RecalibrationOutcome | BaseException] = queue.SimpleQueue()
-        left = threading.Event()
-
+        self,
+        running: RunningJob,
+        pages: PagesToUse,
+        expected_version: str,
+        tell: Callable[[Step | RecalibrationOutcome | BaseException], None],
+    ) -> None:
         def check() -> None:
             if self._stop.is_set():
                 raise StoppingError("recalibration", "a service that stops", "one that serves; nothing was changed")
-            if left.is_set():
-                raise CallerLeft
+            running.check()
 
         def progress(name: str, fraction: float) -> None:
             check()
-            steps.put(Step(name, fraction))
+            self.jobs.tell(name, fraction)
+            tell(Step(name, fraction))
 
-        def work() -> None:
-            try:
-                heard = partial(progress, "read the pages", 0.0)
-                heard()
-                result: RecalibrationOutcome | BaseException = self._work(read(heard), progress, check)
-            except BaseException as error:
-                result = error
-            finally:
-                # Before the last step is told: whoever hears the end may start the next one at once.
-                self._busy.release()
-            self._count(result)
-            steps.put(result)
-
-        thread = threading.Thread(target=work, name="lightpage-recalibration", daemon=True)
+        end: RecalibrationOutcome | BaseException
         try:
-            thread.start()
-        except BaseException:
-            self._busy.release()
-            raise
-        try:
-            yield from _follow(steps, caller)
+            heard = partial(progress, "read the pages", 0.0)
+            heard()
+            end = self._work(pages, pages.read(heard, running.caller), progress, check, expected_version)
+        except CallerLeft as left:  # whoever waits for a slot knows no more than that
+            end = _cause(check, left)
+        except BaseException as error:
+            end = error
         finally:
-            left.set()
+            pages.release()
+        self._count(end)
+        # Before the last step is told: whoever hears the end may start the next one at once.
+        self.jobs.end(running, end)
+        tell(end)
 
-    def _work(self, pages: KnownPages, progress: Progress, check: Callable[[], None]) -> RecalibrationOutcome:
+    def _work(
+        self,
+        task: PagesToUse,
+        pages: KnownPages,
+        progress: Progress,
+        check: Callable[[], None],
+        expected_version: str,
+    ) -> RecalibrationOutcome:
         plane = self._plane
         model = plane.registry.current
-        with own_fault():  # the pages are the service's own
+        _check_version(model, expected_version)  # it may have changed while pages were read
+        with own_fault() if task.own else nullcontext():
             pages = pages.lit(model.decoder.bundle.manifest.camera_bit_depth)
             pages.check(model.decoder)
         store = self._store()
@@ -184,6 +288,7 @@ class Recalibrator:
             outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker)
         try:
             progress("put the new model in service", 1.0)
+            self.jobs.foretell(outcome)
             plane.adopt(Decoder(Bundle.open(path), model.decoder.threads), expected=model)
         except BaseException:
             path.unlink(missing_ok=True)
@@ -214,10 +319,16 @@ class Recalibrator:
         elif isinstance(result, RecalibrationRefusedError):
             name = "refused"
         else:
-            name = "dropped" if isinstance(result, CallerLeft | StoppingError) else "failed"
+            dropped = isinstance(result, CallerLeft | JobCancelledError | StoppingError)
+            name = "dropped" if dropped else "failed"
         self._plane.metrics.recalibrations.labels(name).inc()
 
-    def _check_count(self, count: int) -> None:
+    def check_count(self, count: int) -> None:
+        """Check a number of pages.
+
+        Raises:
+            LimitError: more than the service takes.
+        """
         if count > self._plane.limits.recalibration_pages:
             limit = self._plane.limits.recalibration_pages
             raise LimitError("pages to recalibrate with", count, f"at most {limit}")
@@ -241,8 +352,18 @@ class Recalibrator:
         return path
 
 
-def _nothing() -> None:
-    """Nobody listens."""
+def _check_version(model: Model, expected: str) -> None:
+    if expected and model.version != expected:
+        raise OtherModelError("model in service", model.version, f"{expected}, as the caller expects")
+
+
+def _cause(check: Callable[[], None], left: CallerLeft) -> BaseException:
+    """Why a job's caller has left: what `check` raises."""
+    try:
+        check()
+    except Exception as cause:
+        return cause
+    return left
 
 
 def read_known(

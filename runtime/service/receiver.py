@@ -74,6 +74,11 @@ class PairReceiver:
         self._filled = 0
 
     @property
+    def filled(self) -> int:
+        """Bytes that have come."""
+        return self._filled
+
+    @property
     def complete(self) -> bool:
         """Whether every pixel has come."""
         return self._filled == self.size

@@ -30,6 +30,7 @@ from lightpage.errors import (
 from runtime.errors import (
     ERRORS,
     CallerLeft,
+    JobCancelledError,
     LostPageError,
     LostShotError,
     MalformedError,
@@ -81,6 +82,7 @@ _MEANINGS: tuple[tuple[type[BaseException], grpc.StatusCode, pb.ErrorReason], ..
     (RecalibrationRefusedError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_RECALIBRATION_REFUSED),
     (CalibrationError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_RECALIBRATION_REFUSED),
     (NoSuchJobError, _Code.NOT_FOUND, pb.ERROR_REASON_NO_SUCH_JOB),
+    (JobCancelledError, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),
     (StalledError, _Code.CANCELLED, pb.ERROR_REASON_STALLED),
     (CallerLeft, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),
     (grpc.RpcError, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),  # while reading from a sender who has gone
@@ -212,14 +214,18 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
     """The error that the service at `target` meant, of the same class wherever it said which."""
     call: Any = rpc
     retry_s: float | None = None
+    job: str | None = None
     detail: pb.ErrorDetail | None = None
     for key, value in call.trailing_metadata() or ():
         if key == DETAIL_KEY:
             detail = pb.ErrorDetail.FromString(value)
         elif key == STATUS_KEY:
-            retry_s = _retry_s(value)
+            retry_s, job = _retry_s(value), _job(value)
     if detail is not None:
-        return error_from(detail, retry_s)
+        error = error_from(detail, retry_s)
+        if isinstance(error, BusyError):
+            error.job = job
+        return error
     code, text = call.code(), call.details() or "no details"
     subject = f"service at {target}"
     if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
@@ -227,6 +233,14 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
     if code == grpc.StatusCode.UNAVAILABLE:
         return LightpageError(subject, f"no connection ({text})", "a running Lightpage service at this address")
     return LightpageError(subject, f"{code.name}: {text}", "an answer")
+
+
+def is_lost_connection(rpc: grpc.RpcError) -> bool:
+    """Whether a call ended since nobody was there any more, or in good time for another try, and no error was meant."""
+    call: Any = rpc
+    if any(key == DETAIL_KEY for key, _ in call.trailing_metadata() or ()):
+        return False
+    return call.code() in (_Code.UNAVAILABLE, _Code.CANCELLED, _Code.UNKNOWN, _Code.DEADLINE_EXCEEDED)
 
 
 def error_from(detail: pb.ErrorDetail, retry_s: float | None = None) -> LightpageError:
@@ -245,6 +259,14 @@ def _retry_s(value: bytes) -> float | None:
     for packed in rpc_status.Status.FromString(value).details:
         if packed.Unpack(retry):
             return float(1e-9 * retry.retry_delay.ToNanoseconds())
+    return None
+
+
+def _job(value: bytes) -> str | None:
+    info = rpc_details.ErrorInfo()
+    for packed in rpc_status.Status.FromString(value).details:
+        if packed.Unpack(info):
+            return str(info.metadata["job"]) if "job" in info.metadata else None
     return None
 
 

@@ -17,9 +17,12 @@ from lightpage.errors import (
     PageError,
     RecalibrationRefusedError,
 )
+from lightpage.metrics.measures import measure
+from lightpage.page.pilots import Pilots
 from lightpage.recording.reader import FramePair, hash_frames
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
+from runtime.decoding.tracking import NoTracker
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RefitReport, RefitResult
 from runtime.recalibration.recalibration import next_version, recalibrate
@@ -99,6 +102,45 @@ def test_a_table_worse_than_the_one_in_use_is_refused(decoder: Decoder, tmp_path
     with pytest.raises(RecalibrationRefusedError, match="model in service"):
         recalibrate(decoder, known(toy.OFFSETS), tmp_path / "n.zip", "toy-1+r1", away, quiet)
     assert list(tmp_path.iterdir()) == []
+
+
+class Follows(NoTracker):
+    """Follows the cameras' offsets, which it has learnt, whatever the model in service says of them."""
+
+    def __init__(self, decoder: Decoder, learnt: FramePair) -> None:
+        table = {
+            "reference_in_phase": learnt.in_phase.astype(np.float32),
+            "reference_quadrature": learnt.quadrature.astype(np.float32),
+        }
+        super().__init__(decoder.with_table(table))
+        self._learnt = learnt
+
+    def fork(self) -> Follows:
+        return self
+
+    def refitted(self, decoder: Decoder) -> Follows:
+        return Follows(decoder, self._learnt)
+
+
+def test_both_models_are_judged_as_the_tracker_decodes(decoder: Decoder, tmp_path: Path) -> None:
+    def a_little_off(bundle: Bundle, pages: KnownPages, *rest: object) -> RefitResult:
+        found = toy.fit_references(bundle, pages, *rest)  # type: ignore[arg-type]
+        table = {name: values - 4 for name, values in found.table.items()}
+        return RefitResult(table, found.calibration_toml, found.report)
+
+    pages = known()
+    assert pages.references is not None
+    plain = recalibrate(decoder, pages, tmp_path / "1.zip", "toy-1+r1", a_little_off, quiet, NoTracker(decoder))
+    tracker = Follows(decoder, pages.references)
+    outcome = recalibrate(decoder, pages, tmp_path / "2.zip", "toy-1+r2", a_little_off, quiet, tracker)
+    held_back, data = pages.part(slice(1, None)), ~decoder.bundle.pilot_mask
+    shown = []
+    for pair, symbols in zip(held_back.pairs, held_back.symbols, strict=True):
+        page = tracker.decode(pair, 16, Pilots.of_symbols(~data, symbols, 16))
+        shown.append(measure(page.phase[data], page.concentration[data], symbols[data], 16).air_bits_per_symbol)
+    assert outcome.air_before == outcome.air_after == pytest.approx(np.mean(shown))
+    assert plain.air_before < outcome.air_before - 0.1
+    assert plain.air_after < outcome.air_after - 0.01
 
 
 def test_a_version_that_is_none_is_refused_before_the_fit(decoder: Decoder, tmp_path: Path) -> None:

@@ -761,7 +761,7 @@ def test_a_change_of_model_that_cannot_be_noted_is_not_made(
             service.client.recalibrate(count=2)
     assert service.client.describe().model.version == "toy-1+r1"
     assert service.count("lightpage_model_info", version="toy-1+r1") == 1
-    assert sorted(path.name for path in store.folder.iterdir()) == ["current.json", "toy-1+r1.zip"]
+    assert sorted(path.name for path in store.folder.iterdir()) == ["current.json", "jobs.json", "toy-1+r1.zip"]
     assert store.last() == store.path_of("toy-1+r1")
     assert service.client.rollback()[0] == "toy-1"
     assert store.last() is None

@@ -1,0 +1,252 @@
+"""Jobs are told apart, kept over a restart whatever ended the service, and cost nobody more than their record."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lightpage.errors import BusyError, CalibrationError, FrameError, RecalibrationRefusedError
+from runtime.bundle.bundle import Bundle
+from runtime.decoding.decoder import Decoder
+from runtime.errors import CallerLeft, JobCancelledError, NoSuchJobError, StoppingError
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.recalibration.outcome import RecalibrationOutcome, Refit, RefitReport
+from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane
+from runtime.service.jobs import DAMAGED, FILE, Jobs
+from runtime.service.limits import Limits
+from runtime.service.recalibrator import Recalibrator
+from runtime.service.registry import ModelRegistry
+from runtime.service.store import ModelStore
+from tests.lightpage.full_disk import full_disk
+from tests.runtime import toy
+from tests.runtime.rpc.test_service import slow_fit, wait_until
+
+OUTCOME = RecalibrationOutcome(Path("x.zip"), "toy-1+r1", "toy-1", RefitReport(angle_deg=0.5), 1.0, 3.5, 1, 3, 2, 4.0)
+
+
+def ended(jobs: Jobs, end: RecalibrationOutcome | BaseException = OUTCOME) -> str:
+    running = jobs.begin("source", Caller(), "mine")
+    jobs.end(running, end)
+    return running.id
+
+
+@pytest.mark.parametrize("folder", [True, False])
+def test_one_runs_at_a_time_and_the_second_hears_which(folder: bool, tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path if folder else None)
+    running = jobs.begin("source", Caller())
+    with pytest.raises(BusyError, match=running.id) as caught:
+        jobs.begin("frames", Caller())
+    assert caught.value.job == running.id
+    assert not jobs.wait_idle(0)
+    jobs.tell("fit", 0.5)
+    job = jobs.job(running.id)
+    assert (job.state, job.progress.step, job.progress.fraction) == (pb.JOB_STATE_RUNNING, "fit", 0.5)
+    assert job.created_s > 0
+    assert job.ended_s == 0
+    jobs.end(running, OUTCOME)
+    assert jobs.wait_idle(0)
+    assert jobs.begin("frames", Caller()).id != running.id
+
+
+@pytest.mark.parametrize(
+    ("end", "state"),
+    [
+        (OUTCOME, pb.JOB_STATE_DONE),
+        (RecalibrationRefusedError("fit", "worse", "better"), pb.JOB_STATE_REFUSED),
+        (CalibrationError("fit", "nothing", "a peak"), pb.JOB_STATE_REFUSED),
+        (FrameError("frame", "black", "light"), pb.JOB_STATE_FAILED),
+        (ZeroDivisionError("a bug"), pb.JOB_STATE_FAILED),
+        (JobCancelledError("job", "cancelled", "one that goes on"), pb.JOB_STATE_CANCELLED),
+        (CallerLeft(), pb.JOB_STATE_CANCELLED),
+        (StoppingError("job", "the end", "more"), pb.JOB_STATE_INTERRUPTED),
+    ],
+)
+def test_each_end_is_told_and_kept_over_a_restart(
+    end: RecalibrationOutcome | BaseException, state: pb.JobState, tmp_path: Path
+) -> None:
+    jobs = Jobs(tmp_path)
+    found = jobs.job(ended(jobs, end))
+    assert found.state == state
+    assert found.HasField("result") == isinstance(end, RecalibrationOutcome)
+    assert found.HasField("refusal") != found.HasField("result")
+    assert (found.correlation_id, found.pages_of) == ("mine", "source")
+    assert found.ended_s >= found.created_s
+    assert Jobs(tmp_path).all() == [found]
+    assert Jobs(None).all() == []
+
+
+def test_figures_that_are_no_numbers_are_kept_too(tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path)
+    ended(jobs, replace(OUTCOME, air_before=float("nan")))
+    assert str(Jobs(tmp_path).all()[0].result.air_before) == "nan"
+
+
+def test_the_newest_come_first_and_the_oldest_are_forgotten(tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path, kept=3)
+    names = [ended(jobs) for _ in range(5)]
+    assert [job.id for job in jobs.all()] == names[:1:-1]
+    assert [job.id for job in Jobs(tmp_path, kept=2).all()] == names[:2:-1]
+    for unknown in (names[0], "", "x"):
+        with pytest.raises(NoSuchJobError):
+            jobs.job(unknown)
+        with pytest.raises(NoSuchJobError):
+            jobs.cancel(unknown)
+
+
+def test_a_job_whose_service_was_killed_is_interrupted_after_the_restart(tmp_path: Path) -> None:
+    before = Jobs(tmp_path)
+    first = ended(before)
+    running = before.begin("frames", Caller())
+    after = Jobs(tmp_path)  # nothing of the service's own end was heard
+    job = after.job(running.id)
+    assert job.state == pb.JOB_STATE_INTERRUPTED
+    assert job.refusal.detail.kind == "StoppingError"
+    assert job.ended_s >= job.created_s
+    assert after.job(first).state == pb.JOB_STATE_DONE
+    assert after.wait_idle(0)
+    assert [one.state for one in Jobs(tmp_path).all()] == [pb.JOB_STATE_INTERRUPTED, pb.JOB_STATE_DONE]
+
+
+@pytest.mark.parametrize(("in_service", "state"), [("toy-1+r1", "DONE"), ("toy-1", "INTERRUPTED")])
+def test_a_kill_between_swap_and_note_is_told_by_the_model_in_service(
+    in_service: str, state: str, tmp_path: Path
+) -> None:
+    before = Jobs(tmp_path)
+    running = before.begin("source", Caller())
+    before.foretell(OUTCOME)
+    assert not before.job(running.id).HasField("result")  # nobody hears of it before it is so
+    job = Jobs(tmp_path, version=in_service).job(running.id)
+    assert job.state == pb.JobState.Value(f"JOB_STATE_{state}")
+    assert job.HasField("result") == (state == "DONE")
+    assert job.HasField("refusal") == (state != "DONE")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"junk",
+        b"\xff\xfe",
+        b"[]",
+        b"{}",
+        b'{"format": "lightpage-jobs", "version": 2, "jobs": []}',
+        b'{"format": "lightpage-jobs", "version": 1, "jobs": [{"state": "JOB_STATE_DONE"}]}',
+        b'{"format": "lightpage-jobs", "version": 1, "jobs": [{"id": "x", "ended_s": "soon"}]}',
+        b'{"format": "lightpage-jobs", "version": 1, "jobs": [{"id": 3}]}',
+        b'{"format": "lightpage-jobs", "version": 1, "jobs": [null]}',
+        b'{"format": "lightpage-jobs", "version": 1, "jobs": null}',
+        b'{"format": "lightpage-jobs", "version": 1, "jobs": [{"id": "x"}',
+        b"[" * 100_000,
+    ],
+)
+def test_a_damaged_record_is_set_aside_with_a_warning(
+    content: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / FILE).write_bytes(content)
+    jobs = Jobs(tmp_path)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert jobs.all() == []
+    assert (tmp_path / DAMAGED).read_bytes() == content
+    done = ended(jobs)
+    assert Jobs(tmp_path).job(done).state == pb.JOB_STATE_DONE
+
+
+def test_a_record_that_cannot_even_be_set_aside_stops_nothing(tmp_path: Path) -> None:
+    (tmp_path / FILE).mkdir()
+    (tmp_path / DAMAGED).write_text("a file, which no folder replaces")
+    jobs = Jobs(tmp_path)
+    assert jobs.job(ended(jobs)).state == pb.JOB_STATE_DONE
+
+
+def test_what_a_newer_program_has_added_is_passed_over(tmp_path: Path) -> None:
+    ended(Jobs(tmp_path))
+    noted = json.loads((tmp_path / FILE).read_text())
+    noted["jobs"][0]["colour"] = "green"
+    (tmp_path / FILE).write_text(json.dumps(noted))
+    assert Jobs(tmp_path).all()[0].state == pb.JOB_STATE_DONE
+    assert not (tmp_path / DAMAGED).exists()
+
+
+def test_a_full_disk_costs_the_record_and_not_the_job(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    jobs = Jobs(tmp_path)
+    kept = ended(jobs)
+    caplog.clear()
+    with full_disk(10):
+        lost = ended(jobs)
+    assert {record.levelname for record in caplog.records} == {"WARNING"}
+    assert jobs.job(lost).state == pb.JOB_STATE_DONE
+    assert [job.id for job in Jobs(tmp_path).all()] == [kept]
+    assert [path.name for path in tmp_path.iterdir()] == [FILE]
+
+
+def test_what_nobody_foresaw_is_logged_with_its_traceback(caplog: pytest.LogCaptureFixture) -> None:
+    jobs, caught = Jobs(), ZeroDivisionError("a bug")
+    with caplog.at_level(logging.INFO):
+        ended(jobs, caught)
+    assert caplog.records[-1].exc_info
+    assert "a bug" not in jobs.all()[0].refusal.detail.got  # its text may hold anything
+
+
+Make = Callable[..., tuple[DataPlane, Recalibrator]]
+
+
+@pytest.fixture
+def make(toy_zip: Path) -> Make:
+    def begin(
+        fit: Refit = toy.fit_references, store: Path | None = None, limits: Limits | None = None
+    ) -> tuple[DataPlane, Recalibrator]:
+        registry = ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1))
+        models = None if store is None else ModelStore(store, registry.current.decoder.bundle)
+        plane = DataPlane(registry, toy.ToySource(toy.ToyDevice()), models, limits)
+        return plane, Recalibrator(plane, fit)
+
+    return begin
+
+
+def test_the_end_of_the_service_interrupts_the_job_and_the_next_start_knows(make: Make, tmp_path: Path) -> None:
+    fit = slow_fit()
+    _, recalibrator = make(fit, tmp_path)
+    job = recalibrator.start(recalibrator.source_pages(2), correlation_id="night")
+    assert fit.entered.wait(10)
+    recalibrator.close(5.0)
+    with pytest.raises(StoppingError):
+        recalibrator.start(recalibrator.source_pages(2))
+    found = make(store=tmp_path)[1].jobs.job(job.id)
+    assert (found.state, found.correlation_id) == (pb.JOB_STATE_INTERRUPTED, "night")
+    assert found.refusal.detail.kind == "StoppingError"
+
+
+def test_a_job_that_waits_for_a_slot_is_cancelled_at_once(make: Make) -> None:
+    plane, recalibrator = make(limits=Limits(concurrent_decodes=1))
+    with plane.decodes.held(Caller()):
+        job = recalibrator.start(recalibrator.source_pages(2))
+        assert wait_until(lambda: plane.decodes.queued == 1)
+        recalibrator.jobs.cancel(job.id)
+        assert recalibrator.jobs.wait_idle(5)
+    found = recalibrator.jobs.job(job.id)
+    assert found.state == pb.JOB_STATE_CANCELLED
+    assert found.refusal.detail.exact_kind == "JobCancelledError"
+    assert plane.decodes.busy == 0
+
+
+def test_a_thread_that_cannot_be_started_leaves_nothing_that_runs(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, recalibrator = make()
+
+    def none(self: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", none)
+        with pytest.raises(RuntimeError):
+            recalibrator.start(recalibrator.source_pages(2))
+    assert recalibrator.jobs.all()[0].state == pb.JOB_STATE_FAILED
+    recalibrator.start(recalibrator.source_pages(2))
+    assert recalibrator.jobs.wait_idle(10)
+    assert recalibrator.jobs.all()[0].state == pb.JOB_STATE_DONE
