@@ -47,6 +47,7 @@ SUMMARIES = {
     "encode": "Put a file on pages to write.",
     "evaluate": "Measure a bundle on a recording with known symbols.",
     "export": "Turn a training run into a bundle.",
+    "models": "List, add and change the models of a running service.",
     "recalibrate": "Re-fit a drifted device's geometry and write a new bundle.",
     "record": "Record pages of cameras, or of any other source.",
     "recover": "Read a file back from recorded pages.",

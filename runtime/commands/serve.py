@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from lightpage.errors import BundleError, CalibrationError, InvalidInputError
+from lightpage.errors import InvalidInputError
 from lightpage.recording.pages import Pages
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import FrameSource
@@ -110,13 +110,14 @@ def serve(
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     with stop_signals() as wait_for_stop:
         base = Decoder.load(bundle_path(bundle), threads)
-        models = ModelStore(store, base.bundle) if store is not None else None
         registry = ModelRegistry(base, tracker_for) if tracking else ModelRegistry(base)
-        if models is not None:
-            _resume(registry, models, threads)
         metrics = ServiceMetrics()
         monitor = Monitor(metrics=metrics)
         with ExitStack() as stack:
+            models = None
+            if store is not None:
+                models = ModelStore(store, base.bundle)
+                stack.enter_context(models.locked())
             pages = None if source is None else stack.enter_context(_source(source, pages_file, base))
             if pages is not None:
                 _take_dark_frames(pages)
@@ -127,6 +128,7 @@ def serve(
             history = History()
             observers: list[Observer] = [history] if recorder is None else [history, recorder]
             plane = DataPlane(registry, pages, models, metrics=metrics, observers=observers, monitor=monitor)
+            plane.models.resume()
             source_name = pages.name if pages is not None else "no source"
             console = Console(metrics, history, registry, monitor, source_name)
             stack.enter_context(_shown(console, metrics_port, metrics_host))
@@ -193,17 +195,6 @@ def stop_signals() -> Iterator[Callable[[], None]]:
             signal.set_wakeup_fd(waking)
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-
-def _resume(registry: ModelRegistry, store: ModelStore, threads: int | None) -> None:
-    """Put the model back in service that was recalibrated from this bundle before a restart, if it can be used."""
-    path = store.last()
-    if path is None:
-        return
-    try:
-        registry.swap(Decoder.load(path, threads))
-    except (BundleError, CalibrationError) as error:
-        _log.warning("serving %s as it was given: %s", registry.current.version, error)
 
 
 @contextmanager

@@ -29,7 +29,6 @@ from runtime.acquisition.sources import open_source
 from runtime.bundle.bundle import Bundle
 from runtime.client.client import LightpageClient
 from runtime.commands import recalibrate as cli_recalibrate
-from runtime.commands.serve import _resume
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
 from runtime.rpc.server import LightpageServer
@@ -736,7 +735,7 @@ def test_a_stored_model_whose_calibration_is_bad_leaves_the_base_in_service(
 
     store, registry = ModelStore(tmp_path / "store", decoder.bundle), ModelRegistry(decoder, tracker)
     store.remember(toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1"))
-    _resume(registry, store, 1)
+    DataPlane(registry, store=store).models.resume()
     assert [model.version for model in registry.models] == ["toy-1"]
     assert "serving toy-1 as it was given: bundle toy-1+r1: calibration" in caplog.text
 
