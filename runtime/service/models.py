@@ -160,10 +160,11 @@ class Models:
         places = [
             base if name is None else Place(name.removesuffix(".zip"), store.folder / name) for name in note.history
         ]
-        errors, history = list[BundleError](), History(tuple(places), note.cursor)
-        for place in sorted({place for place in places if place != base and not place.path.exists()}, key=str):
-            errors.append(BundleError(f"bundle {place.path}", "nothing", "a bundle that was in service"))
-        for cursor in range(note.cursor, -1, -1):
+        gone = dict.fromkeys(place for place in places if place != base and not place.path.exists())
+        history = History(tuple(places), note.cursor).without(gone)
+        gone.pop(history.current, None)  # an attempt to load it says so
+        errors = [BundleError(f"bundle {place.path}", "nothing", "a bundle that was in service") for place in gone]
+        for cursor in range(history.cursor, -1, -1):
             try:
                 self.registry.resume(History(history.places, cursor))
                 break
@@ -252,7 +253,7 @@ class Models:
                 expected = "one that the service does not have"
                 raise ModelExistsError("new bundle: version", version, expected) from None
             except OSError as error:
-                raise StoreError("model store", error, "a folder that can be written") from None
+                raise store.failed(error) from None
         try:
             with self._noting:
                 self._remember(origins=self._origins(version, Origin.UPLOADED))
