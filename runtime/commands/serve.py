@@ -26,6 +26,7 @@ from runtime.errors import LostShotError, SourceError
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.flight_recorder import PAGES, FlightRecorder, FlightSettings
+from runtime.service.incoming import Incoming
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.observation import Observer
@@ -56,7 +57,12 @@ _log = logging.getLogger(__name__)
     type=click.Path(file_okay=False, path_type=Path),
     envvar="LIGHTPAGE_STORE",
     show_envvar=True,
-    help="Folder for recalibrated bundles; the one in service is used again after a restart.",
+    help="Folder for recalibrated and uploaded bundles; the one in service is used again after a restart.",
+)
+@click.option(
+    "--incoming",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder whose bundles are taken into the store, as uploads are.",
 )
 @click.option(
     "--recordings",
@@ -93,6 +99,7 @@ def serve(
     metrics_port: int | None,
     metrics_host: str,
     store: Path | None,
+    incoming: Path | None,
     recordings: Path | None,
     threads: int | None,
     tracking: bool,
@@ -106,6 +113,8 @@ def serve(
     self_calibrate = bool(calibration_pages) if self_calibrate is None else self_calibrate
     if self_calibrate and source is None:
         raise InvalidInputError("--self-calibrate", "no --source", "a source that shows known pages")
+    if incoming is not None and store is None:
+        raise InvalidInputError("--incoming", "no --store", "a folder where its bundles are kept")
     calibrating = SelfCalibrationSettings(calibration_pages)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     with stop_signals() as wait_for_stop:
@@ -134,6 +143,8 @@ def serve(
             stack.enter_context(_shown(console, metrics_port, metrics_host))
             recalibrator = Recalibrator(plane, recordings=recordings)
             server = stack.enter_context(LightpageServer(plane, recalibrator, address))
+            if incoming is not None:
+                stack.enter_context(Incoming(plane, incoming))
             if self_calibrate:
                 stack.enter_context(SelfCalibration(plane, monitor, recalibrator, calibrating))
             click.echo(f"serving {registry.current.version} from {source_name} at {server.target}")

@@ -266,18 +266,23 @@ class Models:
 
     def prune(self, store: ModelStore, more: Collection[Path] = ()) -> None:
         """Delete the oldest bundles of a store, but none that is loaded, pinned, or one of `more`."""
-        loaded = [model.decoder.bundle.path for model in self.registry.models]
-        held = {*loaded, *more, *(store.path_of(version) for version in self._noted.pinned)}
         if store is self.store and store.is_damaged:  # what is still there may be needed
             return
         try:
-            self.registry.forget(store.surplus(held), lambda history: self._remember(**self._history(history)))
-            dropped = store.prune(held)
+            surplus = store.surplus(self._held(store, more))
+            self.registry.forget(surplus, lambda history: self._remember(**self._history(history)))
+            with self._noting:  # nobody pins one meanwhile
+                dropped = store.prune(self._held(store, more))
         except (OSError, StoreError) as error:  # the models serve all the same
             _log.warning("model store %s: old bundles stay: %s", store.folder, error)
         else:
             for path in dropped:
                 _log.info("model store %s: dropped %s", store.folder, path.name)
+
+    def _held(self, store: ModelStore, more: Collection[Path]) -> set[Path]:
+        """Bundles that are loaded, pinned, or one of `more`."""
+        loaded = (model.decoder.bundle.path for model in self.registry.models)
+        return {*loaded, *more, *(store.path_of(version) for version in self._noted.pinned)}
 
     @property
     def _noted(self) -> Note:

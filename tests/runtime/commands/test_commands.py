@@ -740,6 +740,13 @@ def test_a_stored_model_whose_calibration_is_bad_leaves_the_base_in_service(
     assert "serving toy-1 as it was given: bundle toy-1+r1: calibration" in caplog.text
 
 
+def test_serve_takes_bundles_from_a_folder_only_into_a_store(
+    toy_zip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["serve", "--bundle", toy_zip, "--incoming", tmp_path]) == 2
+    assert "--incoming: got no --store" in capsys.readouterr().err
+
+
 def test_serve_refuses_a_damaged_bundle_in_one_line(toy_zip: Path, tmp_path: Path) -> None:
     data = bytearray(toy_zip.read_bytes())
     data[len(data) // 2] ^= 1
