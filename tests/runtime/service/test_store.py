@@ -178,6 +178,21 @@ def test_a_bundle_of_the_history_that_is_gone_is_said_and_stepped_over(
     assert plane.rollback()[0].version == "toy-1+r1"
 
 
+def test_nothing_is_deleted_while_it_is_not_settled_what_is_to_be_in_service(
+    decoder: Decoder, store: ModelStore
+) -> None:
+    a_worn_plane(decoder, store)
+    (store.folder / CURRENT).unlink()
+    plane = DataPlane(ModelRegistry(decoder), store=ModelStore(store.folder, decoder.bundle, kept=0))
+    plane.models.resume()
+    assert plane.store is not None
+    plane.models.prune(plane.store)
+    assert plane.store.versions() == ["toy-1+r1", "toy-1+r2", "toy-1+r3"]
+    plane.models.activate("toy-1+r2")
+    plane.models.prune(plane.store)
+    assert plane.store.versions() == ["toy-1+r2"]
+
+
 @pytest.mark.parametrize("content", [None, "junk", "[]", '{"bundle": null}', '{"bundle": "../x", "base": "BASE"}'])
 def test_a_note_that_is_damaged_or_gone_is_said(
     content: str | None, decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
