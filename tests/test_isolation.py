@@ -42,6 +42,7 @@ ROOMS = (
     "train",
     "runtime.pb",
     "runtime.errors",
+    "runtime.helper_process",
     "runtime.bundle",
     "runtime.execution",
     "runtime.decoding",

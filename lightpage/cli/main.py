@@ -48,6 +48,7 @@ SUMMARIES = {
     "evaluate": "Measure a bundle on a recording with known symbols.",
     "export": "Turn a training run into a bundle.",
     "jobs": "Show, follow or cancel the recalibrations of a running service.",
+    "models": "List, add and change the models of a running service.",
     "recalibrate": "Re-fit a drifted device's geometry and write a new bundle.",
     "record": "Record pages of cameras, or of any other source.",
     "recover": "Read a file back from recorded pages.",

@@ -43,6 +43,9 @@ from runtime.bundle.manifest import (
 MAX_ARRAY_BYTES = MAX_BYTES
 """All arrays of one .npz file, unpacked: it is compressed by itself, and may be a bomb inside a small bundle."""
 
+MAX_MANIFEST_BYTES = 16 << 20
+"""A manifest that is read alone: a recalibration a minute for a year makes half of that."""
+
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Fixed time in the zip, so that the same contents give the same bytes."""
 
@@ -219,6 +222,23 @@ class Bundle:
             raise
         except Exception as error:  # numpy and zipfile raise many kinds on damaged data
             raise BundleError(subject, error, "arrays in .npz format") from None
+
+
+def read_manifest(path: Path) -> Manifest:
+    """The manifest of the zip at `path`, whose other files are not looked at.
+
+    Raises:
+        BundleError: no bundle, or a damaged one.
+    """
+    subject = f"bundle {path}"
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open(MANIFEST) as file:
+            text = file.read(MAX_MANIFEST_BYTES + 1)
+    except Exception as error:  # zipfile raises many kinds on damaged data
+        raise BundleError(subject, error, f"a zip with its {MANIFEST}") from None
+    if len(text) > MAX_MANIFEST_BYTES:
+        raise BundleError(f"{subject}: {MANIFEST}", f"more than {MAX_MANIFEST_BYTES} bytes", "a shorter one")
+    return parse_manifest(text, f"{subject}: {MANIFEST}")
 
 
 def npz(**arrays: NDArray[Any]) -> bytes:

@@ -18,13 +18,24 @@ from runtime.wire.status import error_from
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """A model that the service holds."""
+    """A model that the service has.
+
+    Attributes:
+        name, version, created, metrics: as its bundle says.
+        current: whether it decodes now.
+        pinned: whether it is never deleted.
+        loaded: whether it is loaded.
+        origin: "given", "recalibrated" or "uploaded"; empty where that is not known.
+    """
 
     name: str
     version: str
     created: str
     current: bool
     metrics: dict[str, float]
+    pinned: bool = False
+    loaded: bool = True
+    origin: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,9 +100,25 @@ class Recalibrated:
     image: ImagePosition | None = None
 
 
+_ORIGINS = {
+    pb.MODEL_ORIGIN_GIVEN: "given",
+    pb.MODEL_ORIGIN_RECALIBRATED: "recalibrated",
+    pb.MODEL_ORIGIN_UPLOADED: "uploaded",
+}
+
+
 def model_info(model: pb.Model) -> ModelInfo:
     """A model from its message."""
-    return ModelInfo(model.name, model.version, model.created, model.current, dict(model.metrics))
+    return ModelInfo(
+        name=model.name,
+        version=model.version,
+        created=model.created,
+        current=model.current,
+        metrics=dict(model.metrics),
+        pinned=model.pinned,
+        loaded=model.loaded,
+        origin=_ORIGINS.get(model.origin, ""),
+    )
 
 
 def recalibrated(result: pb.RecalibrationResult) -> Recalibrated:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -45,6 +48,9 @@ DATA_S = 600.0
 RECALIBRATION_S = 600.0
 """Deadline of a recalibration where none is given."""
 
+
+UPLOAD_S = 600.0
+"""Deadline of an uploaded model where none is given."""
 
 _WATCH_S = 60.0
 """A watch that hears nothing for so long begins anew: a network that swallows everything tells nobody."""
@@ -453,23 +459,90 @@ class LightpageClient:
         """
         return job_info(self._unary(self._stub.CancelJob, pb.CancelJobRequest(id=job_id)))
 
-    def rollback(self) -> tuple[str, str]:
-        """Go back to the model before; returns the versions (now current, dropped).
+    def rollback(self, expected_version: str = "") -> tuple[str, str]:
+        """Go back to the model before; returns the versions (now current, before).
+
+        Args:
+            expected_version: that must be in service, empty for any: a call that is repeated with it steps back once.
 
         Raises:
+            OtherModelError: another one is.
             BundleError: there is none, or the change cannot be noted in the service's store; then nothing changes.
         """
-        reply: pb.RollbackReply = self._unary(self._stub.Rollback, pb.RollbackRequest())
+        request = pb.RollbackRequest(expected_version=expected_version)
+        reply: pb.RollbackReply = self._unary(self._stub.Rollback, request)
         return reply.model_version, reply.previous_version
 
-    def models(self) -> list[ModelInfo]:
-        """All models that the service holds, the oldest first.
+    def roll_forward(self, expected_version: str = "") -> tuple[str, str]:
+        """Go to the later model again, after a roll-back; else as `rollback`."""
+        request = pb.RollForwardRequest(expected_version=expected_version)
+        reply: pb.RollForwardReply = self._unary(self._stub.RollForward, request)
+        return reply.model_version, reply.previous_version
+
+    def models(self, stored: bool = False) -> list[ModelInfo]:
+        """All models that the service holds loaded, the oldest first; before them those that only its store has.
+
+        Args:
+            stored: whether to name the latter too.
 
         Raises:
             LightpageError: no answer.
         """
-        reply: pb.ListModelsReply = self._unary(self._stub.ListModels, pb.ListModelsRequest())
+        reply: pb.ListModelsReply = self._unary(self._stub.ListModels, pb.ListModelsRequest(stored=stored))
         return [model_info(model) for model in reply.models]
+
+    def upload_model(self, path: str | Path, timeout_s: float = UPLOAD_S) -> ModelInfo:
+        """Give the service a bundle, a zip file. It is kept in the store, not put in service.
+
+        Raises:
+            InvalidInputError: no file that can be read.
+            ModelExistsError: the service has a model of its version.
+            BundleError: it is damaged, or for another device.
+            StoreError: the service has no store, or one that cannot be written.
+            LimitError: it is too large.
+        """
+        path = Path(path)
+        try:
+            with path.open("rb") as file:
+                header = pb.UploadModelHeader(
+                    bytes=os.fstat(file.fileno()).st_size, sha256=hashlib.file_digest(file, "sha256").digest()
+                )
+                file.seek(0)
+
+                def parts() -> Iterator[pb.UploadModelRequest]:
+                    yield pb.UploadModelRequest(header=header)
+                    while chunk := file.read(CHUNK_BYTES):
+                        yield pb.UploadModelRequest(chunk=chunk)
+
+                reply: pb.UploadModelReply = self._unary(self._stub.UploadModel, parts(), timeout_s)
+        except OSError as error:
+            raise InvalidInputError(f"bundle {path}", error, "a zip file that can be read") from None
+        return model_info(reply.model)
+
+    def activate_model(self, version: str, expected_version: str = "") -> tuple[str, str]:
+        """Put a model in service that the service has; returns the versions (now current, before).
+
+        Args:
+            version: of it.
+            expected_version: that must be in service, empty for any.
+
+        Raises:
+            OtherModelError: another one is.
+            BundleError: there is none, it is damaged, or the change cannot be noted; then nothing changes.
+        """
+        request = pb.ActivateModelRequest(version=version, expected_version=expected_version)
+        reply: pb.ActivateModelReply = self._unary(self._stub.ActivateModel, request)
+        return reply.model_version, reply.previous_version
+
+    def pin_model(self, version: str, pinned: bool = True) -> ModelInfo:
+        """See that a model is never deleted, nor replaced by the service itself; or let go of it.
+
+        Raises:
+            BundleError: there is none, or it cannot be noted.
+        """
+        request = pb.PinModelRequest(version=version, pinned=pinned)
+        reply: pb.PinModelReply = self._unary(self._stub.PinModel, request)
+        return model_info(reply.model)
 
     def _unary(self, method: Callable[..., Any], request: object, timeout_s: float | None = None) -> Any:
         try:

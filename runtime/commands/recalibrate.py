@@ -192,8 +192,9 @@ def _read(decoder: Decoder, recording: str, pages: int) -> KnownPages:
 
 @click.command()
 @click.option("--target", metavar="HOST:PORT", required=True, help="The running service.")
-def rollback(target: str) -> None:
-    """Put a service's previous model back in service."""
+@click.option("--expect", metavar="VERSION", default="", help="Only if this version is in service.")
+def rollback(target: str, expect: str) -> None:
+    """Put a service's previous model back in service; `lightpage models forward` undoes it."""
     with LightpageClient(target) as client:
-        current, dropped = client.rollback()
-    click.echo(f"{current} is in service again, {dropped} is not")
+        current, before = client.rollback(expect)
+    click.echo(f"{current} is in service again, {before} is not")

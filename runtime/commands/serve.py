@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from lightpage.errors import BundleError, CalibrationError, InvalidInputError
+from lightpage.errors import InvalidInputError
 from lightpage.recording.pages import Pages
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import FrameSource
@@ -27,6 +27,7 @@ from runtime.rpc.health_server import HealthServer, next_port
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.flight_recorder import PAGES, FlightRecorder, FlightSettings
+from runtime.service.incoming import Incoming
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.observation import Observer
@@ -61,7 +62,12 @@ _log = logging.getLogger(__name__)
     type=click.Path(file_okay=False, path_type=Path),
     envvar="LIGHTPAGE_STORE",
     show_envvar=True,
-    help="Folder for recalibrated bundles; the one in service is used again after a restart.",
+    help="Folder for recalibrated and uploaded bundles; the one in service is used again after a restart.",
+)
+@click.option(
+    "--incoming",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder whose bundles are taken into the store, as uploads are.",
 )
 @click.option(
     "--recordings",
@@ -99,6 +105,7 @@ def serve(
     metrics_port: int | None,
     metrics_host: str,
     store: Path | None,
+    incoming: Path | None,
     recordings: Path | None,
     threads: int | None,
     tracking: bool,
@@ -112,17 +119,20 @@ def serve(
     self_calibrate = bool(calibration_pages) if self_calibrate is None else self_calibrate
     if self_calibrate and source is None:
         raise InvalidInputError("--self-calibrate", "no --source", "a source that shows known pages")
+    if incoming is not None and store is None:
+        raise InvalidInputError("--incoming", "no --store", "a folder where its bundles are kept")
     calibrating = SelfCalibrationSettings(calibration_pages)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     with stop_signals() as wait_for_stop:
         base = Decoder.load(bundle_path(bundle), threads)
-        models = ModelStore(store, base.bundle) if store is not None else None
         registry = ModelRegistry(base, tracker_for) if tracking else ModelRegistry(base)
-        if models is not None:
-            _resume(registry, models, threads)
         metrics = ServiceMetrics()
         monitor = Monitor(metrics=metrics)
         with ExitStack() as stack:
+            models = None
+            if store is not None:
+                models = ModelStore(store, base.bundle)
+                stack.enter_context(models.locked())
             pages = None if source is None else stack.enter_context(_source(source, pages_file, base))
             if pages is not None:
                 _take_dark_frames(pages)
@@ -133,6 +143,7 @@ def serve(
             history = History()
             observers: list[Observer] = [history] if recorder is None else [history, recorder]
             plane = DataPlane(registry, pages, models, metrics=metrics, observers=observers, monitor=monitor)
+            plane.models.resume()
             source_name = pages.name if pages is not None else "no source"
             console = Console(metrics, history, registry, monitor, source_name)
             stack.enter_context(_shown(console, metrics_port, metrics_host))
@@ -142,6 +153,8 @@ def serve(
                 health = stack.enter_context(HealthServer(health_address or next_port(address), server.health))
                 click.echo(f"health checks at {health.target}")
             stack.enter_context(server)
+            if incoming is not None:
+                stack.enter_context(Incoming(plane, incoming))
             if self_calibrate:
                 stack.enter_context(SelfCalibration(plane, monitor, recalibrator, calibrating))
             click.echo(f"serving {registry.current.version} from {source_name} at {server.target}")
@@ -203,17 +216,6 @@ def stop_signals() -> Iterator[Callable[[], None]]:
             signal.set_wakeup_fd(waking)
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-
-def _resume(registry: ModelRegistry, store: ModelStore, threads: int | None) -> None:
-    """Put the model back in service that was recalibrated from this bundle before a restart, if it can be used."""
-    path = store.last()
-    if path is None:
-        return
-    try:
-        registry.swap(Decoder.load(path, threads))
-    except (BundleError, CalibrationError) as error:
-        _log.warning("serving %s as it was given: %s", registry.current.version, error)
 
 
 @contextmanager

@@ -47,7 +47,7 @@ class Describing:
         (rows_px, columns_px), (rows, columns) = bundle.profile.frame_shape, bundle.profile.page_shape
         return pb.DescribeReply(
             service_version=installed_version("lightpage"),
-            model=model_message(model, True),
+            model=model_message(plane.models.entry(model)),
             camera=pb.Camera(
                 rows_px=rows_px,
                 columns_px=columns_px,

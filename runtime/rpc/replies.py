@@ -10,8 +10,9 @@ from lightpage.recording.layout import FrameInfo
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.service.dataplane import Answer, ReadAnswer
 from runtime.service.display import Wanted
+from runtime.service.models import ModelEntry
 from runtime.service.monitor import AIR, MARGIN, PISTON_WALK, RESIDUAL, SHARE, SHIFT, TRUST, UNREAD
-from runtime.service.registry import Model
+from runtime.service.store import Origin
 from runtime.service.user_data import DataPage
 from runtime.wire.messages import DATA_LOSSES, FLOAT, image_message
 from runtime.wire.status import detail_of
@@ -138,10 +139,23 @@ def wanted_message(wanted: Wanted) -> pb.WatchDisplayReply:
     )
 
 
-def model_message(model: Model, current: bool) -> pb.Model:
+_ORIGINS = {
+    Origin.GIVEN: pb.MODEL_ORIGIN_GIVEN,
+    Origin.RECALIBRATED: pb.MODEL_ORIGIN_RECALIBRATED,
+    Origin.UPLOADED: pb.MODEL_ORIGIN_UPLOADED,
+}
+
+
+def model_message(entry: ModelEntry) -> pb.Model:
     """A model as its message; metrics that are no numbers stay behind."""
-    manifest = model.decoder.bundle.manifest
-    numbers = {k: float(v) for k, v in manifest.metrics.items() if isinstance(v, int | float)}
+    manifest = entry.manifest
     return pb.Model(
-        name=manifest.name, version=manifest.version, created=manifest.created, current=current, metrics=numbers
+        name=manifest.name,
+        version=manifest.version,
+        created=manifest.created,
+        current=entry.current,
+        metrics={k: float(v) for k, v in manifest.metrics.items() if isinstance(v, int | float)},
+        pinned=entry.pinned,
+        loaded=entry.loaded,
+        origin=pb.MODEL_ORIGIN_UNSPECIFIED if entry.origin is None else _ORIGINS[entry.origin],
     )

@@ -25,6 +25,7 @@ from runtime.service.display import Display
 from runtime.service.heart import Heart
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
+from runtime.service.models import Models
 from runtime.service.monitor import Monitor
 from runtime.service.observation import Observer, Seen, observed
 from runtime.service.receiver import PairReceiver, ReceiveBudget
@@ -103,7 +104,11 @@ class DataPlane:
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s)
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s)
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s)
+        self.uploads = Slots(1, "uploads of models", self.limits.deadline_s)
+        self.models = Models(registry, store, self.limits.model_bytes, self._in_service)
         self._in_service(registry.current)
+        if store is not None:
+            self.metrics.watch_store(self.models.trouble)
         if source is not None:
             self.metrics.watch(source)
 
@@ -306,27 +311,17 @@ class DataPlane:
         return found
 
     def adopt(self, decoder: Decoder, expected: Model | None = None) -> Model:
-        """Remember a loaded decoder and put it in service: both or neither.
+        """Put a recalibrated decoder in service; see `Models.adopt`."""
+        return self.models.adopt(decoder, expected)
 
-        Raises:
-            BundleError: it cannot be remembered, or see `ModelRegistry.swap`.
-            RecalibrationRefusedError: see `ModelRegistry.swap`.
-        """
-        return self.registry.swap(decoder, expected, self._remember)
+    def rollback(self, expected_version: str = "") -> tuple[Model, Model]:
+        """Go back to the model before; see `Models.rollback`."""
+        return self.models.rollback(expected_version)
 
-    def rollback(self) -> tuple[Model, Model]:
-        """Remember the model before and go back to it; returns (now current, dropped).
-
-        Raises:
-            BundleError: there is none, or it cannot be remembered; then nothing changes.
-        """
-        return self.registry.rollback(self._remember)
-
-    def _remember(self, model: Model) -> None:
-        path = model.decoder.bundle.path
-        if self.store is not None:
-            self.store.remember(path if path.parent == self.store.folder else None)
-        self._in_service(model)
+    def store_trouble(self) -> str:
+        """What is wrong with the store, empty where nothing is, or where there is none; see `Models.trouble`."""
+        trouble = self.models.trouble()
+        return "" if trouble is None else trouble.text
 
     def _in_service(self, model: Model) -> None:
         self.metrics.in_service(model.version)

@@ -34,6 +34,9 @@ REPLAY_BYTES = 64 << 20
 MODEL_BYTES = 1 << 30
 """An uploaded bundle: five times a full-size one."""
 
+MODEL_S = 600.0
+"""A bundle that has not come by then is dropped: a full-size one comes over a slow line in that time."""
+
 JOBS_KEPT = 64
 """Results of jobs that are kept."""
 
@@ -82,6 +85,7 @@ class Limits:
     replay_s: float = REPLAY_S
     replay_bytes: int = REPLAY_BYTES
     model_bytes: int = MODEL_BYTES
+    model_s: float = MODEL_S
     jobs_kept: int = JOBS_KEPT
     decode_s: float = DECODE_S
     deadline_s: float = DEADLINE_S

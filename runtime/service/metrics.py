@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
@@ -15,6 +15,7 @@ from runtime.acquisition.source import FrameSource
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import unconfirmed_page
 from runtime.errors import LostPageError, UnconfirmedPageError
+from runtime.service.store import Reason, Trouble
 
 if TYPE_CHECKING:
     pass
@@ -93,6 +94,10 @@ class ServiceMetrics:
         """Show what the source counts, whenever somebody looks."""
         self.registry.register(_SourceFigures(source))
 
+    def watch_store(self, trouble: Callable[[], Trouble | None]) -> None:
+        """Show what is wrong with the store, whenever somebody looks."""
+        self.registry.register(_StoreFigures(trouble))
+
     def in_service(self, version: str) -> None:
         """Say which model decodes now."""
         self.model.clear()
@@ -115,3 +120,19 @@ class _SourceFigures(Collector):
         for camera, value in self._source.saturated_shares().items():
             share.add_metric([camera], value)
         yield share
+
+
+class _StoreFigures(Collector):
+    """How the store is."""
+
+    def __init__(self, trouble: Callable[[], Trouble | None]) -> None:
+        self._trouble = trouble
+
+    def collect(self) -> Iterator[Metric]:
+        """The figures as they are now."""
+        trouble = self._trouble()
+        yield GaugeMetricFamily("lightpage_store_ok", "1 where the model store is well.", value=float(trouble is None))
+        reasons = GaugeMetricFamily("lightpage_store_trouble", "1 for what is wrong with it.", labels=["reason"])
+        for reason in Reason:
+            reasons.add_metric([reason.value], float(trouble is not None and trouble.reason is reason))
+        yield reasons

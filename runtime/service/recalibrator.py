@@ -251,6 +251,7 @@ class Recalibrator:
         try:
             heard = partial(progress, "read the pages", 0.0)
             heard()
+            self._plane.models.check_store()
             end = self._work(pages, pages.read(heard, running.caller), progress, check, expected_version)
         except CallerLeft as left:  # whoever waits for a slot knows no more than that
             end = _cause(check, left)
@@ -278,7 +279,7 @@ class Recalibrator:
             pages = pages.lit(model.decoder.bundle.manifest.camera_bit_depth)
             pages.check(model.decoder)
         store = self._store()
-        version = next_version(model.version, [*(m.version for m in plane.registry.models), *store.versions()])
+        version = next_version(model.version, [*plane.models.versions(), *store.versions()])
         path = store.path_of(version)
         # Judged against what is in service now: the model with what its tracker has learnt.
         if self._fit is None:
@@ -293,17 +294,8 @@ class Recalibrator:
         except BaseException:
             path.unlink(missing_ok=True)
             raise
-        self._prune(store)
+        plane.models.prune(store)
         return outcome
-
-    def _prune(self, store: ModelStore) -> None:
-        try:
-            dropped = store.prune([model.decoder.bundle.path for model in self._plane.registry.models])
-        except OSError as error:  # the new model serves all the same
-            _log.warning("model store %s: old bundles stay: %s", store.folder, error)
-        else:
-            for path in dropped:
-                _log.info("model store %s: dropped %s", store.folder, path.name)
 
     def _store(self) -> ModelStore:
         """The service's store; without one, a temporary folder that keeps no more than the models held."""

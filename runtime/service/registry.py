@@ -1,28 +1,28 @@
-"""The models' life: which one decodes now, how the next one takes over, and the way back."""
+"""The models' life: which one decodes now, how the next one takes over, and the way back and forward again."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
-from lightpage.errors import BundleError, RecalibrationRefusedError
+from lightpage.errors import BundleError, CalibrationError, RecalibrationRefusedError
+from runtime.bundle.manifest import Manifest
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker, Tracker
+from runtime.errors import ModelExistsError, OtherModelError
 from runtime.service.caller import Caller
 from runtime.service.sessions import Sessions
 
 KEPT_MODELS = 4
 """Models held loaded, the current one included: enough to step back over a bad day, and a bound on the memory."""
 
+HISTORY = 64
+"""Steps of the history that are kept: beyond the bundles of a store there is nothing to go back to."""
+
 TrackerFactory = Callable[[Decoder], Tracker]
-ModelNote = Callable[["Model"], None]
-"""Writes down the model that is about to be in service; raises where it cannot, and then nothing changes."""
-
-
-def no_note(model: Model) -> None:
-    """Writes nothing down."""
 
 
 def no_tracker(decoder: Decoder) -> Tracker:
@@ -59,34 +59,104 @@ class Model:
         return self.decoder.version
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where a model can be loaded from: its version and the path of its bundle."""
+
+    version: str
+    path: Path
+
+
+@dataclass(frozen=True)
+class History:
+    """Models in the order in which they came into service, at least one.
+
+    Attributes:
+        places: of them; one that was put in service twice is there twice.
+        cursor: index of the one in service.
+    """
+
+    places: tuple[Place, ...]
+    cursor: int = 0
+
+    @property
+    def current(self) -> Place:
+        """The one in service."""
+        return self.places[self.cursor]
+
+    def stepped(self, by: int) -> History:
+        """The history after a step of `by` places.
+
+        Raises:
+            BundleError: there is no model.
+        """
+        cursor = self.cursor + by
+        if not 0 <= cursor < len(self.places):
+            name, way = ("rollback", "an earlier model to go back to") if by < 0 else ("roll-forward", "a later model")
+            raise BundleError(name, f"only {self.current.version}", way)
+        return History(self.places, cursor)
+
+    def followed_by(self, place: Place) -> History:
+        """The history with another model in service; those that were ahead are dropped."""
+        places = (*self.places[: self.cursor + 1], place)[-HISTORY:]
+        return History(places, len(places) - 1)
+
+    def without(self, dropped: Collection[Place]) -> History:
+        """The history without some places, the current one of which stays."""
+        kept = [i for i, place in enumerate(self.places) if i == self.cursor or place not in dropped]
+        return History(tuple(self.places[i] for i in kept), kept.index(self.cursor))
+
+    def distance(self, version: str) -> int:
+        """Steps from the model in service to the nearest place of this version, which must be there."""
+        return min(abs(i - self.cursor) for i, place in enumerate(self.places) if place.version == version)
+
+
+ModelNote = Callable[[Model, History], None]
+"""Writes down the model that is about to be in service; raises where it cannot, and then nothing changes."""
+
+
+def no_note(model: Model, history: History) -> None:
+    """Writes nothing down."""
+
+
 class ModelRegistry:
     """Holds the models. A request takes `current` once and keeps it: a swap never pulls a model from under it.
 
     Args:
         first: the decoder to start with.
         make_tracker: makes the tracker of each model.
-        kept: models held at most.
+        kept: models held loaded at most; others of the history are loaded again when they are gone to.
     """
 
     def __init__(self, first: Decoder, make_tracker: TrackerFactory = no_tracker, kept: int = KEPT_MODELS) -> None:
-        self._make_tracker, self._kept = make_tracker, kept
+        self._make_tracker, self._kept, self._threads = make_tracker, kept, first.threads
         self._changing = threading.Lock()
         """Held from the checks of a change to its end, its note included; taken before the lock below."""
         self._lock = threading.Lock()
-        """Guards the list; never held while a model is loaded, noted or decodes."""
-        self._models = [Model(first, make_tracker(first))]
+        """Guards the two below; never held while a model is loaded, noted or decodes."""
+        self.base = Place(first.version, first.bundle.path)
+        self.base_manifest: Manifest = first.bundle.manifest
+        self._history = History((self.base,))
+        self._loaded = {first.version: Model(first, make_tracker(first))}
 
     @property
     def current(self) -> Model:
         """The model that new requests use."""
         with self._lock:
-            return self._models[-1]
+            return self._loaded[self._history.current.version]
+
+    @property
+    def history(self) -> History:
+        """Models in the order in which they came into service."""
+        with self._lock:
+            return self._history
 
     @property
     def models(self) -> tuple[Model, ...]:
-        """All models held, the oldest first, the current one last."""
+        """All models held loaded, in the order of the history."""
         with self._lock:
-            return tuple(self._models)
+            order = dict.fromkeys(place.version for place in self._history.places)
+            return tuple(self._loaded[version] for version in order if version in self._loaded)
 
     def swap(self, decoder: Decoder, expected: Model | None = None, note: ModelNote = no_note) -> Model:
         """Put a loaded decoder in service and return its model; the previous one is kept for `rollback`.
@@ -97,43 +167,133 @@ class ModelRegistry:
             note: called with the new model before it is in service; what it raises leaves the old one there.
 
         Raises:
-            BundleError: the decoder is for another device, its version is held already, or it cannot be tracked.
+            BundleError: the decoder is for another device, its version is in the history, or it cannot be tracked.
             CalibrationError: its tracker needs a calibration that the bundle does not hold.
             RecalibrationRefusedError: `expected` is no longer current.
         """
         model = Model(decoder, self._make_tracker(decoder))
         with self._changing:
-            held = self.models
-            current = held[-1]
+            current, history = self.current, self.history
             if expected is not None and current is not expected:
                 raise RecalibrationRefusedError(
                     "model in service", f"{current.version} by now", f"{expected.version}, which was recalibrated"
                 )
             self._check_replaces(decoder, current.decoder)
-            if any(other.version == decoder.version for other in held):
-                raise BundleError(f"{decoder.bundle.subject}: version", decoder.version, "a version not held already")
-            note(model)
-            with self._lock:
-                self._models = [*held, model][-self._kept :]
+            if any(place.version == decoder.version for place in history.places):
+                subject = f"{decoder.bundle.subject}: version"
+                raise ModelExistsError(subject, decoder.version, "a version not held already")
+            self._change(model, history.followed_by(Place(decoder.version, decoder.bundle.path)), note)
         return model
 
-    def rollback(self, note: ModelNote = no_note) -> tuple[Model, Model]:
-        """Put the model before the current one back in service; returns (now current, dropped).
+    def step(self, by: int, expected: str = "", note: ModelNote = no_note) -> tuple[Model, Model]:
+        """Put an earlier (`by` = -1) or later (1) model of the history in service; returns (now current, before).
 
         Args:
-            note: called with the earlier model before it is in service; what it raises leaves the later one there.
+            by: places.
+            expected: version that must be in service; empty for any.
+            note: as for `swap`.
 
         Raises:
-            BundleError: there is no earlier model.
+            BundleError: there is none, or it cannot be loaded any more.
+            OtherModelError: another version is in service.
         """
         with self._changing:
-            held = self.models
-            if len(held) < 2:
-                raise BundleError("rollback", f"only {held[-1].version}", "an earlier model to go back to")
-            note(held[-2])
-            with self._lock:
-                self._models = list(held[:-1])
-            return held[-2], held[-1]
+            before = self._expect(expected)
+            history = self.history.stepped(by)
+            model = self._model(history.current)
+            self._change(model, history, note)
+            return model, before
+
+    def rollback(self, expected: str = "", note: ModelNote = no_note) -> tuple[Model, Model]:
+        """Put the model before the current one back in service; see `step`."""
+        return self.step(-1, expected, note)
+
+    def go_to(self, place: Place, expected: str = "", note: ModelNote = no_note) -> tuple[Model, Model]:
+        """Put a model in service that need not be loaded; returns (now current, before).
+
+        The current one stays where it is in service already.
+
+        Args:
+            place: where the model is.
+            expected: version that must be in service; empty for any.
+            note: as for `swap`.
+
+        Raises:
+            BundleError: it cannot be loaded, or is for another device.
+            OtherModelError: another version is in service.
+        """
+        with self._changing:
+            before = self._expect(expected)
+            if place.version == before.version:
+                return before, before
+            model = self._model(place)
+            self._change(model, self.history.followed_by(place), note)
+            return model, before
+
+    def resume(self, history: History) -> None:
+        """Take over a history with its model in service, as after a restart.
+
+        Raises:
+            BundleError: that model cannot be loaded, or is for another device.
+        """
+        with self._changing:
+            self._change(self._model(history.current), history, no_note)
+
+    def forget(self, paths: Collection[Path], note: Callable[[History], None]) -> None:
+        """Drop places of the history whose bundles are about to be deleted, and that are not loaded.
+
+        `note` is called before, if anything is dropped; what it raises leaves the history as it is.
+        """
+        with self._changing:
+            loaded, history = {model.version for model in self.models}, self.history
+            dropped = [place for place in history.places if place.path in paths and place.version not in loaded]
+            if dropped:
+                history = history.without(dropped)
+                note(history)
+                with self._lock:
+                    self._history = history
+
+    def check(self, decoder: Decoder) -> None:
+        """Check that a decoder could be put in service.
+
+        Raises:
+            BundleError: it is for another device, or cannot be tracked.
+        """
+        self._tracked(decoder)
+
+    def _expect(self, version: str) -> Model:
+        """The model in service, if it is of this version."""
+        current = self.current
+        if version and current.version != version:
+            raise OtherModelError("model in service", current.version, version)
+        return current
+
+    def _model(self, place: Place) -> Model:
+        """A model, loaded if it is not."""
+        with self._lock:
+            held = self._loaded.get(place.version)
+        if held is not None:
+            return held
+        decoder = Decoder.load(place.path, self._threads)
+        if decoder.version != place.version:
+            raise BundleError(f"{decoder.bundle.subject}: version", decoder.version, place.version)
+        return self._tracked(decoder)
+
+    def _tracked(self, decoder: Decoder) -> Model:
+        self._check_replaces(decoder, self.current.decoder)
+        try:
+            return Model(decoder, self._make_tracker(decoder))
+        except CalibrationError as error:
+            raise BundleError(error.subject, error.got, error.expected) from None
+
+    def _change(self, model: Model, history: History, note: ModelNote) -> None:
+        note(model, history)
+        with self._lock:
+            loaded = self._loaded | {model.version: model}
+            named = {place.version for place in history.places}
+            nearest = sorted((v for v in loaded if v in named), key=history.distance)
+            self._history = history
+            self._loaded = {version: loaded[version] for version in nearest[: self._kept]}
 
     @staticmethod
     def _check_replaces(new: Decoder, old: Decoder) -> None:
@@ -144,3 +304,6 @@ class ModelRegistry:
         ]
         if shapes[0] != shapes[1]:
             raise BundleError(f"{new.bundle.subject}: frames and page", shapes[0], f"{shapes[1]}, as in service")
+        depth, current = (d.bundle.manifest.camera_bit_depth for d in (new, old))
+        if depth != current:
+            raise BundleError(f"{new.bundle.subject}: camera", f"{depth} bits", f"{current} bits, as in service")

@@ -81,6 +81,8 @@ class SelfCalibration:
         self._wake, self._stopping = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="lightpage-self-calibration", daemon=True)
         self._caller = Caller()
+        self._pinned = False
+        """Whether it was said that the model in service is pinned."""
         monitor.listen(self._wake.set)
 
     def start(self) -> Self:
@@ -120,7 +122,14 @@ class SelfCalibration:
         return min(left, self._settings.busy_s) if self._monitor.due else None
 
     def _try_once(self) -> None:
-        """Recalibrate, and decide when the next time may be."""
+        """Recalibrate, and decide when the next time may be; not while the model in service is pinned."""
+        if self._plane.models.current_pinned:
+            if not self._pinned:
+                _log.info("self-calibration: put off, since the model in service is pinned")
+            self._pinned = True
+            self._wait(self._settings.busy_s)
+            return
+        self._pinned = False
         reasons = "; ".join(self._monitor.state().reasons) or "the monitor says so"
         _log.info("self-calibration: begins, since %s", reasons)
         try:

@@ -29,7 +29,6 @@ from runtime.acquisition.sources import open_source
 from runtime.bundle.bundle import Bundle
 from runtime.client.client import LightpageClient
 from runtime.commands import recalibrate as cli_recalibrate
-from runtime.commands.serve import _resume
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
 from runtime.rpc.server import LightpageServer
@@ -736,9 +735,16 @@ def test_a_stored_model_whose_calibration_is_bad_leaves_the_base_in_service(
 
     store, registry = ModelStore(tmp_path / "store", decoder.bundle), ModelRegistry(decoder, tracker)
     store.remember(toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1"))
-    _resume(registry, store, 1)
+    DataPlane(registry, store=store).models.resume()
     assert [model.version for model in registry.models] == ["toy-1"]
     assert "serving toy-1 as it was given: bundle toy-1+r1: calibration" in caplog.text
+
+
+def test_serve_takes_bundles_from_a_folder_only_into_a_store(
+    toy_zip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["serve", "--bundle", toy_zip, "--incoming", tmp_path]) == 2
+    assert "--incoming: got no --store" in capsys.readouterr().err
 
 
 def test_serve_refuses_a_damaged_bundle_in_one_line(toy_zip: Path, tmp_path: Path) -> None:

@@ -130,6 +130,24 @@ def test_without_pages_of_its_own_the_next_two_serve(make: Make) -> None:
     assert loop.source.shown == list(range(18))
 
 
+def test_a_pinned_model_stays_in_service_until_it_is_let_go_of(make: Make, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    loop = make()
+    loop.plane.models.pin("toy-1", True)
+    loop.start(SelfCalibrationSettings(pages=(100, 101), busy_s=0.02))
+    loop.drift()
+    assert loop.monitor.due
+    for _ in range(10):  # looked at again and again
+        loop.seconds += 1
+        time.sleep(0.03)
+    assert loop.version == "toy-1"
+    assert caplog.text.count("since the model in service is pinned") == 1
+    assert not [page for page in loop.source.shown if page >= 100]
+    loop.plane.models.pin("toy-1", False)
+    loop.seconds += 1
+    assert wait_until(lambda: loop.version == "toy-1+r1")
+
+
 def refusing(*_: object) -> RefitResult:
     raise CalibrationError("known pages", "no significant peak", "a device within the capture range")
 
