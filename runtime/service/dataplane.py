@@ -104,6 +104,8 @@ class DataPlane:
         self._in_service(registry.current)
         if source is not None:
             self.metrics.watch(source)
+            if source.pages is not None:
+                source.pages.most_bytes = self.limits.uploaded_bytes
 
     @property
     def source(self) -> FrameSource:
