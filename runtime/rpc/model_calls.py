@@ -20,7 +20,7 @@ class ModelCalls:
 
     def Rollback(self, request: pb.RollbackRequest, call: Call) -> pb.RollbackReply:
         """Go back to the model before."""
-        current, dropped = self._plane.rollback()
+        current, dropped = self._plane.rollback(actor=call.actor)
         return pb.RollbackReply(model_version=current.version, previous_version=dropped.version)
 
     def ListModels(self, request: pb.ListModelsRequest, call: Call) -> pb.ListModelsReply:

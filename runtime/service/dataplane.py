@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -20,7 +21,8 @@ from runtime.acquisition.source import FrameSource, Shot, own_fault
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
 from runtime.errors import LostPageError, NoSourceError, SourceError
-from runtime.service.caller import Caller
+from runtime.service.audit import AuditLog
+from runtime.service.caller import NOBODY, Actor, Caller
 from runtime.service.display import Display
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
@@ -73,6 +75,7 @@ class DataPlane:
         metrics: what is counted.
         observers: are told of every page.
         monitor: says by all pages whether a recalibration is due; it is told of every page first.
+        audit: where changes of models are written down, None for the log alone.
 
     Raises:
         InvalidInputError: the source is not for this device.
@@ -87,11 +90,14 @@ class DataPlane:
         metrics: ServiceMetrics | None = None,
         observers: Sequence[Observer] = (),
         monitor: Monitor | None = None,
+        audit: AuditLog | None = None,
     ) -> None:
         self.registry, self.store = registry, store
         self.limits = limits or Limits()
         self.metrics = metrics or ServiceMetrics()
-        self.monitor = monitor
+        self.monitor, self.audit = monitor, audit or AuditLog()
+        self._changing = threading.Lock()
+        """Held from before a change of models until it is written down, so that the record has them in their order."""
         self.observers = tuple(observers) if monitor is None else (monitor, *observers)
         self._source = source
         if source is not None:
@@ -297,22 +303,46 @@ class DataPlane:
         self.metrics.user_data(found)
         return found
 
-    def adopt(self, decoder: Decoder, expected: Model | None = None) -> Model:
+    def adopt(
+        self, decoder: Decoder, expected: Model | None = None, *, what: str = "recalibrate", actor: Actor = NOBODY
+    ) -> Model:
         """Remember a loaded decoder and put it in service: both or neither.
+
+        Args:
+            decoder, expected: see `ModelRegistry.swap`.
+            what: is done, for the record.
+            actor: who does it.
 
         Raises:
             BundleError: it cannot be remembered, or see `ModelRegistry.swap`.
             RecalibrationRefusedError: see `ModelRegistry.swap`.
         """
-        return self.registry.swap(decoder, expected, self._remember)
+        with self._audited(what, actor, decoder.version):
+            return self.registry.swap(decoder, expected, self._remember)
 
-    def rollback(self) -> tuple[Model, Model]:
+    def rollback(self, *, actor: Actor = NOBODY) -> tuple[Model, Model]:
         """Remember the model before and go back to it; returns (now current, dropped).
+
+        Args:
+            actor: who does it, for the record.
 
         Raises:
             BundleError: there is none, or it cannot be remembered; then nothing changes.
         """
-        return self.registry.rollback(self._remember)
+        with self._audited("rollback", actor):
+            return self.registry.rollback(self._remember)
+
+    @contextmanager
+    def _audited(self, what: str, actor: Actor, wanted: str = "") -> Iterator[None]:
+        """Write down a change of the model in service, or that it failed."""
+        with self._changing:
+            before = self.registry.current.version
+            try:
+                yield
+            except Exception as error:
+                self.audit.record(what, before, wanted, actor=actor, outcome="failed", detail=str(error) or repr(error))
+                raise
+            self.audit.record(what, before, self.registry.current.version, actor=actor)
 
     def _remember(self, model: Model) -> None:
         path = model.decoder.bundle.path

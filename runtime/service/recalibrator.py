@@ -33,7 +33,7 @@ from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
 from runtime.recalibration.recalibration import next_version, recalibrate
 from runtime.recalibration.separate_process import recalibrate_apart
-from runtime.service.caller import Caller
+from runtime.service.caller import Actor, Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import GRACE_S
 from runtime.service.store import ModelStore
@@ -147,7 +147,7 @@ class Recalibrator:
             try:
                 heard = partial(progress, "read the pages", 0.0)
                 heard()
-                result: RecalibrationOutcome | BaseException = self._work(read(heard), progress, check)
+                result: RecalibrationOutcome | BaseException = self._work(read(heard), progress, check, caller.actor)
             except BaseException as error:
                 result = error
             finally:
@@ -167,7 +167,9 @@ class Recalibrator:
         finally:
             left.set()
 
-    def _work(self, pages: KnownPages, progress: Progress, check: Callable[[], None]) -> RecalibrationOutcome:
+    def _work(
+        self, pages: KnownPages, progress: Progress, check: Callable[[], None], actor: Actor
+    ) -> RecalibrationOutcome:
         plane = self._plane
         model = plane.registry.current
         with own_fault():  # the pages are the service's own
@@ -184,7 +186,7 @@ class Recalibrator:
             outcome = recalibrate(model.decoder, pages, path, version, self._fit, progress, model.tracker)
         try:
             progress("put the new model in service", 1.0)
-            plane.adopt(Decoder(Bundle.open(path), model.decoder.threads), expected=model)
+            plane.adopt(Decoder(Bundle.open(path), model.decoder.threads), expected=model, actor=actor)
         except BaseException:
             path.unlink(missing_ok=True)
             raise
@@ -216,6 +218,7 @@ class Recalibrator:
         else:
             name = "dropped" if isinstance(result, CallerLeft | StoppingError) else "failed"
         self._plane.metrics.recalibrations.labels(name).inc()
+        _log.info("recalibration %s", name)
 
     def _check_count(self, count: int) -> None:
         if count > self._plane.limits.recalibration_pages:

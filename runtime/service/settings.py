@@ -350,11 +350,11 @@ def read_settings(
     named = {name: key for name, key in (short_names or {}).items() if environment.get(name)}
     named |= {name: key for name in sorted(environment) if (key := _key_of(name)) is not None and environment[name]}
     given = [Option(name, key, _from_text(model, name, key, environment[name])) for name, key in named.items()]
-    for kind, option in [*(("environment", each) for each in given), *(("option", each) for each in options)]:
-        table, key = option.key
-        if isinstance(data.setdefault(table, {}), dict):
-            data[table][key] = option.value
-        origins[option.key] = f"{kind} {option.name}"
+    for origin, option in [*(("environment", each) for each in given), *(("option", each) for each in options)]:
+        table_name, key_name = option.key
+        if isinstance(data.setdefault(table_name, {}), dict):
+            data[table_name][key_name] = option.value
+        origins[option.key] = f"{origin} {option.name}"
     subject = "settings" if file is None else f"settings {file}"
     try:
         return Effective(model.model_validate(data), origins)
