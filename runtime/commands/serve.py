@@ -16,6 +16,7 @@ import click
 from click.core import ParameterSource
 
 from lightpage.errors import BundleError, CalibrationError, InvalidInputError
+from lightpage.progress import reporting
 from lightpage.recording.pages import Pages
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import FrameSource
@@ -122,7 +123,8 @@ def serve(context: click.Context, /, config: Path | None, print_config: bool, **
     settings = effective.settings
     settings.check_paths()
     logs = settings.logs
-    with stop_signals() as wait_for_stop, logging_to_stderr(logs.format, logs.level, logs.lines_per_second):
+    written = logging_to_stderr(logs.format, logs.level, logs.lines_per_second)
+    with stop_signals() as wait_for_stop, written, reporting(None):  # what work tells of itself is logged too
         _serve(effective, wait_for_stop)
 
 

@@ -260,11 +260,17 @@ def _kind(record: logging.LogRecord) -> tuple[str, ...]:
     return record.name, str(record.msg)
 
 
+def _thread_broke(found: threading.ExceptHookArgs) -> None:
+    if found.exc_value is not None and not isinstance(found.exc_value, SystemExit):
+        name = "of no name" if found.thread is None else found.thread.name
+        _log.error("thread %s broke", name, exc_info=found.exc_value)
+
+
 @contextmanager
 def logging_to_stderr(
     form: Literal["text", "json"], level: str, lines_per_second: int, stream: TextIO | None = None
 ) -> Iterator[LimitedHandler]:
-    """Have everything that is logged in the `with` statement written.
+    """Have everything that is logged in the `with` statement written, and what ends threads that nobody waits for.
 
     Args:
         form: of a line.
@@ -275,13 +281,15 @@ def logging_to_stderr(
     root = logging.getLogger()
     handler = LimitedHandler(sys.stderr if stream is None else stream, lines_per_second)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
-    before = root.level
+    before, hook = root.level, threading.excepthook
     root.addHandler(handler)
     root.setLevel(level.upper())
     logging.captureWarnings(True)
+    threading.excepthook = _thread_broke
     try:
         yield handler
     finally:
+        threading.excepthook = hook
         logging.captureWarnings(False)
         root.setLevel(before)
         root.removeHandler(handler)

@@ -109,6 +109,15 @@ def test_only_what_nobody_foresaw_has_a_traceback() -> None:
     assert "gone" not in lines[0]["message"]
 
 
+def test_a_thread_that_breaks_is_logged() -> None:
+    with json_lines() as lines:
+        thread = threading.Thread(target=lambda: [][0], name="odd")
+        thread.start()
+        thread.join(10)
+    assert lines[0]["message"] == "thread odd broke"
+    assert "IndexError" in lines[0]["traceback"]
+
+
 def test_a_caller_cannot_write_lines_of_its_own() -> None:
     stream = io.StringIO()
     with logging_to_stderr("text", "info", 5, stream):
