@@ -14,6 +14,11 @@ from typing import Any
 from lightpage.files import sync_folder
 from runtime.service.caller import NOBODY, Actor
 
+AUDIT_BYTES = 10 << 20
+"""Of a record of model changes before a new one is begun: some 40,000 changes."""
+AUDIT_KEPT = 10
+"""Earlier records that stay."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -29,7 +34,7 @@ class AuditLog:
         kept: files put aside that stay.
     """
 
-    def __init__(self, path: Path | None = None, most_bytes: int = 10 << 20, kept: int = 10) -> None:
+    def __init__(self, path: Path | None = None, most_bytes: int = AUDIT_BYTES, kept: int = AUDIT_KEPT) -> None:
         self._path, self._most_bytes, self._kept = path, most_bytes, kept
         self._lock = threading.Lock()
         """Guards the file."""

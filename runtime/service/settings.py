@@ -29,6 +29,7 @@ from lightpage.device.profile import TomlTable, toml_value
 from lightpage.errors import InvalidInputError
 from runtime.bundle.shipped import DEFAULT
 from runtime.recalibration.known_pages import MIN_PAGES
+from runtime.service.audit import AUDIT_BYTES, AUDIT_KEPT
 from runtime.service.flight_recorder import PAGES, RING_BYTES, FlightSettings
 from runtime.service.limits import Limits
 from runtime.service.self_calibration import SelfCalibrationSettings
@@ -46,10 +47,6 @@ AUDIT_FILE = "audit.jsonl"
 """Name of the record of model changes in the store, where no other file is named."""
 LINES_PER_SECOND = 5
 """Lines of one kind in a log: enough to see that it goes on, and too few to fill a disk in a night."""
-AUDIT_BYTES = 10 << 20
-"""Of a record of model changes before a new one is begun: some 40,000 changes."""
-AUDIT_KEPT = 10
-"""Earlier records that stay."""
 
 _MASK = "********"
 _HEADER_BYTES = 1 << 10
