@@ -220,13 +220,14 @@ def to_toml(table: TomlTable, without: tuple[str, ...] = ()) -> str:
     tables: list[str] = []
     for key, value in table.model_dump(exclude=set(without)).items():
         if isinstance(value, dict):
-            tables += ["", f"[{key}]", *(f"{k} = {_toml_value(v)}" for k, v in value.items())]
+            tables += ["", f"[{key}]", *(f"{k} = {toml_value(v)}" for k, v in value.items())]
         else:
-            scalars.append(f"{key} = {_toml_value(value)}")
+            scalars.append(f"{key} = {toml_value(value)}")
     return "\n".join([*scalars, *tables]) + "\n"
 
 
-def _toml_value(value: object) -> str:
+def toml_value(value: object) -> str:
+    """A text, a truth value or a number as TOML writes it."""
     if isinstance(value, str):
         # a JSON string is a TOML one but for this character
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -24,6 +24,9 @@ class PageStore:
         written: pages of a file, or None; it is closed with the store.
         levels: M, where there is no file to say it; None leaves it to the first upload.
 
+    Attributes:
+        most_bytes: of uploaded pages; more are refused.
+
     Raises:
         RecordingError: pages for another profile.
         PageError: a level count outside 2..256.
@@ -36,6 +39,7 @@ class PageStore:
         if levels is not None:
             check_levels(levels)
         self._shape, self._written, self._levels = profile.page_shape, written, levels
+        self.most_bytes = UPLOADED_BYTES
         self._uploaded: list[NDArray[np.uint8]] = []
         self._lock = threading.Lock()
         """Guards all of it; the file is read under it too."""
@@ -89,8 +93,8 @@ class PageStore:
             if self._levels is not None and levels != self._levels:
                 raise InvalidInputError("levels of uploaded pages", levels, f"{self._levels}, as the pages before have")
             held = sum(page.nbytes for page in self._uploaded) + pages.nbytes
-            if held > UPLOADED_BYTES:
-                raise LimitError("uploaded pages", f"{held} bytes with those held", f"at most {UPLOADED_BYTES}")
+            if held > self.most_bytes:
+                raise LimitError("uploaded pages", f"{held} bytes with those held", f"at most {self.most_bytes}")
             first = self._in_file + len(self._uploaded)
             self._levels = levels
             self._uploaded.extend(page.copy() for page in pages)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import logging
+import platform
 import signal
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from lightpage.errors import InvalidInputError
+from lightpage.progress import reporting
 from lightpage.recording.pages import Pages
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import FrameSource
@@ -25,48 +29,77 @@ from runtime.decoding.image_tracker import tracker_for
 from runtime.errors import LostShotError, SourceError
 from runtime.rpc.health_server import HealthServer, next_port
 from runtime.rpc.server import LightpageServer
+from runtime.service.audit import AuditLog
 from runtime.service.dataplane import DataPlane
-from runtime.service.flight_recorder import PAGES, FlightRecorder, FlightSettings
+from runtime.service.flight_recorder import PAGES, FlightRecorder
 from runtime.service.incoming import Incoming
+from runtime.service.logs import CallLog, PageLog, logging_to_stderr
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.observation import Observer
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
-from runtime.service.self_calibration import SelfCalibration, SelfCalibrationSettings
+from runtime.service.self_calibration import SelfCalibration
+from runtime.service.settings import ADDRESS, OFF, STORE_VARIABLE, Effective, Option, ServiceSettings, service_settings
 from runtime.service.store import ModelStore
-from runtime.wire.address import check_address
-
-ADDRESS = "127.0.0.1:50051"
 
 _log = logging.getLogger(__name__)
 
+STORE_HEALTH = "lightpage.store"
+"""Name under which health checks ask whether the store can be written."""
+
+_KEYS = {
+    "bundle": ("service", "bundle"),
+    "source": ("service", "source"),
+    "pages_file": ("service", "pages"),
+    "address": ("service", "address"),
+    "health_address": ("service", "health_address"),
+    "metrics_port": ("metrics", "port"),
+    "metrics_host": ("metrics", "host"),
+    "store": ("service", "store"),
+    "incoming": ("service", "incoming"),
+    "recordings": ("service", "recordings"),
+    "threads": ("service", "threads"),
+    "tracking": ("service", "tracking"),
+    "self_calibrate": ("self_calibration", "enabled"),
+    "calibration_pages": ("self_calibration", "pages"),
+    "flight_recorder": ("flight_recorder", "folder"),
+    "flight_recorder_pages": ("flight_recorder", "pages"),
+}
+"""Of each option the setting that it is above of."""
+
 
 @click.command()
-@click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    envvar="LIGHTPAGE_CONFIG",
+    show_envvar=True,
+    help="Settings, SERVICE.toml; variables of the environment and options count before them.",
+)
+@click.option("--print-config", is_flag=True, help="Print the settings in effect and where they come from, and end.")
+@click.option("--bundle", show_default=DEFAULT, help="A bundle's path, or the name of a shipped one.")
 @click.option(
     "--source", help="simulator:PROFILE, recording:FILE, camera:CONFIG.toml; without it only sent frames decode."
 )
 @click.option(
     "--pages", "pages_file", type=click.Path(path_type=Path), help="Pages that the source is to show, PAGES.h5."
 )
-@click.option("--address", default=ADDRESS, show_default=True, help="HOST:PORT to listen on; port 0 takes a free one.")
+@click.option("--address", show_default=ADDRESS, help="HOST:PORT to listen on; port 0 takes a free one.")
 @click.option(
     "--health-address",
     help="HOST:PORT of health checks, answered by a process of their own; by default the next port. off: none.",
 )
 @click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show metrics and console on this port.")
-@click.option("--metrics-host", default="127.0.0.1", show_default=True, help="Where the figures are shown.")
+@click.option("--metrics-host", show_default="127.0.0.1", help="Where the figures are shown.")
 @click.option(
     "--store",
     type=click.Path(file_okay=False, path_type=Path),
-    envvar="LIGHTPAGE_STORE",
-    show_envvar=True,
-    help="Folder for recalibrated and uploaded bundles; the one in service is used again after a restart.",
+    help=f"Folder of recalibrated and uploaded bundles; the one in service is used after a restart. {STORE_VARIABLE} too.",
 )
 @click.option(
     "--incoming",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    type=click.Path(file_okay=False, path_type=Path),
     help="Folder whose bundles are taken into the store, as uploads are.",
 )
 @click.option(
@@ -75,7 +108,9 @@ _log = logging.getLogger(__name__)
     help="Folder whose recordings a caller may name to recalibrate with.",
 )
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
-@click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
+@click.option(
+    "--tracking/--no-tracking", default=None, show_default="tracking", help="Follow the image, and find it again."
+)
 @click.option(
     "--self-calibrate/--no-self-calibrate",
     default=None,
@@ -93,73 +128,92 @@ _log = logging.getLogger(__name__)
     type=click.Path(file_okay=False, path_type=Path),
     help="Folder in which the frames of lost and weak pages are kept.",
 )
-@click.option(
-    "--flight-recorder-pages", default=PAGES, show_default=True, type=click.IntRange(1), help="Kept there at most."
-)
-def serve(
-    bundle: str,
-    source: str | None,
-    pages_file: Path | None,
-    address: str,
-    health_address: str | None,
-    metrics_port: int | None,
-    metrics_host: str,
-    store: Path | None,
-    incoming: Path | None,
-    recordings: Path | None,
-    threads: int | None,
-    tracking: bool,
-    self_calibrate: bool | None,
-    calibration_pages: tuple[int, ...],
-    flight_recorder: Path | None,
-    flight_recorder_pages: int,
-) -> None:
+@click.option("--flight-recorder-pages", show_default=str(PAGES), type=click.IntRange(1), help="Kept there at most.")
+@click.pass_context
+def serve(context: click.Context, /, config: Path | None, print_config: bool, **_: Any) -> None:
     """Run the service until SIGTERM or Ctrl-C; calls in flight are finished first."""
-    check_address("--address", address, least_port=0)
-    self_calibrate = bool(calibration_pages) if self_calibrate is None else self_calibrate
-    if self_calibrate and source is None:
-        raise InvalidInputError("--self-calibrate", "no --source", "a source that shows known pages")
-    if incoming is not None and store is None:
-        raise InvalidInputError("--incoming", "no --store", "a folder where its bundles are kept")
-    calibrating = SelfCalibrationSettings(calibration_pages)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
-    with stop_signals() as wait_for_stop:
-        base = Decoder.load(bundle_path(bundle), threads)
-        registry = ModelRegistry(base, tracker_for) if tracking else ModelRegistry(base)
-        metrics = ServiceMetrics()
-        monitor = Monitor(metrics=metrics)
-        with ExitStack() as stack:
-            models = None
-            if store is not None:
-                models = ModelStore(store, base.bundle)
-                stack.enter_context(models.locked())
-            pages = None if source is None else stack.enter_context(_source(source, pages_file, base))
-            if pages is not None:
-                _take_dark_frames(pages)
-            recorder = None
-            if flight_recorder is not None:
-                kept = FlightSettings(flight_recorder_pages)
-                recorder = stack.enter_context(FlightRecorder(flight_recorder, registry, kept, monitor, metrics))
-            history = History()
-            observers: list[Observer] = [history] if recorder is None else [history, recorder]
-            plane = DataPlane(registry, pages, models, metrics=metrics, observers=observers, monitor=monitor)
-            plane.models.resume()
-            source_name = pages.name if pages is not None else "no source"
-            console = Console(metrics, history, registry, monitor, source_name)
-            stack.enter_context(_shown(console, metrics_port, metrics_host))
-            recalibrator = Recalibrator(plane, recordings=recordings)
-            server = LightpageServer(plane, recalibrator, address)
-            if health_address != "off":  # entered first: it says NOT_SERVING until the last call has ended
-                health = stack.enter_context(HealthServer(health_address or next_port(address), server.health))
-                click.echo(f"health checks at {health.target}")
-            stack.enter_context(server)
-            if incoming is not None:
-                stack.enter_context(Incoming(plane, incoming))
-            if self_calibrate:
-                stack.enter_context(SelfCalibration(plane, monitor, recalibrator, calibrating))
-            click.echo(f"serving {registry.current.version} from {source_name} at {server.target}")
-            wait_for_stop()
-            click.echo("stopping")
+    effective = service_settings(config, options=_given(context))
+    if print_config:
+        click.echo(effective.to_toml(), nl=False)
+        return
+    settings = effective.settings
+    settings.check_paths()
+    logs = settings.logs
+    written = logging_to_stderr(logs.format, logs.level, logs.lines_per_second)
+    with stop_signals() as wait_for_stop, written, reporting(None):  # what work tells of itself is logged too
+        _serve(effective, wait_for_stop)
+
+
+def _given(context: click.Context) -> list[Option]:
+    """The options that somebody gave."""
+    names = {parameter.name: parameter.opts[0] for parameter in context.command.params}
+    given = [name for name in _KEYS if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
+    return [Option(names[name], _KEYS[name], context.params[name]) for name in given]
+
+
+def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], None]) -> None:
+    settings = effective.settings
+    service, audit = settings.service, settings.audit
+    base = Decoder.load(bundle_path(service.bundle), service.threads)
+    registry = ModelRegistry(base, tracker_for) if service.tracking else ModelRegistry(base)
+    metrics = ServiceMetrics()
+    monitor = Monitor(metrics=metrics)
+    with ExitStack() as stack:
+        models = None
+        if service.store is not None:
+            models = ModelStore(service.store, base.bundle)
+            stack.enter_context(models.locked())
+        pages = None if service.source is None else stack.enter_context(_source(service.source, service.pages, base))
+        if pages is not None:
+            _take_dark_frames(pages)
+        history = History()
+        observers: list[Observer] = [history, PageLog()]
+        if settings.flight_recorder.folder is not None:
+            folder, kept = settings.flight_recorder.folder, settings.flight_recorder.settings()
+            observers.append(stack.enter_context(FlightRecorder(folder, registry, kept, monitor, metrics)))
+        plane = DataPlane(
+            registry,
+            pages,
+            models,
+            settings.limits,
+            metrics=metrics,
+            observers=observers,
+            monitor=monitor,
+            audit=AuditLog(settings.audit_file, audit.file_bytes, audit.kept),
+        )
+        plane.models.resume()
+        source_name = pages.name if pages is not None else "no source"
+        console = Console(metrics, history, registry, monitor, source_name)
+        stack.enter_context(_shown(console, settings.metrics.port, settings.metrics.host))
+        recalibrator = Recalibrator(plane, recordings=service.recordings)
+        server = LightpageServer(plane, recalibrator, service.address, CallLog())
+        if service.health_address != OFF:  # entered first: it says NOT_SERVING until the last call has ended
+            address = service.health_address or next_port(service.address)
+            health = stack.enter_context(HealthServer(address, lambda: _health(server, plane)))
+            click.echo(f"health checks at {health.target}")
+        stack.enter_context(server)
+        if service.incoming is not None:
+            stack.enter_context(Incoming(plane, service.incoming))
+        if settings.self_calibrates:
+            stack.enter_context(SelfCalibration(plane, monitor, recalibrator, settings.self_calibration.settings()))
+        click.echo(f"serving {registry.current.version} from {source_name} at {server.target}")
+        _log_start(registry.current.version, source_name, server.target, len(effective.origins))
+        wait_for_stop()
+        click.echo("stopping")
+        _log.info("stopping with model %s", registry.current.version)
+    _log.info("stopped")
+
+
+def _log_start(model: str, source: str, address: str, given: int) -> None:
+    versions = {name: installed_version(name) for name in ("lightpage", "onnxruntime", "grpcio", "numpy")}
+    versions["python"] = platform.python_version()
+    text = "serving %s from %s at %s, %d settings given"
+    _log.info(text, model, source, address, given, extra={"told": versions})
+
+
+def _health(server: LightpageServer, plane: DataPlane) -> dict[str, bool]:
+    """What health checks say."""
+    return {**server.health(), STORE_HEALTH: not plane.store_trouble()}
 
 
 def _source(name: str, pages_file: Path | None, base: Decoder) -> FrameSource:

@@ -11,10 +11,11 @@ import asyncio
 import inspect
 import logging
 import math
+import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Generator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
@@ -23,7 +24,7 @@ from google.protobuf.message import DecodeError, Message
 
 from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.service.caller import Caller
+from runtime.service.caller import Actor, Caller
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
 from runtime.wire.status import status_of, told, trailers
@@ -48,6 +49,7 @@ class Call:
         pool: threads for what blocks.
         peer: address and connection that it came from.
         correlation_id: the caller's own text for the log, empty where it gave none.
+        begun: when its first byte came, by `time.perf_counter`.
     """
 
     method: str
@@ -55,6 +57,17 @@ class Call:
     pool: Executor
     peer: str = ""
     correlation_id: str = ""
+    begun: float = field(default_factory=time.perf_counter)
+
+    @property
+    def actor(self) -> Actor:
+        """Who calls, for records."""
+        return Actor(self.peer, self.correlation_id)
+
+    @property
+    def is_watch(self) -> bool:
+        """Whether it lasts as long as its caller likes."""
+        return self.method in ENDLESS
 
     async def in_thread(self, work: Callable[[], T]) -> T:
         """Do in a thread what blocks or computes; when the call ends before, the work goes on by itself."""
@@ -233,6 +246,7 @@ def _parsed(parse: Callable[[bytes], Any], data: bytes, call: Call) -> Any:
     except DecodeError as error:
         raise MalformedError(f"message of {call.method}", str(error), "one that can be parsed") from None
     call.correlation_id = getattr(message, "correlation_id", "") or call.correlation_id
+    call.caller.actor = call.actor
     return message
 
 

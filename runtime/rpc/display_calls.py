@@ -30,12 +30,13 @@ class DisplayCalls:
 
     async def UploadPages(self, requests: AsyncIterator[pb.UploadPagesRequest], call: Call) -> pb.UploadPagesReply:
         """Receive pages to show."""
-        shape, limit_s = self._plane.registry.current.decoder.bundle.profile.page_shape, self._plane.limits.receive_s
+        limits, shape = self._plane.limits, self._plane.registry.current.decoder.bundle.profile.page_shape
         try:
-            async with asyncio.timeout(limit_s):
-                levels, symbols = await uploaded_pages(requests, shape)
+            async with asyncio.timeout(limits.receive_s):
+                levels, symbols = await uploaded_pages(requests, shape, limits.uploaded_bytes)
         except TimeoutError:
-            raise StalledError("uploaded pages", f"not all of them within {limit_s:g} s", "faster pages") from None
+            late = f"not all of them within {limits.receive_s:g} s"
+            raise StalledError("uploaded pages", late, "faster pages") from None
         first = await call.in_thread(lambda: self._plane.display.upload(symbols, levels))
         return pb.UploadPagesReply(first_page=first, pages=len(symbols))
 

@@ -49,7 +49,9 @@ class JobCalls:
 
     def StartRecalibration(self, request: pb.StartRecalibrationRequest, call: Call) -> pb.Job:
         """Start a recalibration that goes on when its caller leaves."""
-        return self._recalibrator.start(self._pages(request), request.expected_version, request.correlation_id)
+        return self._recalibrator.start(
+            self._pages(request), request.expected_version, request.correlation_id, call.actor
+        )
 
     async def RecalibrateFrames(self, requests: AsyncIterator[pb.RecalibrateFramesRequest], call: Call) -> pb.Job:
         """Receive known pages, and start a recalibration with them."""
@@ -62,7 +64,7 @@ class JobCalls:
         sent = SentPages(header, self._plane)
         try:
             await sent.receive(requests)
-            return await call.in_thread(partial(self._start_with, sent, header))
+            return await call.in_thread(partial(self._start_with, sent, header, call))
         finally:
             sent.close()  # does nothing where the job has taken them
 
@@ -108,7 +110,7 @@ class JobCalls:
             return self._recalibrator.recorded_pages(request.recording, request.recording_count)
         raise InvalidInputError("pages to recalibrate with", "none", "pages of the source or a recording")
 
-    def _start_with(self, sent: SentPages, header: pb.RecalibrateFramesHeader) -> pb.Job:
+    def _start_with(self, sent: SentPages, header: pb.RecalibrateFramesHeader, call: Call) -> pb.Job:
         with sent.handed_over() as release:
             pages = self._recalibrator.sent_pages(sent.known(), release)
-            return self._recalibrator.start(pages, header.expected_version, header.correlation_id)
+            return self._recalibrator.start(pages, header.expected_version, header.correlation_id, call.actor)

@@ -30,22 +30,22 @@ class ModelCalls:
 
     def Rollback(self, request: pb.RollbackRequest, call: Call) -> pb.RollbackReply:
         """Go back to the model before."""
-        current, before = self._models.rollback(request.expected_version)
+        current, before = self._models.rollback(request.expected_version, call.actor)
         return pb.RollbackReply(model_version=current.version, previous_version=before.version)
 
     def RollForward(self, request: pb.RollForwardRequest, call: Call) -> pb.RollForwardReply:
         """Go to the later model again."""
-        current, before = self._models.roll_forward(request.expected_version)
+        current, before = self._models.roll_forward(request.expected_version, call.actor)
         return pb.RollForwardReply(model_version=current.version, previous_version=before.version)
 
     def ActivateModel(self, request: pb.ActivateModelRequest, call: Call) -> pb.ActivateModelReply:
         """Put a model in service."""
-        current, before = self._models.activate(request.version, request.expected_version)
+        current, before = self._models.activate(request.version, request.expected_version, call.actor)
         return pb.ActivateModelReply(model_version=current.version, previous_version=before.version)
 
     def PinModel(self, request: pb.PinModelRequest, call: Call) -> pb.PinModelReply:
         """Pin a model, or let go of it."""
-        return pb.PinModelReply(model=model_message(self._models.pin(request.version, request.pinned)))
+        return pb.PinModelReply(model=model_message(self._models.pin(request.version, request.pinned, call.actor)))
 
     async def UploadModel(self, requests: AsyncIterator[pb.UploadModelRequest], call: Call) -> pb.UploadModelReply:
         """Receive a bundle, check it, and keep it."""
@@ -54,6 +54,7 @@ class ModelCalls:
             raise MalformedError("first message of UploadModel", "no header", "a header, then chunks")
         header, limit_s = first.header, self._plane.limits.model_s
         call.correlation_id = header.correlation_id or call.correlation_id
+        call.caller.actor = call.actor
         with self._plane.uploads.held_at_once():
             upload = self._models.upload(header.bytes, header.sha256, call.caller)
             try:

@@ -8,14 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError, LimitError, PageError
-from runtime.acquisition.page_store import UPLOADED_BYTES
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 
 async def uploaded_pages(
-    messages: AsyncIterator[pb.UploadPagesRequest], page_shape: tuple[int, int]
+    messages: AsyncIterator[pb.UploadPagesRequest], page_shape: tuple[int, int], most_bytes: int
 ) -> tuple[int, NDArray[np.uint8]]:
     """Level count M and pages [page, ny, nx].
+
+    Args:
+        messages: that the caller sends.
+        page_shape: symbols as (rows, columns).
+        most_bytes: of all pages together.
 
     Raises:
         InvalidInputError: messages in the wrong order.
@@ -34,8 +38,8 @@ async def uploaded_pages(
         if not content.size or content.size % size:
             raise PageError("uploaded pages", f"{content.size} symbols", f"whole pages of {size}")
         held += content.size
-        if held > UPLOADED_BYTES:
-            raise LimitError("uploaded pages", f"at least {held} bytes", f"at most {UPLOADED_BYTES}")
+        if held > most_bytes:
+            raise LimitError("uploaded pages", f"at least {held} bytes", f"at most {most_bytes}")
         parts.append(content.reshape(-1, *page_shape))
     if not parts:
         raise PageError("uploaded pages", "none", "at least one")

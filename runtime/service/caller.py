@@ -6,8 +6,26 @@ import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 from runtime.errors import CallerLeft
+
+
+@dataclass(frozen=True)
+class Actor:
+    """Who does something to the service, for its records.
+
+    Attributes:
+        name: address of a caller, or what in the service acts by itself.
+        correlation_id: the caller's own text, empty where it gave none.
+    """
+
+    name: str
+    correlation_id: str = ""
+
+
+NOBODY = Actor("the service")
+"""Where nobody is known."""
 
 
 class Caller:
@@ -17,12 +35,18 @@ class Caller:
         seconds_left: how long the caller still waits, infinite without a deadline.
         session: whose pages are followed together, see `Sessions`; empty for the device's own.
         stateless: whether every page is decoded as if it were the first.
+        actor: who it is, for records.
     """
 
     def __init__(
-        self, seconds_left: Callable[[], float] = lambda: math.inf, session: str = "", stateless: bool = False
+        self,
+        seconds_left: Callable[[], float] = lambda: math.inf,
+        session: str = "",
+        stateless: bool = False,
+        actor: Actor = NOBODY,
     ) -> None:
         self.seconds_left, self.session, self.stateless = seconds_left, session, stateless
+        self.actor = actor
         self._lock = threading.Lock()
         self._left = False
         self._listeners: list[Callable[[], None]] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -20,7 +21,8 @@ from runtime.acquisition.source import FrameSource, Shot, own_fault
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
 from runtime.errors import LostPageError, NoSourceError, SourceError
-from runtime.service.caller import Caller
+from runtime.service.audit import AuditLog
+from runtime.service.caller import NOBODY, Actor, Caller
 from runtime.service.display import Display
 from runtime.service.heart import Heart
 from runtime.service.limits import Limits
@@ -75,6 +77,7 @@ class DataPlane:
         metrics: what is counted.
         observers: are told of every page.
         monitor: says by all pages whether a recalibration is due; it is told of every page first.
+        audit: where changes of models are written down, None for the log alone.
 
     Raises:
         InvalidInputError: the source is not for this device.
@@ -89,11 +92,14 @@ class DataPlane:
         metrics: ServiceMetrics | None = None,
         observers: Sequence[Observer] = (),
         monitor: Monitor | None = None,
+        audit: AuditLog | None = None,
     ) -> None:
         self.registry, self.store = registry, store
         self.limits = limits or Limits()
         self.metrics = metrics or ServiceMetrics()
-        self.monitor = monitor
+        self.monitor, self.audit = monitor, audit or AuditLog()
+        self._changing = threading.Lock()
+        """Held from before a change of models until it is written down, so that the record has them in their order."""
         self.observers = tuple(observers) if monitor is None else (monitor, *observers)
         self._source = source
         if source is not None:
@@ -105,12 +111,14 @@ class DataPlane:
         self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s)
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s)
         self.uploads = Slots(1, "uploads of models", self.limits.deadline_s)
-        self.models = Models(registry, store, self.limits.model_bytes, self._in_service)
+        self.models = Models(registry, store, self.limits.model_bytes, self._in_service, self.audit)
         self._in_service(registry.current)
         if store is not None:
             self.metrics.watch_store(self.models.trouble)
         if source is not None:
             self.metrics.watch(source)
+            if source.pages is not None:
+                source.pages.most_bytes = self.limits.uploaded_bytes
 
     @property
     def source(self) -> FrameSource:
@@ -310,13 +318,13 @@ class DataPlane:
         self.metrics.user_data(found)
         return found
 
-    def adopt(self, decoder: Decoder, expected: Model | None = None) -> Model:
+    def adopt(self, decoder: Decoder, expected: Model | None = None, *, actor: Actor = NOBODY) -> Model:
         """Put a recalibrated decoder in service; see `Models.adopt`."""
-        return self.models.adopt(decoder, expected)
+        return self.models.adopt(decoder, expected, actor)
 
-    def rollback(self, expected_version: str = "") -> tuple[Model, Model]:
+    def rollback(self, expected_version: str = "", *, actor: Actor = NOBODY) -> tuple[Model, Model]:
         """Go back to the model before; see `Models.rollback`."""
-        return self.models.rollback(expected_version)
+        return self.models.rollback(expected_version, actor)
 
     def store_trouble(self) -> str:
         """What is wrong with the store, empty where nothing is, or where there is none; see `Models.trouble`."""

@@ -11,7 +11,7 @@ from typing import Self
 
 from lightpage.errors import BusyError, LightpageError
 from runtime.errors import CallerLeft, StoreError
-from runtime.service.caller import Caller
+from runtime.service.caller import Actor, Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import GRACE_S
 from runtime.wire.sizes import CHUNK_BYTES
@@ -42,7 +42,7 @@ class Incoming:
         self._seen: dict[Path, _Stamp] = {}
         self._refused: dict[Path, _Stamp] = {}
         self._put_off: dict[Path, _Stamp] = {}
-        self._caller, self._stopping = Caller(), threading.Event()
+        self._caller, self._stopping = Caller(actor=Actor("incoming folder")), threading.Event()
         self._thread = threading.Thread(target=self._run, name="lightpage-incoming", daemon=True)
 
     def __enter__(self) -> Self:

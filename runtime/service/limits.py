@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
 
+from pydantic import ConfigDict, Field
+
+from lightpage.device.profile import TomlTable
+from runtime.acquisition.page_store import UPLOADED_BYTES
 from runtime.wire.sizes import CHUNK_BYTES, MESSAGE_BYTES, REPLY_BYTES
 
 PAIR_BYTES = 256 << 20
@@ -69,30 +73,42 @@ GRACE_S = 10.0
 """Time that calls in flight get when the service is told to stop."""
 
 
-@dataclass(frozen=True)
-class Limits:
-    """The limits that one service runs under."""
+_Bytes = Annotated[int, Field(ge=1, le=(1 << 31) - 1)]
+"""Of a message: gRPC counts them in 32 bits."""
+_MemoryBytes = Annotated[int, Field(ge=1, le=1 << 40)]
+_Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
+_Count = Annotated[int, Field(ge=1, le=4096)]
 
-    message_bytes: int = MESSAGE_BYTES
-    chunk_bytes: int = CHUNK_BYTES
-    pair_bytes: int = PAIR_BYTES
-    reply_bytes: int = REPLY_BYTES
-    receive_bytes: int = RECEIVE_BYTES
-    concurrent_decodes: int = CONCURRENT_DECODES
-    concurrent_calls: int = CONCURRENT_CALLS
-    receive_s: float = RECEIVE_S
-    stall_s: float = STALL_S
-    replay_s: float = REPLAY_S
-    replay_bytes: int = REPLAY_BYTES
-    model_bytes: int = MODEL_BYTES
-    model_s: float = MODEL_S
-    jobs_kept: int = JOBS_KEPT
-    decode_s: float = DECODE_S
-    deadline_s: float = DEADLINE_S
-    recalibration_pages: int = RECALIBRATION_PAGES
-    recalibration_s: float = RECALIBRATION_S
-    concurrent_ranges: int = CONCURRENT_RANGES
-    range_pages: int = RANGE_PAGES
-    range_s: float = RANGE_S
-    concurrent_watches: int = CONCURRENT_WATCHES
-    grace_s: float = GRACE_S
+
+class Limits(TomlTable):
+    """The limits that one service runs under: the table [limits] of its settings.
+
+    Each default has its reason above, where it is named.
+    """
+
+    model_config = ConfigDict(strict=True)
+
+    message_bytes: _Bytes = MESSAGE_BYTES
+    chunk_bytes: _Bytes = CHUNK_BYTES
+    pair_bytes: _MemoryBytes = PAIR_BYTES
+    reply_bytes: _Bytes = REPLY_BYTES
+    receive_bytes: _MemoryBytes = RECEIVE_BYTES
+    concurrent_decodes: Annotated[int, Field(ge=1, le=256)] = CONCURRENT_DECODES
+    concurrent_calls: _Count = CONCURRENT_CALLS
+    receive_s: _Seconds = RECEIVE_S
+    stall_s: _Seconds = STALL_S
+    replay_s: _Seconds = REPLAY_S
+    replay_bytes: _MemoryBytes = REPLAY_BYTES
+    model_bytes: _MemoryBytes = MODEL_BYTES
+    model_s: _Seconds = MODEL_S
+    jobs_kept: Annotated[int, Field(ge=1, le=1_000_000)] = JOBS_KEPT
+    decode_s: _Seconds = DECODE_S
+    deadline_s: _Seconds = DEADLINE_S
+    recalibration_pages: _Count = RECALIBRATION_PAGES
+    recalibration_s: _Seconds = RECALIBRATION_S
+    uploaded_bytes: _MemoryBytes = UPLOADED_BYTES
+    concurrent_ranges: _Count = CONCURRENT_RANGES
+    range_pages: Annotated[int, Field(ge=1, le=1 << 32)] = RANGE_PAGES
+    range_s: _Seconds = RANGE_S
+    concurrent_watches: _Count = CONCURRENT_WATCHES
+    grace_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = GRACE_S

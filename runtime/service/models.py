@@ -19,7 +19,8 @@ from runtime.bundle.bundle import read_manifest
 from runtime.bundle.manifest import Manifest, check_version
 from runtime.decoding.decoder import Decoder
 from runtime.errors import CallerLeft, ModelExistsError, StoreError
-from runtime.service.caller import Caller
+from runtime.service.audit import AuditLog
+from runtime.service.caller import NOBODY, Actor, Caller
 from runtime.service.registry import History, Model, ModelRegistry, Place
 from runtime.service.store import UPLOAD, ModelStore, Note, Origin, Reason, Trouble
 
@@ -53,11 +54,18 @@ class Models:
         store: where they are kept, or None.
         most_bytes: size of an uploaded bundle at most.
         in_service: is told which model is about to be in service.
+        audit: is told of every change, and of those that failed.
     """
 
     def __init__(
-        self, registry: ModelRegistry, store: ModelStore | None, most_bytes: int, in_service: Callable[[Model], None]
+        self,
+        registry: ModelRegistry,
+        store: ModelStore | None,
+        most_bytes: int,
+        in_service: Callable[[Model], None],
+        audit: AuditLog | None = None,
     ) -> None:
+        self._audit, self._changing = audit or AuditLog(), threading.RLock()
         self.registry, self.store = registry, store
         self._most_bytes, self._in_service = most_bytes, in_service
         self._own_note = Note()
@@ -66,7 +74,7 @@ class Models:
         self._uploading = threading.Lock()
         """Held while a version is looked for and taken."""
 
-    def adopt(self, decoder: Decoder, expected: Model | None = None) -> Model:
+    def adopt(self, decoder: Decoder, expected: Model | None = None, actor: Actor = NOBODY) -> Model:
         """Remember a recalibrated decoder and put it in service: both or neither.
 
         Raises:
@@ -79,48 +87,80 @@ class Models:
                 self._remember(**self._history(history), origins=self._origins(model.version, Origin.RECALIBRATED))
             self._begin(model)
 
-        return self.registry.swap(decoder, expected, note)
+        with self._audited("recalibrate", actor, decoder.version):
+            return self.registry.swap(decoder, expected, note)
 
-    def rollback(self, expected: str = "") -> tuple[Model, Model]:
+    def rollback(self, expected: str = "", actor: Actor = NOBODY) -> tuple[Model, Model]:
         """Remember the model before and go back to it; returns (now current, before).
 
         Args:
             expected: version that must be in service; empty for any.
+            actor: who does it, for the record.
 
         Raises:
             BundleError: there is none, it is damaged, or it cannot be remembered; then nothing changes.
             OtherModelError: another version is in service.
         """
-        return self.registry.rollback(expected, self._note)
+        with self._audited("rollback", actor):
+            return self.registry.rollback(expected, self._note)
 
-    def roll_forward(self, expected: str = "") -> tuple[Model, Model]:
+    def roll_forward(self, expected: str = "", actor: Actor = NOBODY) -> tuple[Model, Model]:
         """The opposite of `rollback`; raises as that does."""
-        return self.registry.step(1, expected, self._note)
+        with self._audited("roll forward", actor):
+            return self.registry.step(1, expected, self._note)
 
-    def activate(self, version: str, expected: str = "") -> tuple[Model, Model]:
+    def activate(self, version: str, expected: str = "", actor: Actor = NOBODY) -> tuple[Model, Model]:
         """Remember a model and put it in service; returns (now current, before).
 
         Args:
             version: of it.
             expected: version that must be in service; empty for any.
+            actor: who does it, for the record.
 
         Raises:
             BundleError: there is none, it is damaged or foreign, or it cannot be remembered; then nothing changes.
             OtherModelError: another version is in service.
         """
-        return self.registry.go_to(self._place(version), expected, self._note)
+        with self._audited("activate", actor, version):
+            return self.registry.go_to(self._place(version), expected, self._note)
 
-    def pin(self, version: str, pinned: bool) -> ModelEntry:
+    def pin(self, version: str, pinned: bool, actor: Actor = NOBODY) -> ModelEntry:
         """Pin a model, or let go of it.
 
         Raises:
             BundleError: there is none, or it cannot be remembered.
         """
         manifest = self._manifest(self._place(version))
-        with self._noting:
+        with self._audited("pin" if pinned else "unpin", actor, version), self._noting:
             held = self._noted.pinned
             self._remember(pinned=held | {version} if pinned else held - {version})
         return self._entry(manifest)
+
+    @contextmanager
+    def _audited(self, what: str, actor: Actor, version: str = "") -> Iterator[None]:
+        """Write down a change of the model in service, or of `version`, or that it failed."""
+        with self._changing:
+            before = self.registry.current.version
+            try:
+                yield
+            except Exception as error:
+                told = str(error) or repr(error)
+                self._audit.record(what, before, version, actor=actor, outcome="failed", detail=told)
+                raise
+            self._audit.record(what, before, version or self.registry.current.version, actor=actor)
+
+    @contextmanager
+    def audited_upload(self, actor: Actor) -> Iterator[list[ModelEntry]]:
+        """Write down what was taken in, which is to be put into the list, or that it failed."""
+        taken, current = list[ModelEntry](), self.registry.current.version
+        try:
+            yield taken
+        except Exception as error:
+            told = str(error) or repr(error)
+            self._audit.record("upload", current, "", actor=actor, outcome="failed", detail=told)
+            raise
+        for entry in taken:
+            self._audit.record("upload", current, entry.manifest.version, actor=actor)
 
     @property
     def current_pinned(self) -> bool:
@@ -430,7 +470,9 @@ class Upload:
                 raise BundleError("uploaded model: SHA-256", found, f"{self._digest.hex()}, as announced")
             self._file.flush()
             os.fsync(self._file.fileno())
-            return self._models.take_in(self._path, self._check_here)
+            with self._models.audited_upload(self._caller.actor) as taken:
+                taken.append(entry := self._models.take_in(self._path, self._check_here))
+            return entry
 
     def drop(self) -> None:
         """Remove what has come, at once or when the piece at work is done; the bundle stays if it was taken in."""

@@ -33,7 +33,7 @@ from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
 from runtime.recalibration.recalibration import next_version, recalibrate
 from runtime.recalibration.separate_process import recalibrate_apart
-from runtime.service.caller import Caller
+from runtime.service.caller import NOBODY, Actor, Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.jobs import Jobs, RunningJob
 from runtime.service.limits import GRACE_S
@@ -172,13 +172,17 @@ class Recalibrator:
             JobCancelledError: somebody has cancelled the job.
         """
         steps: queue.SimpleQueue[Step | RecalibrationOutcome | BaseException] = queue.SimpleQueue()
-        running = self._begin(pages, Caller(caller.seconds_left), steps.put, expected_version, correlation_id)
+        running = self._begin(
+            pages, Caller(caller.seconds_left, actor=caller.actor), steps.put, expected_version, correlation_id
+        )
         try:
             yield from _follow(steps, caller)
         finally:
             running.caller.leave()
 
-    def start(self, pages: PagesToUse, expected_version: str = "", correlation_id: str = "") -> pb.Job:
+    def start(
+        self, pages: PagesToUse, expected_version: str = "", correlation_id: str = "", actor: Actor = NOBODY
+    ) -> pb.Job:
         """Start a job that goes on by itself; returns it as it begins.
 
         Raises:
@@ -186,7 +190,9 @@ class Recalibrator:
             OtherModelError: another model is in service than `expected_version`; empty stands for any.
             StoppingError: the service is being stopped.
         """
-        return self.jobs.job(self._begin(pages, Caller(), lambda _: None, expected_version, correlation_id).id)
+        return self.jobs.job(
+            self._begin(pages, Caller(actor=actor), lambda _: None, expected_version, correlation_id).id
+        )
 
     def check_start(self, expected_version: str = "") -> None:
         """See whether a job may begin now; raises as `start` would."""
@@ -247,12 +253,13 @@ class Recalibrator:
             self.jobs.tell(name, fraction)
             tell(Step(name, fraction))
 
+        actor = running.caller.actor
         end: RecalibrationOutcome | BaseException
         try:
             heard = partial(progress, "read the pages", 0.0)
             heard()
             self._plane.models.check_store()
-            end = self._work(pages, pages.read(heard, running.caller), progress, check, expected_version)
+            end = self._work(pages, pages.read(heard, running.caller), progress, check, expected_version, actor)
         except CallerLeft as left:  # whoever waits for a slot knows no more than that
             end = _cause(check, left)
         except BaseException as error:
@@ -271,6 +278,7 @@ class Recalibrator:
         progress: Progress,
         check: Callable[[], None],
         expected_version: str,
+        actor: Actor,
     ) -> RecalibrationOutcome:
         plane = self._plane
         model = plane.registry.current
@@ -290,7 +298,8 @@ class Recalibrator:
         try:
             progress("put the new model in service", 1.0)
             self.jobs.foretell(outcome)
-            plane.adopt(Decoder(Bundle.open(path), model.decoder.threads), expected=model)
+            decoder = Decoder(Bundle.open(path), model.decoder.threads)
+            plane.adopt(decoder, expected=model, actor=actor)
         except BaseException:
             path.unlink(missing_ok=True)
             raise
@@ -314,6 +323,7 @@ class Recalibrator:
             dropped = isinstance(result, CallerLeft | JobCancelledError | StoppingError)
             name = "dropped" if dropped else "failed"
         self._plane.metrics.recalibrations.labels(name).inc()
+        _log.info("recalibration %s", name)
 
     def check_count(self, count: int) -> None:
         """Check a number of pages.

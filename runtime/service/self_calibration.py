@@ -14,9 +14,8 @@ from lightpage.errors import BusyError, InvalidInputError, LightpageError, Limit
 from runtime.errors import CallerLeft, StoppingError
 from runtime.recalibration.known_pages import MIN_PAGES
 from runtime.recalibration.outcome import RecalibrationOutcome
-from runtime.service.caller import Caller
+from runtime.service.caller import Actor, Caller
 from runtime.service.dataplane import DataPlane
-from runtime.service.limits import GRACE_S
 from runtime.service.monitor import Monitor
 from runtime.service.recalibrator import Recalibrator
 
@@ -80,7 +79,7 @@ class SelfCalibration:
         self._interval_s, self._not_before = self._settings.least_s, -float("inf")
         self._wake, self._stopping = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="lightpage-self-calibration", daemon=True)
-        self._caller = Caller()
+        self._caller = Caller(actor=Actor("self-calibration"))
         self._pinned = False
         """Whether it was said that the model in service is pinned."""
         monitor.listen(self._wake.set)
@@ -90,8 +89,9 @@ class SelfCalibration:
         self._thread.start()
         return self
 
-    def stop(self, wait_s: float = GRACE_S) -> None:
-        """Drop a recalibration that runs, and end the thread, which is waited for at most `wait_s`."""
+    def stop(self, wait_s: float | None = None) -> None:
+        """Drop a recalibration that runs, and end the thread, which is waited for at most `wait_s`, as calls are."""
+        wait_s = self._plane.limits.grace_s if wait_s is None else wait_s
         self._stopping.set()
         self._caller.leave()
         self._wake.set()

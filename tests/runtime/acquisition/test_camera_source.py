@@ -12,7 +12,6 @@ import pytest
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError, LimitError, PageError
 from lightpage.recording.pages import Pages, PagesWriter
-from runtime.acquisition import page_store
 from runtime.acquisition.camera_source import CameraSource, Exposures, View
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.pairing import PairingSettings
@@ -201,7 +200,7 @@ def test_mirrored_cameras_are_set_upright(tmp_path: Path) -> None:
         assert (shot.pair.quadrature == modulator.pair.quadrature[::-1]).all()
 
 
-def test_uploaded_pages_follow_those_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uploaded_pages_follow_those_of_the_file(tmp_path: Path) -> None:
     store = PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path, 2)))
     more = np.stack([toy.symbols_of(16, number)[0] for number in (7, 8)])
     assert store.append(more, 16) == 2
@@ -213,7 +212,7 @@ def test_uploaded_pages_follow_those_of_the_file(tmp_path: Path, monkeypatch: py
         store.append(more, 4)
     with pytest.raises(PageError):
         store.append(more[:, :-1], 16)
-    monkeypatch.setattr(page_store, "UPLOADED_BYTES", more.nbytes)
+    store.most_bytes = more.nbytes
     with pytest.raises(LimitError, match="uploaded pages"):
         store.append(more, 16)
     store.close()

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from lightpage.errors import InvalidInputError, LimitError, PageError
-from runtime.acquisition import page_store
 from runtime.acquisition.camera_source import CameraSource, Exposures
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import FrameSource
@@ -139,7 +138,7 @@ def test_a_controller_that_says_nothing_costs_its_page(serve: type[Serve]) -> No
         assert raised.value.reason is Reason.NOT_ON_DISPLAY
 
 
-def test_what_cannot_be_uploaded_is_named(serve: type[Serve], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_uploaded_is_named(serve: type[Serve]) -> None:
     source, _ = external(Lab())
     client = serve(source).client  # type: ignore[call-arg,arg-type]
     client.upload_pages(PAGES, 16)
@@ -151,7 +150,7 @@ def test_what_cannot_be_uploaded_is_named(serve: type[Serve], monkeypatch: pytes
         client.upload_pages(np.full_like(PAGES, 200), 16)
     with pytest.raises(PageError, match="none"):
         client.upload_pages(PAGES[:0], 16)
-    monkeypatch.setattr(page_store, "UPLOADED_BYTES", 2 * PAGES.nbytes - 1)
+    source.pages.most_bytes = 2 * PAGES.nbytes - 1
     with pytest.raises(LimitError):
         client.upload_pages(PAGES, 16)
     assert len(source.pages) == 2

@@ -1,0 +1,296 @@
+"""What the service logs to stderr: lines for people or of JSON, of one kind only so many a second."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Literal, Protocol, TextIO
+
+import grpc
+
+from runtime.errors import CallerLeft
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.service.observation import Observation
+from runtime.wire.status import reason_of, told
+
+FIELDS = ("method", "peer", "correlation_id", "code", "reason", "seconds")
+"""What may be said of a call beside the message, in this order."""
+
+_MOST_TEXT = 300
+"""Characters of a field: a caller chooses its correlation id."""
+_WINDOW_S = 1.0
+_MOST_KINDS = 1000
+"""Kinds of lines that are counted apart; beyond them those of earlier seconds are forgotten."""
+_FAULTS_OF_THE_SERVICE = frozenset(
+    [
+        grpc.StatusCode.FAILED_PRECONDITION,
+        grpc.StatusCode.RESOURCE_EXHAUSTED,
+        grpc.StatusCode.UNAVAILABLE,
+    ]
+)
+"""Ends of calls that the operator of the service may want to do something about. Of lost pages `PageLog` tells."""
+
+_log = logging.getLogger(__name__)
+
+
+class EndedCall(Protocol):
+    """What is logged of a call, see `runtime.rpc.call.Call`."""
+
+    method: str
+    peer: str
+    correlation_id: str
+    begun: float
+
+    @property
+    def is_watch(self) -> bool:
+        """Whether it lasts as long as its caller likes."""
+
+
+class CallLog:
+    """Logs how calls end, see `runtime.rpc.call.CallLog`.
+
+    Calls that end well, and watches that somebody ends, are told of at DEBUG. A traceback comes with errors that nobody
+    foresaw, and with no other.
+
+    Args:
+        clock: seconds, that of `Call.begun`.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
+
+    def ended(self, call: EndedCall, code: grpc.StatusCode, error: BaseException | None) -> None:
+        """A call has ended, well where `error` is None."""
+        unforeseen = error if code is grpc.StatusCode.INTERNAL else None
+        fields: dict[str, Any] = {
+            "method": call.method,
+            "peer": call.peer,
+            "correlation_id": call.correlation_id,
+            "code": code.name,
+            "reason": _reason(error),
+            "seconds": round(self._clock() - call.begun, 4),
+        }
+        text = "done" if error is None else told(error) if isinstance(error, Exception) else "the caller has gone"
+        _log.log(_level(call, code, error), "%s: %s", call.method, text, extra={"told": fields}, exc_info=unforeseen)
+
+
+def _level(call: EndedCall, code: grpc.StatusCode, error: BaseException | None) -> int:
+    if code is grpc.StatusCode.INTERNAL:
+        return logging.ERROR
+    if error is None or (call.is_watch and code is grpc.StatusCode.CANCELLED):
+        return logging.DEBUG
+    return logging.WARNING if code in _FAULTS_OF_THE_SERVICE else logging.INFO
+
+
+def _reason(error: BaseException | None) -> str:
+    """The name of the reason that the caller hears; empty where there is none to tell."""
+    if error is None or isinstance(error, CallerLeft) or not isinstance(error, Exception):
+        return ""
+    return pb.ErrorReason.Name(reason_of(error)).removeprefix("ERROR_REASON_")
+
+
+class PageLog:
+    """Logs lost pages, an `Observer`: those of calls that go on too, which read many."""
+
+    def observe(self, observation: Observation) -> None:
+        """See `Observer`."""
+        if observation.lost is not None:
+            fields = {"method": "page", "reason": observation.lost.value, "seconds": round(observation.seconds, 4)}
+            subject, detail = observation.subject, observation.detail
+            text = detail if detail.startswith(subject) else f"{subject}: {detail}"
+            _log.warning("lost with model %s: %s", observation.model_version, text, extra={"told": fields})
+
+
+class TextFormatter(logging.Formatter):
+    """A line for people: time, level, logger, message, and what else is said as KEY=VALUE."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as text; only a traceback has more than one line."""
+        pairs = "".join(f" {key}={_word(value)}" for key, value in _fields(record).items())
+        line = f"{_time(record)} {record.levelname} {record.name}: {_one_line(record.getMessage())}{pairs}"
+        return f"{line}\n{self.formatException(record.exc_info)}" if _has_traceback(record) else line  # type: ignore[arg-type]
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line, with the same in it, and a traceback as `traceback`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as JSON."""
+        entry = {
+            "time": _time(record),
+            "level": record.levelname,
+            "logger": record.name,
+            "message": record.getMessage(),
+            **_fields(record),
+        }
+        if _has_traceback(record):
+            entry["traceback"] = self.formatException(record.exc_info)  # type: ignore[arg-type]
+        return json.dumps(entry, default=str)
+
+
+def _time(record: logging.LogRecord) -> str:
+    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+
+
+def _has_traceback(record: logging.LogRecord) -> bool:
+    return record.exc_info is not None and record.exc_info[0] is not None
+
+
+def _fields(record: logging.LogRecord) -> dict[str, Any]:
+    """What is said beside the message, without what is empty."""
+    said = getattr(record, "told", {})
+    known = [*(key for key in FIELDS if key in said), *(key for key in said if key not in FIELDS)]
+    cut = {key: said[key][:_MOST_TEXT] if isinstance(said[key], str) else said[key] for key in known}
+    return {key: value for key, value in cut.items() if value != ""}
+
+
+def _one_line(text: str) -> str:
+    """Text of a caller must not look like a line of its own."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def _word(value: Any) -> str:
+    text = str(value)
+    return text if text.isprintable() and not set(text) & set(' "=') else json.dumps(text)
+
+
+@dataclass
+class _Second:
+    """Lines of one kind in one second."""
+
+    begun: float
+    level: int
+    logger: str
+    lines: int = 0
+    left_out: int = 0
+
+
+class LimitedHandler(logging.StreamHandler[TextIO]):
+    """Writes at most so many lines of one kind a second, and then one that says how many were left out.
+
+    Of one kind are lines of one method and reason, and other lines that differ in their values only.
+
+    Args:
+        stream: where they go.
+        lines_per_second: of one kind.
+        clock: seconds that never go back.
+    """
+
+    def __init__(
+        self, stream: TextIO | None, lines_per_second: int, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        super().__init__(stream)
+        self._most, self._clock = lines_per_second, clock
+        self._seconds: dict[tuple[str, ...], _Second] = {}
+        self._timer: threading.Timer | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record, or count it; called with the handler's lock held."""
+        kind, now = _kind(record), self._clock()
+        second = self._seconds.get(kind)
+        if second is None or now - second.begun >= _WINDOW_S:
+            self._tell(kind, now)
+            self._forget(now)
+            second = self._seconds[kind] = _Second(now, record.levelno, record.name)
+        second.lines += 1
+        if second.lines <= self._most:
+            super().emit(record)
+            return
+        second.left_out += 1
+        self._wake_later()
+
+    def tell_left_out(self, at_once: bool = False) -> None:
+        """Say what was left out in seconds that are over; `at_once`, in those that are not over too."""
+        self.acquire()
+        try:
+            now, self._timer = self._clock(), None
+            over = [kind for kind, each in self._seconds.items() if at_once or now - each.begun >= _WINDOW_S]
+            for kind in over:
+                self._tell(kind, now)
+                del self._seconds[kind]
+            if any(each.left_out for each in self._seconds.values()):
+                self._wake_later()
+        finally:
+            self.release()
+
+    def _wake_later(self) -> None:
+        """See to it that what was left out is told of, even if nothing else is logged."""
+        if self._timer is None:
+            self._timer = threading.Timer(_WINDOW_S, self.tell_left_out)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def close(self) -> None:
+        """Say what was left out, and end."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self.tell_left_out(at_once=True)
+        super().close()
+
+    def _tell(self, kind: tuple[str, ...], now: float) -> None:
+        second = self._seconds.get(kind)
+        if second is None or not second.left_out:
+            return
+        text = f"{second.left_out} more of these were left out in {max(now - second.begun, _WINDOW_S):.0f} s"
+        record = logging.LogRecord(second.logger, second.level, __file__, 0, "%s: %s", (" ".join(kind), text), None)
+        record.told = {"left_out": second.left_out}
+        super().emit(record)
+        second.left_out = 0
+
+    def _forget(self, now: float) -> None:
+        if len(self._seconds) < _MOST_KINDS:
+            return
+        old = [kind for kind, each in self._seconds.items() if now - each.begun >= _WINDOW_S]
+        for kind in old:
+            self._tell(kind, now)
+            del self._seconds[kind]
+
+
+def _kind(record: logging.LogRecord) -> tuple[str, ...]:
+    said = getattr(record, "told", {})
+    if "method" in said:
+        return str(said["method"]), str(said.get("reason") or said.get("code") or "")
+    return record.name, str(record.msg)
+
+
+def _thread_broke(found: threading.ExceptHookArgs) -> None:
+    if found.exc_value is not None and not isinstance(found.exc_value, SystemExit):
+        name = "of no name" if found.thread is None else found.thread.name
+        _log.error("thread %s broke", name, exc_info=found.exc_value)
+
+
+@contextmanager
+def logging_to_stderr(
+    form: Literal["text", "json"], level: str, lines_per_second: int, stream: TextIO | None = None
+) -> Iterator[LimitedHandler]:
+    """Have everything that is logged in the `with` statement written, and what ends threads that nobody waits for.
+
+    Args:
+        form: of a line.
+        level: `debug`, `info`, `warning` or `error`; lesser lines are left out.
+        lines_per_second: of one kind.
+        stream: where to, stderr by default.
+    """
+    root = logging.getLogger()
+    handler = LimitedHandler(sys.stderr if stream is None else stream, lines_per_second)
+    handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
+    before, hook = root.level, threading.excepthook
+    root.addHandler(handler)
+    root.setLevel(level.upper())
+    logging.captureWarnings(True)
+    threading.excepthook = _thread_broke
+    try:
+        yield handler
+    finally:
+        threading.excepthook = hook
+        logging.captureWarnings(False)
+        root.setLevel(before)
+        root.removeHandler(handler)
+        handler.close()

@@ -1,0 +1,492 @@
+"""The service's settings: one TOML file, above it the environment, above both the options of the command line."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar, get_args, get_origin
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SecretStr,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from lightpage.device.profile import TomlTable, toml_value
+from lightpage.errors import InvalidInputError
+from runtime.bundle.shipped import DEFAULT
+from runtime.recalibration.known_pages import MIN_PAGES
+from runtime.service.audit import AUDIT_BYTES, AUDIT_KEPT
+from runtime.service.flight_recorder import PAGES, RING_BYTES, FlightSettings
+from runtime.service.limits import Limits
+from runtime.service.self_calibration import SelfCalibrationSettings
+from runtime.wire.address import check_address
+
+PREFIX = "LIGHTPAGE_"
+"""Of variables of the environment: LIGHTPAGE_TABLE__KEY."""
+STORE_VARIABLE = "LIGHTPAGE_STORE"
+"""Short name of LIGHTPAGE_SERVICE__STORE."""
+EXPLAINED = "settings as docs/service-settings.md explains them"
+
+ADDRESS = "127.0.0.1:50051"
+"""Where the service listens: on this machine alone, since whoever reaches it may change its model."""
+AUDIT_FILE = "audit.jsonl"
+"""Name of the record of model changes in the store, where no other file is named."""
+LINES_PER_SECOND = 5
+"""Lines of one kind in a log: enough to see that it goes on, and too few to fill a disk in a night."""
+
+_MASK = "********"
+_HEADER_BYTES = 1 << 10
+"""Of a message beside the chunk in it, at most."""
+
+
+class Secret(SecretStr):
+    """Text that nobody shall read in a log, in an error, or among the printed settings: a key, a password."""
+
+
+def _not_empty(value: Any) -> Any:
+    if value == "":
+        raise PydanticCustomError("wanted", "a path that is not empty")
+    return value
+
+
+_Text = Annotated[str, Field(min_length=1)]
+_Path = Annotated[Path, Field(strict=False), BeforeValidator(_not_empty)]
+_Port = Annotated[int, Field(ge=0, le=65535)]
+_Seconds = Annotated[float, Field(gt=0, le=31e6, allow_inf_nan=False)]
+
+
+class SettingsTable(TomlTable):
+    """One table of the file. Values are of the right type to begin with: no text that stands for a number."""
+
+    model_config = ConfigDict(strict=True)
+
+
+OFF = "off"
+"""In place of an address: nowhere."""
+
+
+class ServiceTable(SettingsTable):
+    """What is served, and where.
+
+    Attributes:
+        bundle: path of a bundle, or the name of a shipped one.
+        source: where pages are read from; without one only sent frames decode.
+        pages: file of pages that the source is to show.
+        address: HOST:PORT to listen on; port 0 takes a free one.
+        health_address: HOST:PORT of health checks; without, the next port; `off` for none.
+        store: folder of recalibrated and uploaded bundles.
+        incoming: folder whose bundles are taken into the store.
+        recordings: folder whose recordings a caller may name to recalibrate with.
+        threads: of one inference; without, all cores.
+        tracking: whether the image is followed and searched for.
+    """
+
+    bundle: _Text = DEFAULT
+    source: _Text | None = None
+    pages: _Path | None = None
+    address: str = ADDRESS
+    health_address: str | None = None
+    store: _Path | None = None
+    incoming: _Path | None = None
+    recordings: _Path | None = None
+    threads: Annotated[int, Field(ge=1, le=4096)] | None = None
+    tracking: bool = True
+
+    @field_validator("address", "health_address")
+    @classmethod
+    def _is_address(cls, address: str | None) -> str | None:
+        if address is None or address == OFF:
+            return address
+        try:
+            check_address("address", address, least_port=0)
+        except InvalidInputError as error:
+            raise PydanticCustomError("wanted", "{wanted}", {"wanted": error.expected}) from None
+        return address
+
+
+class MetricsTable(SettingsTable):
+    """Where metrics and the console are shown; without a port, nowhere."""
+
+    host: _Text = "127.0.0.1"
+    port: _Port | None = None
+
+
+class SelfCalibrationTable(SettingsTable):
+    """See `SelfCalibrationSettings`; `enabled` left out means: where pages are named."""
+
+    enabled: bool | None = None
+    pages: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = SelfCalibrationSettings.pages
+    least_s: _Seconds = SelfCalibrationSettings.least_s
+    longest_s: _Seconds = SelfCalibrationSettings.longest_s
+    busy_s: _Seconds = SelfCalibrationSettings.busy_s
+
+    def settings(self) -> SelfCalibrationSettings:
+        """The same as self-calibration takes them."""
+        return SelfCalibrationSettings(self.pages, self.least_s, self.longest_s, self.busy_s)
+
+
+class FlightRecorderTable(SettingsTable):
+    """See `FlightSettings`; without a folder nothing is kept."""
+
+    folder: _Path | None = None
+    pages: Annotated[int, Field(ge=1, le=1_000_000)] = PAGES
+    ring_bytes: Annotated[int, Field(ge=1)] = RING_BYTES
+    low_margin_bits: Annotated[float, Field(ge=0, le=8, allow_inf_nan=False)] = FlightSettings.low_margin_bits
+    read_every_s: Annotated[float, Field(ge=0, le=31e6, allow_inf_nan=False)] = FlightSettings.read_every_s
+
+    def settings(self) -> FlightSettings:
+        """The same as the flight recorder takes them."""
+        return FlightSettings(self.pages, self.ring_bytes, self.low_margin_bits, self.read_every_s)
+
+
+class LogsTable(SettingsTable):
+    """What goes to stderr.
+
+    Attributes:
+        format: of a line.
+        level: lesser lines are left out.
+        lines_per_second: of one kind, e.g. of one method and reason; the others are counted.
+    """
+
+    format: Literal["text", "json"] = "text"
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    lines_per_second: Annotated[int, Field(ge=1, le=100_000)] = LINES_PER_SECOND
+
+
+class AuditTable(SettingsTable):
+    """The record of model changes.
+
+    Attributes:
+        file: where it is; without, `audit.jsonl` in the store.
+        file_bytes: a larger file is put aside, and a new one begun.
+        kept: files put aside that stay.
+    """
+
+    file: _Path | None = None
+    file_bytes: Annotated[int, Field(ge=1024)] = AUDIT_BYTES
+    kept: Annotated[int, Field(ge=1, le=1000)] = AUDIT_KEPT
+
+
+class ServiceSettings(TomlTable):
+    """The whole file."""
+
+    service: ServiceTable = ServiceTable()
+    metrics: MetricsTable = MetricsTable()
+    self_calibration: SelfCalibrationTable = SelfCalibrationTable()
+    flight_recorder: FlightRecorderTable = FlightRecorderTable()
+    limits: Limits = Limits()
+    logs: LogsTable = LogsTable()
+    audit: AuditTable = AuditTable()
+
+    @property
+    def self_calibrates(self) -> bool:
+        """Whether the service recalibrates itself."""
+        enabled = self.self_calibration.enabled
+        return bool(self.self_calibration.pages) if enabled is None else enabled
+
+    @property
+    def audit_file(self) -> Path | None:
+        """The record of model changes, None for none."""
+        if self.audit.file is not None or self.service.store is None:
+            return self.audit.file
+        return self.service.store / AUDIT_FILE
+
+    @model_validator(mode="after")
+    def _fit_together(self) -> Self:
+        limits, own = self.limits, self.self_calibration
+        _want(
+            limits.chunk_bytes + _HEADER_BYTES <= limits.message_bytes,
+            "limits.chunk_bytes",
+            limits.chunk_bytes,
+            f"at least {_HEADER_BYTES} less than limits.message_bytes, which is {limits.message_bytes}",
+        )
+        _want(
+            limits.receive_bytes >= limits.pair_bytes,
+            "limits.receive_bytes",
+            limits.receive_bytes,
+            f"at least limits.pair_bytes, which is {limits.pair_bytes}: a larger pair would never be taken",
+        )
+        _want(
+            limits.stall_s <= limits.receive_s,
+            "limits.stall_s",
+            limits.stall_s,
+            f"at most limits.receive_s, which is {limits.receive_s:g}",
+        )
+        _want(
+            own.longest_s >= own.least_s,
+            "self_calibration.longest_s",
+            own.longest_s,
+            f"at least self_calibration.least_s, which is {own.least_s:g}",
+        )
+        _want(
+            not own.pages or (len(own.pages) >= MIN_PAGES and len(set(own.pages)) == len(own.pages)),
+            "self_calibration.pages",
+            own.pages,
+            f"at least {MIN_PAGES} that differ: one to fit, one to judge by",
+        )
+        _want(
+            len(own.pages) <= limits.recalibration_pages,
+            "self_calibration.pages",
+            own.pages,
+            f"at most limits.recalibration_pages, which is {limits.recalibration_pages}",
+        )
+        _want(
+            self.service.address != OFF,
+            "service.address",
+            OFF,
+            "an address: only health_address may be off",
+        )
+        _want(
+            self.service.incoming is None or self.service.store is not None,
+            "service.incoming",
+            str(self.service.incoming),
+            "service.store too: a folder where its bundles are kept",
+        )
+        _want(
+            self.service.source is not None or not self.self_calibrates,
+            "self_calibration.pages" if own.enabled is None else "self_calibration.enabled",
+            own.pages if own.enabled is None else own.enabled,
+            "service.source: a source that shows known pages",
+        )
+        _want(
+            self.service.source is not None or self.service.pages is None,
+            "service.pages",
+            self.service.pages,
+            "service.source: a source that shows them",
+        )
+        return self
+
+    def check_paths(self) -> None:
+        """Check what is to be read and need not be opened for it.
+
+        Raises:
+            InvalidInputError: a folder or a file is not there.
+        """
+        pages = self.service.pages
+        for key in ("recordings", "incoming"):
+            folder = getattr(self.service, key)
+            if folder is not None and not folder.is_dir():
+                raise InvalidInputError(f"service.{key}", str(folder), "a folder that is there")
+        if pages is not None and not pages.is_file():
+            raise InvalidInputError("service.pages", str(pages), "a file that is there")
+
+
+def _want(right: bool, key: str, got: Any, wanted: str) -> None:
+    """Have pydantic tell that a key does not go with another one."""
+    if not right:
+        raise PydanticCustomError("together", "{wanted}", {"key": key, "got": got, "wanted": wanted})
+
+
+Key = tuple[str, str]
+"""Table and key."""
+T = TypeVar("T", bound=TomlTable)
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of the command line that somebody gave: its name, the key that it sets, and the value."""
+
+    name: str
+    key: Key
+    value: Any
+
+
+@dataclass(frozen=True)
+class Effective(Generic[T]):
+    """Settings, and where each that is no default comes from."""
+
+    settings: T
+    origins: Mapping[Key, str]
+
+    def to_toml(self) -> str:
+        """All settings as TOML text, each with its origin as a comment; secrets are masked."""
+        lines = ["# The settings in effect, and where each of them comes from."]
+        for name in type(self.settings).model_fields:
+            table = getattr(self.settings, name)
+            lines += ["", f"[{name}]"]
+            for key in type(table).model_fields:
+                value, origin = getattr(table, key), self.origins.get((name, key), "default")
+                told = f"# {key} is not set" if value is None else f"{key} = {_toml(value)}"
+                lines.append(f"{told}  # {_printable(origin)}")
+        return "\n".join(lines) + "\n"
+
+
+def service_settings(
+    file: Path | None = None, environment: Mapping[str, str] | None = None, options: Iterable[Option] = ()
+) -> Effective[ServiceSettings]:
+    """The settings of a service; see `read_settings`.
+
+    Args:
+        file: TOML, None for none.
+        environment: variables, by default those of this process; `STORE_VARIABLE` counts too.
+        options: of the command line.
+
+    Raises:
+        InvalidInputError: the file cannot be read, or a setting is wrong.
+    """
+    environment = os.environ if environment is None else environment
+    return read_settings(ServiceSettings, file, environment, options, {STORE_VARIABLE: ("service", "store")})
+
+
+def read_settings(
+    model: type[T],
+    file: Path | None,
+    environment: Mapping[str, str],
+    options: Iterable[Option] = (),
+    short_names: Mapping[str, Key] | None = None,
+) -> Effective[T]:
+    """Settings of a file, of the environment and of options, checked together; the later of these count.
+
+    An empty variable of the environment counts as one that is not set.
+
+    Args:
+        model: its fields are tables.
+        file: TOML, None for none.
+        environment: variables; those named `PREFIX` + TABLE__KEY count.
+        options: of the command line.
+        short_names: further variables and the keys that they set; the long names count before them.
+
+    Raises:
+        InvalidInputError: the file cannot be read, or a setting is wrong.
+    """
+    data: dict[str, Any] = {} if file is None else _parsed(file)
+    origins: dict[Key, str] = {}
+    for name, table in data.items():
+        if isinstance(table, dict):
+            origins |= {(name, key): f"file {file}" for key in table}
+    named = {name: key for name, key in (short_names or {}).items() if environment.get(name)}
+    named |= {name: key for name in sorted(environment) if (key := _key_of(name)) is not None and environment[name]}
+    given = [Option(name, key, _from_text(model, name, key, environment[name])) for name, key in named.items()]
+    for origin, option in [*(("environment", each) for each in given), *(("option", each) for each in options)]:
+        table_name, key_name = option.key
+        if isinstance(data.setdefault(table_name, {}), dict):
+            data[table_name][key_name] = option.value
+        origins[option.key] = f"{origin} {option.name}"
+    subject = "settings" if file is None else f"settings {file}"
+    try:
+        return Effective(model.model_validate(data), origins)
+    except ValidationError as error:
+        problems = [_problem(model, each, origins) for each in error.errors(include_url=False)]
+    if len(problems) == 1:
+        origin, got, wanted = problems[0]
+        raise InvalidInputError(origin or subject, got, wanted)
+    told = "; ".join(f"{got}{f' ({origin})' * bool(origin)}, wanted {wanted}" for origin, got, wanted in problems)
+    raise InvalidInputError(subject, told, EXPLAINED)
+
+
+def _parsed(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InvalidInputError(f"settings {file}", error, "a TOML file that can be read") from None
+
+
+def _key_of(variable: str) -> Key | None:
+    """The key that a variable of the environment sets; None for a variable of another kind."""
+    table, apart, key = variable.removeprefix(PREFIX).lower().partition("__")
+    return (table, key) if variable.startswith(PREFIX) and apart else None
+
+
+def _field(model: type[BaseModel], key: Key) -> FieldInfo | None:
+    """The field of a key, None where there is no such key."""
+    table = model.model_fields.get(key[0])
+    kind = None if table is None else table.annotation
+    return kind.model_fields.get(key[1]) if isinstance(kind, type) and issubclass(kind, BaseModel) else None
+
+
+def _from_text(model: type[BaseModel], variable: str, key: Key, text: str) -> Any:
+    """A value of the environment in the type of its key, not yet checked for its bounds."""
+    if (field := _field(model, key)) is None:
+        raise InvalidInputError(variable, f"no setting {'.'.join(key)}", _meant(model, key))
+    kind: Any = field.annotation
+    try:
+        if get_origin(kind) is not tuple:
+            return TypeAdapter(kind).validate_strings(text)
+        one: TypeAdapter[Any] = TypeAdapter(get_args(kind)[0])
+        parts = text.strip("[] ").split(",")
+        return tuple(one.validate_strings(part.strip()) for part in parts if part.strip())
+    except ValidationError as error:
+        shown = _MASK if _is_secret(kind) else repr(text)
+        raise InvalidInputError(variable, shown, _wanted(error.errors(include_url=False)[0])) from None
+
+
+def _meant(model: type[BaseModel], key: Key) -> str:
+    """What may have been meant by a key that is not there."""
+    tables = {name: set(_keys(model, name)) for name in model.model_fields}
+    table, name = key
+    if table not in tables:
+        found = difflib.get_close_matches(table, tables, 1)
+        return f"table [{found[0]}]" if found else f"one of the tables {', '.join(tables)}"
+    if found := difflib.get_close_matches(name, tables[table], 1):
+        return f"{table}.{found[0]}"
+    elsewhere = [other for other, keys in tables.items() if name in keys]
+    return f"{elsewhere[0]}.{name}" if elsewhere else f"one of {', '.join(sorted(tables[table]))}"
+
+
+def _keys(model: type[BaseModel], table: str) -> Iterable[str]:
+    kind = model.model_fields[table].annotation
+    return kind.model_fields if isinstance(kind, type) and issubclass(kind, BaseModel) else ()
+
+
+def _problem(model: type[BaseModel], error: ErrorDetails, origins: Mapping[Key, str]) -> tuple[str, str, str]:
+    """Where one wrong setting comes from, what came, and what was wanted; a secret is not shown."""
+    if error["type"] == "together":
+        told = error["ctx"]
+        table, _, name = told["key"].partition(".")
+        return origins.get((table, name), ""), f"{told['key']} = {_shown(told['got'])}", told["wanted"]
+    names = [str(part) for part in error["loc"]]
+    table, name = (names[0], names[1] if len(names) > 1 else "") if names else ("", "")
+    origin, field = origins.get((table, name), ""), _field(model, (table, name))
+    if error["type"] == "extra_forbidden":
+        return origin, f"unknown {'.'.join(names)}", _meant(model, (table, name))
+    if error["type"] == "missing":
+        return origin, f"no {'.'.join(names)}", "a value"
+    if len(names) < 2:
+        return origin, f"{table or 'document'} = {type(error['input']).__name__}", "a table of settings"
+    if field is not None and _is_secret(field.annotation):
+        return origin, f"{table}.{name} = {_MASK}", _wanted(error)
+    indexed = "".join(f"[{part}]" if part.isdigit() else "" for part in names[2:])
+    return origin, f"{table}.{name}{indexed} = {_shown(error['input'])}", _wanted(error)
+
+
+def _wanted(error: ErrorDetails) -> str:
+    return re.sub(r"^(Input should be|\w+ should have) ", "", error["msg"])
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, tuple):
+        return str(list(value))
+    return repr(str(value) if isinstance(value, Path) else value)
+
+
+def _is_secret(annotation: Any) -> bool:
+    if isinstance(annotation, type) and issubclass(annotation, SecretStr):
+        return True
+    return any(_is_secret(part) for part in get_args(annotation))
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, SecretStr):
+        return toml_value(_MASK)
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return toml_value(str(value) if isinstance(value, Path) else value)
+
+
+def _printable(text: str) -> str:
+    """Text for a comment: of one line, whatever a file is called."""
+    return text if text.isprintable() else ascii(text)
