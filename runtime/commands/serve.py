@@ -95,7 +95,7 @@ _KEYS = {
 @click.option(
     "--store",
     type=click.Path(file_okay=False, path_type=Path),
-    help=f"Folder of recalibrated and uploaded bundles; the one in service is used after a restart. {STORE_VARIABLE} too.",
+    help=f"Folder of recalibrated and uploaded bundles; it remembers which one serves. {STORE_VARIABLE} too.",
 )
 @click.option(
     "--incoming",

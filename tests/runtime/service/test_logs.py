@@ -293,11 +293,11 @@ def test_a_change_comes_about_though_it_cannot_be_written_down(toy_zip: Path, tm
     plane = DataPlane(registry, audit=AuditLog(tmp_path / "file" / "audit.jsonl"))
     other = toy.write_toy_bundle(tmp_path / "other.zip", version="toy-2")
     with json_lines() as lines:
-        plane.adopt(Decoder(Bundle.open(other), 1), what="activate")
+        plane.adopt(Decoder(Bundle.open(other), 1))
     assert registry.current.version == "toy-2"
     assert any("not written down" in line["message"] for line in lines)
     with pytest.raises(BundleError):
-        plane.adopt(Decoder(Bundle.open(other), 1), what="activate")
+        plane.adopt(Decoder(Bundle.open(other), 1))
 
 
 def test_changes_at_once_are_written_down_whole(tmp_path: Path) -> None:
