@@ -29,6 +29,9 @@ _log = logging.getLogger(__name__)
 
 WORKER = ("-m", "runtime.recalibration.worker")
 
+SCRATCH = ".recalibration-"
+"""How the name of a folder begins in which a recalibration keeps its files."""
+
 THREADS = 1
 """Of the worker's inferences and matrices: the other cores are left to reads."""
 
@@ -53,6 +56,7 @@ def recalibrate_apart(
     progress: Progress,
     check: Callable[[], None],
     limit_s: float,
+    scratch: Path | None = None,
     worker: Sequence[str] = WORKER,
 ) -> RecalibrationOutcome:
     """Recalibrate in a process of its own; see `runtime.recalibration.recalibration.recalibrate`.
@@ -68,6 +72,8 @@ def recalibrate_apart(
         progress: told of every step.
         check: called several times a second; what it raises ends the work.
         limit_s: longest time that it may take, seconds.
+        scratch: folder for the work's own files, in a hidden folder of it whose name begins with `SCRATCH`; the
+            machine's temporary folder if None.
         worker: arguments of the interpreter that start the worker, before its folder.
 
     Raises:
@@ -77,7 +83,7 @@ def recalibrate_apart(
     out = out.absolute()
     if out.exists() or out.is_symlink():
         raise BundleError(f"bundle {out}", "something that exists", "a new path: bundles are never overwritten")
-    with _private_folder() as path:
+    with _private_folder(scratch) as path:
         folder = WorkFolder(path)
         job = Job(bundle=decoder.bundle.path, out=out, version=version, threads=THREADS, memory=tracker.memory())
         try:
@@ -100,9 +106,9 @@ def recalibrate_apart(
 
 
 @contextmanager
-def _private_folder() -> Iterator[Path]:
+def _private_folder(scratch: Path | None) -> Iterator[Path]:
     try:
-        folder = tempfile.TemporaryDirectory(prefix="lightpage-recalibration-", ignore_cleanup_errors=True)
+        folder = tempfile.TemporaryDirectory(prefix=SCRATCH, dir=scratch, ignore_cleanup_errors=True)
     except OSError as error:
         raise WorkerError(f"{_SUBJECT}, its folder", error, "a temporary folder that can be written") from error
     with folder as name:

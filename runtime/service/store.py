@@ -23,6 +23,7 @@ from lightpage.files import replace_text
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import sha256
 from runtime.errors import StoreError
+from runtime.recalibration.separate_process import SCRATCH
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +36,7 @@ UPLOAD = ".upload-"
 
 _PROBE = ".probe-"
 
-_LEFTOVERS = (f"{UPLOAD}*", f"{_PROBE}*", f".{CURRENT}-*", ".*.zip-*")
+_LEFTOVERS = (f"{UPLOAD}*", f"{SCRATCH}*", f"{_PROBE}*", f".{CURRENT}-*", ".*.zip-*")
 """Names of what a program that was killed leaves here."""
 
 KEPT_BUNDLES = 32

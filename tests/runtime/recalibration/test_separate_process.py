@@ -65,7 +65,7 @@ def apart(
     worker = ("-m", "tests.runtime.recalibration.toy_worker", kind)
     tracker = NoTracker(decoder)
     return recalibrate_apart(
-        decoder, tracker, known() if pages is None else pages, out, "toy-1+r1", progress, check, limit_s, worker
+        decoder, tracker, pages or known(), out, "toy-1+r1", progress, check, limit_s, worker=worker
     )
 
 
