@@ -14,7 +14,7 @@ IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image check-image check-camera-image proto lint format clean
+.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image check-image check-camera-image proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -87,8 +87,20 @@ SPEED_ARGS ?= --decoder fast --decoder coherent --decoder wave --decoder refined
 bench-speed: $(STAMP)  ## time decoders side by side in one run: SPEED_ARGS chooses them
 	$(BIN)/python -m analysis.speed.speed $(SPEED_ARGS)
 
-bench-service: $(STAMP)  ## time a page through the running service
-	$(BIN)/lightpage bench
+BENCH_SERVICE := runs/bench-service
+bench-service: $(STAMP)  ## the service under load, faults and attack, from outside: in about an hour
+	@mkdir -p $(BENCH_SERVICE)
+	$(BIN)/lightpage bench --json $(BENCH_SERVICE)/page.json
+	$(BIN)/python -m analysis.service.overload --json $(BENCH_SERVICE)/overload.json
+	$(BIN)/python -m analysis.service.lifecycle --json $(BENCH_SERVICE)/lifecycle.json
+	$(BIN)/python -m analysis.service.changes --json $(BENCH_SERVICE)/changes.json
+	$(BIN)/python -m analysis.service.hostile --json $(BENCH_SERVICE)/hostile.json
+	$(BIN)/python -m analysis.service.kills --out $(BENCH_SERVICE)/kills --json $(BENCH_SERVICE)/kills.json
+	$(BIN)/python -m analysis.hardware.recalibration --json $(BENCH_SERVICE)/recalibration.json
+
+soak: $(STAMP)  ## half an hour at 80% of the service's load: does its memory grow?
+	@mkdir -p $(BENCH_SERVICE)
+	$(BIN)/python -m analysis.service.soak --json $(BENCH_SERVICE)/soak.json
 
 bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 	$(BIN)/lightpage bench
