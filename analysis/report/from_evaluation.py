@@ -19,8 +19,8 @@ from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.measures import PageMeasures, SymbolMaps
 from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.page.pilots import remove_piston
-from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.reader import FramePair
 
 Rows = list[list[float | None]]

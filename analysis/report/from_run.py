@@ -18,7 +18,7 @@ from analysis.report.data import Golden, Rays, ReportData, how_long
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.information import decide
-from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.reader import FramePair, Recording, page_hashes
 from train.data.feature_store import FeatureStore
 from train.data.features import PageState

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json
 
 from lightpage.errors import InvalidInputError
-from lightpage.page.symbols import MAX_LEVELS
+from lightpage.page.levels import MAX_LEVELS
 
 EVALUATE, RECOVER = "evaluate", "recover"
 EXPECTED = f"a finished training run, or the JSON that this version's `lightpage {EVALUATE}` or `{RECOVER}` writes"

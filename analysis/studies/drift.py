@@ -15,7 +15,7 @@ from analysis.studies.study import Case, Result, Row, Settings, Study
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
-from lightpage.page.symbols import MAX_LEVELS
+from lightpage.page.levels import MAX_LEVELS
 from lightpage.progress import Progress, reporting
 from lightpage.recording.reader import Recording
 from lightpage.simulator.cameras import expose, resample

@@ -10,7 +10,7 @@ import click
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
-from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.pages import Pages
 from lightpage.simulator.recording_job import RecordingJob
 

@@ -20,7 +20,7 @@ from lightpage.codec.ldpc.decoder import decode
 from lightpage.codec.mapping import bit_information, bit_llrs, decide_in_coset, labels, level_bits
 from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import InvalidInputError
-from lightpage.page.symbols import MIN_LEVELS
+from lightpage.page.levels import MIN_LEVELS
 
 FEWEST_PAGES = 3
 """Fewer say nothing of how pages differ."""

@@ -7,10 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.errors import PageError
-
-MIN_LEVELS = 2
-MAX_LEVELS = 256
-"""A symbol is stored in one byte."""
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 
 MIN_PILOTS = 4
 """Fewer cannot tell a page's piston from its shift."""

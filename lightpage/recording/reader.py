@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import ProfileError, RecordingError
-from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.black_level import without_black
 from lightpage.recording.layout import (
     CAMERAS,

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from lightpage.device.profile import Profile, TomlTable, load_profile, validate
 from lightpage.errors import InvalidInputError, ProfileError
-from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.pages import Pages
 from runtime.acquisition.camera_source import CameraSource, Exposures, View
 from runtime.acquisition.page_store import PageStore

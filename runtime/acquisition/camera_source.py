@@ -18,7 +18,7 @@ from pydantic import Field
 
 from lightpage.device.profile import Profile, TomlTable
 from lightpage.errors import FrameError
-from lightpage.page.symbols import MAX_LEVELS
+from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.layout import FramePair, frame_type

@@ -11,7 +11,8 @@ import numpy as np
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError, NoSuchPageError
-from lightpage.page.symbols import MAX_LEVELS, pilot_mask, random_symbols
+from lightpage.page.levels import MAX_LEVELS
+from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.page_store import PageStore

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, InvalidInputError, LightpageError, PageError
-from lightpage.page.symbols import MAX_LEVELS
+from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.frame_pair import FramePair
 from runtime.client.answers import (
     Description,

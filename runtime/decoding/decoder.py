@@ -17,8 +17,9 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.device.profile import Profile
 from lightpage.errors import BundleError, FrameError, FramesDisagreeError, InvalidInputError, NoCodeError
 from lightpage.metrics.information import decide_with_confidence
+from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
-from lightpage.page.symbols import MAX_LEVELS, check_levels, symbol_phases
+from lightpage.page.symbols import check_levels, symbol_phases
 from lightpage.recording.reader import FramePair
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import DECODER, FIELD, GOLDEN

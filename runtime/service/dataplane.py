@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lightpage.codec.header import Header
 from lightpage.codec.page_codec import Loss, PageBytes
 from lightpage.errors import FrameError, InvalidInputError
+from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.pilots import Pilots
-from lightpage.page.symbols import MAX_LEVELS
 from lightpage.recording.reader import FramePair
 from runtime.acquisition.source import FrameSource, Shot, own_fault
 from runtime.decoding.decoder import Decoder

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 
 from lightpage.errors import LightpageError
-from lightpage.page.symbols import MAX_LEVELS
+from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.layout import frame_type
 from lightpage.recording.reader import FramePair
 from lightpage.recording.writer import RecordingWriter

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
-from lightpage.page.symbols import MAX_LEVELS, check_levels
+from lightpage.page.levels import MAX_LEVELS
+from lightpage.page.symbols import check_levels
 from lightpage.recording.layout import FramePair, frame_type
 from lightpage.simulator.simulator import Simulator
 

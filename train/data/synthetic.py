@@ -18,7 +18,8 @@ from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.calibration.wave_model import FittedWaves, illumination_terms, on_modulator
-from lightpage.page.symbols import MAX_LEVELS, random_symbols, symbol_phases
+from lightpage.page.levels import MAX_LEVELS
+from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.waves.grid import FieldGrid, field_grid, symbol_samples
 from train.data.features import PageFeatures, PageState, demodulate, localized
 from train.data.known_light import Explained
