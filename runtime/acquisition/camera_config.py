@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import parse_qsl
@@ -184,8 +185,8 @@ class _Builder:
             table = table.model_copy(update={"port": str(self.folder / table.port)})
         return PulseGenerator(table)
 
-    def modulator(self, levels: int) -> Modulator | None:
-        """What shows the pages."""
+    def modulator(self, levels: int | None) -> Modulator | None:
+        """What shows the pages, of so many levels where that is known yet."""
         table = self.table.modulator
         if isinstance(table, NoModulatorTable):
             return None
@@ -193,9 +194,18 @@ class _Builder:
             return ExternalModulator()
         if isinstance(table, SimulatedTable):
             return SimulatedModulator(self.folder / table.address)
-        path = table.lookup_table
-        greys = LookupTable.linear(levels) if path is None else LookupTable.from_file(self.folder / path, levels)
-        return ScreenModulator(table, self.profile, greys)
+        return ScreenModulator(table, self.profile, self._greys(table, levels))
+
+    def _greys(self, table: ScreenTable, levels: int | None) -> Callable[[int], LookupTable]:
+        """What makes a lookup table for the levels of the pages that are shown; tried with those that are known."""
+        if table.lookup_table is None:
+            return LookupTable.linear
+        path = self.folder / table.lookup_table
+        if levels is not None:
+            LookupTable.from_file(path, levels)
+        elif not path.is_file():
+            raise InvalidInputError(f"lookup table {path}", "no such file", "a readable text file")
+        return partial(LookupTable.from_file, path)
 
     def beams(self, trigger: Trigger) -> Beams:
         """What blocks them."""
@@ -238,7 +248,7 @@ def open_camera(rest: str) -> CameraSource:
                 profile,
                 cameras,
                 trigger,
-                builder.modulator(store.levels or MAX_LEVELS),
+                builder.modulator(store.levels),
                 builder.beams(trigger),
                 store,
                 table.pairing,

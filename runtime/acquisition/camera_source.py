@@ -154,11 +154,22 @@ class CameraSource(FrameSource):
         with self._lock:
             if self._armed:
                 return
+            if not self._was_armed:
+                self._open_modulator()
             for camera in self._cameras:
                 self._arm(camera, Reason.CAMERA_GONE)
             self._arm(self._trigger, Reason.TRIGGER_GONE)
             self._pairing.forget()
             self._armed = self._was_armed = True
+
+    def _open_modulator(self) -> None:
+        """Connect what shows the pages: settings that are wrong are not to be found after minutes of other shots."""
+        if self.modulator is None:
+            return
+        try:
+            self.modulator.open(SHOT_S, self.pages.levels)
+        except LostShotError as error:
+            raise SourceError(error.subject, error.got, error.expected) from None
 
     def _arm(self, device: Camera | Trigger, reason: Reason) -> None:
         """Make one device ready. One that was ready before and cannot be found now has gone, and may come back."""

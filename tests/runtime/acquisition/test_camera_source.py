@@ -31,6 +31,7 @@ class LabModulator:
     def __init__(self, lab: Lab, device: toy.ToyDevice) -> None:
         self.lab, self.device = lab, device
         self.shown: list[int] = []
+        self.opened_for: list[int | None] = []
         self.beams: list[tuple[bool, bool]] = []
         self.pair = device.references()
         for which, camera in zip(("in_phase", "quadrature"), lab.cameras, strict=True):
@@ -41,6 +42,9 @@ class LabModulator:
         self.lab.poll()
         self.shown.append(page)
         self.pair = self.device.page(symbols, levels, 0.1)
+
+    def open(self, timeout_s: float, levels: int | None = None) -> None:
+        self.opened_for.append(levels)
 
     def shows(self) -> bool:
         return True
