@@ -127,7 +127,7 @@ class Stage:
         self.page = page
 
     def open(self, timeout_s: float, levels: int | None = None) -> None:
-        pass
+        """See `Modulator`."""
 
     def shows(self) -> bool:
         """See `Modulator`."""

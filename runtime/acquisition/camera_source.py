@@ -135,6 +135,11 @@ class CameraSource(FrameSource):
         """Level count of its pages; 256 before any page is known."""
         return self.pages.levels or MAX_LEVELS
 
+    def page_count(self) -> int | None:
+        """See `FrameSource.page_count`."""
+        count = len(self.pages)
+        return count if count or self.modulator is not None else None
+
     def show_pages(self, pages: PageStore) -> None:
         """See `FrameSource.show_pages`."""
         with self._lock:
