@@ -302,12 +302,16 @@ class CameraSource(FrameSource):
                     if time.monotonic() + _AGAIN_S < deadline:
                         time.sleep(_AGAIN_S)
                         continue
-                elif repeats > 0 and time.monotonic() < deadline:
+                elif repeats > 0 and time.monotonic() < deadline and not self._never_came(error):
                     repeats -= 1
                     continue
                 raise error.about(f"{subject} of {self.name}") from None
             self._outcomes["TAKEN"] += 1
             return frames
+
+    def _never_came(self, error: LostShotError) -> bool:
+        """Whether a shot is lost as no trigger has ever reached a camera, which no repeat mends."""
+        return error.reason is Reason.MISSING_FRAME and bool(self._pairing.silent)
 
     def _cleaned(self, one: int, frame: Frame) -> Counts:
         """The counts of a frame, upright, hot pixels mended, the black level taken off."""

@@ -137,13 +137,17 @@ class PulseGenerator:
                 raise
 
     def disarm(self) -> None:
-        """See `Trigger`: stops T0. A device that has gone fires no more anyway."""
+        """See `Trigger`: stops T0, and switches off the cameras' channels. A device that has gone fires no more anyway.
+
+        Channels that stayed on would fire for whoever uses the device next, and hide that theirs are others.
+        """
         with self._lock:
             ready, self._ready = self._ready, None
             if ready is None:
                 return
             try:
-                self._line.send(":PULSE0:STATE OFF", ready)
+                for channel in (0, *self.settings.channels):
+                    self._line.send(f":PULSE{channel}:STATE OFF", ready)
             except LostShotError as error:
                 _log.warning("not disarmed: %s", error)
 
