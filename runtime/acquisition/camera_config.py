@@ -7,13 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 from urllib.parse import parse_qsl
 
-from pydantic import Field
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
-from lightpage.device.profile import Profile, TomlTable, load_profile, validate
-from lightpage.errors import InvalidInputError, ProfileError
+from lightpage.device.problems import Problem, problems_of
+from lightpage.device.profile import Profile, TomlTable, load_profile
+from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.pages import Pages
 from runtime.acquisition.camera_source import CameraSource, Exposures, View
@@ -36,6 +37,8 @@ from runtime.trigger.software import SoftwareTrigger
 from runtime.trigger.trigger import Trigger
 
 ROLES = ("in_phase", "quadrature")
+KEYS = "docs/cameras.md, all keys"
+"""Where what a file may say is explained."""
 
 
 class CameraTable(CameraSettings):
@@ -97,6 +100,8 @@ class ShuttersTable(TomlTable):
 class ExternalBeamsTable(TomlTable):
     """The controller moves the shutters, and says so over gRPC."""
 
+    model_config = ConfigDict(strict=True)
+
     kind: Literal["external"]
     timeout_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = 10.0
 
@@ -121,6 +126,8 @@ class DeviceTable(TomlTable):
         pairing, exposures: how frames are taken and told apart.
     """
 
+    model_config = ConfigDict(strict=True)
+
     profile: str
     levels: Annotated[int, Field(ge=MIN_LEVELS, le=MAX_LEVELS)] | None = None
     pages: str | None = None
@@ -136,6 +143,24 @@ class DeviceTable(TomlTable):
     pairing: PairingSettings = PairingSettings()
     exposures: Exposures = Exposures()
 
+    @model_validator(mode="after")
+    def _two_cameras(self) -> Self:
+        for key in ("serial", "address"):
+            first, second = (getattr(table, key) for table in (self.in_phase, self.quadrature))
+            if first is not None and first == second:
+                raise ValueError(f"{key} {first} for in_phase and for quadrature, wanted two cameras")
+        return self
+
+    @model_validator(mode="after")
+    def _shutters_on_spare_channels(self) -> Self:
+        if isinstance(self.beams, ShuttersTable) and isinstance(self.trigger, PulseGeneratorTable):
+            others = f"none of the cameras' ({', '.join(map(str, self.trigger.channels))})"
+            for beam in ("signal", "reference"):
+                channel = getattr(self.beams, beam).channel
+                if channel in self.trigger.channels:
+                    raise ValueError(f"beams.{beam}.channel = {channel}, wanted {others}")
+        return self
+
 
 def load_device_table(path: Path) -> DeviceTable:
     """Read and check the file.
@@ -149,9 +174,19 @@ def load_device_table(path: Path) -> DeviceTable:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InvalidInputError(subject, error, "a TOML file that can be read") from None
     try:
-        return validate(DeviceTable, data, subject)
-    except ProfileError as error:
-        raise InvalidInputError(subject, error.got, "keys as docs/cameras.md explains them") from None
+        return DeviceTable.model_validate(data)
+    except ValidationError as error:
+        raise _told(subject, problems_of(DeviceTable, error)) from None
+
+
+def _told(subject: str, problems: list[Problem]) -> InvalidInputError:
+    """The error of a file with mistakes, of which a single one stands for itself."""
+    if len(problems) == 1:
+        place, got, expected = problems[0].parted()
+        return InvalidInputError(f"{subject}: {place}" if place else subject, got, f"{expected} ({KEYS})")
+    parts = (problem.parted() for problem in problems)
+    told = (f"{place}: {got} (wanted {expected})".removeprefix(": ") for place, got, expected in parts)
+    return InvalidInputError(subject, f"{len(problems)} mistakes: {'; '.join(told)}", f"what {KEYS}, says")
 
 
 @dataclass

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from lightpage.device.profile import Profile, TomlTable
 from lightpage.errors import FrameError
@@ -49,6 +49,8 @@ class Exposures(TomlTable):
         reference_frames, dark_frames: shots that make the mean of each.
         shot_s: longest wait for one page, repeats included.
     """
+
+    model_config = ConfigDict(strict=True)
 
     repeats: Annotated[int, Field(ge=0, le=100)] = 1
     reference_frames: Annotated[int, Field(ge=1, le=256)] = 8

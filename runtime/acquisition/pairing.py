@@ -24,7 +24,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Self
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from lightpage.device.profile import TomlTable
 from lightpage.progress import note
@@ -59,6 +59,8 @@ class PairingSettings(TomlTable):
         clock_drift: relative drift of a camera's clock against this machine's that is allowed for.
     """
 
+    model_config = ConfigDict(strict=True)
+
     tolerance_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.02
     frame_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = 0.5
     quiet_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 0.15
@@ -68,7 +70,7 @@ class PairingSettings(TomlTable):
     @model_validator(mode="after")
     def _tells_shots_apart(self) -> Self:
         if self.spacing_s < (least := 2.5 * self.tolerance_s):
-            raise ValueError(f"spacing_s is at least {least:g}, 2.5 tolerances")
+            raise ValueError(f"spacing_s = {self.spacing_s:g}, wanted at least {least:g}, 2.5 tolerances")
         return self
 
     @property

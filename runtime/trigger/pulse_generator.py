@@ -52,11 +52,11 @@ class PulseGeneratorSettings(BaseModel):
         synchronise_s: longest wait until the line is in order after it was not.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     port: Annotated[str, Field(min_length=1)]
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
-    channels: Annotated[tuple[Channel, ...], Field(min_length=1)] = (1, 2)
+    channels: Annotated[tuple[Channel, ...], Field(min_length=1, strict=False)] = (1, 2)
     width_s: Annotated[float, Field(ge=RESOLUTION_S, le=10.0)] = 1e-3
     delay_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
     polarity: Literal["normal", "inverted"] = "normal"
@@ -71,7 +71,7 @@ class PulseGeneratorSettings(BaseModel):
     @classmethod
     def _each_once(cls, channels: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(channels)) != len(channels):
-            raise ValueError("name each channel once")
+            raise ValueError("a channel twice, wanted each once")
         return channels
 
     @property

@@ -246,9 +246,7 @@ def test_a_trigger_that_never_arrives_is_told_soon(tmp_path: Path) -> None:
     with source:
         for take in (source.dark_frames, source.references, source.shot):
             begun = time.monotonic()
-            with pytest.raises(
-                LostShotError, match=r"Q: got no frame since.*trigger_source.*cable"
-            ) as raised:
+            with pytest.raises(LostShotError, match=r"Q: got no frame since.*trigger_source.*cable") as raised:
                 take()
             assert raised.value.reason is Reason.MISSING_FRAME
             assert str(raised.value).endswith("(MISSING_FRAME)")
