@@ -140,7 +140,8 @@ def _tell_where(out: Path, pages: int) -> None:
 
 
 def _tell_loss(page: int, error: LostShotError) -> None:
-    warn(f"{f'page {page}' if page >= 0 else 'frames without a page'}: shot lost: {error}")
+    what = f"page {page}" if page >= 0 else "frames without a page"
+    warn(f"{what}: shot lost ({error.reason.value}): {error.subject}: {error.got}")
 
 
 def _record(

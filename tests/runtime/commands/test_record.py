@@ -301,7 +301,7 @@ def test_a_lost_page_is_told_once_with_its_reason(
         assert run("--source", "toy:x", "--pages", "1", "--out", tmp_path / "r.h5") == EXIT_LOST
         told = capsys.readouterr().err.splitlines()
         assert told[:2] == ["lightpage: dark frames", "lightpage: reference frames"]
-        assert told[2] == "lightpage: warning: page 0: shot lost: I: frame: got none, wanted one (MISSING_FRAME)"
+        assert told[2] == "lightpage: warning: page 0: shot lost (MISSING_FRAME): I: frame: none"
         assert told[-1].startswith("lightpage: error: page 0 of toy:bench: I: frame: got none, wanted one (MISSING")
 
 
