@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -51,6 +52,28 @@ def move_into_place(made: str | Path, path: Path) -> None:
     with open(made, "rb") as file:
         os.fsync(file.fileno())
     os.replace(made, path)
+    sync_folder(path.parent)
+
+
+def move_to_new_name(made: str | Path, path: Path) -> None:
+    """The same where nothing has the final name.
+
+    Raises:
+        FileExistsError: something has it; both files stay as they are.
+        OSError: the system does not let it.
+    """
+    with open(made, "rb") as file:
+        os.fsync(file.fileno())
+    try:
+        os.link(made, path)  # in one step, unlike a look whether it is there
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from None
+        os.replace(made, path)
+    else:
+        os.unlink(made)
     sync_folder(path.parent)
 
 

@@ -140,6 +140,10 @@ class LostPageError(LightpageError):
 class LostShotError(LostPageError):
     """A page was not photographed as one whole pair of frames; what is wrong is in the device."""
 
+    def __str__(self) -> str:
+        told = super().__str__()
+        return told if self.reason is Reason.UNSPECIFIED else f"{told} ({self.reason.value})"
+
 
 class UnconfirmedPageError(LostPageError):
     """The pilots of a page do not bear out what the decoder claims of it: its symbols would be noise.

@@ -20,6 +20,7 @@ ROOMS = (
     "lightpage.errors",
     "lightpage.files",
     "lightpage.progress",
+    "lightpage.words",
     "lightpage.von_mises",
     "lightpage.device",
     "lightpage.page",

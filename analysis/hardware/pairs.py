@@ -126,6 +126,9 @@ class Stage:
         """See `Modulator`."""
         self.page = page
 
+    def open(self, timeout_s: float, levels: int | None = None) -> None:
+        """See `Modulator`."""
+
     def shows(self) -> bool:
         """See `Modulator`."""
         return True

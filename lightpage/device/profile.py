@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import ErrorDetails
 
 from lightpage.device.lens_path import SeidelTerms
+from lightpage.device.problems import problems_of
 from lightpage.errors import ProfileError
 
 Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
@@ -241,18 +241,8 @@ def validate(model: type[T], data: dict[str, Any], source: str) -> T:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        problems = "; ".join(_problem(e) for e in error.errors())
+        problems = "; ".join(map(str, problems_of(model, error)))
         raise ProfileError(source, problems, f"a valid {model.__name__.lower()}") from None
-
-
-def _problem(error: ErrorDetails) -> str:
-    """One offending key, in words: what pydantic gives with a missing or an unknown one is a whole table."""
-    key = ".".join(str(part) for part in error["loc"]) or "document"
-    if error["type"] == "missing":
-        return f"no {key}"
-    if error["type"] == "extra_forbidden":
-        return f"unknown {key}"
-    return f"{key} = {error['input']!r} ({error['msg']})"
 
 
 def parse_profile(text: str, source: str = "profile") -> Profile:

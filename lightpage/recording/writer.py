@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lightpage.device.profile import Profile
-from lightpage.errors import PageError, RecordingError
-from lightpage.files import move_into_place
+from lightpage.errors import NoSuchPageError, PageError, RecordingError
+from lightpage.files import move_into_place, move_to_new_name
 from lightpage.page.symbols import check_levels, check_symbols
 from lightpage.recording.hdf_file import HdfFile
 from lightpage.recording.layout import (
@@ -36,15 +36,94 @@ from lightpage.recording.layout import (
     LostShot,
     frame_type,
 )
+from lightpage.words import counted
 
 Infos = tuple[FrameInfo, FrameInfo]
 HotPixels = tuple[NDArray[np.intp], NDArray[np.intp]]
 """Of both cameras, [n, 2]: row and column."""
+Symbols = Callable[[int], NDArray[np.uint8]]
+"""Of a page by its number; `NoSuchPageError` where there is none."""
 
 
 def partial_path(path: Path) -> Path:
     """Where a recording lies until it is complete and gets its name `path`."""
     return path.with_name(path.name + ".partial")
+
+
+def pages_there(
+    path: Path,
+    profile: Profile,
+    levels: int,
+    bit_depth: int,
+    *,
+    code: str | None = None,
+    symbols: Symbols | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Pages of the unfinished recording `path` that `RecordingWriter.resume` would go on from; arguments as there.
+
+    Raises:
+        RecordingError: another process is writing them; or they are others, and `overwrite` is not asked for.
+    """
+    partial = partial_path(path)
+    if not _take(partial, remove=False):
+        return 0
+    try:
+        with h5py.File(str(partial), "r") as file:
+            pages = _pages_of(file)
+            other = _difference(file, pages, _header(profile, levels, bit_depth, code), symbols)
+    except (OSError, KeyError, TypeError, ValueError):  # it was cut off, and is begun anew
+        return 0
+    if not (pages and other):
+        return pages
+    if overwrite:
+        return 0
+    raise _others(partial, pages, other)
+
+
+def _pages_of(file: h5py.File) -> int:
+    """Without its count a file was interrupted while it was completed: all of its pages are there."""
+    return int(file.attrs.get("pages_complete", file[FRAMES[0]].shape[0]))
+
+
+def _header(profile: Profile, levels: int, bit_depth: int, code: str | None) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "camera_bit_depth": bit_depth,
+        "levels": levels,
+        "profile": profile.to_toml(),
+        **({} if code is None else {"code": code}),
+    }
+
+
+def _difference(file: h5py.File, pages: int, header: Mapping[str, Any], symbols: Symbols | None) -> str:
+    """Of what else than `header` and `symbols` the pages of a file are; empty if they are the same."""
+    for name, what in (("profile", "another profile"), ("camera_bit_depth", "another bit depth")):
+        if file.attrs.get(name) != header[name]:
+            return what
+    if any(file.attrs.get(name) != header.get(name) for name in ("levels", "code")):
+        return "other symbols"
+    if any(file.attrs.get(name) != header[name] for name in ("format", "version")):
+        return "another format"
+    if symbols is None or not pages:
+        return ""
+    if "symbols" not in file:
+        return "unknown symbols"
+    try:
+        same = all(np.array_equal(file["symbols"][page], symbols(page)) for page in range(pages))
+    except NoSuchPageError:
+        same = False
+    return "" if same else "other symbols"
+
+
+def _others(partial: Path, pages: int, other: str) -> RecordingError:
+    same = "symbols" if other.endswith("symbols") else other.removeprefix("another ").removeprefix("other ")
+    return RecordingError(
+        f"recording {partial}",
+        f"{counted(pages, 'page')} of {other}",
+        f"the same {'--symbols' if same == 'symbols' else same}, another name, or --force",
+    )
 
 
 def discard_partial(path: Path) -> None:
@@ -97,6 +176,8 @@ class RecordingWriter:
         resume: bool = False,
         code: str | None = None,
         keep_references: bool = False,
+        symbols: Symbols | None = None,
+        overwrite: bool = True,
     ) -> None:
         """Start a new recording; a partial file of the same name that nobody is writing is overwritten.
 
@@ -111,13 +192,20 @@ class RecordingWriter:
             code: what the pages hold, JSON text, where they were made by an encoder.
             keep_references: whether a recording that is gone on with keeps its own reference frames, where `references`
                 are others: no camera takes the same ones twice.
+            symbols: of the pages to come; a recording whose pages have others is not gone on with.
+            overwrite: whether a file that has the final name, then or at the end, and pages of a recording that is not
+                gone on with, may be lost.
 
         Raises:
-            RecordingError: wrong bit depth, frames or pilots, or the file cannot be written or is being written.
+            RecordingError: wrong bit depth, frames or pilots, or the file cannot be written or is being written; or
+                there is something that may not be lost.
             PageError: a level count outside 2..256.
         """
         self._prepare(path, profile, levels, bit_depth)
         self._code, self._keep_references = code, keep_references
+        self._symbols, self._overwrite = symbols, overwrite
+        if not overwrite and self.path.exists():
+            raise self._exists()
         if not (resume and self._continue(references, pilots)):
             self._create(references, pilots)
 
@@ -133,6 +221,8 @@ class RecordingWriter:
         code: str | None = None,
         *,
         keep_references: bool = False,
+        symbols: Symbols | None = None,
+        overwrite: bool = True,
     ) -> Self:
         """Go on with `<path>.partial` if it was started with the same arguments, else start anew.
 
@@ -148,6 +238,8 @@ class RecordingWriter:
             resume=True,
             code=code,
             keep_references=keep_references,
+            symbols=symbols,
+            overwrite=overwrite,
         )
 
     @property
@@ -258,7 +350,9 @@ class RecordingWriter:
                 del self._file.attrs["pages_complete"]
             self._file.close()
             self._disk.check()
-            move_into_place(self._partial, self.path)  # still locked
+            (move_into_place if self._overwrite else move_to_new_name)(self._partial, self.path)  # still locked
+        except FileExistsError:
+            raise self._exists() from None
         except OSError as error:
             raise RecordingError(self._subject, error, "a file that can be completed") from None
         finally:
@@ -279,15 +373,12 @@ class RecordingWriter:
         self._profile, self._levels, self._bit_depth = profile, levels, bit_depth
         self._pages = 0
 
+    def _exists(self) -> RecordingError:
+        there = f"; the pages are in {self._partial}" if self._pages else ""
+        return RecordingError(self._subject, "a file that exists by now", f"a new name, or --force{there}")
+
     def _header(self) -> dict[str, Any]:
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "camera_bit_depth": self._bit_depth,
-            "levels": self._levels,
-            "profile": self._profile.to_toml(),
-            **({} if self._code is None else {"code": self._code}),
-        }
+        return _header(self._profile, self._levels, self._bit_depth, self._code)
 
     def _checked(self, name: str, frame: NDArray[Any]) -> NDArray[Any]:
         frame = np.asarray(frame)
@@ -341,7 +432,8 @@ class RecordingWriter:
         """Open the partial file if it is sound and was started with the same arguments.
 
         Raises:
-            RecordingError: another process is writing it, or the system does not let it be read.
+            RecordingError: another process is writing it, the system does not let it be read, or it has other pages
+                that may not be lost.
         """
         fixed = self._checked_fixed(references, pilots)
         if not _take(self._partial, remove=False):
@@ -355,15 +447,16 @@ class RecordingWriter:
         except OSError:  # the file was cut off or is none of HDF5's
             disk.close()
             return False
+        pages, other = 0, ""
         try:
-            # Without its count a file was interrupted while it was completed: all of its pages are there.
-            pages = int(file.attrs.get("pages_complete", file[FRAMES[0]].shape[0]))
-            same = (
-                all(file.attrs[name] == value for name, value in self._header().items())
-                and all(self._is_same(file[name], name, value) for name, value in fixed.items())
+            pages = _pages_of(file)
+            other = _difference(file, pages, self._header(), self._symbols)
+            if not other and not (
+                all(self._is_same(file[name], name, value) for name, value in fixed.items())
                 and ("pilots" in file) == ("pilots" in fixed)
-            )
-            if same:
+            ):
+                other = "other settings"
+            if same := not other:
                 self._file, self._disk = file, disk
                 for name in self._growing():
                     if file[name].shape[0] < pages:
@@ -371,12 +464,18 @@ class RecordingWriter:
                     file[name].resize(pages, axis=0)
         except (OSError, KeyError, TypeError, ValueError):
             same = False
-        if same:
-            self._pages = pages
-        else:
+        except BaseException:
             file.close()
             disk.close()
-        return same
+            raise
+        if same:
+            self._pages = pages
+            return True
+        file.close()
+        disk.close()
+        if pages and other and not self._overwrite:
+            raise _others(self._partial, pages, other)
+        return False
 
     def _is_same(self, dataset: h5py.Dataset, name: str, value: NDArray[Any]) -> bool:
         if self._keep_references and name in REFERENCES:

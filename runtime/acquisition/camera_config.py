@@ -5,14 +5,16 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 from urllib.parse import parse_qsl
 
-from pydantic import Field
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
-from lightpage.device.profile import Profile, TomlTable, load_profile, validate
-from lightpage.errors import InvalidInputError, ProfileError
+from lightpage.device.problems import Problem, problems_of
+from lightpage.device.profile import Profile, TomlTable, load_profile
+from lightpage.errors import InvalidInputError
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.pages import Pages
 from runtime.acquisition.camera_source import CameraSource, Exposures, View
@@ -35,6 +37,8 @@ from runtime.trigger.software import SoftwareTrigger
 from runtime.trigger.trigger import Trigger
 
 ROLES = ("in_phase", "quadrature")
+KEYS = "docs/cameras.md, all keys"
+"""Where what a file may say is explained."""
 
 
 class CameraTable(CameraSettings):
@@ -96,6 +100,8 @@ class ShuttersTable(TomlTable):
 class ExternalBeamsTable(TomlTable):
     """The controller moves the shutters, and says so over gRPC."""
 
+    model_config = ConfigDict(strict=True)
+
     kind: Literal["external"]
     timeout_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = 10.0
 
@@ -120,6 +126,8 @@ class DeviceTable(TomlTable):
         pairing, exposures: how frames are taken and told apart.
     """
 
+    model_config = ConfigDict(strict=True)
+
     profile: str
     levels: Annotated[int, Field(ge=MIN_LEVELS, le=MAX_LEVELS)] | None = None
     pages: str | None = None
@@ -135,6 +143,24 @@ class DeviceTable(TomlTable):
     pairing: PairingSettings = PairingSettings()
     exposures: Exposures = Exposures()
 
+    @model_validator(mode="after")
+    def _two_cameras(self) -> Self:
+        for key in ("serial", "address"):
+            first, second = (getattr(table, key) for table in (self.in_phase, self.quadrature))
+            if first is not None and first == second:
+                raise ValueError(f"{key} {first} for in_phase and for quadrature, wanted two cameras")
+        return self
+
+    @model_validator(mode="after")
+    def _shutters_on_spare_channels(self) -> Self:
+        if isinstance(self.beams, ShuttersTable) and isinstance(self.trigger, PulseGeneratorTable):
+            others = f"none of the cameras' ({', '.join(map(str, self.trigger.channels))})"
+            for beam in ("signal", "reference"):
+                channel = getattr(self.beams, beam).channel
+                if channel in self.trigger.channels:
+                    raise ValueError(f"beams.{beam}.channel = {channel}, wanted {others}")
+        return self
+
 
 def load_device_table(path: Path) -> DeviceTable:
     """Read and check the file.
@@ -148,9 +174,19 @@ def load_device_table(path: Path) -> DeviceTable:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InvalidInputError(subject, error, "a TOML file that can be read") from None
     try:
-        return validate(DeviceTable, data, subject)
-    except ProfileError as error:
-        raise InvalidInputError(subject, error.got, "keys as docs/cameras.md explains them") from None
+        return DeviceTable.model_validate(data)
+    except ValidationError as error:
+        raise _told(subject, problems_of(DeviceTable, error)) from None
+
+
+def _told(subject: str, problems: list[Problem]) -> InvalidInputError:
+    """The error of a file with mistakes, of which a single one stands for itself."""
+    if len(problems) == 1:
+        place, got, expected = problems[0].parted()
+        return InvalidInputError(f"{subject}: {place}" if place else subject, got, f"{expected} ({KEYS})")
+    parts = (problem.parted() for problem in problems)
+    told = (f"{place}: {got} (wanted {expected})".removeprefix(": ") for place, got, expected in parts)
+    return InvalidInputError(subject, f"{len(problems)} mistakes: {'; '.join(told)}", f"what {KEYS}, says")
 
 
 @dataclass
@@ -184,8 +220,8 @@ class _Builder:
             table = table.model_copy(update={"port": str(self.folder / table.port)})
         return PulseGenerator(table)
 
-    def modulator(self, levels: int) -> Modulator | None:
-        """What shows the pages."""
+    def modulator(self, levels: int | None) -> Modulator | None:
+        """What shows the pages, of so many levels where that is known yet."""
         table = self.table.modulator
         if isinstance(table, NoModulatorTable):
             return None
@@ -193,9 +229,18 @@ class _Builder:
             return ExternalModulator()
         if isinstance(table, SimulatedTable):
             return SimulatedModulator(self.folder / table.address)
-        path = table.lookup_table
-        greys = LookupTable.linear(levels) if path is None else LookupTable.from_file(self.folder / path, levels)
-        return ScreenModulator(table, self.profile, greys)
+        return ScreenModulator(table, self.profile, self._greys(table, levels))
+
+    def _greys(self, table: ScreenTable, levels: int | None) -> Callable[[int], LookupTable]:
+        """What makes a lookup table for the levels of the pages that are shown; tried with those that are known."""
+        if table.lookup_table is None:
+            return LookupTable.linear
+        path = self.folder / table.lookup_table
+        if levels is not None:
+            LookupTable.from_file(path, levels)
+        elif not path.is_file():
+            raise InvalidInputError(f"lookup table {path}", "no such file", "a readable text file")
+        return partial(LookupTable.from_file, path)
 
     def beams(self, trigger: Trigger) -> Beams:
         """What blocks them."""
@@ -238,7 +283,7 @@ def open_camera(rest: str) -> CameraSource:
                 profile,
                 cameras,
                 trigger,
-                builder.modulator(store.levels or MAX_LEVELS),
+                builder.modulator(store.levels),
                 builder.beams(trigger),
                 store,
                 table.pairing,

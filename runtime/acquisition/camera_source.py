@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from lightpage.device.profile import Profile, TomlTable
 from lightpage.errors import FrameError
@@ -49,6 +49,8 @@ class Exposures(TomlTable):
         reference_frames, dark_frames: shots that make the mean of each.
         shot_s: longest wait for one page, repeats included.
     """
+
+    model_config = ConfigDict(strict=True)
 
     repeats: Annotated[int, Field(ge=0, le=100)] = 1
     reference_frames: Annotated[int, Field(ge=1, le=256)] = 8
@@ -135,6 +137,11 @@ class CameraSource(FrameSource):
         """Level count of its pages; 256 before any page is known."""
         return self.pages.levels or MAX_LEVELS
 
+    def page_count(self) -> int | None:
+        """See `FrameSource.page_count`."""
+        count = len(self.pages)
+        return count if count or self.modulator is not None else None
+
     def show_pages(self, pages: PageStore) -> None:
         """See `FrameSource.show_pages`."""
         with self._lock:
@@ -154,11 +161,22 @@ class CameraSource(FrameSource):
         with self._lock:
             if self._armed:
                 return
+            if not self._was_armed:
+                self._open_modulator()
             for camera in self._cameras:
                 self._arm(camera, Reason.CAMERA_GONE)
             self._arm(self._trigger, Reason.TRIGGER_GONE)
             self._pairing.forget()
             self._armed = self._was_armed = True
+
+    def _open_modulator(self) -> None:
+        """Connect what shows the pages: settings that are wrong are not to be found after minutes of other shots."""
+        if self.modulator is None:
+            return
+        try:
+            self.modulator.open(SHOT_S, self.pages.levels)
+        except LostShotError as error:
+            raise SourceError(error.subject, error.got, error.expected) from None
 
     def _arm(self, device: Camera | Trigger, reason: Reason) -> None:
         """Make one device ready. One that was ready before and cannot be found now has gone, and may come back."""
@@ -286,12 +304,16 @@ class CameraSource(FrameSource):
                     if time.monotonic() + _AGAIN_S < deadline:
                         time.sleep(_AGAIN_S)
                         continue
-                elif repeats > 0 and time.monotonic() < deadline:
+                elif repeats > 0 and time.monotonic() < deadline and not self._never_came(error):
                     repeats -= 1
                     continue
                 raise error.about(f"{subject} of {self.name}") from None
             self._outcomes["TAKEN"] += 1
             return frames
+
+    def _never_came(self, error: LostShotError) -> bool:
+        """Whether a shot is lost as no trigger has ever reached a camera, which no repeat mends."""
+        return error.reason is Reason.MISSING_FRAME and bool(self._pairing.silent)
 
     def _cleaned(self, one: int, frame: Frame) -> Counts:
         """The counts of a frame, upright, hot pixels mended, the black level taken off."""

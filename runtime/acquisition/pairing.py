@@ -24,10 +24,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Self
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from lightpage.device.profile import TomlTable
+from lightpage.progress import note
 from lightpage.recording.layout import FrameInfo
+from lightpage.words import counted
 from runtime.cameras.camera import Camera, Frame, FrameStatus
 from runtime.errors import LostShotError, Reason
 from runtime.trigger.trigger import Trigger
@@ -37,6 +39,8 @@ _GAPS = (0.0, 3.0, 7.0)
 is one frame behind shows."""
 _TRIES = 8
 """Synchronisations in a row."""
+_SILENT_TRIES = 3
+"""The same where a camera has sent no frame since the start: its trigger does not arrive, and waiting mends nothing."""
 _MOST_QUIET = 20
 """A line that is never silent is given up after so many times the silence that is waited for."""
 _FOLLOWING = 0.1
@@ -55,6 +59,8 @@ class PairingSettings(TomlTable):
         clock_drift: relative drift of a camera's clock against this machine's that is allowed for.
     """
 
+    model_config = ConfigDict(strict=True)
+
     tolerance_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.02
     frame_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = 0.5
     quiet_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 0.15
@@ -64,7 +70,7 @@ class PairingSettings(TomlTable):
     @model_validator(mode="after")
     def _tells_shots_apart(self) -> Self:
         if self.spacing_s < (least := 2.5 * self.tolerance_s):
-            raise ValueError(f"spacing_s is at least {least:g}, 2.5 tolerances")
+            raise ValueError(f"spacing_s = {self.spacing_s:g}, wanted at least {least:g}, 2.5 tolerances")
         return self
 
     @property
@@ -81,12 +87,20 @@ class _Channel:
         last_id: number of its last frame, None where it is not known.
         reference_s: device time less trigger time of a good shot, None before a synchronisation.
         opened: how often the camera was opened when that was learnt.
+        came: frames so far, whole or not.
     """
 
     camera: Camera
     last_id: int | None = None
     reference_s: float | None = None
     opened: int = -1
+    came: int = 0
+
+    def frame(self, timeout_s: float) -> Frame | None:
+        """The camera's next frame, counted."""
+        frame = self.camera.frame(timeout_s)
+        self.came += frame is not None
+        return frame
 
     def forget(self) -> None:
         """Know nothing any more."""
@@ -128,6 +142,11 @@ class Pairing:
         return fresh and all(
             channel.reference_s is not None and channel.opened == channel.camera.opened for channel in self._channels
         )
+
+    @property
+    def silent(self) -> list[str]:
+        """Cameras that have sent no frame since the start."""
+        return [channel.camera.name for channel in self._channels if not channel.came]
 
     def forget(self) -> None:
         """Synchronise before the next shot: a device that was set up anew may be slower, or another one."""
@@ -192,7 +211,7 @@ class Pairing:
         """
         tolerance = self.settings.tolerance_s
         last: LostShotError | None = None
-        for _ in range(_TRIES):
+        for tried in range(1, _TRIES + 1):
             for channel in self._channels:
                 channel.forget()
             try:
@@ -207,17 +226,30 @@ class Pairing:
                     for channel, ordered in zip(self._channels, each, strict=True):
                         channel.reference_s = ordered[len(ordered) // 2]
                     self._referenced_at = time.monotonic()
+                    note("cameras and trigger are synchronised")
                     return
                 told = f"times that differ by {1e3 * spread:.1f} ms"
                 last = LostShotError("three shots", told, f"at most {1e3 * tolerance:g} ms", Reason.NOT_SYNCHRONISED)
             except LostShotError as error:
                 if error.reason in (Reason.CAMERA_GONE, Reason.TRIGGER_GONE, Reason.TRIGGER_REFUSED):
                     raise
+                if error.reason is Reason.MISSING_FRAME and tried >= _SILENT_TRIES and self.silent:
+                    raise self._never(tried) from None
                 last = error
             if time.monotonic() > deadline:
                 break
-        told = str(last) if last is not None else "no time left"
+        told = f"{last.subject}: {last.got} ({last.reason.value})" if last is not None else "no time left"
         raise LostShotError("synchronisation", told, "three shots that agree", Reason.NOT_SYNCHRONISED)
+
+    def _never(self, triggers: int) -> LostShotError:
+        """The error of cameras that no trigger seems to reach."""
+        return LostShotError(
+            " and ".join(self.silent),
+            f"no frame since the start, after {counted(triggers, 'trigger')}",
+            "a frame for each: look at trigger_source, at the trigger's channels and its cable, "
+            f"and whether frame_s ({self.settings.frame_s:g} s) is longer than the exposure",
+            Reason.MISSING_FRAME,
+        )
 
     def _take(self, deadline: float) -> _Taken:
         """Fire once, and take both frames by rules 1 to 3, the page on display for long enough before."""
@@ -233,7 +265,7 @@ class Pairing:
         end = time.monotonic() + settings.frame_s
         frames, ids = list[Frame](), list[int]()
         for channel in self._channels:
-            frame = channel.camera.frame(max(1e-3, end - time.monotonic()))
+            frame = channel.frame(max(1e-3, end - time.monotonic()))
             frames.append(frame := self._checked(channel, frame))
             ids.append(_info(frame).frame_id)
         if self._drain():
@@ -260,7 +292,7 @@ class Pairing:
         """Drop the frames that wait; returns how many."""
         dropped = 0
         for channel in self._channels:
-            while channel.camera.frame(0.0) is not None:
+            while channel.frame(0.0) is not None:
                 dropped += 1
                 channel.last_id = None
         return dropped

@@ -52,6 +52,10 @@ class RecordingSource(FrameSource):
             except RecordingError as error:
                 raise RecordingError(f"page {page}, {error.subject}", error.got, error.expected) from None
 
+    def page_count(self) -> int:
+        """See `FrameSource.page_count`."""
+        return self._recording.pages
+
     def references(self) -> FramePair:
         """The recording's reference frames."""
         with self._lock:

@@ -132,6 +132,10 @@ class FrameSource(ABC):
         """
         return None
 
+    def page_count(self) -> int | None:
+        """How many pages it has, 0 where it shows pages and has none yet; None where any number can be photographed."""
+        return None if self.pages is None else len(self.pages) or None
+
     def show_pages(self, pages: PageStore) -> None:
         """Show these pages from now on.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from ctypes import byref, c_int
+from ctypes import byref, c_double, c_int, c_uint32
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,12 +19,19 @@ from runtime.cameras.sfnc import (
     EXPOSURE_TOLERANCE,
     FRAME_SELECTORS,
     GAIN_TOLERANCE_DB,
+    KEYS,
     OTHER_SELECTORS,
     SWITCHED_OFF,
+    asked_for,
+    between,
     describe_region,
     frame_numbers,
+    one_of,
 )
 from runtime.errors import SourceError
+
+_BOUNDS = {"exposure_us": "exposure_time", "gain_db": "gain", "black_level_counts": "black_level"}
+"""What the library calls the limits of a number."""
 
 
 @dataclass
@@ -202,7 +209,7 @@ class AravisSetup:
 
     def _compare(self, setting: str, got: object, expected: object) -> None:
         if got != expected:
-            raise SourceError(f"{self.name}: {setting}", got, expected)
+            raise self._refused(setting, expected, got, "")
 
     def _region(self) -> str:
         rows, columns = self.frame_shape
@@ -216,4 +223,28 @@ class AravisSetup:
         except AravisError as error:
             if says_gone(error):
                 raise
-            raise SourceError(f"{self.name}: {setting}", error.message, expected) from None
+            raise self._refused(setting, expected, None, error.message) from None
+
+    def _refused(self, setting: str, asked: object, kept: object, told: str) -> SourceError:
+        """The error of a setting: by its key, where a key says so, with what the camera offers."""
+        if setting not in KEYS:
+            return SourceError(f"{self.name}: {setting}", told if kept is None else kept, asked)
+        try:
+            offers = self._offers(setting)
+        except AravisError:
+            offers = ""
+        expected = offers or f"what the camera knows{f' ({told})' if told else ''}"
+        return SourceError(f"{self.name}: {KEYS[setting]}", asked_for(asked, kept), expected)
+
+    def _offers(self, setting: str) -> str:
+        if setting == "region":
+            sides = [c_int(), c_int()]
+            self._do("get_sensor_size", *map(byref, sides))
+            return f"a region of its sensor, {sides[0].value} x {sides[1].value} pixels, in its steps"
+        if setting in _BOUNDS:
+            limits = [c_double(), c_double()]
+            self._do(f"get_{_BOUNDS[setting]}_bounds", *map(byref, limits))
+            return f"{between(*(limit.value for limit in limits))}, in its steps"
+        count = c_uint32()
+        entries = self._do("dup_available_enumerations_as_strings", setting.encode(), byref(count))
+        return one_of(entries[number].decode("utf-8", "replace") for number in range(count.value))

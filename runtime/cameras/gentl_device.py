@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import mmap
 import time
 from collections.abc import Callable, Iterator
@@ -16,12 +17,16 @@ from runtime.cameras.sfnc import (
     EXPOSURE_TOLERANCE,
     FRAME_SELECTORS,
     GAIN_TOLERANCE_DB,
+    KEYS,
     MOST_DRAINING_S,
     OTHER_SELECTORS,
     QUIET_S,
     SIGN_OF_LIFE_S,
     SWITCHED_OFF,
+    asked_for,
+    between,
     frame_numbers,
+    one_of,
 )
 
 _LEAST_WAIT_S = 1e-3
@@ -66,6 +71,10 @@ class GenTLDevice:
             from harvesters.core import Harvester
         except ImportError as error:
             raise CameraRefusedError("driver", error, "the camera extra: pip install 'lightpage[camera]'") from None
+        logging.getLogger("harvesters").disabled = True  # what it says is in the error, once
+        for name in list(logging.Logger.manager.loggerDict):
+            if name.startswith("harvesters."):
+                logging.getLogger(name).disabled = True
         self._settings, self._shape = task.settings, task.frame_shape
         self._errors: tuple[type[Exception], ...] = (gentl.GenericException, genapi.GenericException)
         self._refusals = (OSError, AttributeError, ValueError, *self._errors)
@@ -216,7 +225,7 @@ class GenTLDevice:
         feature = next((name for name in _EXPOSURES if self._has(name)), None)
         if feature is None:
             if "exposure_us" in self._settings.model_fields_set:
-                raise CameraRefusedError("exposure_us", "a camera without exposure time", wanted)
+                raise CameraRefusedError("exposure_us", wanted, "no such key: the camera knows no exposure time")
             return None
         return 1e-6 * float(self._set(feature, wanted, EXPOSURE_TOLERANCE * wanted, "exposure_us"))
 
@@ -256,9 +265,9 @@ class GenTLDevice:
 
     def _set(self, feature: str, value: Any, tolerance: float = 0.0, setting: str = "") -> Any:
         """Give it a setting, unless it has it; returns the value that it keeps, which must be the one asked for."""
-        with self._setting(setting or feature, value):
+        with self._setting(setting or feature, value, feature):
             if not self._nodes.has_node(feature):
-                raise CameraRefusedError(setting or feature, "a camera that does not know it", value)
+                raise CameraRefusedError(_key(feature, setting), value, "no such key: the camera does not know it")
             node = getattr(self._nodes, feature)
             if node.value != value:
                 node.value = value
@@ -269,16 +278,33 @@ class GenTLDevice:
         with self._setting(setting or feature, value):
             got = getattr(self._nodes, feature).get_value(False, True)
         if (abs(got - value) > tolerance) if tolerance else got != value:
-            raise CameraRefusedError(setting or feature, got, value)
+            raise self._refused(setting or feature, value, feature, got, "")
         return got
 
     @contextmanager
-    def _setting(self, setting: str, expected: object) -> Iterator[None]:
+    def _setting(self, setting: str, expected: object, feature: str = "") -> Iterator[None]:
         """Name the setting that the camera refuses."""
         try:
             yield
         except self._refusals as error:
-            raise CameraRefusedError(setting, _plain(error), expected) from None
+            raise self._refused(setting, expected, feature, None, _plain(error)) from None
+
+    def _refused(self, setting: str, asked: object, feature: str, kept: object, told: str) -> CameraRefusedError:
+        """The error of a setting: by its key, where a key says so, with what the camera offers."""
+        if setting not in KEYS:
+            return CameraRefusedError(setting, told if kept is None else kept, asked)
+        offers = self._offers(feature)
+        expected = offers or f"what the camera knows{f' ({told})' if told else ''}"
+        return CameraRefusedError(KEYS[setting], asked_for(asked, kept), expected)
+
+    def _offers(self, feature: str) -> str:
+        """Entries or limits of a feature, empty where it tells none."""
+        with suppress(*self._refusals):
+            if entries := self._entries(feature):
+                return one_of(entries)
+            node = getattr(self._nodes, feature)
+            return f"{between(node.min, node.max)}, in its steps"
+        return ""
 
     @contextmanager
     def _answering(self) -> Iterator[None]:
@@ -300,6 +326,14 @@ def _calling(called: Callable[[], None]) -> Any:
     return Call()
 
 
+def _key(feature: str, setting: str) -> str:
+    return KEYS.get(setting or feature, setting or feature)
+
+
 def _plain(error: BaseException) -> str:
-    """GenApi's messages without the place in its sources."""
+    """GenApi's messages without the place in its sources; what harvesters does not say."""
+    if isinstance(error, FileNotFoundError) and not str(error):
+        return "no such file"
+    if isinstance(error, OSError) and not str(error):
+        return "a file that cannot be loaded"
     return str(error).split(" : ", 1)[0].removeprefix("GenTL exception: ").split(" (Message from", 1)[0] or repr(error)

@@ -32,7 +32,7 @@ class CameraSettings(BaseModel):
         buffers: frames that may wait in this machine.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     driver: Literal["aravis", "gentl"] = "aravis"
     producer: str | None = Field(default=None, min_length=1)
@@ -55,24 +55,25 @@ class CameraSettings(BaseModel):
         try:
             return pixel_format(name).name
         except InvalidInputError as error:
-            raise ValueError(f"{error.got} is none of {error.expected}") from None
+            raise ValueError(f"{error.got}, wanted {error.expected}") from None
 
     @model_validator(mode="after")
     def _one_camera(self) -> Self:
         if (self.serial is None) == (self.address is None):
-            raise ValueError("give either serial or address")
+            got = "neither serial nor address" if self.serial is None else "serial and address"
+            raise ValueError(f"{got}, wanted one of them")
         return self
 
     @model_validator(mode="after")
     def _of_its_driver(self) -> Self:
         if self.driver == "aravis" and self.producer is not None:
-            raise ValueError('producer is for driver = "gentl"')
+            raise ValueError('producer with driver = "aravis", wanted driver = "gentl"')
         if self.driver == "gentl":
             if self.producer is None:
-                raise ValueError('driver = "gentl" wants a producer')
+                raise ValueError('no producer, wanted one with driver = "gentl"')
             for setting in ("address", "packet_bytes"):
                 if getattr(self, setting) is not None:
-                    raise ValueError(f'{setting} is for driver = "aravis"')
+                    raise ValueError(f'{setting} with driver = "gentl", wanted driver = "aravis"')
         return self
 
     @property

@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 FRAME_SELECTORS = ("FrameStart", "FrameBurstStart")
 """Triggers that start a frame, the better one first."""
 OTHER_SELECTORS = ("AcquisitionStart", "AcquisitionEnd", "FrameEnd", "FrameActive", "ExposureStart", "LineStart")
 SWITCHED_OFF = ("ChunkModeActive", "AcquisitionFrameRateEnable")
 AUTOMATIC = ("ExposureAuto", "GainAuto", "BlackLevelAuto")
 """What a camera would change by itself."""
+
+KEYS = {
+    "PixelFormat": "pixel_format",
+    "TriggerSource": "trigger_source",
+    "TriggerActivation": "trigger_activation",
+    "Width": "columns of the profile's camera",
+    "Height": "rows of the profile's camera",
+    "OffsetX": "offset_x_px",
+    "OffsetY": "offset_y_px",
+    "region": "region by the profile's camera, offset_x_px, offset_y_px",
+    **{key: key for key in ("exposure_us", "gain_db", "black_level_counts")},
+}
+"""What is set because a key says so: the key, for errors."""
 
 EXPOSURE_TOLERANCE = 0.05
 """Relative: cameras expose for whole lines of the sensor."""
@@ -25,6 +40,21 @@ SIGN_OF_LIFE_S = 0.05
 def describe_region(x: int, y: int, columns: int, rows: int) -> str:
     """A region of interest, for people."""
     return f"{columns} x {rows} pixels at ({x}, {y})"
+
+
+def one_of(entries: Iterable[str]) -> str:
+    """What a camera offers, for people; empty if nothing."""
+    return f"one of {told}" if (told := ", ".join(entries)) else ""
+
+
+def between(least: float, most: float) -> str:
+    """The same of a number."""
+    return f"{least:.10g} to {most:.10g}"
+
+
+def asked_for(value: object, kept: object = None) -> str:
+    """What a camera was asked for, and what it made of it, where it refused nothing."""
+    return str(value) if kept is None else f"{value}, of which the camera makes {kept}"
 
 
 def frame_numbers(is_gige: bool, extended_ids: bool) -> int:

@@ -11,16 +11,18 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import FrameError, InvalidInputError, LostDataError
 from lightpage.files import write_json
-from lightpage.progress import track
+from lightpage.progress import note, track, warn
 from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.layout import FramePair, LostShot
 from lightpage.recording.pages import Pages
-from lightpage.recording.writer import RecordingWriter
+from lightpage.recording.writer import RecordingWriter, Symbols, pages_there, partial_path
+from lightpage.words import counted
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import FrameSource, Shot
 from runtime.acquisition.sources import open_source
@@ -58,7 +60,7 @@ def record(
     """Record pages of a camera, or of any other source.
 
     Dark and reference frames come first. The device blocks their beams; where it cannot, you are asked to. Interrupted,
-    the same command goes on where it stopped. Lost shots are noted in the recording.
+    the same command goes on where it stopped. Lost shots are noted in the recording. Exit status 3: shots stayed lost.
     """
     if out.exists() and not force:
         raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
@@ -71,14 +73,75 @@ def record(
         source.check_against(profile)
         if symbols is not None:
             source.show_pages(PageStore(profile, Pages.open(symbols)))
-        count = pages or len(source.pages or ())
-        if not count:
-            raise InvalidInputError("options", "neither --pages nor pages to show", "one of them")
-        with source:
-            longest_s = max(_SHOT_S, source.shot_s) if shot_seconds is None else shot_seconds
-            _record(source, profile, count, out, longest_s, dark, json_path)
+        count = _count(source, pages, symbols)
+        there = _there(source, profile, out, force)
+        _check_room(count, there)
+        _tell_where(out, there)
+        source.on_lost = _tell_loss
+        longest_s = max(_SHOT_S, source.shot_s) if shot_seconds is None else shot_seconds
+        try:
+            with source:
+                _record(source, profile, count, out, longest_s, dark, force, json_path)
+        except LostShotError as error:  # of dark or reference frames
+            raise LostDataError(error.subject, error.got, f"{error.expected} ({error.reason.value})") from None
     finally:
         source.close()
+
+
+def _count(source: FrameSource, asked: int | None, symbols: Path | None) -> int:
+    """How many pages are to be recorded.
+
+    Raises:
+        InvalidInputError: nobody says how many, or there are fewer.
+    """
+    there = source.page_count()
+    if there == 0:
+        raise InvalidInputError("--symbols", f"none, and {source.name} has no pages to show", "PAGES.h5")
+    if asked is None and there is None:
+        raise InvalidInputError("options", "neither --pages nor pages to show", "one of them")
+    if asked is not None and there is not None and asked > there:
+        named = f"--symbols {symbols}" if symbols is not None else source.name
+        raise InvalidInputError("--pages", asked, f"at most the {counted(there, 'page')} of {named}")
+    return asked or there or 0
+
+
+def _code_of(source: FrameSource) -> str | None:
+    return None if source.pages is None else source.pages.code
+
+
+def _symbols_of(source: FrameSource) -> Symbols | None:
+    """Of the pages that it shows, where they are known before they are photographed."""
+    return source.pages.__getitem__ if source.pages is not None and len(source.pages) else None
+
+
+def _there(source: FrameSource, profile: Profile, out: Path, force: bool) -> int:
+    """Pages of an earlier run to go on from, known before anything is connected."""
+    return pages_there(
+        out,
+        profile,
+        source.levels,
+        source.bit_depth,
+        code=_code_of(source),
+        symbols=_symbols_of(source),
+        overwrite=force,
+    )
+
+
+def _check_room(count: int, there: int) -> None:
+    if there > count:
+        raise InvalidInputError("--pages", count, f"at least the {counted(there, 'page')} already there")
+
+
+def _tell_where(out: Path, pages: int) -> None:
+    """Have whoever interrupts the command be told how it goes on."""
+    there = f"{counted(pages, 'page')} {'is' if pages == 1 else 'are'} in {partial_path(out)}; " if pages else ""
+    go_on = "the same command goes on from there" if pages else "no page is recorded yet"
+    click.get_current_context().meta[RESUME_KEY] = there + go_on
+
+
+def _tell_loss(page: int, error: LostShotError) -> None:
+    what = f"page {page}" if page >= 0 else "frames without a page"
+    warn(f"{what}: shot lost ({error.reason.value}): {error.subject}: {error.got}")
 
 
 def _record(
@@ -88,35 +151,47 @@ def _record(
     out: Path,
     shot_seconds: float,
     dark: bool,
+    force: bool,
     json_path: Path | None,
 ) -> None:
     """Record pages of a source that is armed; see `record`."""
+    if dark:
+        note("dark frames")
     dark_frames = source.dark_frames() if dark else None
+    note("reference frames")
     references = source.references()
     if references is None:
         raise InvalidInputError(f"source {source.name}", "no reference frames", "a source that can block its signal")
-    code = None if source.pages is None else source.pages.code
     losses: list[LostShot] = []
     repeated = 0
     begun = time.perf_counter()
     with RecordingWriter.resume(
-        out, profile, source.levels, source.bit_depth, references, code=code, keep_references=True
+        out,
+        profile,
+        source.levels,
+        source.bit_depth,
+        references,
+        code=_code_of(source),
+        keep_references=True,
+        symbols=_symbols_of(source),
+        overwrite=force,
     ) as writer:
-        if writer.pages > count:
-            raise InvalidInputError("--pages", count, f"at least the {writer.pages} pages that are there already")
+        _check_room(count, writer.pages)
         if dark_frames is not None:
             writer.set_dark_frames(*_darkness(dark_frames))
 
-        def note(page: int, error: LostShotError) -> None:
+        def keep(page: int, error: LostShotError) -> None:
+            _tell_loss(page, error)
             losses.append(LostShot(page, error.reason.value, str(error), time.time()))
             writer.add_loss(losses[-1])
 
-        source.on_lost = note
+        source.on_lost = keep
         first = writer.pages
         for index in track(range(first, count), "record", total=count, done=first):
             shot, attempts = _good_shot(source, index, shot_seconds)
             repeated += attempts - 1
             writer.append(shot.symbols, shot.pair, infos=shot.infos)
+            _tell_where(out, writer.pages)
     by_reason = Counter(loss.reason for loss in losses)
     figures = {
         "pages": count,
@@ -134,7 +209,8 @@ def _record(
         write_json(json_path, figures)
     told = ", ".join(f"{times} {reason}" for reason, times in sorted(by_reason.items()))
     click.echo(
-        f"{out}: {count} pages of {source.levels} levels; {len(losses)} shots lost{f' ({told})' if told else ''}"
+        f"{out}: {counted(count, 'page')} of {source.levels} levels; "
+        f"{counted(len(losses), 'shot')} lost{f' ({told})' if told else ''}"
     )
 
 
@@ -152,8 +228,11 @@ def _good_shot(source: FrameSource, index: int, seconds: float) -> tuple[Shot, i
     try:
         return _shot(source, index, seconds), ATTEMPTS
     except (LostPageError, FrameError) as error:
-        expected = f"one good shot of {ATTEMPTS}; run the same command again to go on from here"
-        raise LostDataError(f"page {index} of {source.name}", error, expected) from None
+        page = f"page {index} of {source.name}"
+        subject = error.subject if error.subject.startswith(page) else f"{page}: {error.subject}"
+        reason = f"{error.reason.value}; " if isinstance(error, LostPageError) else ""
+        tried = f"{reason}lost {ATTEMPTS} times in a row; the same command goes on from here"
+        raise LostDataError(subject, error.got, f"{error.expected} ({tried})") from None
 
 
 def _shot(source: FrameSource, index: int, seconds: float) -> Shot:

@@ -227,6 +227,8 @@ def _source(name: str, pages_file: Path | None, base: Decoder) -> FrameSource:
         source.check_against(base.bundle.profile)
         if pages_file is not None:
             source.show_pages(PageStore(base.bundle.profile, Pages.open(pages_file)))
+        if source.page_count() == 0:
+            _log.warning("%s shows pages and has none: name some with --pages, or upload them", source.name)
     except BaseException:
         source.close()
         raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -50,16 +51,29 @@ def virtual_device(
     so does COMMAND, which is started there once the device is ready; the device ends with it. Without COMMAND a shell
     is started.
     """
+    _make(out)
     go_on_inside("lightpage.cli.main")
     context = click.get_current_context()
     context.meta[RESUME_KEY] = "the simulated device has ended, and its command with it"
-    out.mkdir(parents=True, exist_ok=True)
     device = (load_device(device_file) if device_file else Device()).with_settings(list(settings))
     with VirtualDevice(load_profile(profile_name), device, out, seed, pixel_format, black_level, hot_pixels) as running:
         click.echo(f"simulated device at camera:{running.config}", err=True)
         status = _run(command or (os.environ.get("SHELL", "/bin/sh"),))
         running.check()
     context.exit(status)
+
+
+def _make(folder: Path) -> None:
+    """Make the folder unless it is there.
+
+    Raises:
+        InvalidInputError: it cannot be made, or nothing can be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise InvalidInputError(f"--out {folder}", error, "a folder that can be made and written") from None
 
 
 def _run(command: Sequence[str]) -> int:

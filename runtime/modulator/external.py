@@ -95,6 +95,9 @@ class ExternalModulator:
         """The controller says: no page is on display, or will not be from now on."""
         self._pages.announce(None)
 
+    def open(self, timeout_s: float, levels: int | None = None) -> None:
+        """See `Modulator`: the controller may come at any time."""
+
     def show(self, symbols: NDArray[np.uint8], levels: int, page: int, timeout_s: float) -> None:
         """Wait until the controller says that page number `page` is on display; see `Modulator`."""
         self._at_last_show = -1

@@ -15,6 +15,19 @@ class Modulator(Protocol):
     def name(self) -> str:
         """For people, e.g. ``screen :0.1``."""
 
+    def open(self, timeout_s: float, levels: int | None = None) -> None:
+        """Connect, unless that is done: with this, wrong settings show before the first page.
+
+        Args:
+            timeout_s: longest wait.
+            levels: M of the pages that are to be shown, where it is known.
+
+        Raises:
+            SourceError: it is not there, or not as it was said to be.
+            InvalidInputError: it cannot show so many levels.
+            LostShotError: `Reason.NOT_ON_DISPLAY`: it is not ready by then.
+        """
+
     def show(self, symbols: NDArray[np.uint8], levels: int, page: int, timeout_s: float) -> None:
         """Show a page and return once it is on display.
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,16 +32,22 @@ class ScreenModulator:
     Args:
         settings: which monitor, its resolution, and where the page lies.
         profile: how large page and symbols are.
-        lookup_table: grey value of each level.
+        lookup_table: grey value of each level, or what makes a table for a number of levels.
 
     Raises:
         InvalidInputError: the page does not lie on the modulator.
     """
 
-    def __init__(self, settings: ScreenSettings, profile: Profile, lookup_table: LookupTable) -> None:
+    def __init__(
+        self, settings: ScreenSettings, profile: Profile, lookup_table: LookupTable | Callable[[int], LookupTable]
+    ) -> None:
         self._settings = settings
         self._raster = Raster(profile, settings)
-        self._lookup_table = lookup_table
+        self._table_of: Callable[[int], LookupTable]
+        if isinstance(lookup_table, LookupTable):
+            self._table_of = lambda levels: lookup_table
+        else:
+            self._table_of = cache(lookup_table)
         self._window: WindowProcess | None = None
         self._was_open = False
         self._has_page = False
@@ -50,13 +58,16 @@ class ScreenModulator:
         display = self._settings.x_display or os.environ.get("DISPLAY", "without DISPLAY")
         return f"screen {display}, monitor {self._settings.monitor}"
 
-    def open(self, timeout_s: float) -> None:
-        """Open the window unless it is open: with this, wrong settings show before the first page.
+    def open(self, timeout_s: float, levels: int | None = None) -> None:
+        """Open the window unless it is open; see `Modulator`.
 
         Raises:
             SourceError: no such X server or monitor, or its resolution is not the modulator's.
+            InvalidInputError: there is no lookup table for so many levels.
             LostShotError: `Reason.NOT_ON_DISPLAY`: it is not open by then, or it has gone away; opened again next time.
         """
+        if levels is not None:
+            self._table_of(levels)
         self._opened(self.name, time.monotonic() + timeout_s)
 
     def show(self, symbols: NDArray[np.uint8], levels: int, page: int, timeout_s: float) -> None:
@@ -64,13 +75,14 @@ class ScreenModulator:
 
         Raises:
             PageError: symbols of another shape or another number of levels.
+            InvalidInputError: there is no lookup table for so many levels.
             SourceError: see `open`.
             LostShotError: `Reason.NOT_ON_DISPLAY`: not by then, or the window, or the X server, has gone away, or
                 something covers the window. It is opened again at the next call.
         """
         deadline = time.monotonic() + timeout_s
         subject = f"page {page} on {self.name}"
-        image = self._raster.image(self._lookup_table.greys_of(symbols, levels))
+        image = self._raster.image(self._table_of(levels).greys_of(symbols, levels))
         self._has_page = False
         window = self._opened(subject, deadline)
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from lightpage.device.profile import Side, TomlTable
 
@@ -23,6 +23,8 @@ class RasterSettings(TomlTable):
         flip_y: mirror the page, top for bottom; it stays where it is.
         background_grey: grey value beside the page.
     """
+
+    model_config = ConfigDict(strict=True)
 
     rows_px: Side
     columns_px: Side

@@ -6,7 +6,7 @@ import logging
 import time
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from lightpage.device.profile import TomlTable
 from lightpage.errors import InvalidInputError, LightpageError
@@ -24,6 +24,8 @@ class Shutter(TomlTable):
         open_when: level at which it is open: ``high`` while the channel is on, ``low`` while it is off.
         settle_s: it has moved after this.
     """
+
+    model_config = ConfigDict(strict=True)
 
     channel: Channel
     open_when: Literal["high", "low"] = "high"
@@ -45,6 +47,7 @@ class ShutterBeams:
         if signal.channel == reference.channel:
             raise InvalidInputError("shutters of signal and reference", f"channel {signal.channel} for both", "two")
         self._generator, self._signal, self._reference = generator, signal, reference
+        self._moved = False
         self.name = f"shutters on channels {signal.channel} and {reference.channel} of {generator.name}"
 
     def let_through(self, *, signal: bool, reference: bool) -> None:
@@ -52,6 +55,7 @@ class ShutterBeams:
         try:
             for shutter, is_open in ((self._signal, signal), (self._reference, reference)):
                 self._generator.set_channel(shutter.channel, is_open == (shutter.open_when == "high"))
+                self._moved = True
         except LostShotError as error:
             raise LostShotError(
                 f"{self.name}: {error.subject}", error.got, error.expected, Reason.BEAM_CONTROL_FAILED
@@ -60,8 +64,9 @@ class ShutterBeams:
 
     def close(self) -> None:
         """See `Beams`; the pulse generator is let go of as well, and connects again when it is used."""
-        try:
-            self.let_through(signal=True, reference=True)
-        except LightpageError as error:
-            _log.warning("beams may still be blocked: %s", error)
+        if self._moved:  # else nothing blocks them, and perhaps there is nothing to be connected to
+            try:
+                self.let_through(signal=True, reference=True)
+            except LightpageError as error:
+                _log.warning("beams may still be blocked: %s", error)
         self._generator.close()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import to_toml
 from lightpage.device.state import Device
-from runtime.errors import LostShotError, Reason
+from runtime.errors import LostShotError, Reason, SourceError
 
 ANSWER_S = 30.0
 """Longest wait for shutters. A full-size page takes minutes to simulate, but it has the wait of its shot."""
@@ -33,7 +33,12 @@ class SimulatedModulator:
     def __init__(self, address: Path) -> None:
         self._address = address
         self._connection: Connection[Any, Any] | None = None
+        self._was_there = False
         self.name = f"simulated modulator {address.name}"
+
+    def open(self, timeout_s: float, levels: int | None = None) -> None:
+        """See `Modulator`."""
+        self._connected(Reason.NOT_ON_DISPLAY)
 
     def show(self, symbols: NDArray[np.uint8], levels: int, page: int, timeout_s: float) -> None:
         """See `Modulator`."""
@@ -52,7 +57,8 @@ class SimulatedModulator:
         """Let the simulated device drift to another true state; the next page that is shown shows it.
 
         Raises:
-            LostShotError: there is no device.
+            LostShotError: the device has gone.
+            SourceError: there is none.
         """
         self._ask({"device": to_toml(device)}, b"", timeout_s, Reason.NOT_ON_DISPLAY)
 
@@ -63,13 +69,12 @@ class SimulatedModulator:
             connection.close()
 
     def _ask(self, head: dict[str, Any], content: bytes, timeout_s: float, reason: Reason) -> None:
+        connection = self._connected(reason)
         try:
-            if self._connection is None:
-                self._connection = Client(str(self._address), "AF_UNIX")
-            self._connection.send_bytes(json.dumps(head).encode() + b"\n" + content)
-            if not self._connection.poll(timeout_s):
+            connection.send_bytes(json.dumps(head).encode() + b"\n" + content)
+            if not connection.poll(timeout_s):
                 raise LostShotError(self.name, f"no answer within {timeout_s:.1f} s", "an answer", reason)
-            answer = json.loads(self._connection.recv_bytes(1 << 16))
+            answer = json.loads(connection.recv_bytes(1 << 16))
         except (OSError, EOFError, ValueError) as error:
             self.close()
             raise LostShotError(self.name, error or "no connection", "a simulated device", reason) from None
@@ -78,3 +83,16 @@ class SimulatedModulator:
             raise
         if "error" in answer:
             raise LostShotError(self.name, answer["error"], "a page on display, and shutters that moved", reason)
+
+    def _connected(self, reason: Reason) -> Connection[Any, Any]:
+        """The connection. A device that was never there is not one that has gone away."""
+        if self._connection is None:
+            try:
+                self._connection = Client(str(self._address), "AF_UNIX")
+            except OSError as error:
+                expected = f"the socket of a simulated device that runs, {self._address}"
+                if self._was_there:
+                    raise LostShotError(self.name, error, expected, reason) from None
+                raise SourceError(self.name, error, expected) from None
+            self._was_there = True
+        return self._connection

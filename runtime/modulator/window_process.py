@@ -24,7 +24,10 @@ class WindowProcess:
         self._number = 0
         self._opening: Answer | None = None
         self._process = HelperProcess(
-            "runtime.modulator.screen_window", settings.model_dump_json(), subject="the process of its window"
+            "runtime.modulator.screen_window",
+            # of a table that wires a device, what else it says is not the window's
+            settings.model_dump_json(include=set(ScreenSettings.model_fields)),
+            subject="the process of its window",
         )
 
     def opening(self, deadline: float) -> Answer:

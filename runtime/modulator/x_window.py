@@ -134,15 +134,15 @@ class XWindow:
         monitors = self._monitors()
         number = self._settings.monitor
         if number >= len(monitors):
-            sizes = ", ".join(str(monitor) for monitor in monitors) or "no monitor"
-            raise SourceError("screen", f"monitors 0 to {len(monitors) - 1}: {sizes}", f"a monitor {number}")
+            sizes = ", ".join(f"{which} of {monitor} pixels" for which, monitor in enumerate(monitors))
+            raise SourceError("screen", f"monitors {sizes}" if sizes else "no monitor at all", f"monitor {number}")
         monitor = monitors[number]
         if (monitor.rows, monitor.columns) != (self._settings.rows_px, self._settings.columns_px):
             raise SourceError(
                 "screen",
                 f"{monitor} pixels",
                 f"{self._settings.columns_px}x{self._settings.rows_px} pixels, as the modulator has: "
-                "set the monitor's mode to them",
+                "set the monitor's mode to them, or columns_px and rows_px to the monitor's",
             )
         return monitor
 

@@ -52,11 +52,11 @@ class PulseGeneratorSettings(BaseModel):
         synchronise_s: longest wait until the line is in order after it was not.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     port: Annotated[str, Field(min_length=1)]
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
-    channels: Annotated[tuple[Channel, ...], Field(min_length=1)] = (1, 2)
+    channels: Annotated[tuple[Channel, ...], Field(min_length=1, strict=False)] = (1, 2)
     width_s: Annotated[float, Field(ge=RESOLUTION_S, le=10.0)] = 1e-3
     delay_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
     polarity: Literal["normal", "inverted"] = "normal"
@@ -71,7 +71,7 @@ class PulseGeneratorSettings(BaseModel):
     @classmethod
     def _each_once(cls, channels: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(channels)) != len(channels):
-            raise ValueError("name each channel once")
+            raise ValueError("a channel twice, wanted each once")
         return channels
 
     @property
@@ -137,13 +137,17 @@ class PulseGenerator:
                 raise
 
     def disarm(self) -> None:
-        """See `Trigger`: stops T0. A device that has gone fires no more anyway."""
+        """See `Trigger`: stops T0, and switches off the cameras' channels. A device that has gone fires no more anyway.
+
+        Channels that stayed on would fire for whoever uses the device next, and hide that theirs are others.
+        """
         with self._lock:
             ready, self._ready = self._ready, None
             if ready is None:
                 return
             try:
-                self._line.send(":PULSE0:STATE OFF", ready)
+                for channel in (0, *self.settings.channels):
+                    self._line.send(f":PULSE{channel}:STATE OFF", ready)
             except LostShotError as error:
                 _log.warning("not disarmed: %s", error)
 

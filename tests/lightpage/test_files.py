@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from lightpage.cli.paths import OutputFile
 from lightpage.errors import InvalidInputError
-from lightpage.files import replace_file, replace_text
+from lightpage.files import move_to_new_name, replace_file, replace_text
 
 
 @click.command()
@@ -84,3 +84,22 @@ def test_a_file_system_that_cannot_sync_a_folder_keeps_files_all_the_same(
     monkeypatch.setattr(os, "fsync", refused)
     replace_text(tmp_path / "F", "text")
     assert (tmp_path / "F").read_text() == "text"
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_file_that_is_there_keeps_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
+    def unsupported(made: Path, path: Path) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    if not links:
+        monkeypatch.setattr(os, "link", unsupported)
+    made, final = tmp_path / "made", tmp_path / "final"
+    for text in ("first", "second"):
+        made.write_text(text)
+        if text == "first":
+            move_to_new_name(made, final)
+            assert not made.exists()
+        else:
+            with pytest.raises(FileExistsError):
+                move_to_new_name(made, final)
+    assert (made.read_text(), final.read_text()) == ("second", "first")

@@ -30,6 +30,7 @@ flip_y = true
 [trigger]
 kind = "software"
 """
+PULSES = PLAIN.replace('"software"', '"pulse_generator"\nport = "/dev/null"\nchannels = [1, 2]')
 
 
 def opened(tmp_path: Path, text: str) -> CameraSource:
@@ -79,12 +80,47 @@ def test_a_controller_may_do_all_of_it(tmp_path: Path) -> None:
     [
         ("profile =", "TOML"),
         (PLAIN.replace("levels = 16", "levels = 1"), "levels"),
-        (PLAIN.replace('serial = "1"', 'serial = "1"\naddress = "1.2.3.4"'), "either serial or address"),
-        (PLAIN.replace('serial = "1"', 'serial = "1"\ncolour = "red"'), "unknown in_phase.colour"),
-        (PLAIN.replace('"software"', '"bell"'), "bell"),
+        (
+            PLAIN.replace('serial = "1"', 'serial = "1"\naddress = "1.2.3.4"'),
+            r"device\.toml: in_phase: got serial and address, wanted one of them \(docs/cameras\.md, all keys\)$",
+        ),
+        (PLAIN.replace('serial = "1"', "flip_y = true"), "in_phase: got neither serial nor address, wanted one of"),
+        (PLAIN.replace('serial = "1"', 'serial = "1"\ncolour = "red"'), "in_phase.colour: got an unknown key"),
+        (
+            PLAIN.replace('serial = "1"', 'serial = "1"\nexposure_u = 2'),
+            "exposure_u: got an unknown key, wanted exposure_us",
+        ),
+        (
+            PLAIN.replace('serial = "1"', 'serial = "1"\nexposure_us = "200"'),
+            r"exposure_us: got '200', wanted a number",
+        ),
+        (PLAIN.replace('serial = "1"', 'serial = "1"\nexposure_us = true'), r"exposure_us: got true, wanted a number"),
+        (PLAIN.replace('serial = "1"', 'serial = "1"\nbuffers = 1'), r"in_phase\.buffers: got 1, wanted at least 2"),
+        (PLAIN.replace('serial = "2"', 'serial = "1"'), "serial 1 for in_phase and for quadrature, wanted two cameras"),
+        (PLAIN.replace('"software"', '"bell"'), r"trigger\.kind: got 'bell', wanted pulse_generator or software"),
+        (PLAIN.replace('kind = "software"', ""), "trigger: got no kind, wanted pulse_generator or software"),
+        (PLAIN.replace('[trigger]\nkind = "software"', ""), "got no trigger, wanted one"),
+        (PLAIN.replace('"software"', '"pulse_generator"'), "trigger: got no port, wanted one"),
+        (PULSES.replace("channels = [1, 2]", "baud = 3"), r"device\.toml: trigger\.baud: got 3, wanted at least 1200"),
+        (
+            PULSES.replace("channels = [1, 2]", "channels = [1, 1]"),
+            "trigger.channels: got a channel twice, wanted each once",
+        ),
+        (
+            PULSES.replace("channels = [1, 2]", "channels = [1, true]"),
+            r"trigger\.channels\.1: got true, wanted a whole number",
+        ),
+        (
+            PULSES + '[beams]\nkind = "shutters"\nsignal = {channel = 2}\nreference = {channel = 4}\n',
+            r"beams\.signal\.channel = 2, wanted none of the cameras' \(1, 2\)",
+        ),
+        (
+            PLAIN.replace("levels = 16", "levels = 16\nlevel = 3").replace('"software"', '"bell"'),
+            r"got 2 mistakes: trigger\.kind: .bell. \(wanted pulse.*; level: an unknown key \(wanted levels\), wanted",
+        ),
         (PLAIN.replace('"bench"', '"nowhere"'), "nowhere"),
         (PLAIN + '[beams]\nkind = "shutters"\nsignal = {channel = 3}\nreference = {channel = 4}\n', "pulse_generator"),
-        (PLAIN + "[pairing]\ntolerance_s = 0.05\nspacing_s = 0.06\n", "spacing_s"),
+        (PLAIN + "[pairing]\ntolerance_s = 0.05\nspacing_s = 0.06\n", "pairing: got spacing_s = 0.06, wanted at l"),
         (PLAIN.replace("levels = 16", 'levels = 16\npages = "absent.h5"'), "absent.h5"),
     ],
 )

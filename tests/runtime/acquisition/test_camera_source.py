@@ -11,6 +11,7 @@ import pytest
 
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError, LimitError, PageError
+from lightpage.progress import reporting
 from lightpage.recording.pages import Pages, PagesWriter
 from runtime.acquisition.camera_source import CameraSource, Exposures, View
 from runtime.acquisition.page_store import PageStore
@@ -18,6 +19,7 @@ from runtime.acquisition.pairing import PairingSettings
 from runtime.errors import LostShotError, Reason, SourceError
 from tests.runtime import toy
 from tests.runtime.acquisition.lab import Lab
+from tests.told import Told
 
 PAIRING = PairingSettings(tolerance_s=0.012, frame_s=0.15, quiet_s=0.04, spacing_s=0.032)
 
@@ -30,6 +32,7 @@ class LabModulator:
     def __init__(self, lab: Lab, device: toy.ToyDevice) -> None:
         self.lab, self.device = lab, device
         self.shown: list[int] = []
+        self.opened_for: list[int | None] = []
         self.beams: list[tuple[bool, bool]] = []
         self.pair = device.references()
         for which, camera in zip(("in_phase", "quadrature"), lab.cameras, strict=True):
@@ -40,6 +43,9 @@ class LabModulator:
         self.lab.poll()
         self.shown.append(page)
         self.pair = self.device.page(symbols, levels, 0.1)
+
+    def open(self, timeout_s: float, levels: int | None = None) -> None:
+        self.opened_for.append(levels)
 
     def shows(self) -> bool:
         return True
@@ -230,3 +236,55 @@ def test_pages_for_another_profile_are_refused(tmp_path: Path) -> None:
 def test_an_empty_store_says_that_it_has_none() -> None:
     with pytest.raises(PageError, match="none was given or uploaded"):
         PageStore(toy.PROFILE)[0]
+
+
+def test_a_trigger_that_never_arrives_is_told_soon(tmp_path: Path) -> None:
+    lab = Lab()
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))), repeats=50)
+    lab.cameras[1].edge = lambda *_, **__: None  # type: ignore[method-assign]  # its trigger is on another line
+    with source:
+        for take in (source.dark_frames, source.references, source.shot):
+            begun = time.monotonic()
+            with pytest.raises(LostShotError, match=r"Q: got no frame since.*trigger_source.*cable") as raised:
+                take()
+            assert raised.value.reason is Reason.MISSING_FRAME
+            assert str(raised.value).endswith("(MISSING_FRAME)")
+            assert time.monotonic() - begun < 3
+        del lab.cameras[1].edge
+        assert source.shot(page=0).page_index == 0
+
+
+def test_what_is_done_is_told(tmp_path: Path) -> None:
+    lab, told = Lab(), Told()
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    with source, reporting(told):
+        source.shot()
+        assert told.notes == ["cameras and trigger are synchronised"]
+
+
+def test_pages_are_counted_where_they_are_shown() -> None:
+    lab = Lab()
+    source, _ = source_of(lab, PageStore(toy.PROFILE))
+    assert source.page_count() == 0
+    source.pages.append(toy.symbols_of(16, 1), 16)
+    assert source.page_count() == 1
+    source.modulator, source.pages = None, PageStore(toy.PROFILE)
+    assert source.page_count() is None
+
+
+def test_a_modulator_is_opened_for_its_pages_before_the_cameras(tmp_path: Path) -> None:
+    lab = Lab()
+    source, modulator = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    source.arm()
+    source._armed = False
+    source.arm()
+    assert modulator.opened_for == [16]
+    other, modulator = source_of(Lab(), PageStore(toy.PROFILE))
+
+    def absent(timeout_s: float, levels: int | None = None) -> None:
+        raise LostShotError("screen", "no window", "one", Reason.NOT_ON_DISPLAY)
+
+    modulator.open = absent  # type: ignore[method-assign]
+    with pytest.raises(SourceError, match="no window"):
+        other.arm()
+    assert not any(camera.opened for camera in other._cameras)

@@ -144,7 +144,7 @@ def test_cameras_that_never_answer_end_with_the_time_of_the_shot() -> None:
     begun = time.monotonic()
     with pytest.raises(LostShotError) as raised:
         shoot(pairing_of(lab), lab, seconds=1.0)
-    assert raised.value.reason is Reason.NOT_SYNCHRONISED
+    assert raised.value.reason is Reason.MISSING_FRAME
     assert time.monotonic() - begun < 5
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -10,15 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lightpage.cli import main as cli_main
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError, LightpageError, PageError, RecordingError
-from lightpage.page.symbols import pilot_mask
-from lightpage.recording.reader import FramePair
+from lightpage.page.symbols import pilot_mask, random_symbols
+from lightpage.recording.pages import PagesWriter
+from lightpage.recording.reader import FramePair, Recording
 from runtime.acquisition.recording import RecordingSource
 from runtime.acquisition.simulator import SimulatorSource
 from runtime.acquisition.sources import open_source
-from runtime.errors import LostShotError, Reason
+from runtime.commands import record
+from runtime.errors import LostShotError, Reason, SourceError
 from tests.runtime import toy
 
 
@@ -126,38 +130,85 @@ class VendorFrame:
 
 
 class VendorSdk:
-    def __init__(self, rest: str) -> None:
-        self.running, self.number = False, 0
+    """Cameras whose second pair is lost; a page's light is its first symbol."""
 
-    def start(self) -> None:
-        self.running = True
+    absent = False
+
+    def __init__(self, rest: str) -> None:
+        self.running, self.number, self.blocked, self.light = False, 0, False, 0
+
+    def start(self) -> bool:
+        self.running = not self.absent
+        return self.running
 
     def stop(self) -> None:
         self.running = False
 
+    def block_signal(self, blocked: bool) -> None:
+        self.blocked = blocked
+
+    def show(self, symbols: np.ndarray | None) -> None:
+        self.light = 0 if symbols is None else int(symbols[0, 0])
+
     def take_pair(self, timeout_s: float) -> tuple[VendorFrame, VendorFrame] | None:
         assert self.running
         self.number += 1
-        frame = np.full((2, 2), self.number, np.uint8)
-        return None if self.number == 2 else (VendorFrame(self.number, frame), VendorFrame(self.number, frame + 1))
+        if self.number == 2:
+            return None
+        frame = np.full(load_profile("bench").frame_shape, 50 if self.blocked else 100 + self.light, np.uint8)
+        return VendorFrame(self.number, frame), VendorFrame(self.number, frame + 1)
 
 
-def test_the_source_of_a_vendor_in_the_documents_works(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def vendor(monkeypatch: pytest.MonkeyPatch) -> EntryPoint:
+    """The source of the documents, as an entry point."""
     text = (Path(__file__).parents[3] / "docs" / "cameras.md").read_text("utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     assert len(blocks) == 1
-    assert len(blocks[0].strip().splitlines()) <= 32
+    assert len(blocks[0].strip().splitlines()) <= 48
     space: dict[str, object] = {"VendorSdk": VendorSdk}
     exec(compile(blocks[0], "docs/cameras.md", "exec", dont_inherit=True), space)
-    point = EntryPoint("vendor", "vendor:VendorSource", "lightpage.sources")
-    monkeypatch.setattr(EntryPoint, "load", lambda self: space["VendorSource"])
-    with open_source("vendor:7", [point]) as source:
+    packaging = tomllib.loads(re.findall(r"```toml\n(\[project.*?)```", text, re.DOTALL)[0])
+    ((name, value),) = packaging["project"]["entry-points"]["lightpage.sources"].items()
+    load = EntryPoint.load
+    monkeypatch.setattr(EntryPoint, "load", lambda self: space[self.attr] if self.name == "vendor" else load(self))
+    return EntryPoint(name, value, "lightpage.sources")
+
+
+def test_the_source_of_a_vendor_in_the_documents_works(vendor: EntryPoint, monkeypatch: pytest.MonkeyPatch) -> None:
+    lost: list[int] = []
+    with open_source("vendor:7", [vendor]) as source:
         assert source.name == "vendor:7"
+        source.on_lost = lambda page, error: lost.append(page)
         shot = source.shot()
         assert shot.infos is not None
         assert [info.frame_id for info in shot.infos] == [1, 1]
-        assert shot.pair.quadrature[0, 0] == 2
+        assert shot.pair.quadrature[0, 0] == 101
         with pytest.raises(LostShotError) as raised:
             source.shot()
         assert raised.value.reason is Reason.MISSING_FRAME
-        assert source.references() is None
+        assert lost == [1]
+        assert source.shot().page_index == 2
+        references = source.references()
+        assert references is not None
+        assert references.in_phase[0, 0] == 50
+    monkeypatch.setattr(VendorSdk, "absent", True)
+    with pytest.raises(SourceError, match="two that are switched on"):
+        open_source("vendor:7", [vendor]).arm()
+
+
+def test_the_source_of_a_vendor_records(vendor: EntryPoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    profile = load_profile("bench")
+    symbols = random_symbols(profile, 8, 3, np.random.default_rng(1))
+    with PagesWriter(tmp_path / "pages.h5", profile, 8, {}) as writer:
+        writer.append(symbols)
+    monkeypatch.setattr(record, "open_source", lambda spec: open_source(spec, [vendor]))
+    out = tmp_path / "r.h5"
+    arguments = ["record", "--source", "vendor:7", "--symbols", str(tmp_path / "pages.h5"), "--out", str(out)]
+    assert cli_main.run(cli_main.lightpage, arguments) == 0
+    with Recording.open(out) as recording:
+        assert (recording.pages, recording.levels) == (3, 8)
+        for page in range(3):
+            assert (recording.symbols(page) == symbols[page]).all()
+            assert recording.frames(page).in_phase[0, 0] == 100 + symbols[page][0, 0]
+        assert [loss.page for loss in recording.losses()] == [0]

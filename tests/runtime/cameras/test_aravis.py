@@ -232,14 +232,22 @@ def test_a_camera_that_another_program_controls_is_named() -> None:
 @pytest.mark.parametrize(
     ("given", "shape", "told"),
     [
-        ({"pixel_format": "Mono14"}, SENSOR, "PixelFormat.*Mono14"),
-        ({"trigger_source": "Line7"}, SENSOR, "TriggerSource.*Line7"),
-        ({"trigger_activation": "FallingEdge"}, SENSOR, "TriggerActivation.*FallingEdge"),
-        ({"exposure_us": 1e9}, SENSOR, "exposure_us"),
-        ({"gain_db": 2.5}, SENSOR, "gain_db: got 2.0, wanted 2.5"),
-        ({"gain_db": 99.0}, SENSOR, "gain_db"),
-        ({"black_level_counts": 4}, SENSOR, "black_level_counts"),
-        ({}, (SENSOR[0] + 1, SENSOR[1]), "region.*128 x 97"),
+        ({"pixel_format": "Mono14"}, SENSOR, r"pixel_format: got Mono14, wanted one of .*Mono8"),
+        ({"trigger_source": "Line7"}, SENSOR, r"trigger_source: got Line7, wanted one of .*Line1"),
+        (
+            {"trigger_activation": "FallingEdge"},
+            SENSOR,
+            r"trigger_activation: got FallingEdge, wanted one of .*RisingEdge",
+        ),
+        ({"exposure_us": 1e9}, SENSOR, r"exposure_us: got 1000000000\.0, wanted \d+ to 10000000, in its steps"),
+        ({"gain_db": 2.5}, SENSOR, r"gain_db: got 2\.5, of which the camera makes 2\.0, wanted 0 to 10, in its steps"),
+        ({"gain_db": 99.0}, SENSOR, r"gain_db: got 99\.0, wanted 0 to 10"),
+        ({"black_level_counts": 4}, SENSOR, "black_level_counts: got 4, wanted what the camera knows"),
+        (
+            {},
+            (SENSOR[0] + 1, SENSOR[1]),
+            r"region .* got 128 x 97 pixels at \(0, 0\), wanted a region of its sensor, 128 x 96",
+        ),
     ],
 )
 def test_a_setting_that_it_does_not_take_is_named(given: dict[str, Any], shape: tuple[int, int], told: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -33,6 +34,7 @@ class Bench(FrameSource):
 
     def __init__(self, lost: dict[int, int] | None = None, interrupted: int | None = None) -> None:
         self.device, self.lost, self.interrupted = toy.ToyDevice(), dict(lost or {}), interrupted
+        self.at_shot = lambda: None
         self.armed = False
         self.shots = 0
 
@@ -46,6 +48,7 @@ class Bench(FrameSource):
         assert self.armed
         page = page or 0
         self.shots += 1
+        self.at_shot()
         if page == self.interrupted:
             raise KeyboardInterrupt
         if self.lost.get(page, 0) > 0:
@@ -74,6 +77,15 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     asked: list[str] = []
     monkeypatch.setattr(module, "_ask", asked.append)
     return asked
+
+
+def written(path: Path, *numbers: int, code: dict[str, object] | None = None) -> Path:
+    with PagesWriter(path, toy.PROFILE, 16, code or {}) as writer:
+        writer.append(np.stack([toy.symbols_of(16, number)[0] for number in numbers]))
+    if code is None:
+        with h5py.File(path, "r+") as file:
+            del file.attrs["code"]
+    return path
 
 
 def given(monkeypatch: pytest.MonkeyPatch, source: FrameSource) -> None:
@@ -163,8 +175,151 @@ def test_any_source_can_be_recorded(tmp_path: Path, capsys: pytest.CaptureFixtur
     with Recording.open(tmp_path / "in.h5") as before, Recording.open(tmp_path / "out.h5") as after:
         assert (before.frames(1).in_phase == after.frames(1).in_phase).all()
         assert after.frame_infos(0) is None
+    assert run("--source", f"recording:{tmp_path / 'in.h5'}", "--pages", "4", "--out", tmp_path / "o.h5") == EXIT_ERROR
+    assert "at most the 3 pages of recording:" in capsys.readouterr().err
 
 
 def test_an_operator_is_asked_at_a_terminal_only(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(Exception, match="no terminal"):
         module._ask("block the signal beam")
+
+
+@pytest.mark.parametrize("code", [None, {"volume": 1}])
+def test_pages_of_another_file_are_neither_mixed_in_nor_thrown_away(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    bench: list[str],
+    capsys: pytest.CaptureFixture[str],
+    code: dict[str, object] | None,
+) -> None:
+    first = written(tmp_path / "first.h5", 1, 2, 3, code=code)
+    other = written(tmp_path / "other.h5", 4, 5, 6, code=code and {"volume": 2})
+    out = tmp_path / "r.h5"
+    given(monkeypatch, Bench(interrupted=2))
+    assert run("--source", "toy:x", "--symbols", first, "--out", out) == 130
+    assert f"2 pages are in {out}.partial; the same command goes on from there" in capsys.readouterr().err
+    given(monkeypatch, source := Bench())
+    assert run("--source", "toy:x", "--symbols", other, "--out", out) == EXIT_ERROR
+    told = capsys.readouterr().err
+    assert "r.h5.partial: got 2 pages of other symbols, wanted the same --symbols, another name, or --force" in told
+    assert source.shots == 0
+    given(monkeypatch, source := Bench())
+    assert run("--source", "toy:x", "--symbols", first, "--out", out) == 0
+    assert source.shots == 1
+    with Recording.open(out) as recording:
+        assert (recording.symbols(2) == toy.symbols_of(16, 3)[0]).all()
+    out.unlink()
+    given(monkeypatch, Bench(interrupted=2))
+    assert run("--source", "toy:x", "--symbols", first, "--out", out) == 130
+    given(monkeypatch, Bench())
+    assert run("--source", "toy:x", "--symbols", other, "--out", out, "--force") == 0
+    with Recording.open(out) as recording:
+        assert (recording.symbols(0) == toy.symbols_of(16, 4)[0]).all()
+
+
+def test_a_recording_that_is_finished_meanwhile_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "r.h5"
+    given(monkeypatch, source := Bench())
+    source.at_shot = lambda: out.write_text("there")  # type: ignore[assignment,return-value]
+    assert run("--source", "toy:x", "--pages", "1", "--out", out) == EXIT_ERROR
+    assert f"a file that exists by now, wanted a new name, or --force; the pages are in {out}.partial" in (
+        capsys.readouterr().err
+    )
+    assert out.read_text() == "there"
+    given(monkeypatch, source := Bench())
+    monkeypatch.setattr(source, "references", lambda: (out.write_text("again"), source.device.references())[1])
+    out.unlink()
+    assert run("--source", "toy:x", "--pages", "2", "--out", out) == EXIT_ERROR
+    assert out.read_text() == "again"
+    assert source.shots == 0
+    given(monkeypatch, Bench())
+    assert run("--source", "toy:x", "--pages", "2", "--out", out, "--force") == 0
+    with Recording.open(out) as recording:
+        assert recording.pages == 2
+
+
+def test_a_second_run_beside_the_first_is_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "r.h5"
+    second = Bench()
+
+    def again() -> None:
+        given(monkeypatch, second)
+        assert run("--source", "toy:x", "--pages", "1", "--out", out) == EXIT_ERROR
+
+    given(monkeypatch, source := Bench())
+    source.at_shot = again
+    assert run("--source", "toy:x", "--pages", "1", "--out", out) == 0
+    assert "another process is writing now" in capsys.readouterr().err
+    assert second.shots == 0
+    with Recording.open(out) as recording:
+        assert recording.pages == 1
+
+
+def test_numbers_of_pages_are_checked_before_anything_is_connected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, pages = tmp_path / "r.h5", written(tmp_path / "pages.h5", 1, 2)
+
+    def refused(source: FrameSource, *options: str | Path) -> str:
+        given(monkeypatch, source)
+        monkeypatch.setattr(source, "arm", lambda: pytest.fail("armed"))
+        assert run("--source", "toy:x", "--out", out, *options) == EXIT_ERROR
+        return capsys.readouterr().err
+
+    told = refused(Bench(), "--symbols", pages, "--pages", "3")
+    assert f"--pages: got 3, wanted at most the 2 pages of --symbols {pages}" in told
+    empty = Bench()
+    monkeypatch.setattr(empty, "page_count", lambda: 0)
+    assert "--symbols: got none, and toy:bench has no pages to show" in refused(empty, "--pages", "3")
+    given(monkeypatch, Bench(interrupted=2))
+    assert run("--source", "toy:x", "--symbols", pages, "--pages", "2", "--out", out) == 0
+    out.unlink()
+    given(monkeypatch, Bench(interrupted=1))
+    assert run("--source", "toy:x", "--pages", "3", "--out", out) == 130
+    assert "1 page is in" in capsys.readouterr().err
+    given(monkeypatch, Bench(interrupted=2))
+    assert run("--source", "toy:x", "--pages", "3", "--out", out) == 130
+    assert "2 pages already there" in refused(Bench(), "--pages", "1")
+
+
+def test_a_lost_page_is_told_once_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Named(Bench):
+        def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
+            try:
+                return super().shot(timeout_s, page)
+            except LostShotError as error:
+                raise error.about(f"page {page} of {self.name}") from None
+
+    for kind in (Bench, Named):
+        given(monkeypatch, kind(lost={0: 99}))
+        assert run("--source", "toy:x", "--pages", "1", "--out", tmp_path / "r.h5") == EXIT_LOST
+        told = capsys.readouterr().err.splitlines()
+        assert told[:2] == ["lightpage: dark frames", "lightpage: reference frames"]
+        assert told[2] == "lightpage: warning: page 0: shot lost (MISSING_FRAME): I: frame: none"
+        assert told[-1].startswith("lightpage: error: page 0 of toy:bench: I: frame: got none, wanted one (MISSING")
+
+
+def test_frames_without_a_page_that_stay_lost_are_lost_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def lost() -> None:
+        raise LostShotError("I: frame", "none", "one", Reason.MISSING_FRAME)
+
+    given(monkeypatch, source := Bench())
+    monkeypatch.setattr(source, "dark_frames", lost)
+    assert run("--source", "toy:x", "--pages", "1", "--out", tmp_path / "r.h5") == EXIT_LOST
+    assert "I: frame: got none, wanted one (MISSING_FRAME)" in capsys.readouterr().err
+
+
+def test_one_page_is_one_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    given(monkeypatch, Bench(lost={0: 1}))
+    assert run("--source", "toy:x", "--pages", "1", "--out", tmp_path / "r.h5") == 0
+    assert "1 page of 16 levels; 1 shot lost (1 MISSING_FRAME)" in capsys.readouterr().out

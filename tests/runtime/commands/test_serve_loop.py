@@ -10,8 +10,11 @@ from click.testing import CliRunner
 
 from lightpage.errors import InvalidInputError
 from lightpage.recording.reader import Recording
+from runtime.acquisition.recording import RecordingSource
 from runtime.client.client import LightpageClient
+from runtime.commands import serve as serve_module
 from runtime.commands.serve import serve
+from runtime.decoding.decoder import Decoder
 from runtime.errors import UnconfirmedPageError
 from tests.runtime import toy
 from tests.runtime.commands.test_commands import Served
@@ -51,3 +54,17 @@ def test_lost_pages_of_a_served_device_are_kept(toy_zip: Path, tmp_path: Path) -
 def test_self_calibration_that_cannot_work_is_refused_at_once(options: list[str], match: str) -> None:
     with pytest.raises(InvalidInputError, match=match):
         CliRunner().invoke(serve, options, standalone_mode=False, catch_exceptions=False)
+
+
+def test_a_source_that_has_nothing_to_show_is_told(
+    decoder: Decoder, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    source = RecordingSource.__new__(RecordingSource)
+    monkeypatch.setattr(serve_module, "open_source", lambda name: source)
+    monkeypatch.setattr(source, "check_against", lambda profile: None)
+    source.name = "camera:mine.toml"
+    for count in (None, 3, 0):
+        monkeypatch.setattr(source, "page_count", lambda count=count: count)
+        assert not caplog.records
+        serve_module._source("camera:mine.toml", None, decoder)
+    assert "camera:mine.toml shows pages and has none" in caplog.text

@@ -166,7 +166,7 @@ def test_the_window_covers_the_chosen_monitor_alone(tmp_path: Path, profile: Pro
         assert not server.picture()[:, :640].any()
         modulator.close()
         other = ScreenModulator(settings_of(server.display, monitor=2), profile, LookupTable.linear(LEVELS))
-        with pytest.raises(SourceError, match=r"monitors 0 to 1: .*640x800.* wanted a monitor 2"):
+        with pytest.raises(SourceError, match=r"monitors 0 of .*640x800.* wanted monitor 2"):
             other.open(WAIT_S)
         connection.disconnect()
 

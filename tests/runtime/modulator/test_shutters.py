@@ -85,6 +85,19 @@ def test_a_generator_that_has_gone(lab: Lab) -> None:
     assert lab.open() == (False, True)
 
 
+def test_beams_that_nobody_moved_are_not_said_to_be_blocked(lab: Lab, caplog: pytest.LogCaptureFixture) -> None:
+    lab.port.unplug()
+    with pytest.raises(LostShotError):
+        lab.beams.let_through(signal=False, reference=True)
+    lab.beams.close()
+    assert not caplog.records
+    lab.port.plug()
+    lab.beams.let_through(signal=False, reference=True)
+    lab.port.unplug()
+    lab.beams.close()
+    assert "beams may still be blocked" in caplog.text
+
+
 def test_what_makes_no_sense(lab: Lab) -> None:
     with pytest.raises(InvalidInputError, match="channel 3 for both"):
         ShutterBeams(lab.generator, SIGNAL, Shutter(channel=3))

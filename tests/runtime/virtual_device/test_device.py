@@ -21,7 +21,7 @@ from runtime.acquisition.sources import open_source
 from runtime.bundle.shipped import bundle_path
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import confirmed
-from runtime.errors import LostShotError, Reason
+from runtime.errors import LostShotError, Reason, SourceError
 from runtime.virtual_device.device import VirtualDevice
 from tests.lightpage.small import small_profile
 
@@ -130,3 +130,26 @@ def test_a_page_is_read_end_to_end_with_a_missed_trigger_a_lost_packet_and_an_un
         started.start()
         assert decoded(3, 30.0) > 0.9
         started.join()
+
+
+def test_channels_that_no_camera_is_on_lose_their_shots_whoever_used_the_device_before(tmp_path: Path) -> None:
+    profile = small_profile()
+    written(profile, tmp_path / "pages.h5")
+    with VirtualDevice(profile, Device(), tmp_path, seed=5) as hardware:
+        spec = f"camera:{hardware.config}?pages={tmp_path / 'pages.h5'}"
+        with open_source(spec) as source:
+            source.shot(20.0)
+        hardware.config.write_text(hardware.config.read_text().replace("channels = [1, 2]", "channels = [3, 4]"))
+        with open_source(spec) as source, pytest.raises(LostShotError, match="no frame since the start") as raised:
+            source.shot(20.0)
+        assert raised.value.reason is Reason.MISSING_FRAME
+
+
+def test_a_device_that_does_not_run_is_named_before_its_cameras_are_looked_for(tmp_path: Path) -> None:
+    profile = small_profile()
+    with VirtualDevice(profile, Device(), tmp_path) as hardware:
+        spec = f"camera:{hardware.config}"
+    source = open_source(spec)
+    with pytest.raises(SourceError, match=r"modulator\.sock"):
+        source.arm()
+    source.close()

@@ -10,7 +10,7 @@ import pytest
 from lightpage.device.state import Device
 from lightpage.page.symbols import random_symbols
 from lightpage.simulator.simulator import Simulator
-from runtime.errors import LostShotError, Reason
+from runtime.errors import LostShotError, Reason, SourceError
 from runtime.modulator.simulated import SimulatedModulator
 from runtime.virtual_device.light import Light
 from runtime.virtual_device.modulator import ModulatorSocket
@@ -49,10 +49,15 @@ def test_pages_and_shutters_over_the_socket(tmp_path: Path) -> None:
 
 def test_a_device_that_is_not_there_is_named(tmp_path: Path) -> None:
     driver = SimulatedModulator(tmp_path / "nowhere.sock")
-    with pytest.raises(LostShotError, match=r"nowhere\.sock"):
+    with pytest.raises(SourceError, match=r"nowhere\.sock: got No such file.*wanted the socket of a simulated device"):
         driver.show(np.zeros((2, 2), np.uint8), 16, 0, 1.0)
     assert not driver.shows()
-    with pytest.raises(LostShotError) as raised:
+    with pytest.raises(SourceError, match=r"nowhere\.sock"):
+        driver.open(1.0)
+    with ModulatorSocket(Light(small_profile(), Device()), tmp_path / "nowhere.sock"):
+        driver.open(1.0)
+    driver.close()
+    with pytest.raises(LostShotError) as raised:  # it was there, and may come back
         driver.let_through(signal=True, reference=False)
     assert raised.value.reason is Reason.BEAM_CONTROL_FAILED
 

@@ -1,0 +1,157 @@
+"""What is wrong with a TOML table, in the words of whoever wrote it and not in those of the library that checks it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+WANTED = ", wanted "
+"""A `ValueError` of a validator says what came and what was wanted, with this in between."""
+_LONGEST = 60
+"""Characters of a value that are told."""
+
+_TYPES = {
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "string_type": "text in quotes",
+    "string_too_short": "at least one character",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "too_short": "at least one entry",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "dict_type": "a table",
+}
+_BOUNDS = {"greater_than": "gt", "greater_than_equal": "ge", "less_than": "lt", "less_than_equal": "le"}
+_SIDES = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One mistake.
+
+    Attributes:
+        place: the key, or the table, with dots; empty for the whole document.
+        got: what came.
+        expected: what would have been right.
+        kind: ``missing``, ``unknown``, ``value`` where `got` is what the key has, or else ``wrong``.
+    """
+
+    place: str
+    got: str
+    expected: str
+    kind: str = "wrong"
+
+    def __str__(self) -> str:
+        """In a word or two, for a list."""
+        if self.kind == "missing":
+            return f"no {self.place}"
+        if self.kind == "unknown":
+            return f"unknown {self.place}"
+        if self.kind == "value":
+            return f"{self.place} = {self.got} (wanted {self.expected})"
+        return f"{self.place}: {self.got}{WANTED}{self.expected}".removeprefix(": ")
+
+    def parted(self) -> tuple[str, str, str]:
+        """Place, what came and what was wanted, as an error has them."""
+        table, _, key = self.place.rpartition(".")
+        if self.kind == "missing":
+            return table, f"no {key}", self.expected
+        return self.place, "an unknown key" if self.kind == "unknown" else self.got, self.expected
+
+
+def problems_of(model: type[BaseModel], error: ValidationError) -> list[Problem]:
+    """Every mistake in a table that does not validate against `model`."""
+    return [_problem(model, one) for one in error.errors()]
+
+
+def keys_of(model: type[BaseModel]) -> list[str]:
+    """The keys that a table may have."""
+    return list(model.model_fields)
+
+
+def tables_in(annotation: Any) -> list[type[BaseModel]]:
+    """The kinds of tables that a key may hold."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [table for part in get_args(annotation) for table in tables_in(part)]
+
+
+def tag_of(model: type[BaseModel]) -> str:
+    """What the key `kind` of a table says that is one of several."""
+    field = model.model_fields.get("kind")
+    return "" if field is None else str(get_args(field.annotation)[0])
+
+
+def _problem(model: type[BaseModel], error: ErrorDetails) -> Problem:
+    place, owners, within = _walk(model, error["loc"])
+    kind, context = error["type"], error.get("ctx", {})
+    key = place.rpartition(".")[2]
+    if kind == "missing":
+        return Problem(place, f"no {key}", "one", "missing")
+    if kind == "extra_forbidden":
+        known = [name for owner in owners for name in keys_of(owner)]
+        close = get_close_matches(key, known, 1)
+        return Problem(place, "an unknown key", close[0] if close else f"one of {', '.join(known)}", "unknown")
+    if kind in ("union_tag_not_found", "union_tag_invalid"):
+        tags = " or ".join(tag_of(one) for one in within)
+        if kind == "union_tag_not_found":
+            return Problem(place, "no kind", tags)
+        return Problem(f"{place}.kind".removeprefix("."), repr(context["tag"]), tags, "value")
+    if kind == "value_error":
+        got, wanted, expected = str(context["error"]).rpartition(WANTED)
+        if wanted:
+            return Problem(place, got, expected)
+        return Problem(place, _short(error["input"]), expected, "value" if place else "wrong")
+    return Problem(place or "document", _short(error["input"]), _expected(kind, error), "value")
+
+
+def _expected(kind: str, error: ErrorDetails) -> str:
+    context = error.get("ctx", {})
+    if kind in _BOUNDS:
+        bound = _BOUNDS[kind]
+        return f"{_SIDES[bound]} {context[bound]:g}"
+    if kind == "literal_error":
+        return str(context["expected"]).replace("'", "")
+    return _TYPES.get(kind, error["msg"])
+
+
+def _walk(
+    model: type[BaseModel], parts: Sequence[int | str]
+) -> tuple[str, list[type[BaseModel]], list[type[BaseModel]]]:
+    """The place as it is in the file, the table that it is in, and those that it may hold.
+
+    Of a table that is one of several, what tells them apart is among the parts, and not in the file.
+    """
+    names: list[str] = []
+    owners: list[type[BaseModel]] = []
+    within = [model]
+    for part in parts:
+        if len(within) > 1 and (tagged := [one for one in within if tag_of(one) == part]):
+            within = tagged
+            continue
+        names.append(str(part))
+        if isinstance(part, int):
+            continue
+        owners = within
+        field = next((one.model_fields[part] for one in within if part in one.model_fields), None)
+        within = [] if field is None else tables_in(field.annotation)
+    return ".".join(names), owners, within
+
+
+def _short(value: object) -> str:
+    if isinstance(value, dict):
+        return "a table"
+    text = str(value).lower() if isinstance(value, bool) else repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

@@ -1,0 +1,8 @@
+"""Words that errors and commands have in common."""
+
+from __future__ import annotations
+
+
+def counted(number: int, noun: str) -> str:
+    """So many of something, e.g. ``1 page``, ``2 pages``."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
