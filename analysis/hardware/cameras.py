@@ -51,6 +51,8 @@ _SMALL = (256, 320)
 _FULL = (2048, 2048)
 _CHAIN = 4
 """Times as many shots of the whole chain: a lost one costs as much as ten others."""
+_TRIES = 10
+"""Of the first shot, until the cameras' clocks are known."""
 _FRAME_S = 2.0
 _FREE_RUN_S = 0.004
 _LEFTOVERS = 5
@@ -262,7 +264,10 @@ def pairs_per_s(
     with CameraSource(
         profile, cameras, trigger, None, OperatorBeams(click.echo), pairing=settings, exposures=exposures
     ) as source:
-        source.shot()  # synchronises
+        for _ in range(_TRIES):
+            with suppress(LostShotError):
+                source.shot()  # synchronises
+                break
         taken, started = 0, time.perf_counter()
         for _ in track(range(shots), "pairs", total=shots):
             with suppress(LostShotError):

@@ -4,7 +4,7 @@
 
 The bench device with the shipped bundle has drifted a little. Its pages were photographed before, so that a read is
 decoding alone. In turn: pages are read without a recalibration; a recalibration runs and nobody reads; pages are read
-without a pause while one runs.
+while one runs, without a pause or, at `--load 0.6`, so that reads take 60% of the time.
 """
 
 from __future__ import annotations
@@ -98,18 +98,21 @@ class Recalibration:
         self.seconds, self.worked_s = time.perf_counter() - start, getattr(outcome, "seconds", 0.0)
 
 
-def timed(plane: DataPlane) -> float:
-    """Seconds of one read, its bytes too."""
+def timed(plane: DataPlane, pause_s: float = 0.0) -> float:
+    """Seconds of one read, its bytes too, behind which nobody reads for a while."""
     start = time.perf_counter()
     plane.read_page(None, None, Caller(), user_data=True)
-    return time.perf_counter() - start
+    taken = time.perf_counter() - start
+    time.sleep(pause_s)
+    return taken
 
 
 @click.command()
 @click.option("--rounds", default=3, show_default=True, type=click.IntRange(1), help="Of all three.")
+@click.option("--load", default=1.0, show_default=True, type=click.FloatRange(0.05, 1.0), help="Of the reads.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of the service's inference; by default all cores.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-def main(rounds: int, threads: int | None, json_path: Path | None) -> None:
+def main(rounds: int, load: float, threads: int | None, json_path: Path | None) -> None:
     """Time reads with and without a recalibration beside them, and it with and without reads."""
     decoder = Decoder.load(bundle_path(DEFAULT), threads)
     source = Photographed(DriftingSource(decoder, lambda moment: moved(Device(), direction(1)), seed=3))
@@ -118,9 +121,8 @@ def main(rounds: int, threads: int | None, json_path: Path | None) -> None:
     for _ in track(range(rounds), "recalibration", unit="round"):
         plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
         recalibrator = Recalibrator(plane)
-        for _ in range(SETTLED):
-            timed(plane)
-        alone += [timed(plane) for _ in range(BEFORE)]
+        pause_s = median(timed(plane) for _ in range(SETTLED)) * (1 / load - 1)
+        alone += [timed(plane, pause_s) for _ in range(BEFORE)]
         recalibration = Recalibration(recalibrator)
         recalibration.start().join()
         idle.append(recalibration.seconds or np.nan)
@@ -131,22 +133,25 @@ def main(rounds: int, threads: int | None, json_path: Path | None) -> None:
         recalibration = Recalibration(recalibrator)
         thread = recalibration.start()
         while thread.is_alive():
-            beside.append(timed(plane))
+            beside.append(timed(plane, pause_s))
         busy.append(recalibration.seconds or np.nan)
         worked_busy.append(recalibration.worked_s)
         recalibrator.close()
     figures: dict[str, Any] = {
         "threads": threads or available_cpus(),
         "rounds": rounds,
+        "load": load,
         "read_s": median(alone),
         "read_s_beside_recalibration": median(beside),
         "read_ratio": median(beside) / median(alone),
+        "read_ratio_p90": float(np.quantile(beside, 0.9) / np.quantile(alone, 0.9)),
         "read_ratio_p95": float(np.quantile(beside, 0.95) / np.quantile(alone, 0.95)),
         "read_s_longest_beside": max(beside),
         "read_s_longest": max(alone),
         "pages_during_a_recalibration": len(beside) / rounds,
         "recalibration_s_idle": median(idle),
         "recalibration_s_busy": median(busy),
+        "recalibration_ratio": median(busy) / median(idle),
         "in_its_process_s_idle": median(worked_idle),
         "in_its_process_s_busy": median(worked_busy),
     }

@@ -69,9 +69,17 @@ class Call:
         """Whether it lasts as long as its caller likes."""
         return self.method in ENDLESS
 
-    async def in_thread(self, work: Callable[[], T]) -> T:
-        """Do in a thread what blocks or computes; when the call ends before, the work goes on by itself."""
-        return await asyncio.wrap_future(self.pool.submit(work))
+    async def in_thread(self, work: Callable[[], T], otherwise: Callable[[], None] | None = None) -> T:
+        """Do in a thread what blocks or computes; when the call ends before, the work goes on by itself.
+
+        Args:
+            work: what.
+            otherwise: called if the call ends before the work has begun, which it then never does.
+        """
+        future = self.pool.submit(work)
+        if otherwise is not None:
+            future.add_done_callback(lambda done: otherwise() if done.cancelled() else None)
+        return await asyncio.wrap_future(future)
 
 
 class CallLog(Protocol):

@@ -80,7 +80,7 @@ class FrameCalls:
             except BaseException:
                 received.receiver.close()
                 raise
-        return await call.in_thread(partial(self._decode, received, call))
+        return await call.in_thread(partial(self._decode, received, call), received.receiver.close)
 
     async def DecodePages(
         self, requests: AsyncIterator[pb.DecodeFramesRequest], call: Call
@@ -119,7 +119,7 @@ class FrameCalls:
         except LightpageError as error:
             await self._skip(header, counted, error)
             return _refused(error, header)
-        return call.in_thread(partial(self._outcome, received, call))
+        return call.in_thread(partial(self._outcome, received, call), received.receiver.close)
 
     async def _skip(self, header: pb.DecodeHeader, requests: _Counted, error: LightpageError) -> None:
         """Drop what is left of a pair."""

@@ -18,6 +18,8 @@ _PROCESS = "runtime.rpc.health_process"
 _BEAT_S = 0.5
 _START_S = 20.0
 _SEND_S = 2.0
+_AGAIN_S = 5.0
+"""Between two attempts to start the process again."""
 
 _log = logging.getLogger(__name__)
 
@@ -60,20 +62,30 @@ class HealthServer:
         Raises:
             InvalidInputError: the address cannot be listened on.
         """
-        subject = f"health address {self._address}"
         check_free("health address", self._address)
         try:
-            self._process = HelperProcess(_PROCESS, self._address, subject="the process of health checks")
-            answer = json.loads(self._process.line(time.monotonic() + _START_S))
-        except (OSError, ValueError) as error:
+            self._process, self.port = self._started(self._address)
+        except InvalidInputError:
             self.stop()
-            raise InvalidInputError(subject, error, "a process that can be started") from None
-        if "port" not in answer:
-            self.stop()
-            raise InvalidInputError(subject, answer.get("error"), "a free HOST:PORT of this machine")
-        self.port = answer["port"]
+            raise
         self._thread.start()
         return self
+
+    def _started(self, address: str) -> tuple[HelperProcess, int]:
+        """A process that answers at an address, and the port."""
+        subject = f"health address {address}"
+        process: HelperProcess | None = None
+        try:
+            process = HelperProcess(_PROCESS, address, subject="the process of health checks")
+            answer = json.loads(process.line(time.monotonic() + _START_S))
+            if "port" in answer:
+                return process, int(answer["port"])
+            got, expected = answer.get("error"), "a free HOST:PORT of this machine"
+        except (OSError, ValueError) as error:
+            got, expected = error, "a process that can be started"
+        if process is not None:
+            process.end()
+        raise InvalidInputError(subject, got, expected)
 
     def stop(self) -> None:
         """Answer no more."""
@@ -92,17 +104,30 @@ class HealthServer:
         self.stop()
 
     def _beat(self) -> None:
-        assert self._process is not None  # it was started
         while True:
             try:
                 line = json.dumps(dict(self._states())).encode() + b"\n"
             except Exception:
                 _log.exception("health checks: the service does not say how it fares")
             else:
-                try:
-                    self._process.send(line, time.monotonic() + _SEND_S)
-                except OSError as error:
-                    _log.error("health checks: %s", error or "their process does not listen")
-                    return
+                self._tell(line)
             if self._stop.wait(_BEAT_S):
                 return
+
+    def _tell(self, line: bytes) -> None:
+        """Tell the process how the service fares; one that has ended is started again at the same port."""
+        assert self._process is not None  # it was started
+        try:
+            self._process.send(line, time.monotonic() + _SEND_S)
+            return
+        except OSError as error:
+            _log.error("health checks: %s; their process is started again", error or "nobody listens")
+        self._process.end()
+        host = self._address.rpartition(":")[0]
+        try:
+            self._process, _ = self._started(
+                self._address if self._address.startswith("unix:") else f"{host}:{self.port}"
+            )
+        except InvalidInputError as error:
+            _log.error("health checks: %s", error)
+            self._stop.wait(_AGAIN_S)

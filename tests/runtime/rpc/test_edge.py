@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import queue
 import threading
@@ -25,7 +26,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
 from runtime.errors import OverloadedError, SlotsTakenError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.rpc.call import SERVICE
+from runtime.rpc.call import SERVICE, Call
 from runtime.service.caller import Caller
 from runtime.service.limits import Limits
 from runtime.service.slots import Slots
@@ -478,3 +479,21 @@ def test_nothing_of_the_contract_of_0_1_was_renumbered_or_renamed() -> None:
     for method in service.method:
         assert methods[method.name] == method
     assert len(before.message_type) > 20
+
+
+def test_work_that_never_begins_leaves_nothing_behind() -> None:
+    closed = threading.Event()
+
+    async def cut_off(pool: ThreadPoolExecutor) -> None:
+        call = Call("DecodeFrames", Caller(), pool)
+        waiting = asyncio.ensure_future(call.in_thread(lambda: None, closed.set))
+        await asyncio.sleep(0.05)
+        waiting.cancel()
+        await asyncio.sleep(0.05)
+
+    hold = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(hold.wait, 20)
+        asyncio.run(cut_off(pool))
+        assert closed.is_set()
+        hold.set()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -90,6 +91,15 @@ def test_the_process_ends_with_the_service_even_if_that_is_killed() -> None:
     health._process._link.close()  # as the end of the service's process does
     assert until(lambda: not _is_there(process) or not is_serving(health.target, timeout_s=1)[0])
     health.stop()
+
+
+def test_a_process_that_was_killed_is_started_again_at_its_port() -> None:
+    with HealthServer("127.0.0.1:0", lambda: {"": True}) as health:
+        assert until(lambda: is_serving(health.target)[0])
+        assert health._process is not None
+        os.kill(health._process._process.pid, signal.SIGKILL)
+        assert until(lambda: not is_serving(health.target, timeout_s=1)[0])
+        assert until(lambda: is_serving(health.target)[0])
 
 
 def test_a_port_that_is_taken_is_named() -> None:
