@@ -28,7 +28,8 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.files import write_json
 from lightpage.progress import Progress, note, warn
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 from runtime.bulk.coded_pages import choose_code
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.bundle import Bundle, npz, write_bundle

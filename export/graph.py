@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lightpage.device.profile import Profile
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from train.models.decoder import SymbolDecoder
 from train.models.field import FieldRecovery, relative_power
 from train.published.decoder import PublishedDecoder, sample_frames

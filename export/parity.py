@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from export.graph import Graph
 from lightpage.errors import BundleError
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 
 TOLERANCE = 1e-3
 """Largest error of p relative to its norm in fp32."""

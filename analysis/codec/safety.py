@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import Code
-from lightpage.codec.header import Header
-from lightpage.codec.page_codec import FileFacts, PageCodec
+from lightpage.codec.page_bytes import FileFacts, Header
+from lightpage.codec.page_codec import PageCodec
 from lightpage.device.profile import load_profile
 from lightpage.errors import LightpageError
 from lightpage.files import write_json

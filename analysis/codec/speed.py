@@ -24,11 +24,11 @@ from analysis.codec.numba_decoder import NumbaDecoder
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import Code
-from lightpage.codec.header import Header
 from lightpage.codec.ldpc.code import LdpcCode
 from lightpage.codec.ldpc.decoder import MOST_ITERATIONS, decode
 from lightpage.codec.mapping import bit_information
-from lightpage.codec.page_codec import FileFacts, PageCodec
+from lightpage.codec.page_bytes import FileFacts, Header
+from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.files import write_json

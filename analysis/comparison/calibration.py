@@ -42,7 +42,8 @@ from lightpage.errors import CalibrationError, InvalidInputError
 from lightpage.files import write_json
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.progress import track
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from lightpage.device.profile import Profile
 from lightpage.device.state import Device
 from lightpage.page.symbols import symbol_phases
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 from lightpage.simulator.cameras import resample
 from lightpage.simulator.true_optics import TrueOptics, perfectly_calibrated
 from train.data.features import FeatureExtractor, PageFeatures

@@ -17,7 +17,7 @@ from lightpage.calibration.sampling_table import sampling_table
 from lightpage.codec.volume import Volume, encode_volume
 from lightpage.device.state import Device
 from lightpage.page.pilots import Pilots
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot

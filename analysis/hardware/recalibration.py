@@ -26,7 +26,7 @@ from lightpage.cli.paths import OutputFile
 from lightpage.device.state import Device
 from lightpage.files import write_json
 from lightpage.progress import track
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.decoding.decoder import Decoder

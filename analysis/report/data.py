@@ -15,7 +15,7 @@ from lightpage.device.profile import Profile
 from lightpage.metrics.information import page_kilobytes
 from lightpage.metrics.measures import PageMeasures, SymbolMaps
 from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from train.fitting.curves import Curve
 from train.models.twin import RayTwin, TorchTwin
 

@@ -21,7 +21,7 @@ from lightpage.metrics.measures import PageMeasures, SymbolMaps
 from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.page.pilots import remove_piston
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 
 Rows = list[list[float | None]]
 

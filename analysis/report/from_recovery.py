@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from analysis.report.json_file import Bits, JsonFile, Part, Seconds, Share
 from lightpage.codec.code import Code
-from lightpage.codec.page_codec import LOSSES, Loss
+from lightpage.codec.page_bytes import LOSSES, Loss
 from lightpage.codec.volume import Volume
 from lightpage.codec.volume_file import ranges
 from lightpage.errors import InvalidInputError

@@ -19,7 +19,8 @@ from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.information import decide
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
-from lightpage.recording.reader import FramePair, Recording, page_hashes
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording, page_hashes
 from train.data.feature_store import FeatureStore
 from train.data.features import PageState
 from train.data.pages import Page

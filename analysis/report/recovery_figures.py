@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from analysis.report.drawing import BLUE, GREY, ORANGE, Picture, as_picture, one_axis
 from analysis.report.from_recovery import UNDECODED, PageResult
 from analysis.report.tables import number
-from lightpage.codec.page_codec import Loss
+from lightpage.codec.page_bytes import Loss
 
 _MARKERS = {Loss.OPTICS: "x", Loss.HEADER: "^", Loss.CODE: "s", Loss.BODY: "v", Loss.CHECKSUM: "D"}
 _LOST_STYLE: dict[str, Any] = {"linestyle": "none", "color": ORANGE, "fillstyle": "none", "markersize": 6}

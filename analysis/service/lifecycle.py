@@ -29,7 +29,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
-from lightpage.recording.layout import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 _SHIFTS_PX = (1, -2, 3, 0)

@@ -20,7 +20,7 @@ from typing import Self
 import grpc
 import numpy as np
 
-from lightpage.recording.layout import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.writer import RecordingWriter
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.shipped import DEFAULT, bundle_path
@@ -189,14 +189,8 @@ def stub(channel: grpc.Channel) -> pb_grpc.LightpageStub:
 
 def quantiles_ms(seconds: Sequence[float]) -> dict[str, float]:
     """p50, p99 and the largest, milliseconds."""
-    ordered = sorted(seconds)
-    last = len(ordered) - 1
-    return {
-        "count": len(ordered),
-        "p50_ms": 1e3 * ordered[last // 2],
-        "p99_ms": 1e3 * ordered[min(last, int(0.99 * len(ordered)))],
-        "max_ms": 1e3 * ordered[last],
-    }
+    p50, p99, largest = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0])
+    return {"count": len(seconds), "p50_ms": float(p50), "p99_ms": float(p99), "max_ms": float(largest)}
 
 
 def until(end: float, step_s: float = 0.0) -> Iterator[float]:

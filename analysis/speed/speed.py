@@ -32,7 +32,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.files import write_json
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.decoding.decoder import inputs_left
 from runtime.execution.constant_table import GraphFile
 from runtime.execution.cpus import available_cpus

@@ -51,7 +51,8 @@ from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from runtime.bulk.evaluation import evaluate, was_seen

@@ -28,7 +28,7 @@ from lightpage.calibration.wave_fit import WaveFit
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
 from lightpage.progress import Progress
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid, symbol_samples
 
 Real = NDArray[np.float64]

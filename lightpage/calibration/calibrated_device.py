@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.document import Calibration
 from lightpage.device.profile import Profile
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 
 
 @dataclass(frozen=True)

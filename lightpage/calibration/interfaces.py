@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 
 Real = NDArray[np.float64]
 

@@ -12,7 +12,8 @@ from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, RecordingError
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.exposure import check_pair_light
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 
 
 def lit_pages(recording: Recording, left_out: Callable[[str], None]) -> Iterator[tuple[int, FramePair]]:

@@ -21,7 +21,7 @@ from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
 from lightpage.calibration.samplers import smooth_reference
 from lightpage.calibration.wave_model import FittedWaves, illumination_terms, on_modulator
 from lightpage.device.profile import Profile
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid, symbol_samples
 
 Real = NDArray[np.float64]

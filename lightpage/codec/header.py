@@ -16,8 +16,7 @@ from lightpage.codec.checksum import crc16
 from lightpage.codec.ldpc.code import Bits, LdpcCode
 from lightpage.codec.ldpc.decoder import decode
 from lightpage.codec.mapping import bit_llrs, level_bits, to_levels
-from lightpage.codec.page_bytes import VERSION as VERSION
-from lightpage.codec.page_bytes import Header as Header
+from lightpage.codec.page_bytes import VERSION, Header
 from lightpage.codec.random_bits import random_bytes
 from lightpage.errors import InvalidInputError
 

@@ -17,11 +17,7 @@ from lightpage.codec.header import decode_header, encode_headers, header_symbols
 from lightpage.codec.ldpc.code import MOST_INFORMATION_BITS, Bits, LdpcCode
 from lightpage.codec.ldpc.decoder import decode
 from lightpage.codec.mapping import bit_information, bit_llrs, decide_in_coset, to_levels
-from lightpage.codec.page_bytes import FILE_BYTES, Header
-from lightpage.codec.page_bytes import LOSSES as LOSSES
-from lightpage.codec.page_bytes import FileFacts as FileFacts
-from lightpage.codec.page_bytes import Loss as Loss
-from lightpage.codec.page_bytes import PageBytes as PageBytes
+from lightpage.codec.page_bytes import FILE_BYTES, FileFacts, Header, Loss, PageBytes
 from lightpage.codec.random_bits import random_bytes, random_order
 from lightpage.codec.reed_solomon import LONGEST_WORD, SYMBOL_BITS, parity, repair
 from lightpage.errors import InvalidInputError, PageError

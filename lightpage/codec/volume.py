@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from lightpage.codec.checksum import Checksum
 from lightpage.codec.erasure import check_group, parity_of, restore
-from lightpage.codec.header import Header, check_volume
-from lightpage.codec.page_codec import FileFacts, PageBytes, PageCodec
+from lightpage.codec.header import check_volume
+from lightpage.codec.page_bytes import FileFacts, Header, PageBytes
+from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import InvalidInputError
 
 DATA_PAGES, PARITY_PAGES = 60, 4

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Self
 
 from lightpage.codec.checksum import Checksum
-from lightpage.codec.page_codec import PageBytes
+from lightpage.codec.page_bytes import PageBytes
 from lightpage.codec.volume import Volume, restore_group
 from lightpage.errors import InvalidInputError, LostDataError
 from lightpage.files import move_into_place

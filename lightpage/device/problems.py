@@ -73,7 +73,7 @@ class Problem:
 
 def problems_of(model: type[BaseModel], error: ValidationError) -> list[Problem]:
     """Every mistake in a table that does not validate against `model`."""
-    return [_problem(model, one) for one in error.errors()]
+    return [problem_of(model, one) for one in error.errors()]
 
 
 def keys_of(model: type[BaseModel]) -> list[str]:
@@ -94,7 +94,8 @@ def tag_of(model: type[BaseModel]) -> str:
     return "" if field is None else str(get_args(field.annotation)[0])
 
 
-def _problem(model: type[BaseModel], error: ErrorDetails) -> Problem:
+def problem_of(model: type[BaseModel], error: ErrorDetails) -> Problem:
+    """One mistake of a `ValidationError`."""
     place, owners, within = _walk(model, error["loc"])
     kind, context = error["type"], error.get("ctx", {})
     key = place.rpartition(".")[2]
@@ -114,11 +115,12 @@ def _problem(model: type[BaseModel], error: ErrorDetails) -> Problem:
         if wanted:
             return Problem(place, got, expected)
         return Problem(place, _short(error["input"]), expected, "value" if place else "wrong")
-    return Problem(place or "document", _short(error["input"]), _expected(kind, error), "value")
+    return Problem(place or "document", _short(error["input"]), expected_of(error), "value")
 
 
-def _expected(kind: str, error: ErrorDetails) -> str:
-    context = error.get("ctx", {})
+def expected_of(error: ErrorDetails) -> str:
+    """What would have been right in place of a single value."""
+    kind, context = error["type"], error.get("ctx", {})
     if kind in _BOUNDS:
         bound = _BOUNDS[kind]
         return f"{_SIDES[bound]} {context[bound]:g}"

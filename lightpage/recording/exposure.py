@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import BlackFrameError, FrameError, SaturatedFrameError
-from lightpage.recording.layout import FramePair
+from lightpage.recording.frame_pair import FramePair
 
 BLACK_FRACTION = 0.02
 """A frame whose brightest pixel is below this share of full scale is dark: its laser or its shutter is off."""

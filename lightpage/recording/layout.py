@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import RecordingError
-from lightpage.recording.frame_pair import FramePair as FramePair
+from lightpage.recording.frame_pair import FramePair
 
 FORMAT = "lightpage-recording"
 VERSION = 1

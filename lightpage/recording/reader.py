@@ -23,6 +23,7 @@ from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import ProfileError, RecordingError
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.black_level import without_black
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import (
     CAMERAS,
     DARK,
@@ -36,7 +37,6 @@ from lightpage.recording.layout import (
     SHOT_DATA,
     VERSION,
     FrameInfo,
-    FramePair,
     LostShot,
     frame_type,
     hash_frames,
@@ -46,7 +46,7 @@ from lightpage.recording.layout import (
 )
 from lightpage.recording.writer import RecordingWriter
 
-__all__ = ["FramePair", "Recording", "RecordingWriter", "hash_frames", "page_hashes"]
+__all__ = ["Recording", "RecordingWriter", "hash_frames", "page_hashes"]
 
 _SYMBOL_PAGES_AT_ONCE = 64
 """Pages of symbols checked in one read, so that opening a long recording stays small in memory."""

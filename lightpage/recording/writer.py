@@ -18,6 +18,7 @@ from lightpage.device.profile import Profile
 from lightpage.errors import NoSuchPageError, PageError, RecordingError
 from lightpage.files import move_into_place, move_to_new_name
 from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf_file import HdfFile
 from lightpage.recording.layout import (
     CAMERAS,
@@ -32,7 +33,6 @@ from lightpage.recording.layout import (
     SHOT_DATA,
     VERSION,
     FrameInfo,
-    FramePair,
     LostShot,
     frame_type,
 )

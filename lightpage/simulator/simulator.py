@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
 from lightpage.page.symbols import check_levels, check_symbols, symbol_phases
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
-from lightpage.recording.reader import FramePair
 from lightpage.simulator.cameras import (
     expose,
     in_phase_intensity,

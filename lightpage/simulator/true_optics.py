@@ -12,7 +12,7 @@ from lightpage.calibration.parameters import NAMES, as_dict, as_vector
 from lightpage.calibration.wave_model import fitted_geometry
 from lightpage.device.profile import Profile
 from lightpage.device.state import CameraPose, Device
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.cameras import CameraView
 from lightpage.waves.channel import WaveChannel
 from lightpage.waves.geometry import WaveGeometry, cells_for

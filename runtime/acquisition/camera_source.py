@@ -21,7 +21,8 @@ from lightpage.errors import FrameError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
 from lightpage.recording.exposure import check_pair_light
-from lightpage.recording.layout import FramePair, frame_type
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import frame_type
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.pairing import Pairing, PairingSettings
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from lightpage.device.profile import Profile
 from lightpage.errors import NoSuchPageError, RecordingError
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 from runtime.decoding.frames import narrow
 

@@ -13,8 +13,8 @@ from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError, NoSuchPageError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.symbols import pilot_mask, random_symbols
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import Pages
-from lightpage.recording.reader import FramePair
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 

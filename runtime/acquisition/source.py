@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from lightpage.device.profile import Profile
 from lightpage.errors import FrameError, InvalidInputError, RecordingError
 from lightpage.recording.black_level import DarkFrame
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import FrameInfo
-from lightpage.recording.reader import FramePair
 from runtime.acquisition.page_store import PageStore
 from runtime.errors import LostShotError, SourceError
 from runtime.modulator.modulator import Beams, Modulator

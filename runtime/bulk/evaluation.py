@@ -15,7 +15,8 @@ from lightpage.metrics.measures import PageMeasures, SymbolMaps
 from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.progress import track
-from lightpage.recording.reader import FramePair, Recording, page_hashes
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording, page_hashes
 from runtime.bulk.refused import RefusedPage, refusal, unconfirmed
 from runtime.bundle.manifest import GOLDEN
 from runtime.decoding.decoder import Decoder

@@ -14,13 +14,14 @@ from pydantic import ValidationError
 from scipy.stats import beta
 
 from lightpage.codec.code import Code, problems_of
-from lightpage.codec.header import Header
-from lightpage.codec.page_codec import LOSSES, Loss, PageBytes, PageCodec
+from lightpage.codec.page_bytes import LOSSES, Header, Loss, PageBytes
+from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import Successor, Volume
 from lightpage.codec.volume_file import Restored, VolumeFiles, ranges
 from lightpage.errors import InvalidInputError, LostDataError, RecordingError
 from lightpage.progress import track
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 from runtime.bulk.coded_pages import air_bits
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.bundle import Bundle

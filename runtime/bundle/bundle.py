@@ -23,7 +23,7 @@ from lightpage.errors import BundleError, InvalidInputError, ProfileError
 from lightpage.files import sync_folder
 from lightpage.metrics.information import decide
 from lightpage.page.symbols import check_levels, pilot_mask, pilot_symbols
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.bundle.archive import MAX_BYTES, MAX_FILES, check_name, read_files
 from runtime.bundle.manifest import (
     DECODER,

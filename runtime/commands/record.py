@@ -19,7 +19,8 @@ from lightpage.files import write_json
 from lightpage.progress import note, track, warn
 from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.exposure import check_pair_light
-from lightpage.recording.layout import FramePair, LostShot
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import LostShot
 from lightpage.recording.pages import Pages
 from lightpage.recording.writer import RecordingWriter, Symbols, pages_there, partial_path
 from lightpage.words import counted

@@ -7,6 +7,7 @@ import platform
 import signal
 import socket
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from importlib.metadata import version as installed_version
 from pathlib import Path
@@ -33,7 +34,7 @@ from runtime.service.audit import AuditLog
 from runtime.service.dataplane import DataPlane
 from runtime.service.flight_recorder import PAGES, FlightRecorder
 from runtime.service.incoming import Incoming
-from runtime.service.logs import CallLog, PageLog, logging_to_stderr
+from runtime.service.logs import PageLog, logging_to_stderr
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.observation import Observer
@@ -186,10 +187,10 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         console = Console(metrics, history, registry, monitor, source_name)
         stack.enter_context(_shown(console, settings.metrics.port, settings.metrics.host))
         recalibrator = Recalibrator(plane, recordings=service.recordings)
-        server = LightpageServer(plane, recalibrator, service.address, CallLog())
+        server = LightpageServer(plane, recalibrator, service.address)
         if service.health_address != OFF:  # entered first: it says NOT_SERVING until the last call has ended
             address = service.health_address or next_port(service.address)
-            health = stack.enter_context(HealthServer(address, lambda: _health(server, plane)))
+            health = stack.enter_context(HealthServer(address, _Health(server, plane)))
             click.echo(f"health checks at {health.target}")
         stack.enter_context(server)
         if service.incoming is not None:
@@ -211,9 +212,21 @@ def _log_start(model: str, source: str, address: str, given: int) -> None:
     _log.info(text, model, source, address, given, extra={"told": versions})
 
 
-def _health(server: LightpageServer, plane: DataPlane) -> dict[str, bool]:
-    """What health checks say."""
-    return {**server.health(), STORE_HEALTH: not plane.store_trouble()}
+class _Health:
+    """What health checks say. The store is looked at beside: a disk that hangs must not silence the rest."""
+
+    def __init__(self, server: LightpageServer, plane: DataPlane) -> None:
+        self._server, self._plane = server, plane
+        self._look = ThreadPoolExecutor(1, thread_name_prefix="lightpage-store-look")
+        self._looking: Future[str] | None = None
+        self._store_serves = True
+
+    def __call__(self) -> dict[str, bool]:
+        if self._looking is None or self._looking.done():
+            if self._looking is not None:
+                self._store_serves = not self._looking.result()
+            self._looking = self._look.submit(self._plane.store_trouble)
+        return {**self._server.health(), STORE_HEALTH: self._store_serves}
 
 
 def _source(name: str, pages_file: Path | None, base: Decoder) -> FrameSource:

@@ -20,7 +20,7 @@ from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
 from lightpage.page.symbols import check_levels, symbol_phases
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import DECODER, FIELD, GOLDEN
 from runtime.decoding.field_solver import BundleFieldSolver

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import BundleError
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import DECODER, FIELD

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lightpage.errors import FrameError
 from lightpage.recording.exposure import check_light
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
-from lightpage.recording.reader import FramePair
 
 
 def check_pair(pair: FramePair, shape: tuple[int, int], dtype: str, bit_depth: int) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.image_search import FoundImage, ImageSearch
 from lightpage.calibration.interfaces import Twin
 from lightpage.page.pilots import Pilots
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.bundle.calibrated import calibration_of
 from runtime.decoding.decoder import Decoder
 

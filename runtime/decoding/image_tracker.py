@@ -14,12 +14,13 @@ from lightpage.calibration.image_search import FEWEST_SEARCHED, FoundImage
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.page.pilots import PilotCheck, Pilots, read_pilots
 from lightpage.page.symbols import check_levels
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.drift_tables import BundleTables, DriftTables
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
+from runtime.decoding.image_position import ImagePosition
 from runtime.decoding.image_search import BundleSearch, PageSearch
-from runtime.decoding.page import DecodedPage, ImagePosition, Inference, Timings
+from runtime.decoding.page import DecodedPage, Inference, Timings
 from runtime.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
 from runtime.execution.twin import TWIN_THREADS, OnnxTwin
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.page.pilots import PilotCheck
-from runtime.decoding.image_position import ImagePosition as ImagePosition
+from runtime.decoding.image_position import ImagePosition
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict
 
 from lightpage.calibration.image_search import REACH_PX, FoundImage
 from lightpage.page.pilots import LEAST_CONFIRMED_SHARE, Pilots
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
 from runtime.errors import Reason, UnconfirmedPageError

@@ -24,8 +24,8 @@ from lightpage.device.state import CameraPose, Device
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.information import achievable_rate
 from lightpage.progress import Progress
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import Pages, PagesWriter
-from lightpage.recording.reader import FramePair
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.simulator import SimulatorSource
 from runtime.acquisition.source import FrameSource

@@ -11,7 +11,8 @@ from lightpage.errors import FrameError, InvalidInputError
 from lightpage.page.symbols import check_symbols
 from lightpage.progress import warn
 from lightpage.recording.exposure import check_pair_light
-from lightpage.recording.reader import FramePair, hash_frames
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import hash_frames
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import named
 

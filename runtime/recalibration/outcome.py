@@ -10,7 +10,7 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.progress import Progress
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
-from runtime.decoding.page import ImagePosition
+from runtime.decoding.image_position import ImagePosition
 from runtime.recalibration.known_pages import KnownPages
 
 

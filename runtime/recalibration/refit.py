@@ -15,12 +15,13 @@ from lightpage.errors import BundleError, CalibrationError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
-from lightpage.recording.reader import FramePair, hash_frames
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import hash_frames
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.calibrated import calibration_of
 from runtime.decoding.decoder import Decoder
+from runtime.decoding.image_position import ImagePosition
 from runtime.decoding.image_search import BundleSearch
-from runtime.decoding.page import ImagePosition
 from runtime.execution.twin import TWIN_THREADS, OnnxTwin
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RefitReport, RefitResult

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from lightpage.errors import LightpageError
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.bundle.bundle import Bundle, write_bundle
 from runtime.decoding.tracking import TrackerMemory
 from runtime.errors import ERRORS

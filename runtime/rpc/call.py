@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import logging
 import math
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Generator, Sequence
@@ -17,13 +16,14 @@ from concurrent.futures import Executor, Future
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import grpc
 from google.protobuf.message import DecodeError, Message
 
 from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.rpc.call_log import CallLog
 from runtime.service.caller import Actor, Caller
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
@@ -35,8 +35,6 @@ ENDLESS = frozenset(["WatchDisplay", "WatchJob"])
 """Calls that last as long as their callers like: they hold no thread, are no load, and end with the service."""
 
 T = TypeVar("T")
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -82,22 +80,6 @@ class Call:
         return await asyncio.wrap_future(future)
 
 
-class CallLog(Protocol):
-    """Is told how calls end."""
-
-    def ended(self, call: Call, code: grpc.StatusCode, error: BaseException | None) -> None:
-        """A call has ended, well where `error` is None."""
-
-
-class PlainCallLog:
-    """Logs what nobody foresaw."""
-
-    def ended(self, call: Call, code: grpc.StatusCode, error: BaseException | None) -> None:
-        """See `CallLog`."""
-        if code is grpc.StatusCode.INTERNAL:
-            _log.error("%s failed", call.method, exc_info=error)
-
-
 class Dispatcher:
     """Hands calls to their handlers. Lives on one event loop.
 
@@ -106,14 +88,11 @@ class Dispatcher:
         pool: threads for handlers that block, as many as there may be calls.
         limits: of the service.
         metrics: what is counted.
-        log: is told how calls end.
     """
 
-    def __init__(
-        self, handlers: Sequence[object], pool: Executor, limits: Limits, metrics: ServiceMetrics, log: CallLog
-    ) -> None:
+    def __init__(self, handlers: Sequence[object], pool: Executor, limits: Limits, metrics: ServiceMetrics) -> None:
         self._handlers, self._pool, self._limits = tuple(handlers), pool, limits
-        self._metrics, self._log = metrics, log
+        self._metrics, self._log = metrics, CallLog()
         self._active = 0
         self._endless: set[asyncio.Task[Any]] = set()
         self._ending = False

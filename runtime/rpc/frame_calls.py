@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator, Awaitable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,7 +14,8 @@ import numpy as np
 from lightpage.errors import InvalidInputError, LightpageError, LimitError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.black_level import without_black
-from lightpage.recording.layout import FramePair, frame_type
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import frame_type
 from runtime.errors import MalformedError, StalledError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import Call
@@ -74,12 +76,13 @@ class FrameCalls:
         """Receive a frame pair and decode it."""
         header = _header(await anext(requests, None), call)
         received = await self._receive(header, requests, call)
-        async for part in requests:
-            try:
-                received.receiver.add(self._chunk(part))  # says that it is too much
-            except BaseException:
-                received.receiver.close()
-                raise
+        try:
+            async with self._in_time():
+                async for part in requests:
+                    received.receiver.add(self._chunk(part))  # says that it is too much
+        except BaseException:
+            received.receiver.close()
+            raise
         return await call.in_thread(partial(self._decode, received, call), received.receiver.close)
 
     async def DecodePages(
@@ -126,30 +129,38 @@ class FrameCalls:
         size = 2 * header.rows_px * header.columns_px * np.dtype(pixel_type(header.pixel_type)).itemsize
         if size > self._plane.limits.pair_bytes:
             raise error
-        while requests.bytes < size and (part := await anext(requests, None)) is not None:
-            self._chunk(part)
+        async with self._in_time():
+            while requests.bytes < size and (part := await anext(requests, None)) is not None:
+                self._chunk(part)
 
     async def _receive(
         self, header: pb.DecodeHeader, requests: AsyncIterator[pb.DecodeFramesRequest], call: Call
     ) -> _Received:
         """Take in the chunks of a pair, as soon as its header is known to be right and there will be time for it."""
-        start, limit_s = time.perf_counter(), self._plane.limits.receive_s
+        start = time.perf_counter()
         check_options(header.options)
         check_black(header)
         self._pilots(header)
         shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
         receiver = self._plane.receiver(shape, dtype, header.bit_depth, _caller(header, call))
         try:
-            async with asyncio.timeout(limit_s):
+            async with self._in_time():
                 while not receiver.complete and (part := await anext(requests, None)) is not None:
                     receiver.add(self._chunk(part))
             return _Received(header, receiver.checked(), start, time.perf_counter())
-        except TimeoutError:
-            receiver.close()
-            raise StalledError("frame pair", f"not all of it within {limit_s:g} s", "faster frames") from None
         except BaseException:
             receiver.close()
             raise
+
+    @asynccontextmanager
+    async def _in_time(self) -> AsyncIterator[None]:
+        """Give up on a sender who takes too long in the `with` statement, however little it sends meanwhile."""
+        limit_s = self._plane.limits.receive_s
+        try:
+            async with asyncio.timeout(limit_s):
+                yield
+        except TimeoutError:
+            raise StalledError("frame pair", f"not all of it within {limit_s:g} s", "faster frames") from None
 
     def _chunk(self, part: pb.DecodeFramesRequest) -> bytes:
         if part.WhichOneof("part") != "chunk":
@@ -212,10 +223,8 @@ def _header(first: pb.DecodeFramesRequest | None, call: Call) -> pb.DecodeHeader
 
 def _caller(header: pb.DecodeHeader, call: Call) -> Caller:
     """The caller, whose pages without a session of their own are those of its connection."""
-    caller = call.caller
-    caller.session = header.options.session or f"connection {call.peer}"
-    caller.stateless = header.options.tracking == pb.TRACKING_STATELESS
-    return caller
+    session = header.options.session or f"connection {call.peer}"
+    return call.caller.in_session(session, header.options.tracking == pb.TRACKING_STATELESS)
 
 
 def check_black(header: pb.DecodeHeader | pb.RecalibrateFramesHeader) -> None:

@@ -41,7 +41,7 @@ class PageCalls:
         def work() -> bytes:
             # The answer is wanted even where its caller leaves meanwhile, and asks again.
             until = time.monotonic() + limit_s
-            detached = Caller(lambda: until - time.monotonic(), caller.session, caller.stateless)
+            detached = Caller(lambda: until - time.monotonic(), caller.session, caller.stateless, caller.actor)
             return self._read(request, detached).SerializeToString()
 
         same = pb.ReadPageRequest()
@@ -98,5 +98,4 @@ class PageCalls:
 
 def _caller(options: pb.DecodeOptions, caller: Caller) -> Caller:
     """The caller with its session; without one, the pages are those of the device."""
-    caller.session, caller.stateless = options.session, options.tracking == pb.TRACKING_STATELESS
-    return caller
+    return caller.in_session(options.session, options.tracking == pb.TRACKING_STATELESS)

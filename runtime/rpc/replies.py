@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.page_codec import PageBytes
+from lightpage.codec.page_bytes import PageBytes
 from lightpage.recording.layout import FrameInfo
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.service.dataplane import Answer, ReadAnswer

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from lightpage.errors import InvalidInputError, LimitError, PageError
 from lightpage.page.symbols import check_levels, check_symbols
 from lightpage.recording.black_level import without_black
-from lightpage.recording.layout import FramePair, frame_type
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import frame_type
 from runtime.errors import CallerLeft, MalformedError, StalledError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.known_pages import MIN_PAGES, KnownPages

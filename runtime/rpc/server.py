@@ -15,7 +15,7 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from lightpage.errors import InvalidInputError
-from runtime.rpc.call import SERVICE, CallLog, Dispatcher, PlainCallLog
+from runtime.rpc.call import SERVICE, Dispatcher
 from runtime.rpc.handlers import handlers
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
@@ -73,7 +73,6 @@ class LightpageServer:
         plane: the service's logic.
         recalibrator: what recalibrates it.
         address: HOST:PORT; port 0 takes a free one.
-        log: is told how calls end.
         more: further handlers.
     """
 
@@ -82,11 +81,10 @@ class LightpageServer:
         plane: DataPlane,
         recalibrator: Recalibrator,
         address: str = "127.0.0.1:0",
-        log: CallLog | None = None,
         more: Sequence[object] = (),
     ) -> None:
         self._plane, self._recalibrator, self._address = plane, recalibrator, address
-        self._handlers, self._log = (*more, *handlers(plane, recalibrator)), log or PlainCallLog()
+        self._handlers = (*more, *handlers(plane, recalibrator))
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, name="lightpage-rpc", daemon=True)
         self._pool = ThreadPoolExecutor(plane.limits.concurrent_calls, thread_name_prefix="lightpage-call")
@@ -161,7 +159,7 @@ class LightpageServer:
                 ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
             )
         )
-        self._dispatcher = Dispatcher(self._handlers, self._pool, limits, self._plane.metrics, self._log)
+        self._dispatcher = Dispatcher(self._handlers, self._pool, limits, self._plane.metrics)
         self._server.add_generic_rpc_handlers((self._dispatcher.rpc_handler(),))
         self._health = _Health()
         await self._say(False)
@@ -181,7 +179,10 @@ class LightpageServer:
     async def _look(self) -> dict[str, bool]:
         trouble = self._plane.heart.trouble()
         if bool(trouble) == self._serving and not self._stopping:
-            _log.error("not serving: %s", trouble) if trouble else _log.warning("serving again")
+            if trouble:
+                _log.error("not serving: %s", trouble)
+            else:
+                _log.warning("serving again")
             await self._say(not trouble)
         return dict.fromkeys(self._names, self._serving and not self._stopping)
 

@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 
 from runtime.errors import CallerLeft
@@ -48,18 +49,25 @@ class Caller:
         self.seconds_left, self.session, self.stateless = seconds_left, session, stateless
         self.actor = actor
         self._lock = threading.Lock()
-        self._left = False
+        self._left = threading.Event()
         self._listeners: list[Callable[[], None]] = []
+
+    def in_session(self, session: str, stateless: bool) -> Caller:
+        """The same caller, whose pages are followed so; when one of both leaves, the other has left too."""
+        other = copy(self)
+        other.session, other.stateless = session, stateless
+        return other
 
     @property
     def is_here(self) -> bool:
         """False once the caller has gone."""
-        return not self._left
+        return not self._left.is_set()
 
     def leave(self) -> None:
         """The caller has gone; whoever waits on its behalf is told at once."""
         with self._lock:
-            self._left, listeners = True, list(self._listeners)
+            self._left.set()
+            listeners = list(self._listeners)
         for tell in listeners:
             tell()
 
@@ -68,8 +76,7 @@ class Caller:
         """Call `tell` when the caller leaves, within the `with` statement; at once for one who has left before."""
         with self._lock:
             self._listeners.append(tell)
-            left = self._left
-        if left:
+        if not self.is_here:
             tell()
         try:
             yield
@@ -79,5 +86,5 @@ class Caller:
 
     def check(self) -> None:
         """Raise `CallerLeft` if the caller has gone."""
-        if self._left:
+        if not self.is_here:
             raise CallerLeft

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.header import Header
-from lightpage.codec.page_codec import Loss, PageBytes
+from lightpage.codec.page_bytes import Header, Loss, PageBytes
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.pilots import Pilots
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.acquisition.source import FrameSource, Shot, own_fault
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage

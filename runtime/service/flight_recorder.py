@@ -15,8 +15,8 @@ import numpy as np
 
 from lightpage.errors import LightpageError
 from lightpage.page.levels import MAX_LEVELS
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
-from lightpage.recording.reader import FramePair
 from lightpage.recording.writer import RecordingWriter
 from runtime.errors import Reason
 from runtime.service.file_ring import FileRing

@@ -11,14 +11,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Literal, Protocol, TextIO
+from typing import Any, Literal, TextIO
 
-import grpc
-
-from runtime.errors import CallerLeft
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.service.observation import Observation
-from runtime.wire.status import reason_of, told
 
 FIELDS = ("method", "peer", "correlation_id", "code", "reason", "seconds")
 """What may be said of a call beside the message, in this order."""
@@ -28,72 +23,7 @@ _MOST_TEXT = 300
 _WINDOW_S = 1.0
 _MOST_KINDS = 1000
 """Kinds of lines that are counted apart; beyond them those of earlier seconds are forgotten."""
-_FAULTS_OF_THE_SERVICE = frozenset(
-    [
-        grpc.StatusCode.FAILED_PRECONDITION,
-        grpc.StatusCode.RESOURCE_EXHAUSTED,
-        grpc.StatusCode.UNAVAILABLE,
-    ]
-)
-"""Ends of calls that the operator of the service may want to do something about. Of lost pages `PageLog` tells."""
-
 _log = logging.getLogger(__name__)
-
-
-class EndedCall(Protocol):
-    """What is logged of a call, see `runtime.rpc.call.Call`."""
-
-    method: str
-    peer: str
-    correlation_id: str
-    begun: float
-
-    @property
-    def is_watch(self) -> bool:
-        """Whether it lasts as long as its caller likes."""
-
-
-class CallLog:
-    """Logs how calls end, see `runtime.rpc.call.CallLog`.
-
-    Calls that end well, and watches that somebody ends, are told of at DEBUG. A traceback comes with errors that nobody
-    foresaw, and with no other.
-
-    Args:
-        clock: seconds, that of `Call.begun`.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
-        self._clock = clock
-
-    def ended(self, call: EndedCall, code: grpc.StatusCode, error: BaseException | None) -> None:
-        """A call has ended, well where `error` is None."""
-        unforeseen = error if code is grpc.StatusCode.INTERNAL else None
-        fields: dict[str, Any] = {
-            "method": call.method,
-            "peer": call.peer,
-            "correlation_id": call.correlation_id,
-            "code": code.name,
-            "reason": _reason(error),
-            "seconds": round(self._clock() - call.begun, 4),
-        }
-        text = "done" if error is None else told(error) if isinstance(error, Exception) else "the caller has gone"
-        _log.log(_level(call, code, error), "%s: %s", call.method, text, extra={"told": fields}, exc_info=unforeseen)
-
-
-def _level(call: EndedCall, code: grpc.StatusCode, error: BaseException | None) -> int:
-    if code is grpc.StatusCode.INTERNAL:
-        return logging.ERROR
-    if error is None or (call.is_watch and code is grpc.StatusCode.CANCELLED):
-        return logging.DEBUG
-    return logging.WARNING if code in _FAULTS_OF_THE_SERVICE else logging.INFO
-
-
-def _reason(error: BaseException | None) -> str:
-    """The name of the reason that the caller hears; empty where there is none to tell."""
-    if error is None or isinstance(error, CallerLeft) or not isinstance(error, Exception):
-        return ""
-    return pb.ErrorReason.Name(reason_of(error)).removeprefix("ERROR_REASON_")
 
 
 class PageLog:

@@ -10,7 +10,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from lightpage.codec.page_codec import Loss, PageBytes
+from lightpage.codec.page_bytes import Loss, PageBytes
 from runtime.acquisition.source import FrameSource
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import unconfirmed_page

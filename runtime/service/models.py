@@ -149,18 +149,11 @@ class Models:
                 raise
             self._audit.record(what, before, version or self.registry.current.version, actor=actor)
 
-    @contextmanager
-    def audited_upload(self, actor: Actor) -> Iterator[list[ModelEntry]]:
-        """Write down what was taken in, which is to be put into the list, or that it failed."""
-        taken, current = list[ModelEntry](), self.registry.current.version
-        try:
-            yield taken
-        except Exception as error:
-            told = str(error) or repr(error)
-            self._audit.record("upload", current, "", actor=actor, outcome="failed", detail=told)
-            raise
-        for entry in taken:
-            self._audit.record("upload", current, entry.manifest.version, actor=actor)
+    def record_upload(self, version: str, actor: Actor, error: Exception | None = None) -> None:
+        """Write down what was taken in, or that it failed."""
+        outcome, told = ("done", "") if error is None else ("failed", str(error) or repr(error))
+        current = self.registry.current.version
+        self._audit.record("upload", current, version, actor=actor, outcome=outcome, detail=told)
 
     @property
     def current_pinned(self) -> bool:
@@ -470,8 +463,12 @@ class Upload:
                 raise BundleError("uploaded model: SHA-256", found, f"{self._digest.hex()}, as announced")
             self._file.flush()
             os.fsync(self._file.fileno())
-            with self._models.audited_upload(self._caller.actor) as taken:
-                taken.append(entry := self._models.take_in(self._path, self._check_here))
+            try:
+                entry = self._models.take_in(self._path, self._check_here)
+            except Exception as error:
+                self._models.record_upload("", self._caller.actor, error)
+                raise
+            self._models.record_upload(entry.manifest.version, self._caller.actor)
             return entry
 
     def drop(self) -> None:

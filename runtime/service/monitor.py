@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import i0e
 
-from lightpage.codec.page_codec import Loss
+from lightpage.codec.page_bytes import Loss
 from lightpage.von_mises import mean_resultant
 from runtime.decoding.page import DecodedPage
 from runtime.errors import Reason

@@ -12,11 +12,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.page_codec import PageBytes
+from lightpage.codec.page_bytes import PageBytes
 from lightpage.errors import FramesDisagreeError
 from lightpage.metrics.information import own_information
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import FrameInfo
-from lightpage.recording.reader import FramePair
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import unconfirmed_page
 from runtime.errors import LostPageError, Reason, SourceError, UnconfirmedPageError

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from lightpage.errors import FrameError, LimitError
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.errors import OverloadedError
 
 _RETRY_S = 1.0

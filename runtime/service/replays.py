@@ -77,7 +77,7 @@ class Replays:
                 expected = "its answer; ask again with the same id"
                 raise SlotsTakenError(f"request {request_id!r}", "no answer yet", expected, retry_s=1.0)
         if entry.error is not None:
-            raise entry.error
+            raise entry.error.with_traceback(None)  # else it grows with each answer
         return entry.answer, not mine
 
     def _work(self, request_id: str, entry: _Entry, work: Callable[[], bytes]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import os
-import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -23,8 +22,9 @@ from pydantic import (
     model_validator,
 )
 from pydantic.fields import FieldInfo
-from pydantic_core import ErrorDetails, PydanticCustomError
+from pydantic_core import ErrorDetails
 
+from lightpage.device.problems import WANTED, expected_of, problem_of
 from lightpage.device.profile import TomlTable, toml_value
 from lightpage.errors import InvalidInputError
 from runtime.bundle.shipped import DEFAULT
@@ -59,7 +59,7 @@ class Secret(SecretStr):
 
 def _not_empty(value: Any) -> Any:
     if value == "":
-        raise PydanticCustomError("wanted", "a path that is not empty")
+        raise ValueError("a path that is not empty")
     return value
 
 
@@ -114,7 +114,7 @@ class ServiceTable(SettingsTable):
         try:
             check_address("address", address, least_port=0)
         except InvalidInputError as error:
-            raise PydanticCustomError("wanted", "{wanted}", {"wanted": error.expected}) from None
+            raise ValueError(error.expected) from None
         return address
 
 
@@ -286,9 +286,9 @@ class ServiceSettings(TomlTable):
 
 
 def _want(right: bool, key: str, got: Any, wanted: str) -> None:
-    """Have pydantic tell that a key does not go with another one."""
+    """Have it told that a key does not go with another one."""
     if not right:
-        raise PydanticCustomError("together", "{wanted}", {"key": key, "got": got, "wanted": wanted})
+        raise ValueError(f"{key} = {_shown(got)}{WANTED}{wanted}")
 
 
 Key = tuple[str, str]
@@ -380,7 +380,7 @@ def read_settings(
     try:
         return Effective(model.model_validate(data), origins)
     except ValidationError as error:
-        problems = [_problem(model, each, origins) for each in error.errors(include_url=False)]
+        problems = [_told(model, each, origins) for each in error.errors(include_url=False)]
     if len(problems) == 1:
         origin, got, wanted = problems[0]
         raise InvalidInputError(origin or subject, got, wanted)
@@ -421,7 +421,7 @@ def _from_text(model: type[BaseModel], variable: str, key: Key, text: str) -> An
         return tuple(one.validate_strings(part.strip()) for part in parts if part.strip())
     except ValidationError as error:
         shown = _MASK if _is_secret(kind) else repr(text)
-        raise InvalidInputError(variable, shown, _wanted(error.errors(include_url=False)[0])) from None
+        raise InvalidInputError(variable, shown, expected_of(error.errors(include_url=False)[0])) from None
 
 
 def _meant(model: type[BaseModel], key: Key) -> str:
@@ -442,29 +442,19 @@ def _keys(model: type[BaseModel], table: str) -> Iterable[str]:
     return kind.model_fields if isinstance(kind, type) and issubclass(kind, BaseModel) else ()
 
 
-def _problem(model: type[BaseModel], error: ErrorDetails, origins: Mapping[Key, str]) -> tuple[str, str, str]:
+def _told(model: type[BaseModel], error: ErrorDetails, origins: Mapping[Key, str]) -> tuple[str, str, str]:
     """Where one wrong setting comes from, what came, and what was wanted; a secret is not shown."""
-    if error["type"] == "together":
-        told = error["ctx"]
-        table, _, name = told["key"].partition(".")
-        return origins.get((table, name), ""), f"{told['key']} = {_shown(told['got'])}", told["wanted"]
-    names = [str(part) for part in error["loc"]]
-    table, name = (names[0], names[1] if len(names) > 1 else "") if names else ("", "")
-    origin, field = origins.get((table, name), ""), _field(model, (table, name))
-    if error["type"] == "extra_forbidden":
-        return origin, f"unknown {'.'.join(names)}", _meant(model, (table, name))
-    if error["type"] == "missing":
-        return origin, f"no {'.'.join(names)}", "a value"
-    if len(names) < 2:
-        return origin, f"{table or 'document'} = {type(error['input']).__name__}", "a table of settings"
-    if field is not None and _is_secret(field.annotation):
-        return origin, f"{table}.{name} = {_MASK}", _wanted(error)
-    indexed = "".join(f"[{part}]" if part.isdigit() else "" for part in names[2:])
-    return origin, f"{table}.{name}{indexed} = {_shown(error['input'])}", _wanted(error)
-
-
-def _wanted(error: ErrorDetails) -> str:
-    return re.sub(r"^(Input should be|\w+ should have) ", "", error["msg"])
+    problem = problem_of(model, error)
+    place = problem.place or problem.got.partition(" = ")[0]  # of settings that do not go together
+    table, _, name = place.partition(".")
+    key = (table, name.partition(".")[0])
+    origin, field = origins.get(key, ""), _field(model, key)
+    if problem.kind == "unknown":
+        return origin, f"unknown {place}", _meant(model, (table, name))
+    if problem.kind == "missing" or not problem.place:
+        return origin, problem.got, problem.expected
+    got = _MASK if field is not None and _is_secret(field.annotation) else problem.got
+    return origin, f"{place} = {got}", problem.expected
 
 
 def _shown(value: Any) -> str:

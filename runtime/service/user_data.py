@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-from lightpage.codec.page_codec import PageBytes
+from lightpage.codec.page_bytes import PageBytes
 from lightpage.codec.volume import Successor, Volume, restore_group
 from lightpage.errors import LightpageError, PageError
 from runtime.errors import LostPageError, SourceError

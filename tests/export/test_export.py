@@ -25,7 +25,7 @@ from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.page.symbols import pilot_mask, random_symbols
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid

@@ -10,8 +10,9 @@ from click.testing import CliRunner
 
 from lightpage.codec.code import Code
 from lightpage.errors import PageError
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import Pages
-from lightpage.recording.reader import FramePair, RecordingWriter
+from lightpage.recording.reader import RecordingWriter
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 from runtime.commands.encode import encode
 from tests.runtime import toy

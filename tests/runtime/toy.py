@@ -17,7 +17,8 @@ from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import CalibrationError
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.progress import Progress
-from lightpage.recording.reader import FramePair, RecordingWriter
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import RecordingWriter
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
 from runtime.bundle.bundle import Bundle, npz, write_bundle
 from runtime.bundle.manifest import DECODER, GOLDEN, PILOTS, TWIN, Manifest

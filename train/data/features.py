@@ -19,7 +19,8 @@ from lightpage.calibration.samplers import FieldSampler
 from lightpage.calibration.sampling_table import SamplingTable, sampling_table, shifted
 from lightpage.errors import CalibrationError
 from lightpage.page.symbols import symbol_phases
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 from lightpage.waves.grid import GRID_STEP_PX, FieldGrid
 from train.models.field import Measured, TorchFieldSolver
 from train.models.hyperparameters import Hyperparameters

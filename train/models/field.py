@@ -22,7 +22,7 @@ from lightpage.calibration.sampling_table import monomial_powers
 from lightpage.calibration.wave_fit import READ_NOISE
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import FieldGrid, field_grid
 from train.models.filters import SeparableFilter
 

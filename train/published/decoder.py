@@ -13,7 +13,7 @@ from lightpage.calibration.samplers import smooth_reference
 from lightpage.device.lenses import LENSES
 from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from train.published.localizers import NAMES, Localizer, ModeLocalizer, NoLocalizer, RayLocalizer
 from train.published.unet import PublishedUNet, samples_for
 

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 
 from lightpage.device.lenses import lens_of
 from lightpage.device.profile import Profile
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from train.data.training_inputs import Trained, TrainingInputs
 from train.fitting.concentration_scale import best_kappa_scale
 from train.fitting.fit import fit, seed_stretch

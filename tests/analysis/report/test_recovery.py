@@ -16,7 +16,7 @@ from analysis.report.command import report
 from analysis.report.from_recovery import report_of_recovery
 from analysis.report.json_file import JsonFile
 from lightpage.codec.code import Code
-from lightpage.codec.page_codec import LOSSES, Loss
+from lightpage.codec.page_bytes import LOSSES, Loss
 from lightpage.codec.volume import Volume
 from lightpage.errors import InvalidInputError
 from lightpage.files import write_json

@@ -13,7 +13,8 @@ from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.device.profile import load_profile
 from lightpage.errors import CalibrationError, InvalidInputError, ProfileError, RecordingError
-from lightpage.recording.reader import FramePair, Recording, RecordingWriter
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording, RecordingWriter
 from tests.lightpage.calibration.flat_twin import FlatTwin
 
 PROFILE = load_profile("bench")

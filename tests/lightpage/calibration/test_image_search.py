@@ -11,7 +11,7 @@ from lightpage.calibration.sampling_table import registration_coefficients
 from lightpage.device.state import Device
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.small import small_profile

@@ -14,7 +14,8 @@ from lightpage.cli.simulate import simulate
 from lightpage.device.profile import Camera, PageLayout, load_profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError, ProfileError, RecordingError
-from lightpage.recording.reader import FramePair, Recording, RecordingWriter
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording, RecordingWriter
 from lightpage.simulator import recording_job
 from lightpage.simulator.simulator import LIGHT, SimulatedPage, Simulator
 

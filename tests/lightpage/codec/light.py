@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lightpage.codec.code import Code
-from lightpage.codec.header import Header
-from lightpage.codec.page_codec import FileFacts, PageCodec
+from lightpage.codec.page_bytes import FileFacts, Header
+from lightpage.codec.page_codec import PageCodec
 from lightpage.page.symbols import symbol_phases
 
 SHAPE = (16, 24)

@@ -12,7 +12,6 @@ from lightpage.codec.header import (
     HEADER_BYTES,
     MOST_BYTES,
     MOST_PAGES,
-    Header,
     check_volume,
     decode_header,
     encode_headers,
@@ -20,6 +19,7 @@ from lightpage.codec.header import (
     header_symbols,
     parse_header,
 )
+from lightpage.codec.page_bytes import Header
 from lightpage.errors import InvalidInputError
 from tests.lightpage.codec.light import noisy
 

@@ -15,8 +15,8 @@ import pytest
 from click.testing import CliRunner
 
 from lightpage.codec.code import Code
-from lightpage.codec.header import Header
-from lightpage.codec.page_codec import FileFacts, PageCodec
+from lightpage.codec.page_bytes import FileFacts, Header
+from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.page.symbols import pilot_mask, pilot_symbols

@@ -12,7 +12,8 @@ import pytest
 from lightpage.codec.choose import DrawnPage, needed_information
 from lightpage.codec.code import Code
 from lightpage.codec.header import header_symbols
-from lightpage.codec.page_codec import Loss, PageCodec
+from lightpage.codec.page_bytes import Loss
+from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import InvalidInputError, PageError
 from tests.lightpage.codec.light import GROUP, SHAPE, codec_of, header_of, noisy, pilot_mask, written
 

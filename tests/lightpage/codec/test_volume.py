@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lightpage.codec.header import MOST_BYTES
-from lightpage.codec.page_codec import PageBytes
+from lightpage.codec.page_bytes import PageBytes
 from lightpage.codec.volume import Volume, encode_volume, restore_group
 from lightpage.codec.volume_file import MOST_VOLUMES, VolumeFile, VolumeFiles, ranges
 from lightpage.errors import InvalidInputError, LostDataError

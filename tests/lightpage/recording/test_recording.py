@@ -15,7 +15,8 @@ from lightpage.device.profile import Profile, load_profile, parse_profile
 from lightpage.errors import FrameError, PageError, RecordingError
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.exposure import check_light
-from lightpage.recording.reader import FramePair, Recording, RecordingWriter, hash_frames
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording, RecordingWriter, hash_frames
 from tests.lightpage.full_disk import full_disk
 
 LEVELS = 16

@@ -16,8 +16,9 @@ from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError, LightpageError, PageError, RecordingError
 from lightpage.page.symbols import pilot_mask, random_symbols
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import PagesWriter
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.reader import Recording
 from runtime.acquisition.recording import RecordingSource
 from runtime.acquisition.simulator import SimulatorSource
 from runtime.acquisition.sources import open_source

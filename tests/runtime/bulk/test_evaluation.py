@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightpage.recording.reader import FramePair, Recording, hash_frames
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording, hash_frames
 from runtime.bulk.evaluation import evaluate, was_seen
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder

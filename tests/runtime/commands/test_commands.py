@@ -24,7 +24,8 @@ from lightpage.cli import main as cli_main
 from lightpage.cli.main import RESUME_KEY, LazyGroup, lightpage
 from lightpage.errors import CalibrationError
 from lightpage.page.pilots import Pilots
-from lightpage.recording.reader import FramePair, Recording, RecordingWriter
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording, RecordingWriter
 from runtime.acquisition.sources import open_source
 from runtime.bundle.bundle import Bundle
 from runtime.client.client import LightpageClient

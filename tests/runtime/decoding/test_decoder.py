@@ -12,7 +12,7 @@ from onnx import TensorProto
 from lightpage.errors import BundleError, FrameError, InvalidInputError, PageError
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.bundle.bundle import npz, write_bundle
 from runtime.bundle.manifest import DECODER, GOLDEN, TABLE
 from runtime.decoding.decoder import Decoder

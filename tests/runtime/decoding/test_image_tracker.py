@@ -11,7 +11,7 @@ import pytest
 from lightpage.calibration.image_search import REACH_PX, FoundImage
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.page.pilots import PilotCheck, Pilots
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
 from runtime.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageTracker

@@ -19,7 +19,8 @@ from lightpage.errors import (
 )
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
-from lightpage.recording.reader import FramePair, hash_frames
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import hash_frames
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import grpc
 import numpy as np
 
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.client.client import LightpageClient
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.server import LightpageServer

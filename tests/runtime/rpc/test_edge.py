@@ -21,7 +21,7 @@ from google.rpc import error_details_pb2, status_pb2
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-from lightpage.recording.layout import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
 from runtime.errors import OverloadedError, SlotsTakenError
@@ -359,6 +359,63 @@ def test_pairs_are_decoded_in_a_row_and_a_bad_one_ends_nothing(start: Start) -> 
         cut = list(service.stub(channel).DecodePages(iter(half), timeout=20))
         assert cut[0].refused.reason == pb.ERROR_REASON_FRAME_FORMAT
     assert service.plane.received.used == 0
+
+
+class Naming(NoTracker):
+    """Tells in its pages which session they were decoded in."""
+
+    def __init__(self, decoder: Decoder, number: float = 0.0) -> None:
+        super().__init__(decoder)
+        self._mine, self._number, self._made = decoder, number, iter(range(1, 100))
+
+    def decode(self, *arguments: Any) -> Any:
+        page = super().decode(*arguments)
+        return type(page)(**{**vars(page), "piston_rad": self._number})
+
+    def anew(self) -> Naming:
+        return Naming(self._mine, float(next(self._made)))
+
+
+def test_pairs_of_one_call_stay_in_the_sessions_that_they_name(start: Start) -> None:
+    service = start(Limits(concurrent_decodes=1), tracker=Naming)
+    service.plane.decodes.take(Caller())
+    pair = a_page()[1]
+
+    def stream() -> Iterator[pb.DecodeFramesRequest]:
+        for session in ("one", "two"):
+            yield from parts(pair, options=pb.DecodeOptions(levels=16, session=session))
+
+    with grpc.insecure_channel(service.server.target) as channel:
+        replies = service.stub(channel).DecodePages(stream(), timeout=20)
+        assert wait_until(lambda: service.plane.decodes.queued == 2)
+        service.plane.decodes.give_back()
+        assert sorted(reply.decoded.piston_rad for reply in replies) == [1, 2]
+
+
+@pytest.mark.parametrize("method", ["DecodeFrames", "DecodePages"])
+@pytest.mark.parametrize("rows", [0, 1])
+def test_one_who_sends_next_to_nothing_for_ever_is_cut_off(start: Start, method: str, rows: int) -> None:
+    """Behind a whole pair (DecodeFrames), behind a pair that is refused (one row more), and in the middle of one."""
+    service = start(Limits(receive_s=0.5))
+    over = threading.Event()
+
+    def dripping() -> Iterator[pb.DecodeFramesRequest]:
+        whole = method == "DecodeFrames" and not rows
+        yield pb.DecodeFramesRequest(header=header(rows_px=toy.PROFILE.frame_shape[0] + rows))
+        if whole:
+            yield from list(parts(a_page()[1]))[1:]
+        while not over.wait(0.05):
+            yield pb.DecodeFramesRequest(chunk=b"")
+
+    with grpc.insecure_channel(service.server.target) as channel:
+        call = getattr(service.stub(channel), method)
+        with pytest.raises(grpc.RpcError) as error:
+            list(call(dripping(), timeout=10))
+        over.set()
+    refused_at_once = method == "DecodeFrames" and rows
+    expected = grpc.StatusCode.INVALID_ARGUMENT if refused_at_once else grpc.StatusCode.CANCELLED
+    assert error.value.code() is expected
+    assert wait_until(lambda: service.plane.received.used == 0)
 
 
 def test_pages_of_the_source_are_read_in_a_row(start: Start) -> None:

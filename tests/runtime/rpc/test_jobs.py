@@ -24,7 +24,8 @@ from lightpage.errors import (
     RecalibrationRefusedError,
 )
 from lightpage.page.symbols import pilot_mask
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 from runtime.bundle.bundle import Bundle
 from runtime.client.answers import JobInfo, JobState
 from runtime.client.client import LightpageClient

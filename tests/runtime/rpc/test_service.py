@@ -28,7 +28,7 @@ from lightpage.errors import (
 )
 from lightpage.metrics.measures import measure
 from lightpage.page.symbols import pilot_mask
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from runtime.acquisition.sources import open_source
 from runtime.bundle.bundle import Bundle
 from runtime.client.client import LightpageClient

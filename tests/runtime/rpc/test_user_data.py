@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightpage.codec.page_codec import Loss
+from lightpage.codec.page_bytes import Loss
 from lightpage.errors import BundleError, InvalidInputError, LimitError, PageError
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder

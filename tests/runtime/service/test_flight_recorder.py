@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lightpage.codec.page_codec import Loss, PageBytes
+from lightpage.codec.page_bytes import Loss, PageBytes
 from lightpage.errors import InvalidInputError, LimitError
 from lightpage.recording.reader import Recording
 from runtime.bundle.bundle import Bundle

@@ -25,11 +25,12 @@ from runtime.errors import CallerLeft, LostShotError, OverloadedError, Reason
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.call import Call
+from runtime.rpc.call_log import CallLog
 from runtime.rpc.server import LightpageServer
 from runtime.service.audit import AuditLog
 from runtime.service.caller import Actor, Caller
 from runtime.service.dataplane import DataPlane
-from runtime.service.logs import CallLog, LimitedHandler, PageLog, TextFormatter, logging_to_stderr
+from runtime.service.logs import LimitedHandler, PageLog, TextFormatter, logging_to_stderr
 from runtime.service.monitor import Monitor
 from runtime.service.observation import Observation
 from runtime.service.recalibrator import Recalibrator
@@ -63,7 +64,7 @@ def test_a_call_is_logged_with_who_called_why_it_ended_and_how_long_it_took() ->
     assert 0 <= line.pop("seconds") < 1
     assert line == {
         "level": "INFO",
-        "logger": "runtime.service.logs",
+        "logger": "runtime.rpc.call_log",
         "message": "ReadPage: levels: got 1, wanted 2..256",
         "method": "ReadPage",
         "peer": "ipv4:127.0.0.1:9",
@@ -200,7 +201,7 @@ class Service:
         models, self.file = ModelStore(store, registry.current.decoder.bundle), store / "audit.jsonl"
         self.plane = DataPlane(registry, source, models, observers=[PageLog()], audit=AuditLog(self.file))
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)
-        self.server = LightpageServer(self.plane, self.recalibrator, log=CallLog(), more=more).start()
+        self.server = LightpageServer(self.plane, self.recalibrator, more=more).start()
 
     def entries(self) -> list[dict[str, Any]]:
         return [json.loads(line) for line in self.file.read_text("utf-8").splitlines()]

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightpage.codec.page_codec import Loss, PageBytes
+from lightpage.codec.page_bytes import Loss, PageBytes
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
-from runtime.decoding.page import DecodedPage, ImagePosition
+from runtime.decoding.image_position import ImagePosition
+from runtime.decoding.page import DecodedPage
 from runtime.errors import Reason, UnconfirmedPageError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane

@@ -102,10 +102,10 @@ def test_the_short_name_of_the_store_counts_less_than_the_long_one() -> None:
         ),
         ("[limts]\nstall_s = 1", r"got unknown limts, wanted table \[limits\]"),
         ("[service]\nport = 9100", r"got unknown service\.port, wanted metrics\.port"),
-        ("limits = 3", r"got limits = int, wanted a table"),
-        ("[limits]\nconcurrent_decodes = 0", r"got limits\.concurrent_decodes = 0, wanted greater than or equal to 1"),
-        ("[limits]\nconcurrent_decodes = true", r"got limits\.concurrent_decodes = True, wanted a valid integer"),
-        ("[limits]\nstall_s = '5'", r"got limits\.stall_s = '5', wanted a valid number"),
+        ("limits = 3", r"got limits = 3, wanted a table"),
+        ("[limits]\nconcurrent_decodes = 0", r"got limits\.concurrent_decodes = 0, wanted at least 1"),
+        ("[limits]\nconcurrent_decodes = true", r"got limits\.concurrent_decodes = true, wanted a whole number"),
+        ("[limits]\nstall_s = '5'", r"got limits\.stall_s = '5', wanted a number"),
         ("[limits]\nstall_s = nan", r"got limits\.stall_s = nan, wanted a finite number"),
         ("[limits]\nchunk_bytes = 4194304", r"chunk_bytes = 4194304, wanted at least 1024 less than limits\.message_"),
         ("[limits]\npair_bytes = 2000000000", r"wanted at least limits\.pair_bytes"),
@@ -113,10 +113,10 @@ def test_the_short_name_of_the_store_counts_less_than_the_long_one() -> None:
         ("[service]\naddress = 'here'", r"got service\.address = 'here', wanted HOST:PORT"),
         ("[service]\nstore = ''", r"service\.store = '', wanted a path that is not empty"),
         ("[service]\npages = 'p.h5'", r"service\.pages = 'p\.h5', wanted service\.source"),
-        ("[logs]\nlevel = 'loud'", r"logs\.level = 'loud', wanted 'debug', 'info', 'warning' or 'error'"),
+        ("[logs]\nlevel = 'loud'", r"logs\.level = 'loud', wanted debug, info, warning or error"),
         (
             "[self_calibration]\npages = [1, -2]",
-            r"calibration\.pages\[1\] = -2, wanted greater than or equal to 0",
+            r"calibration\.pages\.1 = -2, wanted at least 0",
         ),
         ("[self_calibration]\npages = [1]", r"pages = \[1\], wanted at least 2 that differ"),
         ("[self_calibration]\nenabled = true", r"enabled = True, wanted service\.source"),
@@ -134,17 +134,17 @@ def test_a_wrong_setting_is_named_with_what_came_and_what_was_wanted(text: str, 
 def test_all_wrong_settings_are_named_at_once_with_where_they_come_from(tmp_path: Path) -> None:
     option = Option("--threads", ("service", "threads"), 0)
     told = str(refused(tmp_path, "[limits]\nstall_s = -1", option, LIGHTPAGE_LOGS__FORMAT="xml"))
-    assert told.startswith("LIGHTPAGE_LOGS__FORMAT: got 'xml', wanted 'text' or 'json'")
+    assert told.startswith("LIGHTPAGE_LOGS__FORMAT: got 'xml', wanted text or json")
     told = str(refused(tmp_path, "[limits]\nstall_s = -1", option))
     assert "limits.stall_s = -1 (file " in told
-    assert "service.threads = 0 (option --threads), wanted greater than or equal to 1" in told
+    assert "service.threads = 0 (option --threads), wanted at least 1" in told
 
 
 @pytest.mark.parametrize(
     ("variable", "value", "told"),
     [
-        (DECODES, "many", "wanted a valid integer"),
-        (DECODES, "0", "wanted greater than or equal to 1"),
+        (DECODES, "many", "wanted a whole number"),
+        (DECODES, "0", "wanted at least 1"),
         ("LIGHTPAGE_LIMITS__CONCURENT_DECODES", "1", "wanted limits.concurrent_decodes"),
         ("LIGHTPAGE_LIMIT__STALL_S", "1", "wanted table [limits]"),
     ],

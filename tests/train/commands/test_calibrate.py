@@ -21,7 +21,8 @@ from lightpage.device.state import Device
 from lightpage.errors import CalibrationError, FrameError, InvalidInputError, LightpageError, RecordingError
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import reporting
-from lightpage.recording.reader import FramePair, Recording, RecordingWriter
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording, RecordingWriter
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from tests.told import Told

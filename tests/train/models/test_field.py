@@ -12,7 +12,7 @@ from lightpage.calibration.samplers import FieldSampler
 from lightpage.calibration.sampling_table import monomial_powers
 from lightpage.device.state import Aberration, CameraPose, Device, Drift, Homodyne, Reference, Sensor
 from lightpage.errors import InvalidInputError
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.cameras import resample
 from lightpage.simulator.simulator import Simulator
 from lightpage.waves.grid import field_grid

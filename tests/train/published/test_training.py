@@ -13,7 +13,8 @@ from click.testing import CliRunner
 from lightpage.device.profile import load_profile
 from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask
-from lightpage.recording.reader import FramePair, Recording
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 from tests.conftest import SMALL_PAGES
 from tests.lightpage.small import THICK, small_profile
 from train.commands.train import train

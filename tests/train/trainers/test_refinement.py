@@ -15,7 +15,7 @@ from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.wave_model import illumination_terms
 from lightpage.device.state import Device, Drift, Sensor
 from lightpage.page.symbols import random_symbols, symbol_phases
-from lightpage.recording.reader import FramePair
+from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
 from tests.lightpage.small import small_profile
