@@ -67,7 +67,7 @@ RANGE_S = 3600.0
 """A range that is not read to its end by then is dropped, with a caller that does not take it."""
 
 CONCURRENT_WATCHES = 2
-"""Controllers that watch what is to be shown, each holding a thread: one, and one whose connection has been lost."""
+"""Controllers that watch what is to be shown: one, and one whose connection has been lost."""
 
 GRACE_S = 10.0
 """Time that calls in flight get when the service is told to stop."""
