@@ -15,6 +15,9 @@ from runtime.service.caller import Caller
 MARGIN = 1.1
 """Of the usual time: a call with less time left than this many times it is not begun."""
 
+DEVIATIONS = 3.0
+"""Nor one with less time left than the usual time and so many of its usual deviations."""
+
 _MEMORY = 0.2
 """Weight of the last duration in the usual one."""
 
@@ -44,7 +47,7 @@ class Slots:
         self._lock = threading.Lock()
         self._free = count
         self._queue: deque[_Ticket] = deque()
-        self._usual_s = 0.0
+        self._usual_s = self._deviation_s = 0.0
 
     @property
     def queued(self) -> int:
@@ -76,7 +79,7 @@ class Slots:
             OverloadedError: the queue is too long, or the caller's deadline shorter than the work takes.
         """
         wait_s, left_s = self.expected_wait_s(), caller.seconds_left()
-        if wait_s + MARGIN * self._usual_s > left_s:
+        if wait_s + self._needed_s > left_s:
             raise self._too_late(left_s, wait_s, in_queue=wait_s > 0)
 
     def take(self, caller: Caller) -> None:
@@ -98,7 +101,7 @@ class Slots:
         if queues := not ticket.has_slot:
             self._wait(ticket, caller)
         left_s = caller.seconds_left()
-        if MARGIN * self._usual_s > left_s:
+        if self._needed_s > left_s:
             self.give_back()
             raise self._too_late(left_s, 0.0, in_queue=queues)
 
@@ -140,7 +143,16 @@ class Slots:
     def took(self, seconds: float) -> None:
         """Learn from work that was done how long it usually takes."""
         with self._lock:
-            self._usual_s += (_MEMORY if self._usual_s else 1.0) * (seconds - self._usual_s)
+            if not self._usual_s:
+                self._usual_s = seconds
+            off = seconds - self._usual_s
+            self._usual_s += _MEMORY * off
+            self._deviation_s += _MEMORY * (abs(off) - self._deviation_s)
+
+    @property
+    def _needed_s(self) -> float:
+        """Time that the work hardly ever exceeds."""
+        return max(MARGIN * self._usual_s, self._usual_s + DEVIATIONS * self._deviation_s)
 
     def _wait(self, ticket: _Ticket, caller: Caller) -> None:
         until = time.monotonic() + min(caller.seconds_left(), self._deadline_s)
@@ -159,7 +171,7 @@ class Slots:
 
     def _too_late(self, left_s: float, wait_s: float, *, in_queue: bool) -> OverloadedError:
         """The error of a caller who comes too late; without a queue, coming again with that deadline is of no use."""
-        needed_s, left_s = wait_s + MARGIN * self._usual_s, max(0.0, left_s)
+        needed_s, left_s = wait_s + self._needed_s, max(0.0, left_s)
         subject, told = f"concurrent {self._what}", f"{left_s:.2f} s until the deadline"
         if not in_queue:
             return OverloadedError(subject, told, f"at least {needed_s:.2f} s")
