@@ -174,8 +174,9 @@ def main(times: float, deadline_s: float, seconds: float, threads: int | None, j
             for _ in range(3):
                 stub(channel).DecodeFrames(iter(pages.requests(options=_ONE_DEVICE)), timeout=120)
             stub(channel).Describe(pb.DescribeRequest(), timeout=10)
-        alone = capacity(service, pages, seconds / 2)
         targets = {"health_port": service.health, "service_port": service.target, "idle_probe": idle.target}
+        with Checks(**targets):  # they cost time too
+            alone = capacity(service, pages, seconds / 2)
         with Checks(**targets) as checks:
             loaded = overload(service, pages, times * alone, deadline_s, seconds)
         under_load = checks.figures()
