@@ -10,8 +10,8 @@ while one runs, without a pause or, at `--load 0.6`, so that reads take 60% of t
 from __future__ import annotations
 
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -24,6 +24,7 @@ from analysis.hardware.drifting import DriftingSource, direction, moved
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.state import Device
+from lightpage.errors import LightpageError
 from lightpage.files import write_json
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
@@ -73,29 +74,29 @@ class Photographed(FrameSource):
         return self._references
 
 
-@dataclass
-class Recalibration:
-    """A recalibration in the background.
+@dataclass(frozen=True)
+class Taken:
+    """What a recalibration took; not a number where it failed.
 
     Attributes:
-        seconds: that it took, from the call to the new model in service; None before its end.
+        seconds: from the call to the new model in service.
         worked_s: of it, in its own process.
+        error: why it failed, if so.
     """
 
-    recalibrator: Recalibrator
-    seconds: float | None = None
-    worked_s: float = 0.0
+    seconds: float = np.nan
+    worked_s: float = np.nan
+    error: str = ""
 
-    def start(self) -> threading.Thread:
-        """Begin; the thread ends with it."""
-        thread = threading.Thread(target=self._run, daemon=True)
-        thread.start()
-        return thread
 
-    def _run(self) -> None:
-        start = time.perf_counter()
-        *_, outcome = self.recalibrator.from_source(2, [0, 1], Caller())
-        self.seconds, self.worked_s = time.perf_counter() - start, getattr(outcome, "seconds", 0.0)
+def recalibration(recalibrator: Recalibrator) -> Taken:
+    """Run one to its end."""
+    start = time.perf_counter()
+    try:
+        *_, outcome = recalibrator.from_source(2, [0, 1], Caller())
+    except LightpageError as error:
+        return Taken(error=str(error))
+    return Taken(time.perf_counter() - start, getattr(outcome, "seconds", 0.0))
 
 
 def timed(plane: DataPlane, pause_s: float = 0.0) -> float:
@@ -117,26 +118,23 @@ def main(rounds: int, load: float, threads: int | None, json_path: Path | None) 
     decoder = Decoder.load(bundle_path(DEFAULT), threads)
     source = Photographed(DriftingSource(decoder, lambda moment: moved(Device(), direction(1)), seed=3))
     alone, beside = list[float](), list[float]()
-    idle, busy, worked_idle, worked_busy = list[float](), list[float](), list[float](), list[float]()
+    idle, busy = list[Taken](), list[Taken]()
     for _ in track(range(rounds), "recalibration", unit="round"):
         plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
         recalibrator = Recalibrator(plane)
         pause_s = median(timed(plane) for _ in range(SETTLED)) * (1 / load - 1)
         alone += [timed(plane, pause_s) for _ in range(BEFORE)]
-        recalibration = Recalibration(recalibrator)
-        recalibration.start().join()
-        idle.append(recalibration.seconds or np.nan)
-        worked_idle.append(recalibration.worked_s)
+        idle.append(recalibration(recalibrator))
         plane.rollback()
         for _ in range(SETTLED):
             timed(plane)
-        recalibration = Recalibration(recalibrator)
-        thread = recalibration.start()
-        while thread.is_alive():
-            beside.append(timed(plane, pause_s))
-        busy.append(recalibration.seconds or np.nan)
-        worked_busy.append(recalibration.worked_s)
+        with ThreadPoolExecutor(1) as pool:
+            running = pool.submit(recalibration, recalibrator)
+            while not running.done():
+                beside.append(timed(plane, pause_s))
+        busy.append(running.result())
         recalibrator.close()
+    idle_s, busy_s = median(one.seconds for one in idle), median(one.seconds for one in busy)
     figures: dict[str, Any] = {
         "threads": threads or available_cpus(),
         "rounds": rounds,
@@ -149,14 +147,17 @@ def main(rounds: int, load: float, threads: int | None, json_path: Path | None) 
         "read_s_longest_beside": max(beside),
         "read_s_longest": max(alone),
         "pages_during_a_recalibration": len(beside) / rounds,
-        "recalibration_s_idle": median(idle),
-        "recalibration_s_busy": median(busy),
-        "recalibration_ratio": median(busy) / median(idle),
-        "in_its_process_s_idle": median(worked_idle),
-        "in_its_process_s_busy": median(worked_busy),
+        "recalibration_s_idle": idle_s,
+        "recalibration_s_busy": busy_s,
+        "recalibration_ratio": busy_s / idle_s,
+        "in_its_process_s_idle": median(one.worked_s for one in idle),
+        "in_its_process_s_busy": median(one.worked_s for one in busy),
     }
     for name, value in figures.items():
         click.echo(f"{name:<30} {value:.4g}")
+    figures["failed"] = [one.error for one in (*idle, *busy) if one.error]
+    for error in figures["failed"]:
+        click.echo(f"failed: {error}")
     if json_path is not None:
         write_json(json_path, figures)
 
