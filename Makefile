@@ -112,13 +112,15 @@ bench-codec: $(STAMP)  ## user bytes on recorded pages, wrong bytes ever given o
 	$(ONE_THREAD) $(BIN)/python -m analysis.codec.speed --json runs/bench-codec/speed.json
 
 BENCH_HARDWARE := runs/bench-hardware
-bench-hardware: $(STAMP)  ## cameras, trigger, pairing: wrong pairs, losses, plugs, latency, over fake cameras, in half an hour
-	mkdir -p $(BENCH_HARDWARE)
+bench-hardware: $(STAMP)  ## cameras, trigger, pairing over fake cameras in half an hour; then drifts and a week in hours, resumed when run again
+	@mkdir -p $(BENCH_HARDWARE)
 	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.cameras --json $(BENCH_HARDWARE)/cameras.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.scpi --queries 10000 --json $(BENCH_HARDWARE)/scpi.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.pairs --shots 2000 --json $(BENCH_HARDWARE)/pairs.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.hardware.plugs --times 30 --json $(BENCH_HARDWARE)/plugs.json
 	$(BIN)/python -m analysis.hardware.latency --pages 100 --json $(BENCH_HARDWARE)/latency.json
+	$(BIN)/python -m analysis.hardware.drifts --out $(BENCH_HARDWARE)/drifts --json $(BENCH_HARDWARE)/drifts.json
+	$(BIN)/python -m analysis.hardware.week --out $(BENCH_HARDWARE)/week --json $(BENCH_HARDWARE)/week.json
 
 bench-image-search: $(STAMP)  ## how the image is found, followed and confirmed: tables and a picture, in more than an hour
 	$(BIN)/python -m analysis.tracking.image_search --out runs/bench-image-search

@@ -7,7 +7,6 @@ import platform
 import signal
 import socket
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from importlib.metadata import version as installed_version
 from pathlib import Path
@@ -43,6 +42,7 @@ from runtime.service.registry import ModelRegistry
 from runtime.service.self_calibration import SelfCalibration
 from runtime.service.settings import ADDRESS, OFF, STORE_VARIABLE, Effective, Option, ServiceSettings, service_settings
 from runtime.service.store import ModelStore
+from runtime.service.store_health import StoreHealth
 
 _log = logging.getLogger(__name__)
 
@@ -190,7 +190,10 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         server = LightpageServer(plane, recalibrator, service.address)
         if service.health_address != OFF:  # entered first: it says NOT_SERVING until the last call has ended
             address = service.health_address or next_port(service.address)
-            health = stack.enter_context(HealthServer(address, _Health(server, plane)))
+            store = StoreHealth(plane.store_trouble)
+            health = stack.enter_context(
+                HealthServer(address, lambda: {**server.health(), STORE_HEALTH: store.is_well()})
+            )
             click.echo(f"health checks at {health.target}")
         stack.enter_context(server)
         if service.incoming is not None:
@@ -210,23 +213,6 @@ def _log_start(model: str, source: str, address: str, given: int) -> None:
     versions["python"] = platform.python_version()
     text = "serving %s from %s at %s, %d settings given"
     _log.info(text, model, source, address, given, extra={"told": versions})
-
-
-class _Health:
-    """What health checks say. The store is looked at beside: a disk that hangs must not silence the rest."""
-
-    def __init__(self, server: LightpageServer, plane: DataPlane) -> None:
-        self._server, self._plane = server, plane
-        self._look = ThreadPoolExecutor(1, thread_name_prefix="lightpage-store-look")
-        self._looking: Future[str] | None = None
-        self._store_serves = True
-
-    def __call__(self) -> dict[str, bool]:
-        if self._looking is None or self._looking.done():
-            if self._looking is not None:
-                self._store_serves = not self._looking.result()
-            self._looking = self._look.submit(self._plane.store_trouble)
-        return {**self._server.health(), STORE_HEALTH: self._store_serves}
 
 
 def _source(name: str, pages_file: Path | None, base: Decoder) -> FrameSource:
