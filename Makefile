@@ -10,6 +10,8 @@ PYTEST_ARGS ?=
 IMAGE_TARGET ?= runtime
 IMAGE_TAG ?= lightpage:$(IMAGE_TARGET)
 
+# Tests and benches start many processes, and each would compile every module anew.
+export PYTHONDONTWRITEBYTECODE =
 # onnxruntime reports home unless told not to.
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
@@ -98,7 +100,7 @@ bench-service: $(STAMP)  ## the service under load, faults and attack, from outs
 	$(BIN)/python -m analysis.service.kills --out $(BENCH_SERVICE)/kills --json $(BENCH_SERVICE)/kills.json
 	$(BIN)/python -m analysis.hardware.recalibration --load 0.6 --json $(BENCH_SERVICE)/recalibration.json
 
-soak: $(STAMP)  ## half an hour at 80% of the service's load: does its memory grow?
+soak: $(STAMP)  ## 40 minutes at 80% of the service's load: does its memory grow?
 	@mkdir -p $(BENCH_SERVICE)
 	$(BIN)/python -m analysis.service.soak --json $(BENCH_SERVICE)/soak.json
 

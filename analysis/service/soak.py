@@ -4,7 +4,8 @@
 
 Pairs are sent at 80% of what the service decodes, over connections that come and go; now and then a page of its source,
 a bad message and a stream that is left. Memory is looked at every few seconds. Growth is that of its median, from the
-first tenth behind the warm-up to the last tenth.
+first tenth behind the warm-up to the last tenth. The warm-up is as long as the service keeps the answers of request
+ids, ten minutes: until then its memory is meant to grow.
 """
 
 from __future__ import annotations
@@ -30,7 +31,6 @@ from lightpage.progress import track
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import SERVICE
 
-_WARM_UP = 0.2
 _LOOK_S = 2.0
 _CALLERS = 4
 
@@ -58,17 +58,18 @@ def call(service: RunningService, rate: float, end: float, seed: int, ended: Cou
 
 @click.command()
 @click.option("--minutes", default=30.0, show_default=True, type=click.FloatRange(0.1))
+@click.option("--warm-up", default=10.0, show_default=True, type=click.FloatRange(0.0), help="Minutes before these.")
 @click.option("--load", default=0.8, show_default=True, type=click.FloatRange(0.05, 1.0), help="Share of capacity.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-def main(minutes: float, load: float, threads: int | None, json_path: Path | None) -> None:
+def main(minutes: float, warm_up: float, load: float, threads: int | None, json_path: Path | None) -> None:
     """Print how the service's memory grew."""
     own = () if threads is None else ("--threads", str(threads))
     with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
         source = PagesToSend().record(Path(folder) / "pages.h5")
         with RunningService("--source", f"recording:{source}", *own) as service:
             alone = capacity(service, PagesToSend(), 10.0)
-            end, ended = time.monotonic() + 60 * minutes, Counter[str]()
+            end, ended = time.monotonic() + 60 * (warm_up + minutes), Counter[str]()
             rate = load * alone / _CALLERS
             callers = [
                 threading.Thread(target=call, args=(service, rate, end, seed, ended)) for seed in range(_CALLERS)
@@ -76,17 +77,19 @@ def main(minutes: float, load: float, threads: int | None, json_path: Path | Non
             for each in callers:
                 each.start()
             resident: list[int] = []
-            for _ in track(range(int(60 * minutes / _LOOK_S)), "soak", total=int(60 * minutes / _LOOK_S)):
+            looks = int(60 * (warm_up + minutes) / _LOOK_S)
+            for _ in track(range(looks), "soak", total=looks):
                 time.sleep(_LOOK_S)
                 resident.append(service.resident_bytes())
             for each in callers:
                 each.join()
             status = service.stop()
-    warm = resident[int(_WARM_UP * len(resident)) :]
+    warm = resident[int(60 * warm_up / _LOOK_S) :]
     tenth = max(1, len(warm) // 10)
     first, last = median(warm[:tenth]), median(warm[-tenth:])
     figures = {
         "minutes": minutes,
+        "warm_up_minutes": warm_up,
         "calls": sum(ended.values()),
         "ended": dict(ended),
         "first_mb": first / 1e6,
@@ -96,7 +99,8 @@ def main(minutes: float, load: float, threads: int | None, json_path: Path | Non
         "resident_mb": [each / 1e6 for each in resident],
     }
     click.echo(
-        f"{minutes:g} minutes at {load:.0%}: {figures['calls']} calls ({dict(ended)}), memory from {first / 1e6:.1f} "
+        f"{minutes:g} minutes at {load:.0%} behind a warm-up of {warm_up:g}: {figures['calls']} calls ({dict(ended)}), "
+        f"memory from {first / 1e6:.1f} "
         f"to {last / 1e6:.1f} MB, {figures['growth']:+.2%}"
     )
     if json_path is not None:

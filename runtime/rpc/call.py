@@ -34,6 +34,12 @@ SERVICE = pb.DESCRIPTOR.services_by_name["Lightpage"]
 ENDLESS = frozenset(["WatchDisplay", "WatchJob"])
 """Calls that last as long as their callers like: they hold no thread, are no load, and end with the service."""
 
+UPLOADS = frozenset(["UploadPages", "RecalibrateFrames", "UploadModel"])
+"""Calls that change something once their callers have closed their streams."""
+
+_GONE_S = 0.05
+"""From the end of a stream to the word that its caller has gone, rather than closed it, at most."""
+
 T = TypeVar("T")
 
 
@@ -180,6 +186,8 @@ class Dispatcher:
                 async with asyncio.timeout(self._limits.stall_s):
                     message = await anext(data)
             except StopAsyncIteration:
+                if call.method in UPLOADS:  # the library ends the stream of one who has gone too, and then cancels it
+                    await asyncio.sleep(_GONE_S)
                 return
             except TimeoutError:
                 expected = f"the next message within {self._limits.stall_s:g} s"

@@ -5,9 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import ceil
+from statistics import median
 
 from runtime.errors import OverloadedError, SlotsTakenError
 from runtime.service.caller import Caller
@@ -15,11 +17,14 @@ from runtime.service.caller import Caller
 MARGIN = 1.1
 """Of the usual time: a call with less time left than this many times it is not begun."""
 
-DEVIATIONS = 3.0
-"""Nor one with less time left than the usual time and so many of its usual deviations."""
+SLOW = 0.9
+"""Nor one with less time left than this share of the last calls took at most."""
 
-_MEMORY = 0.2
-"""Weight of the last duration in the usual one."""
+REMEMBERED = 20
+"""Calls whose time is remembered."""
+
+FORGET_S = 30.0
+"""After that a call's time is forgotten: where all are refused, nothing else would show that calls are fast again."""
 
 
 @dataclass(eq=False)
@@ -40,14 +45,16 @@ class Slots:
         count: slots.
         what: they are for, for the error, e.g. ``"decodes"``.
         deadline_s: longest wait, seconds.
+        clock: seconds that never go back.
     """
 
-    def __init__(self, count: int, what: str, deadline_s: float) -> None:
-        self._count, self._what, self._deadline_s = count, what, deadline_s
+    def __init__(self, count: int, what: str, deadline_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._count, self._what, self._deadline_s, self._clock = count, what, deadline_s, clock
         self._lock = threading.Lock()
         self._free = count
         self._queue: deque[_Ticket] = deque()
-        self._usual_s = self._deviation_s = 0.0
+        self._lately: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)
+        """When calls ended, and how long they took, seconds."""
 
     @property
     def queued(self) -> int:
@@ -63,14 +70,15 @@ class Slots:
 
     @property
     def usual_s(self) -> float:
-        """What a slot is usually held for, seconds; 0 before anything was done."""
-        return self._usual_s
+        """What a slot was lately held for, the median in seconds; 0 where nothing was done lately."""
+        taken = self._taken()
+        return median(taken) if taken else 0.0
 
     def expected_wait_s(self) -> float:
         """How long whoever comes now will wait for a slot, seconds."""
         with self._lock:
             ahead = len(self._queue) + (0 if self._free else 1)
-        return self._usual_s * ahead / self._count
+        return self.usual_s * ahead / self._count
 
     def check(self, caller: Caller) -> None:
         """Turn a caller away for whom it would be too late, before anything is spent on the call.
@@ -143,16 +151,19 @@ class Slots:
     def took(self, seconds: float) -> None:
         """Learn from work that was done how long it usually takes."""
         with self._lock:
-            if not self._usual_s:
-                self._usual_s = seconds
-            off = seconds - self._usual_s
-            self._usual_s += _MEMORY * off
-            self._deviation_s += _MEMORY * (abs(off) - self._deviation_s)
+            self._lately.append((self._clock(), seconds))
 
     @property
     def _needed_s(self) -> float:
-        """Time that the work hardly ever exceeds."""
-        return max(MARGIN * self._usual_s, self._usual_s + DEVIATIONS * self._deviation_s)
+        """Time that the work hardly ever exceeds; 0 where nothing was done lately."""
+        taken = self._taken()
+        return max(MARGIN * median(taken), taken[ceil(SLOW * len(taken)) - 1]) if taken else 0.0
+
+    def _taken(self) -> list[float]:
+        """What was lately taken, the shortest first."""
+        since = self._clock() - FORGET_S
+        with self._lock:
+            return sorted(seconds for ended, seconds in self._lately if ended >= since)
 
     def _wait(self, ticket: _Ticket, caller: Caller) -> None:
         until = time.monotonic() + min(caller.seconds_left(), self._deadline_s)
@@ -176,4 +187,4 @@ class Slots:
         if not in_queue:
             return OverloadedError(subject, told, f"at least {needed_s:.2f} s")
         expected = f"at least {needed_s:.2f} s, {wait_s:.2f} s of it in the queue; try again later"
-        return OverloadedError(subject, told, expected, max(self._usual_s / self._count, needed_s - left_s))
+        return OverloadedError(subject, told, expected, max(self.usual_s / self._count, needed_s - left_s))

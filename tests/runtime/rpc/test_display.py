@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -100,6 +101,37 @@ def test_a_controller_shows_what_it_has_uploaded(serve: type[Serve]) -> None:
     thread.join(20)
     assert seen == [1, 0]
     client.page_shown(None)
+
+
+def test_an_upload_whose_caller_leaves_adds_no_page(serve: type[Serve]) -> None:
+    service = serve(external(Lab())[0])  # type: ignore[call-arg,arg-type]
+    sent, open_end = threading.Event(), threading.Event()
+
+    def all_but_the_end() -> Iterator[pb.UploadPagesRequest]:
+        yield pb.UploadPagesRequest(levels=16)
+        yield pb.UploadPagesRequest(symbols=PAGES.tobytes())
+        sent.set()
+        open_end.wait(20)
+
+    with grpc.insecure_channel(service.server.target) as channel:
+        stub = pb_grpc.LightpageStub(channel)  # type: ignore[no-untyped-call]
+        call = stub.UploadPages.future(all_but_the_end(), timeout=20)
+        assert sent.wait(10)
+        time.sleep(0.2)  # for the pages to arrive
+        call.cancel()
+        open_end.set()
+        with pytest.raises(grpc.FutureCancelledError):
+            call.result(10)
+
+        def failing() -> Iterator[pb.UploadPagesRequest]:
+            yield pb.UploadPagesRequest(levels=16)
+            yield pb.UploadPagesRequest(symbols=PAGES.tobytes())
+            time.sleep(0.2)
+            raise ValueError
+
+        with pytest.raises(grpc.RpcError):
+            stub.UploadPages(failing(), timeout=20)
+        assert service.client.upload_pages(PAGES[:1], 16) == 0
 
 
 def test_beams_are_moved_by_the_controller_too(serve: type[Serve]) -> None:

@@ -237,6 +237,36 @@ def test_who_would_wait_too_long_is_turned_away_before_anything_is_spent() -> No
         slots.take(Caller(lambda: 0.05))
 
 
+def test_slow_calls_are_forgotten() -> None:
+    """Where all are refused, nothing else would show that calls are fast again."""
+    now = [0.0]
+    slots = Slots(1, "decodes", 60.0, clock=lambda: now[0])
+    for _ in range(30):
+        slots.took(5.0)
+    with pytest.raises(OverloadedError):
+        slots.check(Caller(lambda: 3.0))
+    now[0] = 30.1
+    slots.check(Caller(lambda: 3.0))
+    with slots.held(Caller(lambda: 3.0)):
+        pass
+    slots.took(0.1)
+    with pytest.raises(OverloadedError):
+        slots.check(Caller(lambda: 0.1))
+
+
+def test_a_few_slow_calls_turn_nobody_away() -> None:
+    """Two pages in twenty that are searched for, say, do not shut out callers whose pages are not."""
+    slots = Slots(1, "decodes", 60.0)
+    for _ in range(18):
+        slots.took(0.1)
+    slots.took(5.0)
+    slots.took(5.0)
+    slots.check(Caller(lambda: 0.12))
+    slots.took(5.0)
+    with pytest.raises(OverloadedError):
+        slots.check(Caller(lambda: 0.12))
+
+
 class Remembering(NoTracker):
     """Its answers depend on what it decoded before, as those of a tracker do that was led astray."""
 

@@ -604,6 +604,29 @@ def test_a_caller_who_leaves_or_stalls_leaves_nothing(start: Start) -> None:
     assert service.client.jobs() == []
 
 
+@pytest.mark.parametrize("way", ["cancels", "hangs up", "runs out of time"])
+def test_a_caller_who_has_sent_all_and_leaves_starts_nothing(way: str, start: Start) -> None:
+    """Only a stream that its caller has closed counts: the library ends that of one who has gone too."""
+    service, open_end = start(), threading.Event()
+
+    def all_but_the_end() -> Iterator[pb.RecalibrateFramesRequest]:
+        yield from ALL
+        open_end.wait(20)
+
+    used = service.plane.received
+    with grpc.insecure_channel(service.server.target, options=[("grpc.use_local_subchannel_pool", 1)]) as channel:
+        stub = pb_grpc.LightpageStub(channel)
+        call = stub.RecalibrateFrames.future(all_but_the_end(), timeout=1.0 if way == "runs out of time" else 20)
+        assert wait_until(lambda: used.used == 3 * PAIR_BYTES + 2 * 16 * 24)
+        if way == "cancels":
+            call.cancel()
+        elif way == "hangs up":
+            channel.close()
+        assert wait_until(lambda: used.used == 0)
+    open_end.set()
+    assert service.client.jobs() == []
+
+
 def test_the_client_refuses_what_it_cannot_send(start: Start) -> None:
     client, pages = start().client, known(2)
     wide = FramePair(*2 * (np.zeros((64, 97), np.uint8),))
