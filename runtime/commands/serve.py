@@ -42,12 +42,8 @@ from runtime.service.registry import ModelRegistry
 from runtime.service.self_calibration import SelfCalibration
 from runtime.service.settings import ADDRESS, OFF, STORE_VARIABLE, Effective, Option, ServiceSettings, service_settings
 from runtime.service.store import ModelStore
-from runtime.service.store_health import StoreHealth
 
 _log = logging.getLogger(__name__)
-
-STORE_HEALTH = "lightpage.store"
-"""Name under which health checks ask whether the store can be written."""
 
 _KEYS = {
     "bundle": ("service", "bundle"),
@@ -190,10 +186,7 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         server = LightpageServer(plane, recalibrator, service.address)
         if service.health_address != OFF:  # entered first: it says NOT_SERVING until the last call has ended
             address = service.health_address or next_port(service.address)
-            store = StoreHealth(plane.store_trouble)
-            health = stack.enter_context(
-                HealthServer(address, lambda: {**server.health(), STORE_HEALTH: store.is_well()})
-            )
+            health = stack.enter_context(HealthServer(address, server.health))
             click.echo(f"health checks at {health.target}")
         stack.enter_context(server)
         if service.incoming is not None:

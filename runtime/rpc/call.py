@@ -37,6 +37,9 @@ ENDLESS = frozenset(["WatchDisplay", "WatchJob"])
 UPLOADS = frozenset(["UploadPages", "RecalibrateFrames", "UploadModel"])
 """Calls that change something once their callers have closed their streams."""
 
+_EARLY_S = 0.05
+"""A caller whose call ends so long before its deadline has run out of time too: its clock is its own."""
+
 _GONE_S = 0.05
 """From the end of a stream to the word that its caller has gone, rather than closed it, at most."""
 
@@ -99,9 +102,11 @@ class Dispatcher:
     def __init__(self, handlers: Sequence[object], pool: Executor, limits: Limits, metrics: ServiceMetrics) -> None:
         self._handlers, self._pool, self._limits = tuple(handlers), pool, limits
         self._metrics, self._log = metrics, CallLog()
-        self._active = 0
-        self._endless: set[asyncio.Task[Any]] = set()
-        self._ending = False
+        self._active: set[asyncio.Task[Any]] = set()
+        self._watching: set[asyncio.Task[Any]] = set()
+        self._told: set[asyncio.Task[Any]] = set()
+        """Of both those that were told to end."""
+        self._refuses = False
         self._longest_s = {"ReadData": limits.range_s, "ReadPages": limits.range_s}
 
     def rpc_handler(self) -> grpc.GenericRpcHandler[Any, Any]:
@@ -127,10 +132,27 @@ class Dispatcher:
             methods[method.name] = make(serving, None, getattr(pb, method.output_type.name).SerializeToString)
         return grpc.method_handlers_generic_handler(SERVICE.full_name, methods)
 
-    def end_endless(self) -> None:
-        """End the calls that would not end by themselves: the service stops."""
-        self._ending = True
-        for task in self._endless:
+    def refuse(self) -> None:
+        """Take no more calls: the service stops."""
+        self._refuses = True
+
+    def end_watches(self) -> None:
+        """End the calls that would not end by themselves."""
+        self._end(self._watching)
+
+    def end_all(self) -> None:
+        """End all calls."""
+        self._end(self._active | self._watching)
+
+    async def ended_within(self, seconds: float) -> bool:
+        """Wait for the calls in flight; whether all of them have ended in time."""
+        if self._active:
+            await asyncio.wait(self._active, timeout=seconds)
+        return not self._active
+
+    def _end(self, tasks: set[asyncio.Task[Any]]) -> None:
+        self._told |= tasks
+        for task in tasks:
             task.cancel()
 
     async def _unary(
@@ -200,21 +222,21 @@ class Dispatcher:
         call = Call(name, Caller(partial(_seconds_left, context)), self._pool, context.peer())
         task = asyncio.current_task()
         assert task is not None  # calls run in tasks
-        counted = name not in ENDLESS
-        self._active += counted
-        if not counted:
-            self._endless.add(task)
+        mine = self._watching if call.is_watch else self._active
+        mine.add(task)
         self._metrics.in_flight.inc()
         try:
-            if counted and self._active > self._limits.concurrent_calls:
-                got, expected = f"{self._active - 1} at once", f"at most {self._limits.concurrent_calls}"
+            if self._refuses:
+                raise _stopping(name)
+            if not call.is_watch and len(self._active) > self._limits.concurrent_calls:
+                got, expected = f"{len(self._active) - 1} at once", f"at most {self._limits.concurrent_calls}"
                 raise OverloadedError("calls", got, f"{expected}; try again later", retry_s=1.0)
             yield call
             self._ended(call, grpc.StatusCode.OK, None)
         except (asyncio.CancelledError, GeneratorExit) as left:
-            if self._ending and task in self._endless and isinstance(left, asyncio.CancelledError):
+            if task in self._told and isinstance(left, asyncio.CancelledError):
                 task.uncancel()
-                error = StoppingError(f"call {name}", "a service that stops", "one that serves; call again")
+                error = _stopping(name)
                 self._ended(call, status_of(error), error)
                 await context.abort(status_of(error), told(error), trailers(error))
             self._ended(call, _code_of_leaving(context), left)
@@ -225,8 +247,8 @@ class Dispatcher:
             await context.abort(code, told(error), trailers(error))
         finally:
             call.caller.leave()
-            self._active -= counted
-            self._endless.discard(task)
+            mine.discard(task)
+            self._told.discard(task)
 
     def _ended(self, call: Call, code: grpc.StatusCode, error: BaseException | None) -> None:
         """Count a call, before its caller hears of its end."""
@@ -245,6 +267,10 @@ def _parsed(parse: Callable[[bytes], Any], data: bytes, call: Call) -> Any:
     return message
 
 
+def _stopping(name: str) -> StoppingError:
+    return StoppingError(f"call {name}", "a service that stops", "one that serves; call again")
+
+
 def _seconds_left(context: Any) -> float:
     left = context.time_remaining()
     return math.inf if left is None else float(left)
@@ -252,5 +278,5 @@ def _seconds_left(context: Any) -> float:
 
 def _code_of_leaving(context: Any) -> grpc.StatusCode:
     """A call that is cut off ran out of time, or its caller has gone."""
-    late = _seconds_left(context) <= 0
+    late = _seconds_left(context) <= _EARLY_S
     return grpc.StatusCode.DEADLINE_EXCEEDED if late else grpc.StatusCode.CANCELLED

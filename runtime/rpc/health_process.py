@@ -13,23 +13,22 @@ import socket
 import sys
 
 import grpc
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_health.v1 import health_pb2_grpc
 
 from runtime.helper_process import parent_link
+from runtime.rpc.health_servicer import HealthServicer
 
 SILENCE_S = 3.0
 """A service that says nothing for so long has stopped."""
-
-_STATUS = {True: health_pb2.HealthCheckResponse.SERVING, False: health_pb2.HealthCheckResponse.NOT_SERVING}
 
 
 async def serve(address: str, link: socket.socket) -> None:
     """Answer health checks at an address until the link is closed; says first at which port, or why not."""
     reader, writer = await asyncio.open_connection(sock=link)
     server = grpc.aio.server(options=(("grpc.so_reuseport", 0),))
-    servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]  # without types
+    servicer = HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
-    await servicer.set("", _STATUS[False])
+    await servicer.tell({"": False})
     try:
         port = server.add_insecure_port(address)
         await server.start()
@@ -50,8 +49,7 @@ async def serve(address: str, link: socket.socket) -> None:
                 break
             states = json.loads(line)
         names |= states.keys()
-        for name, serves in states.items():
-            await servicer.set(name, _STATUS[bool(serves)])
+        await servicer.tell(states)
     await server.stop(None)
 
 

@@ -11,56 +11,32 @@ from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import grpc
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_health.v1 import health, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from lightpage.errors import InvalidInputError
 from runtime.rpc.call import SERVICE, Dispatcher
 from runtime.rpc.handlers import handlers
+from runtime.rpc.health_servicer import HealthServicer
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
+from runtime.service.store_health import StoreHealth
 from runtime.wire.address import check_free
 
 _KEEPALIVE_MS = 30_000
 """A connection silent for so long is asked for a sign of life, so that a dead client's call ends."""
 _LAST_WORD_S = 0.1
 """From NOT_SERVING to the end of those who watch: they hear it first."""
+_END_S = 1.0
+"""For calls that were told to end."""
 _LOOK_S = 2.0
-_SERVING, _NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
+
+STORE_HEALTH = "lightpage.store"
+"""Name under which health checks ask whether the store can be written."""
 
 T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
-
-
-class _Health(health.aio.HealthServicer):  # type: ignore[misc,name-defined]  # without types
-    """Health whose watchers can be sent home."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._watchers: set[asyncio.Task[Any]] = set()
-        self._ending = False
-
-    async def Watch(self, request: health_pb2.HealthCheckRequest, context: Any) -> None:
-        """See the protocol."""
-        task = asyncio.current_task()
-        assert task is not None  # calls run in tasks
-        self._watchers.add(task)
-        try:
-            await super().Watch(request, context)
-        except asyncio.CancelledError:
-            if not self._ending:
-                raise
-            task.uncancel()
-            await context.abort(grpc.StatusCode.UNAVAILABLE, "the service stops")
-        finally:
-            self._watchers.discard(task)
-
-    def end_watches(self) -> None:
-        """End them."""
-        self._ending = True
-        for task in self._watchers:
-            task.cancel()
 
 
 class LightpageServer:
@@ -89,6 +65,7 @@ class LightpageServer:
         self._thread = threading.Thread(target=self._run, name="lightpage-rpc", daemon=True)
         self._pool = ThreadPoolExecutor(plane.limits.concurrent_calls, thread_name_prefix="lightpage-call")
         self._names = ("", SERVICE.full_name)
+        self._store = StoreHealth(plane.store_trouble)
         self._serving = self._stopping = self._started = False
         self.port = 0
 
@@ -119,19 +96,19 @@ class LightpageServer:
         return f"{'127.0.0.1' if host in ('0.0.0.0', '[::]', '') else host}:{self.port}"
 
     def health(self) -> dict[str, bool]:
-        """Whether the service as a whole, and by its name, serves now; health checks of this server say the same.
+        """Whether the service as a whole, by its name, and its store serve now; checks of this server say the same.
 
         Raises:
             TimeoutError: its loop does not answer.
         """
         if self._loop.is_closed() or not self._started:
-            return dict.fromkeys(self._names, False)
+            return dict.fromkeys((*self._names, STORE_HEALTH), False)
         return asyncio.run_coroutine_threadsafe(self._look(), self._loop).result(_LOOK_S)
 
     def stop(self, grace_s: float | None = None) -> None:
-        """Say NOT_SERVING, take no new calls, let those in flight end within `grace_s`, then end the rest.
+        """Say NOT_SERVING, refuse new calls, let those in flight end within `grace_s`, then end the rest.
 
-        Calls that only watch are ended at once.
+        Calls that only watch are ended at once. All that are refused or ended hear that the service stops.
         """
         if self._loop.is_closed():
             return
@@ -161,7 +138,7 @@ class LightpageServer:
         )
         self._dispatcher = Dispatcher(self._handlers, self._pool, limits, self._plane.metrics)
         self._server.add_generic_rpc_handlers((self._dispatcher.rpc_handler(),))
-        self._health = _Health()
+        self._health = HealthServicer()
         await self._say(False)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         names = (SERVICE.full_name, health.SERVICE_NAME, reflection.SERVICE_NAME)
@@ -173,8 +150,7 @@ class LightpageServer:
 
     async def _say(self, serving: bool) -> None:
         self._serving = serving
-        for name in self._names:
-            await self._health.set(name, _SERVING if serving else _NOT_SERVING)
+        await self._health.tell({**dict.fromkeys(self._names, serving), STORE_HEALTH: self._store.is_well()})
 
     async def _look(self) -> dict[str, bool]:
         trouble = self._plane.heart.trouble()
@@ -184,16 +160,21 @@ class LightpageServer:
             else:
                 _log.warning("serving again")
             await self._say(not trouble)
-        return dict.fromkeys(self._names, self._serving and not self._stopping)
+        store = self._store.is_well()
+        await self._health.tell({STORE_HEALTH: store})
+        states = {**dict.fromkeys(self._names, self._serving), STORE_HEALTH: store}
+        return {name: serves and not self._stopping for name, serves in states.items()}
 
     async def _stop(self, grace_s: float) -> None:
         self._stopping = True
         await self._health.enter_graceful_shutdown()
-        stopping = asyncio.ensure_future(self._server.stop(grace_s))
+        self._dispatcher.refuse()
         await asyncio.sleep(_LAST_WORD_S)
         self._health.end_watches()
-        self._dispatcher.end_endless()
-        await stopping
+        self._dispatcher.end_watches()
+        if not await self._dispatcher.ended_within(grace_s):
+            self._dispatcher.end_all()
+        await self._server.stop(_END_S)
 
     def _await(self, work: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()

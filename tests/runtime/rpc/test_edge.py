@@ -27,6 +27,7 @@ from runtime.decoding.tracking import NoTracker
 from runtime.errors import OverloadedError, SlotsTakenError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import SERVICE, Call
+from runtime.rpc.health_server import HealthServer
 from runtime.service.caller import Caller
 from runtime.service.limits import Limits
 from runtime.service.slots import Slots
@@ -529,6 +530,49 @@ def test_watchers_do_not_hold_the_stop(start: Start) -> None:
         assert next(watch).status == health_pb2.HealthCheckResponse.NOT_SERVING
         with pytest.raises(grpc.RpcError):
             next(watch)
+
+
+def test_what_a_stop_cuts_off_or_turns_away_hears_why(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+    service = start(Limits(concurrent_decodes=1))
+    service.plane.decodes.take(Caller())
+    stopped = threading.Thread(target=service.server.stop, args=(1.5,))
+    with grpc.insecure_channel(service.server.target) as channel:
+        stub = service.stub(channel)
+        calls = [
+            stub.ReadPage.future(pb.ReadPageRequest(), timeout=20),
+            stub.DecodeFrames.future(parts(a_page()[1]), timeout=20),
+        ]
+        assert wait_until(lambda: service.count("lightpage_calls_in_flight") == 2)
+        stopped.start()
+        assert wait_until(lambda: not service.server.health()[""])
+        with pytest.raises(grpc.RpcError) as turned_away:
+            stub.Describe(pb.DescribeRequest(), timeout=5)
+        for error in (turned_away.value, *(call.exception() for call in calls)):
+            assert error.code() == grpc.StatusCode.UNAVAILABLE
+            assert details(error)["ErrorInfo"].reason == "STOPPING"
+    service.plane.decodes.give_back()
+    stopped.join(10)
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_the_health_of_all_services_is_told_by_both_servers(start: Start) -> None:
+    service = start()
+    with HealthServer("127.0.0.1:0", service.server.health) as health:
+        for target in (service.server.target, health.target):
+            with grpc.insecure_channel(target) as channel:
+                ask = health_pb2_grpc.HealthStub(channel)
+
+                def states(ask: Any = ask) -> dict[str, int]:
+                    answer = ask.List(health_pb2.HealthListRequest(), timeout=5)
+                    return {name: one.status for name, one in answer.statuses.items()}
+
+                names = ("", SERVICE.full_name, "lightpage.store")
+                wanted = dict.fromkeys(names, health_pb2.HealthCheckResponse.SERVING)
+                assert wait_until(lambda: states() == wanted)  # noqa: B023
+                for name in names:
+                    assert ask.Check(health_pb2.HealthCheckRequest(service=name), timeout=5).status == wanted[name]
+        service.server.stop(0.5)
+        assert not any(service.server.health().values())
 
 
 def test_the_service_describes_its_contract_to_strangers(start: Start) -> None:
