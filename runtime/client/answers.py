@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 
 import numpy as np
@@ -39,6 +39,35 @@ class ModelInfo:
 
 
 @dataclass(frozen=True)
+class ServiceLimits:
+    """How much a service takes.
+
+    Attributes:
+        message_bytes, chunk_bytes, pair_bytes: largest message, chunk of frames, and pair of frames.
+        concurrent_decodes: pages decoded at the same time; more wait.
+        replay_s, replay_bytes: how long, and how many bytes of, the answers of request ids are kept.
+        recalibration_pages: of one recalibration.
+        model_bytes: of an uploaded bundle.
+        range_pages: that are read in one call.
+    """
+
+    message_bytes: int
+    chunk_bytes: int
+    pair_bytes: int
+    concurrent_decodes: int
+    replay_s: float
+    replay_bytes: int
+    recalibration_pages: int
+    model_bytes: int
+    range_pages: int
+
+
+def limits_of(message: pb.Limits) -> ServiceLimits:
+    """Limits from their message."""
+    return ServiceLimits(**{field.name: getattr(message, field.name) for field in fields(ServiceLimits)})
+
+
+@dataclass(frozen=True)
 class Description:
     """What a service is."""
 
@@ -58,6 +87,9 @@ class Description:
     code_toml: str = ""
     """How user bytes are protected on this device's pages; empty where the model has no code."""
     user_bytes_per_page: int = 0
+    default_levels: int = 0
+    """What `levels` 0 stands for where no user bytes are asked for."""
+    limits: ServiceLimits | None = None
 
 
 @dataclass(frozen=True)

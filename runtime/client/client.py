@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, Unpack
 
 import grpc
 import numpy as np
@@ -26,6 +26,7 @@ from runtime.client.answers import (
     RemoteData,
     display_order,
     job_info,
+    limits_of,
     model_info,
     recalibrated,
     remote_data,
@@ -34,10 +35,11 @@ from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.wire.address import check_address
 from runtime.wire.channel import open_channel
-from runtime.wire.messages import PIXEL_CODES, PIXEL_TYPES, KnownPilots, pilots_message
+from runtime.wire.messages import PIXEL_CODES, PIXEL_TYPES, KnownPilots, message_of, pilots_message, set_fields
+from runtime.wire.page_options import PageOptions, options_message
 from runtime.wire.pages import RemotePage, remote_page
 from runtime.wire.sizes import CHUNK_BYTES
-from runtime.wire.status import error_of, is_lost_connection
+from runtime.wire.status import error_from, error_of, is_lost_connection
 
 CALL_S = 60.0
 """Deadline of a call where none is given."""
@@ -110,76 +112,175 @@ class LightpageClient:
             code_toml=reply.code_toml,
             user_bytes_per_page=reply.user_bytes_per_page,
             pilot_phases=np.array(reply.pilot_phases, np.float32) if reply.pilot_phases else None,
+            default_levels=reply.default_levels,
+            limits=limits_of(reply.limits),
         )
         return self._description
 
     def decode(
         self,
         pair: FramePair,
-        levels: int = 256,
+        levels: int = 0,
         *,
         bit_depth: int | None = None,
+        black_level: int = 0,
         pilots: KnownPilots | None = None,
-        want_concentration: bool = False,
-        want_phase: bool = False,
-        quantised: bool = False,
-        user_data: bool = False,
+        frame_id: int = 0,
+        captured_s: float = 0.0,
+        correlation_id: str = "",
+        **options: Unpack[PageOptions],
     ) -> RemotePage:
         """Send a frame pair and get its symbols.
 
         Args:
             pair: both frames, uint8 or uint16.
-            levels: M, 2..256.
+            levels: M, 2..256; 0 for the default of the service, `Description.default_levels`, or that of the model's
+                code where user bytes are asked for.
             bit_depth: bits of a camera count; by default those of the service's camera.
+            black_level: counts that the cameras add to every pixel.
             pilots: known symbols, where they differ from the device's pilots.
-            want_concentration: also get kappa.
-            want_phase: also get the phase.
-            quantised: get the confidence in one byte a symbol.
-            user_data: also get the page's bytes; `levels` must then be those of the model's code, or 0.
+            frame_id, captured_s, correlation_id: the caller's own; the page has them too, and the log the last one.
+            options: what to get, and whose pages the page is followed with; see `PageOptions`.
 
         Raises:
             FrameError: frames that cannot be sent, or that the service refuses.
             PageError: an impossible level count, or pilots that do not fit the page.
             SlotsTakenError: the service had no free slot until the deadline.
         """
-        if bit_depth is None:
-            bit_depth = (self._description or self.describe()).bit_depth
-        frames = _sent_frames(pair)
-        header = pb.DecodeHeader(
-            rows_px=frames[0].shape[0],
-            columns_px=frames[0].shape[1],
-            pixel_type=PIXEL_CODES[frames[0].dtype.name],
-            bit_depth=bit_depth,
-            options=_options(levels, want_concentration, want_phase, quantised, user_data),
-            pilots=pilots_message(pilots) if pilots is not None else None,
-        )
-        reply: pb.DecodeReply = self._unary(self._stub.DecodeFrames, _parts(header, frames))
+        header = self._header(pair, levels, bit_depth, black_level, pilots, correlation_id, options)
+        set_fields(header, frame_id=frame_id, captured_s=captured_s)
+        reply: pb.DecodeReply = self._unary(self._stub.DecodeFrames, _parts(header, _sent_frames(pair)))
         return remote_page(reply)
+
+    def decode_pages(
+        self,
+        pairs: Iterable[FramePair],
+        levels: int = 0,
+        *,
+        bit_depth: int | None = None,
+        black_level: int = 0,
+        pilots: KnownPilots | None = None,
+        correlation_id: str = "",
+        timeout_s: float = DATA_S,
+        **options: Unpack[PageOptions],
+    ) -> Iterator[RemotePage | LightpageError]:
+        """Send frame pairs one after another in one call; each one's page, or why there is none, in their order.
+
+        The service reads the next pair while it decodes one. `RemotePage.frame_id` counts the pairs from 0.
+
+        Args:
+            pairs: taken as fast as the service reads them.
+            timeout_s: for all of them.
+            levels, bit_depth, black_level, pilots, correlation_id, options: of every pair, as for `decode`.
+
+        Raises:
+            FrameError: frames that cannot be sent.
+            LightpageError: the whole call ended.
+        """
+        failed: list[BaseException] = []
+        bit_depth = self._bit_depth() if bit_depth is None else bit_depth
+
+        def parts() -> Iterator[pb.DecodeFramesRequest]:
+            try:
+                for number, pair in enumerate(pairs):
+                    header = self._header(pair, levels, bit_depth, black_level, pilots, correlation_id, options)
+                    set_fields(header, frame_id=number)
+                    yield from _parts(header, _sent_frames(pair))
+            except BaseException as error:  # gRPC would tell of it on stderr, and end the call with UNKNOWN
+                failed.append(error)
+                call.cancel()
+
+        call = self._stub.DecodePages(parts(), timeout=timeout_s)
+        try:
+            for reply in call:
+                refused = reply.WhichOneof("outcome") == "refused"
+                yield error_from(reply.refused.detail) if refused else remote_page(reply.decoded)
+        except grpc.RpcError as error:
+            if failed:
+                raise failed[0] from None
+            raise error_of(error, self.target) from None
+        finally:
+            call.cancel()
 
     def read_page(
         self,
         page: int | None = None,
         levels: int | None = None,
         *,
-        want_concentration: bool = False,
-        want_phase: bool = False,
         want_written: bool = False,
-        quantised: bool = False,
-        user_data: bool = False,
+        request_id: str = "",
+        correlation_id: str = "",
+        **options: Unpack[PageOptions],
     ) -> RemotePage:
         """Have the service read a page from its source; None stands for the next page and the source's levels.
 
+        Args:
+            page: its number.
+            levels: M, 2..256.
+            want_written: also get what the source knows to have been written.
+            request_id: a text that is new for each page. Asked again with the same one, the service takes no second
+                shot: it gives the same answer, with `RemotePage.replayed` set.
+            correlation_id: a text that the page and the log have.
+            options: what to get, and whose pages the page is followed with; see `PageOptions`.
+
         Raises:
             SourceError: the service has no source, or one that is damaged or dark.
+            LostPageError: the page is lost; its `reason` says why.
             PageError: no such page, or an impossible level count.
+            RequestIdError: the request id was given with another request.
             SlotsTakenError: the service had no free slot until the deadline.
         """
-        options = _options(levels or 0, want_concentration, want_phase, quantised, user_data)
-        request = pb.ReadPageRequest(options=options, want_written=want_written)
-        if page is not None:
-            request.page = page
+        request = message_of(
+            pb.ReadPageRequest,
+            page=page,
+            options=options_message(levels or 0, options),
+            want_written=want_written,
+            request_id=request_id,
+            correlation_id=correlation_id,
+        )
         reply: pb.ReadPageReply = self._unary(self._stub.ReadPage, request)
         return remote_page(reply.decoded, reply)
+
+    def read_pages(
+        self,
+        pages: Sequence[int] = (),
+        levels: int | None = None,
+        *,
+        count: int = 0,
+        want_written: bool = False,
+        correlation_id: str = "",
+        timeout_s: float = DATA_S,
+        **options: Unpack[PageOptions],
+    ) -> Iterator[RemotePage | LightpageError]:
+        """Have the service read pages from its source in one call; each page, or why there is none, in their order.
+
+        Args:
+            pages: their numbers; none for the next `count`.
+            timeout_s: for all of them.
+            levels, want_written, correlation_id, options: of every page, as for `read_page`.
+
+        Raises:
+            SourceError: the service has no source.
+            LimitError: more pages than the service reads in one call.
+            LightpageError: the whole call ended.
+        """
+        request = message_of(
+            pb.ReadPagesRequest,
+            pages=pages,
+            count=count,
+            options=options_message(levels or 0, options),
+            want_written=want_written,
+            correlation_id=correlation_id,
+        )
+        call = self._stub.ReadPages(request, timeout=timeout_s)
+        try:
+            for reply in call:
+                refused = reply.WhichOneof("outcome") == "refused"
+                yield error_from(reply.refused.detail) if refused else remote_page(reply.read.decoded, reply.read)
+        except grpc.RpcError as error:
+            raise error_of(error, self.target) from None
+        finally:
+            call.cancel()
 
     def read_data(self, first: int, pages: int, timeout_s: float = DATA_S) -> Iterator[RemoteData]:
         """Have the service read the bytes of pages `first` to `first + pages - 1` of its source.
@@ -191,7 +292,7 @@ class LightpageClient:
             SourceError: the service has no source, or one that is damaged or dark.
             PageError: no such page.
         """
-        call = self._stub.ReadData(pb.ReadDataRequest(first_page=first, pages=pages), timeout=timeout_s)
+        call = self._stub.ReadData(message_of(pb.ReadDataRequest, first_page=first, pages=pages), timeout=timeout_s)
         try:
             for reply in call:
                 yield remote_data(reply)
@@ -212,8 +313,10 @@ class LightpageClient:
         pages = np.ascontiguousarray(symbols, np.uint8)
         pages = pages.reshape(-1, *pages.shape[-2:])
 
+        first = message_of(pb.UploadPagesRequest, levels=levels)
+
         def parts() -> Iterator[pb.UploadPagesRequest]:
-            yield pb.UploadPagesRequest(levels=levels)
+            yield first
             step = max(1, CHUNK_BYTES // max(1, pages[0].size)) if len(pages) else 1
             for start in range(0, len(pages), step):
                 yield pb.UploadPagesRequest(symbols=pages[start : start + step].tobytes())
@@ -245,7 +348,7 @@ class LightpageClient:
         if page is None:
             self._unary(self._stub.ReportDisplay, pb.ReportDisplayRequest(withdrawn=True))
         else:
-            self._unary(self._stub.ReportDisplay, pb.ReportDisplayRequest(page=page))
+            self._unary(self._stub.ReportDisplay, message_of(pb.ReportDisplayRequest, page=page))
 
     def beams_set(self, *, signal: bool, reference: bool) -> None:
         """Say which beams are let through and have settled.
@@ -282,11 +385,8 @@ class LightpageClient:
             StoppingError: the service is being stopped.
             BundleError: the new model cannot be written or noted; the old one stays.
         """
-        request = pb.RecalibrateRequest(expected_version=expected_version)
-        if recording is not None:
-            request.recording, request.recording_count = recording, count
-        else:
-            request.source.CopyFrom(pb.SourcePages(count=count, pages=pages))
+        pages_of = _pages_of(count, pages, recording)
+        request = message_of(pb.RecalibrateRequest, expected_version=expected_version, **pages_of)
         call = self._stub.Recalibrate(request, timeout=timeout_s)
         try:
             result = None
@@ -328,11 +428,12 @@ class LightpageClient:
             InvalidInputError: no such recording.
             SourceError: the service has no source or recordings.
         """
-        request = pb.StartRecalibrationRequest(expected_version=expected_version, correlation_id=correlation_id)
-        if recording is not None:
-            request.recording, request.recording_count = recording, count
-        else:
-            request.source.CopyFrom(pb.SourcePages(count=count, pages=pages))
+        request = message_of(
+            pb.StartRecalibrationRequest,
+            expected_version=expected_version,
+            correlation_id=correlation_id,
+            **_pages_of(count, pages, recording),
+        )
         return job_info(self._unary(self._stub.StartRecalibration, request))
 
     def recalibrate_frames(
@@ -375,11 +476,12 @@ class LightpageClient:
             got = f"{len(pairs)} frame pairs and {len(symbols)} pages of symbols"
             raise InvalidInputError("pages to recalibrate with", got, "as many of both")
         first = _sent_frames(references, "reference: ")
-        header = pb.RecalibrateFramesHeader(
+        header = message_of(
+            pb.RecalibrateFramesHeader,
             rows_px=first[0].shape[0],
             columns_px=first[0].shape[1],
             pixel_type=PIXEL_CODES[first[0].dtype.name],
-            bit_depth=(self._description or self.describe()).bit_depth if bit_depth is None else bit_depth,
+            bit_depth=self._bit_depth() if bit_depth is None else bit_depth,
             black_level=black_level,
             levels=levels,
             pages=len(pairs),
@@ -422,7 +524,7 @@ class LightpageClient:
         Raises:
             NoSuchJobError: there is no such job, or it ended long ago.
         """
-        return job_info(self._unary(self._stub.GetJob, pb.GetJobRequest(id=job_id)))
+        return job_info(self._unary(self._stub.GetJob, message_of(pb.GetJobRequest, id=job_id)))
 
     def watch_job(self, job_id: str, timeout_s: float = RECALIBRATION_S) -> Iterator[JobInfo]:
         """A job as it is now, and at each change, until it has ended.
@@ -434,9 +536,10 @@ class LightpageClient:
             LightpageError: no answer at all, or the job has not ended within `timeout_s`; it goes on.
         """
         until, last = time.monotonic() + timeout_s, None
+        request = message_of(pb.WatchJobRequest, id=job_id)
         while True:
             left_s = until - time.monotonic()
-            call = self._stub.WatchJob(pb.WatchJobRequest(id=job_id), timeout=max(0.0, min(left_s, _WATCH_S)))
+            call = self._stub.WatchJob(request, timeout=max(0.0, min(left_s, _WATCH_S)))
             try:
                 for job in call:
                     if job != last:
@@ -457,7 +560,7 @@ class LightpageClient:
         Raises:
             NoSuchJobError: there is no such job, or it ended long ago.
         """
-        return job_info(self._unary(self._stub.CancelJob, pb.CancelJobRequest(id=job_id)))
+        return job_info(self._unary(self._stub.CancelJob, message_of(pb.CancelJobRequest, id=job_id)))
 
     def rollback(self, expected_version: str = "") -> tuple[str, str]:
         """Go back to the model before; returns the versions (now current, before).
@@ -469,13 +572,13 @@ class LightpageClient:
             OtherModelError: another one is.
             BundleError: there is none, or the change cannot be noted in the service's store; then nothing changes.
         """
-        request = pb.RollbackRequest(expected_version=expected_version)
+        request = message_of(pb.RollbackRequest, expected_version=expected_version)
         reply: pb.RollbackReply = self._unary(self._stub.Rollback, request)
         return reply.model_version, reply.previous_version
 
     def roll_forward(self, expected_version: str = "") -> tuple[str, str]:
         """Go to the later model again, after a roll-back; else as `rollback`."""
-        request = pb.RollForwardRequest(expected_version=expected_version)
+        request = message_of(pb.RollForwardRequest, expected_version=expected_version)
         reply: pb.RollForwardReply = self._unary(self._stub.RollForward, request)
         return reply.model_version, reply.previous_version
 
@@ -530,7 +633,7 @@ class LightpageClient:
             OtherModelError: another one is.
             BundleError: there is none, it is damaged, or the change cannot be noted; then nothing changes.
         """
-        request = pb.ActivateModelRequest(version=version, expected_version=expected_version)
+        request = message_of(pb.ActivateModelRequest, version=version, expected_version=expected_version)
         reply: pb.ActivateModelReply = self._unary(self._stub.ActivateModel, request)
         return reply.model_version, reply.previous_version
 
@@ -540,15 +643,50 @@ class LightpageClient:
         Raises:
             BundleError: there is none, or it cannot be noted.
         """
-        request = pb.PinModelRequest(version=version, pinned=pinned)
+        request = message_of(pb.PinModelRequest, version=version, pinned=pinned)
         reply: pb.PinModelReply = self._unary(self._stub.PinModel, request)
         return model_info(reply.model)
+
+    def _bit_depth(self) -> int:
+        """Of the service's camera."""
+        return (self._description or self.describe()).bit_depth
+
+    def _header(
+        self,
+        pair: FramePair,
+        levels: int,
+        bit_depth: int | None,
+        black_level: int,
+        pilots: KnownPilots | None,
+        correlation_id: str,
+        options: PageOptions,
+    ) -> pb.DecodeHeader:
+        """What is sent before a pair; raises `FrameError` where that cannot be sent."""
+        frame = _sent_frames(pair)[0]
+        return message_of(
+            pb.DecodeHeader,
+            rows_px=frame.shape[0],
+            columns_px=frame.shape[1],
+            pixel_type=PIXEL_CODES[frame.dtype.name],
+            bit_depth=self._bit_depth() if bit_depth is None else bit_depth,
+            black_level=black_level,
+            options=options_message(levels, options),
+            pilots=pilots_message(pilots) if pilots is not None else None,
+            correlation_id=correlation_id,
+        )
 
     def _unary(self, method: Callable[..., Any], request: object, timeout_s: float | None = None) -> Any:
         try:
             return method(request, timeout=self._timeout if timeout_s is None else timeout_s)
         except grpc.RpcError as error:
             raise error_of(error, self.target) from None
+
+
+def _pages_of(count: int, pages: Sequence[int], recording: str | None) -> dict[str, Any]:
+    """Where the pages of a recalibration come from, as fields of its request."""
+    if recording is not None:
+        return {"recording": recording, "recording_count": count}
+    return {"source": message_of(pb.SourcePages, count=count, pages=pages)}
 
 
 def _parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> Iterator[pb.DecodeFramesRequest]:
@@ -584,14 +722,3 @@ def _sent_symbols(page: NDArray[np.uint8], subject: str) -> bytes:
     ):
         raise PageError(subject, f"{symbols.dtype}", f"whole numbers from 0 to {MAX_LEVELS - 1}")
     return symbols.astype(np.uint8).tobytes()
-
-
-def _options(levels: int, concentration: bool, phase: bool, quantised: bool, user_data: bool) -> pb.DecodeOptions:
-    code = pb.CONFIDENCE_FORMAT_UINT8 if quantised else pb.CONFIDENCE_FORMAT_FLOAT32
-    return pb.DecodeOptions(
-        levels=levels,
-        confidence_format=code,
-        want_concentration=concentration,
-        want_phase=phase,
-        want_user_data=user_data,
-    )

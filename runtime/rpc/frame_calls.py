@@ -231,10 +231,10 @@ def check_black(header: pb.DecodeHeader | pb.RecalibrateFramesHeader) -> None:
     """Check the black level of a header.
 
     Raises:
-        InvalidInputError: it lies beyond the counts.
+        InvalidInputError: no count would be left above it.
     """
-    if header.black_level and header.black_level >= (most := 1 << header.bit_depth):
-        raise InvalidInputError("black_level", header.black_level, f"less than {most}")
+    if header.black_level and header.black_level >= (full_scale := (1 << header.bit_depth) - 1):
+        raise InvalidInputError("black_level", header.black_level, f"less than {full_scale}, which is full scale")
 
 
 def _without_black(pair: FramePair, header: pb.DecodeHeader) -> FramePair:

@@ -64,6 +64,7 @@ class Describing:
                 replay_bytes=limits.replay_bytes,
                 recalibration_pages=limits.recalibration_pages,
                 model_bytes=limits.model_bytes,
+                range_pages=limits.range_pages,
             ),
             source=without_folders(plane.source.name) if plane.has_source else "",
             source_levels=plane.source.levels if plane.has_source else 0,

@@ -108,7 +108,7 @@ class JobCalls:
             return self._recalibrator.source_pages(request.source.count, list(request.source.pages))
         if kind == "recording":
             return self._recalibrator.recorded_pages(request.recording, request.recording_count)
-        raise InvalidInputError("pages to recalibrate with", "none", "pages of the source or a recording")
+        raise InvalidInputError("pages", "none", "pages of the source or a recording")
 
     def _start_with(self, sent: SentPages, header: pb.RecalibrateFramesHeader, call: Call) -> pb.Job:
         with sent.handed_over() as release:

@@ -56,7 +56,7 @@ class PageCalls:
     def ReadPages(self, request: pb.ReadPagesRequest, call: Call) -> Iterator[pb.ReadPagesReply]:
         """Read several pages; a lost one ends nothing."""
         check_options(request.options)
-        self._check_count("pages to read", len(request.pages) or request.count)
+        self._check_count("pages" if request.pages else "count", len(request.pages) or request.count)
         caller = _caller(request.options, call.caller)
         numbers: list[int | None] = list(request.pages) or [None] * request.count
         with self._plane.ranges.held(caller):
@@ -76,9 +76,9 @@ class PageCalls:
 
     def ReadData(self, request: pb.ReadDataRequest, call: Call) -> Iterator[pb.ReadDataReply]:
         """Read the bytes of a range of pages."""
-        self._check_count("pages to read", request.pages)
+        self._check_count("pages", request.pages)
         if request.first_page + request.pages > _MOST_PAGES:
-            raise InvalidInputError("first page to read", request.first_page, f"less than {_MOST_PAGES} with all")
+            raise InvalidInputError("first_page", request.first_page, f"less than {_MOST_PAGES} with all")
         with self._plane.ranges.held(call.caller):
             for page in read_data(self._plane, request.first_page, request.pages, call.caller):
                 yield data_reply(page)

@@ -79,7 +79,8 @@ class SentPages:
                         timeout.reschedule(loop.time() + limit_s)
         except TimeoutError:
             raise StalledError("frame pair", f"not all of it within {limit_s:g} s", "faster frames") from None
-        self._receivers[-1].checked()
+        if self._symbols:
+            self._receivers[-1].checked()
         if len(self._symbols) < self._header.pages:
             raise MalformedError("pages that came", len(self._symbols), f"{self._header.pages}, as the header says")
 
@@ -127,9 +128,10 @@ class SentPages:
         return False
 
     def _begin_page(self, symbols: bytes) -> None:
-        number, frames = len(self._symbols), "frames of the page before" if self._symbols else "reference frames"
+        number = len(self._symbols)
         if not self._receivers[-1].filled:
-            raise MalformedError(_WHERE, f"symbols of page {number}", f"{frames} before them")
+            before = f"frames of page {number - 1}" if number else "reference frames"
+            raise MalformedError(_WHERE, f"symbols of page {number}", f"{before} first")
         self._receivers[-1].checked()
         if number == self._header.pages:
             raise MalformedError(_WHERE, f"symbols of page {number}", f"{number} pages, as the header says")

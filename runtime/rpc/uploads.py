@@ -7,7 +7,8 @@ from collections.abc import AsyncIterator
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import InvalidInputError, LimitError, PageError
+from lightpage.errors import LimitError, PageError
+from runtime.errors import MalformedError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 
@@ -22,18 +23,19 @@ async def uploaded_pages(
         most_bytes: of all pages together.
 
     Raises:
-        InvalidInputError: messages in the wrong order.
+        MalformedError: messages in the wrong order.
         PageError: parts of pages, or none.
         LimitError: more than the service holds.
     """
     first = await anext(messages, None)
     if first is None or first.WhichOneof("part") != "levels":
         got = "no message" if first is None else first.WhichOneof("part") or "an empty message"
-        raise InvalidInputError("first message of UploadPages", got, "the level count")
+        raise MalformedError("first message of UploadPages", got, "the level count")
     size, parts, held = page_shape[0] * page_shape[1], list[NDArray[np.uint8]](), 0
     async for message in messages:
         if message.WhichOneof("part") != "symbols":
-            raise InvalidInputError("message of UploadPages", "no symbols", "pages from there on")
+            got = "the level count again" if message.HasField("levels") else "an empty message"
+            raise MalformedError("message of UploadPages", got, "pages from there on")
         content = np.frombuffer(message.symbols, np.uint8)
         if not content.size or content.size % size:
             raise PageError("uploaded pages", f"{content.size} symbols", f"whole pages of {size}")

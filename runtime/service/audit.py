@@ -29,7 +29,8 @@ class AuditLog:
     `NAME.1`, the one before it as `NAME.2`, and so on. Its methods may be called from many threads.
 
     Args:
-        path: the file, None for none: then changes are logged alone.
+        path: the file, None for none: then changes are logged alone. Its folder is made if absent; one that
+            goes later, as that of a disk that is taken out, is not made again.
         most_bytes: of the file.
         kept: files put aside that stay.
     """
@@ -38,6 +39,9 @@ class AuditLog:
         self._path, self._most_bytes, self._kept = path, most_bytes, kept
         self._lock = threading.Lock()
         """Guards the file."""
+        if path is not None:
+            with suppress(OSError):  # the first change that cannot be written down says so
+                path.parent.mkdir(parents=True, exist_ok=True)
 
     def record(
         self, what: str, before: str, after: str, *, actor: Actor = NOBODY, outcome: str = "done", detail: str = ""
@@ -84,7 +88,6 @@ class AuditLog:
         """
         self._put_aside(path, len(line))
         is_new = not path.exists()
-        path.parent.mkdir(parents=True, exist_ok=True)
         with open(path, "ab", buffering=0) as file:
             size = os.fstat(file.fileno()).st_size
             try:

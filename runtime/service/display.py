@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.acquisition.source import FrameSource
-from runtime.errors import SourceError
+from runtime.errors import NoSourceError
 from runtime.modulator.beam_state import BeamState
 from runtime.modulator.external import ExternalBeams, ExternalModulator
 
@@ -38,20 +38,20 @@ class Display:
         """Take in pages [page, ny, nx] of M levels; returns the first one's number.
 
         Raises:
-            SourceError: the source shows no pages that it is given.
+            NoSourceError: the source shows no pages that it is given.
             PageError, InvalidInputError, LimitError: see `PageStore.append`.
         """
         pages = self._source.pages
         if pages is None:
             expected = "a source with a modulator, or one that was started with pages"
-            raise SourceError(f"source {self._source.name}", "uploaded pages", expected)
+            raise NoSourceError(f"source {self._source.name}", "uploaded pages", expected)
         return pages.append(symbols, levels)
 
     def wanted(self) -> Wanted:
         """What is waited for now.
 
         Raises:
-            SourceError: the source does all by itself.
+            NoSourceError: the source does all by itself.
         """
         if self._modulator is None and self._beams is None:
             raise self._alone()
@@ -64,7 +64,7 @@ class Display:
         """A page is on display; None: none is.
 
         Raises:
-            SourceError: the source shows its pages by itself.
+            NoSourceError: the source shows its pages by itself.
         """
         if self._modulator is None:
             raise self._alone()
@@ -77,12 +77,12 @@ class Display:
         """The beams are so now.
 
         Raises:
-            SourceError: the source moves its shutters by itself.
+            NoSourceError: the source moves its shutters by itself.
         """
         if self._beams is None:
             raise self._alone()
         self._beams.beams_set(signal=state.signal, reference=state.reference)
 
-    def _alone(self) -> SourceError:
+    def _alone(self) -> NoSourceError:
         expected = 'a source whose modulator or beams have kind = "external"'
-        return SourceError(f"source {self._source.name}", "word from a controller", expected)
+        return NoSourceError(f"source {self._source.name}", "word from a controller", expected)

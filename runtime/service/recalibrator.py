@@ -27,7 +27,7 @@ from runtime.bundle.archive import check_name
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
-from runtime.errors import CallerLeft, JobCancelledError, OtherModelError, SourceError, StoppingError
+from runtime.errors import CallerLeft, JobCancelledError, NoSourceError, OtherModelError, SourceError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
@@ -339,7 +339,7 @@ class Recalibrator:
 
     def _path(self, name: str) -> Path:
         if self._recordings is None:
-            raise SourceError("recording to recalibrate with", name, "a service started with --recordings")
+            raise NoSourceError("recording to recalibrate with", name, "a service started with --recordings")
         try:
             check_name(name, "recording to recalibrate with")
         except Exception as error:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
+from typing import TypeVar
 
 import numpy as np
+from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from lightpage.codec.page_bytes import FileFacts, Header, Loss, PageBytes
@@ -25,6 +28,30 @@ DATA_LOSSES: dict[Loss | None, pb.DataLoss] = {
 }
 FLOAT = np.dtype("<f4")
 """Of confidences, concentrations and phases."""
+
+
+M = TypeVar("M", bound=Message)
+
+
+def message_of(kind: Callable[..., M], **fields: object) -> M:
+    """A message with these fields; None stands for one that is not set.
+
+    Raises:
+        InvalidInputError: one that no message can hold, for instance a number out of range.
+    """
+    message = kind()
+    set_fields(message, **fields)
+    return message
+
+
+def set_fields(message: Message, **fields: object) -> None:
+    """Set fields of a message; raises as `message_of`."""
+    for name, value in fields.items():
+        try:
+            message.MergeFrom(type(message)(**{name: value}))
+        except (ValueError, TypeError) as error:
+            expected = f"what the field {name} of {message.DESCRIPTOR.name} can hold ({error})"
+            raise InvalidInputError(name, repr(value)[:100], expected) from None
 
 
 def pixel_type(code: pb.PixelType) -> str:

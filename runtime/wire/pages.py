@@ -26,6 +26,23 @@ class RemoteTimings:
 
 
 @dataclass(frozen=True)
+class RemoteFrame:
+    """What a camera says of a frame.
+
+    Attributes:
+        serial: of the camera.
+        frame_id: its own count, which wraps.
+        device_time_s: by its clock, from any moment.
+        host_time_s: when the frame was complete, seconds since 1970.
+    """
+
+    serial: str
+    frame_id: int
+    device_time_s: float
+    host_time_s: float
+
+
+@dataclass(frozen=True)
 class RemotePage:
     """A page that a service decoded.
 
@@ -47,6 +64,10 @@ class RemotePage:
         written: what the source knows to have been written, uint8 [ny, nx], or None.
         pilot_mask: where the pilots are, bool [ny, nx]; given with `written`.
         user_data: the page's bytes, or None where not asked for.
+        recalibration_reasons: why a recalibration is due, as the contract names it without prefix.
+        frame_id, captured_s, correlation_id: as the caller gave them.
+        frames: of the in-phase and the quadrature camera; empty where the source has none.
+        replayed: whether this is the answer to an earlier call with the same request id.
     """
 
     symbols: NDArray[np.uint8]
@@ -67,6 +88,12 @@ class RemotePage:
     recalibration_due: bool = False
     image: ImagePosition | None = None
     user_data: PageBytes | None = None
+    recalibration_reasons: tuple[str, ...] = ()
+    frame_id: int = 0
+    captured_s: float = 0.0
+    correlation_id: str = ""
+    frames: tuple[RemoteFrame, ...] = ()
+    replayed: bool = False
 
 
 def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> RemotePage:
@@ -102,7 +129,23 @@ def remote_page(reply: pb.DecodeReply, read: pb.ReadPageReply | None = None) -> 
         page=read.page if read is not None else None,
         written=_array(written, np.dtype(np.uint8), shape, "written") if written else None,
         pilot_mask=_array(read.pilot_mask, np.dtype(np.uint8), shape, "pilot_mask") != 0 if read and written else None,
+        recalibration_reasons=tuple(map(_reason_name, reply.recalibration_reasons)),
+        frame_id=reply.frame_id,
+        captured_s=reply.captured_s,
+        correlation_id=reply.correlation_id,
+        frames=() if read is None else tuple(map(_frame, read.frames)),
+        replayed=read is not None and read.replayed,
     )
+
+
+def _frame(frame: pb.CameraFrame) -> RemoteFrame:
+    return RemoteFrame(frame.serial, frame.frame_id, frame.device_time_s, frame.host_time_s)
+
+
+def _reason_name(reason: pb.RecalibrationReason) -> str:
+    """The name of a reason, "OTHER" of one that this version does not know."""
+    known = reason in pb.RecalibrationReason.values()
+    return pb.RecalibrationReason.Name(reason).removeprefix("RECALIBRATION_REASON_") if known else "OTHER"
 
 
 def _optional(data: bytes, shape: tuple[int, int], name: str) -> NDArray[np.float32] | None:

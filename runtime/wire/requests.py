@@ -25,6 +25,8 @@ def pilots_of(message: pb.Pilots, page_shape: tuple[int, int], levels: int) -> P
     if flags.size != page_shape[0] * page_shape[1] or np.count_nonzero(flags) != values.size:
         got = f"{flags.size} flags, {np.count_nonzero(flags)} of them set, and {values.size} values"
         raise PageError("pilots", got, f"{page_shape[0] * page_shape[1]} flags and one value a set flag")
+    if message.levels:
+        check_levels(message.levels)
     levels = message.levels or levels
     if values.size and int(values.max()) >= levels:
         raise PageError("pilots", f"level {values.max()}", f"0..{levels - 1}")
@@ -36,10 +38,12 @@ def check_options(options: pb.DecodeOptions) -> None:
 
     Raises:
         PageError: an impossible level count; 0 stands for the default.
-        InvalidInputError: an unknown format of confidences.
+        InvalidInputError: an unknown format of confidences, or way of tracking.
     """
     if options.levels:
         check_levels(options.levels)
     if options.confidence_format not in _CONFIDENCE_FORMATS:
         expected = "CONFIDENCE_FORMAT_FLOAT32 or CONFIDENCE_FORMAT_UINT8"
         raise InvalidInputError("confidence_format", options.confidence_format, expected)
+    if options.tracking not in pb.Tracking.values():
+        raise InvalidInputError("tracking", options.tracking, "TRACKING_SESSION or TRACKING_STATELESS")

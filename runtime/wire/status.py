@@ -82,7 +82,7 @@ _MEANINGS: tuple[tuple[type[BaseException], grpc.StatusCode, pb.ErrorReason], ..
     (RecalibrationRefusedError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_RECALIBRATION_REFUSED),
     (CalibrationError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_RECALIBRATION_REFUSED),
     (NoSuchJobError, _Code.NOT_FOUND, pb.ERROR_REASON_NO_SUCH_JOB),
-    (JobCancelledError, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),
+    (JobCancelledError, _Code.CANCELLED, pb.ERROR_REASON_JOB_CANCELLED),
     (StalledError, _Code.CANCELLED, pb.ERROR_REASON_STALLED),
     (CallerLeft, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),
     (grpc.RpcError, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),  # while reading from a sender who has gone
@@ -116,6 +116,9 @@ _EARLIER_KINDS = frozenset(
 """Classes that callers know who do not look at `exact_kind`."""
 
 _REASONS: dict[Reason, Any] = {reason: pb.LossReason.Value(f"LOSS_REASON_{reason}") for reason in Reason}
+
+_FIELD = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
+"""The name of a field, as those have that are about one."""
 
 _FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")
 """The folders of an absolute path, up to its last name."""
@@ -191,7 +194,8 @@ def trailers(error: BaseException) -> tuple[tuple[str, bytes], ...]:
             delay.FromNanoseconds(int(1e9 * retry_s))
             details.append(rpc_details.RetryInfo(retry_delay=delay))
         if isinstance(error, InvalidInputError):
-            violation = rpc_details.BadRequest.FieldViolation(field=detail.thing, description=told(error))
+            field = detail.thing if _FIELD.fullmatch(detail.thing) else ""
+            violation = rpc_details.BadRequest.FieldViolation(field=field, description=told(error))
             details.append(rpc_details.BadRequest(field_violations=[violation]))
     status = rpc_status.Status(code=code.value[0], message=told(error))
     for each in details:

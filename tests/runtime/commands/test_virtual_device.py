@@ -53,7 +53,7 @@ def test_a_command_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_sigterm_ends_the_command_too(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     running = started(
-        tmp_path, "sh", "-c", f"trap 'kill $!; echo ended > {mark}; exit' TERM; echo ready; sleep 60 & wait"
+        tmp_path, "sh", "-c", f"trap 'kill $!; echo ended > {mark}; exit' TERM; sleep 60 & echo ready; wait"
     )
     assert running.stdout is not None
     assert running.stdout.readline() == "ready\n"

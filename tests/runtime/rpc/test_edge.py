@@ -459,7 +459,7 @@ def test_pages_of_the_source_are_read_in_a_row(start: Start) -> None:
         assert [reply.read.page for reply in read(pb.ReadPagesRequest(count=2), timeout=20)] == [0, 1]
         with pytest.raises(grpc.RpcError) as error:
             list(read(pb.ReadPagesRequest(), timeout=20))
-        assert details(error.value)["BadRequest"].field_violations[0].field == "pages to read"
+        assert details(error.value)["BadRequest"].field_violations[0].field == "count"
 
 
 def test_the_black_level_is_taken_off(start: Start) -> None:

@@ -95,6 +95,7 @@ class ErrorReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ERROR_REASON_WORKER: _ClassVar[ErrorReason]
     ERROR_REASON_REQUEST_ID: _ClassVar[ErrorReason]
     ERROR_REASON_INTERNAL: _ClassVar[ErrorReason]
+    ERROR_REASON_JOB_CANCELLED: _ClassVar[ErrorReason]
 
 class LossReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -177,6 +178,7 @@ ERROR_REASON_STOPPING: ErrorReason
 ERROR_REASON_WORKER: ErrorReason
 ERROR_REASON_REQUEST_ID: ErrorReason
 ERROR_REASON_INTERNAL: ErrorReason
+ERROR_REASON_JOB_CANCELLED: ErrorReason
 LOSS_REASON_UNSPECIFIED: LossReason
 LOSS_REASON_PILOTS_DISAGREE: LossReason
 LOSS_REASON_IMAGE_NOT_FOUND: LossReason
@@ -277,7 +279,7 @@ class PageShape(_message.Message):
     def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ...) -> None: ...
 
 class Limits(_message.Message):
-    __slots__ = ("message_bytes", "chunk_bytes", "pair_bytes", "concurrent_decodes", "replay_s", "replay_bytes", "recalibration_pages", "model_bytes")
+    __slots__ = ("message_bytes", "chunk_bytes", "pair_bytes", "concurrent_decodes", "replay_s", "replay_bytes", "recalibration_pages", "model_bytes", "range_pages")
     MESSAGE_BYTES_FIELD_NUMBER: _ClassVar[int]
     CHUNK_BYTES_FIELD_NUMBER: _ClassVar[int]
     PAIR_BYTES_FIELD_NUMBER: _ClassVar[int]
@@ -286,6 +288,7 @@ class Limits(_message.Message):
     REPLAY_BYTES_FIELD_NUMBER: _ClassVar[int]
     RECALIBRATION_PAGES_FIELD_NUMBER: _ClassVar[int]
     MODEL_BYTES_FIELD_NUMBER: _ClassVar[int]
+    RANGE_PAGES_FIELD_NUMBER: _ClassVar[int]
     message_bytes: int
     chunk_bytes: int
     pair_bytes: int
@@ -294,7 +297,8 @@ class Limits(_message.Message):
     replay_bytes: int
     recalibration_pages: int
     model_bytes: int
-    def __init__(self, message_bytes: _Optional[int] = ..., chunk_bytes: _Optional[int] = ..., pair_bytes: _Optional[int] = ..., concurrent_decodes: _Optional[int] = ..., replay_s: _Optional[float] = ..., replay_bytes: _Optional[int] = ..., recalibration_pages: _Optional[int] = ..., model_bytes: _Optional[int] = ...) -> None: ...
+    range_pages: int
+    def __init__(self, message_bytes: _Optional[int] = ..., chunk_bytes: _Optional[int] = ..., pair_bytes: _Optional[int] = ..., concurrent_decodes: _Optional[int] = ..., replay_s: _Optional[float] = ..., replay_bytes: _Optional[int] = ..., recalibration_pages: _Optional[int] = ..., model_bytes: _Optional[int] = ..., range_pages: _Optional[int] = ...) -> None: ...
 
 class DecodeOptions(_message.Message):
     __slots__ = ("levels", "confidence_format", "want_concentration", "want_phase", "want_user_data", "session", "tracking")
