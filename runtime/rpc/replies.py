@@ -11,7 +11,7 @@ from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.service.dataplane import Answer, ReadAnswer
 from runtime.service.display import Wanted
 from runtime.service.models import ModelEntry
-from runtime.service.monitor import AIR, MARGIN, PISTON_WALK, RESIDUAL, SHARE, SHIFT, TRUST, UNREAD
+from runtime.service.monitor import AIR, CHANGED, MARGIN, PISTON_WALK, RESIDUAL, SHARE, SHIFT, TRUST, UNREAD
 from runtime.service.store import Origin
 from runtime.service.user_data import DataPage
 from runtime.wire.messages import DATA_LOSSES, FLOAT, image_message
@@ -55,6 +55,7 @@ _SIGNS = {
     AIR.name: pb.RECALIBRATION_REASON_INFORMATION,
     TRUST.name: pb.RECALIBRATION_REASON_TRUST,
     SHARE.name: pb.RECALIBRATION_REASON_PILOT_SHARE,
+    CHANGED.name: pb.RECALIBRATION_REASON_PAGES,
     UNREAD.name: pb.RECALIBRATION_REASON_UNREAD,
     RESIDUAL.name: pb.RECALIBRATION_REASON_RESIDUAL,
     SHIFT.name: pb.RECALIBRATION_REASON_SHIFT,

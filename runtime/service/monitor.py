@@ -98,6 +98,10 @@ UNREAD = Sign("unread", window=8, raise_by=0.45, clear_by=0.2, rises=True, absol
 """Share of pages that were lost to their optics, or whose bytes were. Four of eight are no accident: after a knock the
 alarm comes with the fourth page."""
 
+CHANGED = Sign("page_due", window=8, raise_by=0.45, clear_by=0.2, rises=True, absolute=True, mean=True)
+"""Share of pages whose pilots confirm so little that each by itself says that a recalibration is due. It needs no
+baseline: it tells of a device that had changed before its model came into service."""
+
 RESIDUAL = Sign("residual_rad", window=7, raise_by=0.03, clear_by=0.015, rises=True)
 """Smooth phase error that was taken off each page. A quiet bench device shows 0.002 +- 0.001 rad; ten times that is a
 wavefront that the calibration does not know."""
@@ -121,7 +125,7 @@ class MonitorSettings:
     """
 
     baseline_pages: int = 20
-    signs: tuple[Sign, ...] = (MARGIN, AIR, TRUST, SHARE, UNREAD, RESIDUAL, SHIFT, PISTON_WALK)
+    signs: tuple[Sign, ...] = (MARGIN, AIR, TRUST, SHARE, CHANGED, UNREAD, RESIDUAL, SHIFT, PISTON_WALK)
 
 
 @dataclass(frozen=True)
@@ -259,6 +263,8 @@ class PageFigures:
             SHARE.name: page.check.share,
             RESIDUAL.name: observation.residual_rad() or 0.0,
         }
+        if observation.tells:
+            figures[CHANGED.name] = float(page.check.recalibration_due)
         if page.image is not None:
             figures[SHIFT.name] = math.hypot(page.image.shift_x_px, page.image.shift_y_px)
         if self._piston is not None:

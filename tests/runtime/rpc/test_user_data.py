@@ -104,7 +104,7 @@ def test_ranges_that_are_none(serve) -> None:  # type: ignore[no-untyped-def]
     client, _, _ = serve()
     with pytest.raises(InvalidInputError, match="pages: got 0, wanted at least 1"):
         list(client.read_data(0, 0))
-    with pytest.raises(LimitError, match="pages to read: got 4097, wanted at most 4096"):
+    with pytest.raises(LimitError, match="pages: got 4097, wanted at most 4096"):
         list(client.read_data(0, 4097))
     with pytest.raises(InvalidInputError, match="first_page: got 4294967295"):
         list(client.read_data((1 << 32) - 1, 2))

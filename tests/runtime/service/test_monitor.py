@@ -149,6 +149,10 @@ def test_what_a_page_says_of_the_device(page: DecodedPage) -> None:
     told = figures.of(observation(replace(page, piston_rad=3.0, image=ImagePosition(3.0, -4.0))))
     assert told["shift_px"] == 5
     assert told["share"] == page.check.share
+    assert told["page_due"] == 0
+    poor = replace(page, check=replace(page.check, confirmed_bits=0.3 * page.check.claimed_bits))
+    assert PageFigures().of(observation(poor))["page_due"] == poor.check.recalibration_due == 1
+    assert "page_due" not in PageFigures().of(observation(poor, tells=False))
     assert told["air_bits"] == claimed_bits(page)
     assert not {"margin_bits", "piston_walk_rad"} & told.keys()
     told = figures.of(observation(replace(page, piston_rad=-3.0), user_data=found(None, 0.1)))

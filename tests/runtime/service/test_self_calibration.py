@@ -181,6 +181,38 @@ def test_a_success_is_followed_by_the_least_interval(make: Make) -> None:
         assert wait_until(lambda number=number: loop.version == f"toy-1+r{number}")
 
 
+def test_one_that_brings_nothing_doubles_the_interval(make: Make) -> None:
+    """Else a device that stays as it is would be recalibrated each minute, for ever."""
+    loop = make()
+    loop.start()
+
+    def complain() -> None:
+        for _ in range(8):
+            loop.monitor.follow(loop.version, {"unread": 1.0})
+
+    complain()
+    assert wait_until(lambda: loop.version == "toy-1+r1")
+    complain()
+    time.sleep(0.05)
+    loop.seconds += 119
+    time.sleep(0.2)
+    assert loop.version == "toy-1+r1"
+    loop.seconds += 2
+    assert wait_until(lambda: loop.version == "toy-1+r2")
+
+
+def test_a_device_that_had_changed_before_the_start_is_recalibrated(make: Make) -> None:
+    """Its first pages are its baseline, so no sign that is measured from there can tell."""
+    loop = make()
+    loop.start()
+    loop.monitor.begin(loop.version)
+    for _ in range(7):
+        loop.monitor.follow(loop.version, {"unread": 0.0, "share": 0.5, "page_due": 1.0})
+    assert not loop.monitor.due
+    loop.monitor.follow(loop.version, {"unread": 0.0, "share": 0.5, "page_due": 1.0})
+    assert wait_until(lambda: loop.version == "toy-1+r1")
+
+
 def test_a_source_without_known_symbols_fails_quietly_and_reads_go_on(
     make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

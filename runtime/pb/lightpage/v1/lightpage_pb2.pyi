@@ -46,6 +46,7 @@ class RecalibrationReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     RECALIBRATION_REASON_SHIFT: _ClassVar[RecalibrationReason]
     RECALIBRATION_REASON_PISTON: _ClassVar[RecalibrationReason]
     RECALIBRATION_REASON_OTHER: _ClassVar[RecalibrationReason]
+    RECALIBRATION_REASON_PAGES: _ClassVar[RecalibrationReason]
 
 class DataLoss(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -138,6 +139,7 @@ RECALIBRATION_REASON_RESIDUAL: RecalibrationReason
 RECALIBRATION_REASON_SHIFT: RecalibrationReason
 RECALIBRATION_REASON_PISTON: RecalibrationReason
 RECALIBRATION_REASON_OTHER: RecalibrationReason
+RECALIBRATION_REASON_PAGES: RecalibrationReason
 DATA_LOSS_UNSPECIFIED: DataLoss
 DATA_LOSS_OPTICS: DataLoss
 DATA_LOSS_HEADER: DataLoss
