@@ -123,10 +123,14 @@ def expected_of(error: ErrorDetails) -> str:
     kind, context = error["type"], error.get("ctx", {})
     if kind in _BOUNDS:
         bound = _BOUNDS[kind]
-        return f"{_SIDES[bound]} {context[bound]:g}"
+        return f"{_SIDES[bound]} {_number(context[bound])}"
     if kind == "literal_error":
         return str(context["expected"]).replace("'", "")
     return _TYPES.get(kind, error["msg"])
+
+
+def _number(value: float) -> str:
+    return f"{int(value)}" if value == int(value) else f"{value:g}"
 
 
 def _walk(

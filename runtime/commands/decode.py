@@ -12,9 +12,10 @@ from typing import Any
 import click
 import numpy as np
 
+from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import parse_profile
-from lightpage.errors import InvalidInputError, RecordingError
+from lightpage.errors import InvalidInputError, LightpageError, RecordingError
 from lightpage.files import write_json
 from lightpage.metrics.measures import PageMeasures, measure
 from lightpage.page.symbols import pilot_symbols
@@ -71,20 +72,31 @@ def decode(
                 raise InvalidInputError(f"service at {target}", "no source", "a service started with --source")
             subject, decoded = f"source of {target}", _read(client, count, levels)
         writer = stack.enter_context(DecodedWriter(out, levels)) if out is not None else None
-        for page in track(decoded, "decode", total=count):
-            if isinstance(page, RefusedPage):
-                refused.append(page)
-                continue
-            if writer is not None:
-                writer.append(page)
-            results.append(page_report(page))
+        broke = None
+        try:
+            for page in track(decoded, "decode", total=count):
+                if isinstance(page, RefusedPage):
+                    refused.append(page)
+                    continue
+                if writer is not None:
+                    writer.append(page)
+                results.append(page_report(page))
+        except (LightpageError, KeyboardInterrupt) as error:
+            if not results or recording is not None:
+                raise
+            broke = error  # the source does not show the same pages again: what came is kept
+            click.get_current_context().meta[RESUME_KEY] = "what came before is kept"
         if json_path is not None:
             data = {"target": target, "levels": levels, "pages": results, "refused_pages": [asdict(r) for r in refused]}
             data["pages_unconfirmed"] = unconfirmed(refused)
+            data["pages_asked_for"] = count
             write_json(json_path, data)
         if refused and not results:
             raise refusal(subject, refused, count)
     click.echo(table(results))
+    if broke is not None:
+        warn(f"{subject}: {len(results) + len(refused)} of {count} pages came")
+        raise broke
     rates = [rate for result in results if (rate := result["air_bits_per_symbol"]) is not None]
     if rates and fmean(rates) <= 0:
         warn(WORTH_NOTHING)

@@ -6,6 +6,7 @@ from datetime import datetime
 
 import click
 
+from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import InvalidInputError
@@ -32,6 +33,8 @@ def jobs(target: str, watch: str | None, cancel: str | None, timeout_s: float) -
         raise InvalidInputError("options", "--watch and --cancel", "one of them")
     with LightpageClient(target) as client:
         if watch is not None:
+            again = f"job {watch} goes on; lightpage jobs --watch {watch} follows it again"
+            click.get_current_context().meta[RESUME_KEY] = again
             with percent_bar() as progress:
                 result = watched(client, watch, progress, timeout_s)
             click.echo(table(summary(result, result.seconds)))

@@ -42,6 +42,7 @@ from runtime.service.registry import ModelRegistry
 from runtime.service.self_calibration import SelfCalibration
 from runtime.service.settings import ADDRESS, OFF, STORE_VARIABLE, Effective, Option, ServiceSettings, service_settings
 from runtime.service.store import ModelStore
+from runtime.wire.address import check_free
 
 _log = logging.getLogger(__name__)
 
@@ -116,7 +117,7 @@ _KEYS = {
 @click.option(
     "--calibration-page",
     "calibration_pages",
-    type=click.IntRange(0),
+    type=click.IntRange(0, 2**32 - 1),
     multiple=True,
     help="Number of a page of the source whose symbols are known; repeat it. Without, the next two pages serve.",
 )
@@ -184,6 +185,7 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         stack.enter_context(_shown(console, settings.metrics.port, settings.metrics.host))
         recalibrator = Recalibrator(plane, recordings=service.recordings)
         server = LightpageServer(plane, recalibrator, service.address)
+        check_free("address", service.address)  # before anything else takes a port
         if service.health_address != OFF:  # entered first: it says NOT_SERVING until the last call has ended
             address = service.health_address or next_port(service.address)
             health = stack.enter_context(HealthServer(address, server.health))
@@ -274,7 +276,8 @@ def _shown(console: Console, port: int | None, host: str) -> Iterator[None]:
     try:
         server = ConsoleServer(console, port, host)
     except OSError as error:
-        raise InvalidInputError(f"--metrics-port {port}", error, "a free port of this machine") from None
+        got, expected = error.strerror or error, "an address of this machine and a free port"
+        raise InvalidInputError(f"metrics at {host}:{port}", got, expected) from None
     click.echo(f"metrics at http://{host}:{server.port}/metrics, console at http://{host}:{server.port}/")
     with server:
         yield

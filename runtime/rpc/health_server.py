@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
@@ -94,6 +96,9 @@ class HealthServer:
             self._thread.join(2 * _SEND_S)
         if self._process is not None:
             self._process.end()
+            if self._address.startswith("unix:"):
+                with suppress(OSError):
+                    os.unlink(self._address.removeprefix("unix:"))
 
     def __enter__(self) -> Self:
         return self.start()

@@ -40,8 +40,11 @@ class AuditLog:
         self._lock = threading.Lock()
         """Guards the file."""
         if path is not None:
-            with suppress(OSError):  # the first change that cannot be written down says so
+            try:
                 path.parent.mkdir(parents=True, exist_ok=True)
+                path.open("ab").close()
+            except OSError as error:
+                _log.warning("model changes are not written down in %s: %s", path, error.strerror or error)
 
     def record(
         self, what: str, before: str, after: str, *, actor: Actor = NOBODY, outcome: str = "done", detail: str = ""
@@ -70,7 +73,8 @@ class AuditLog:
         level = logging.INFO if outcome == "done" else logging.WARNING
         why = f": {detail}" if detail else ""
         told = {"peer": actor.name, "correlation_id": actor.correlation_id, "method": what}
-        _log.log(level, "model change %s: from %s to %s, %s%s", what, before, after, outcome, why, extra={"told": told})
+        change = f"from {before} to {after}" if after else f"of {before}"
+        _log.log(level, "model change %s: %s, %s%s", what, change, outcome, why, extra={"told": told})
         if self._path is None:
             return
         line = json.dumps(entry, ensure_ascii=False).encode("utf-8", "replace") + b"\n"

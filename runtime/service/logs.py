@@ -98,6 +98,7 @@ class _Second:
     begun: float
     level: int
     logger: str
+    shown: str
     lines: int = 0
     left_out: int = 0
 
@@ -128,7 +129,8 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         if second is None or now - second.begun >= _WINDOW_S:
             self._tell(kind, now)
             self._forget(now)
-            second = self._seconds[kind] = _Second(now, record.levelno, record.name)
+            shown = " ".join(filter(None, kind)) if _is_of_a_call(record) else record.getMessage()
+            second = self._seconds[kind] = _Second(now, record.levelno, record.name, shown)
         second.lines += 1
         if second.lines <= self._most:
             super().emit(record)
@@ -169,7 +171,7 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         if second is None or not second.left_out:
             return
         text = f"{second.left_out} more of these were left out in {max(now - second.begun, _WINDOW_S):.0f} s"
-        record = logging.LogRecord(second.logger, second.level, __file__, 0, "%s: %s", (" ".join(kind), text), None)
+        record = logging.LogRecord(second.logger, second.level, __file__, 0, "%s: %s", (second.shown, text), None)
         record.told = {"left_out": second.left_out}
         super().emit(record)
         second.left_out = 0
@@ -183,9 +185,13 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
             del self._seconds[kind]
 
 
+def _is_of_a_call(record: logging.LogRecord) -> bool:
+    return "method" in getattr(record, "told", {})
+
+
 def _kind(record: logging.LogRecord) -> tuple[str, ...]:
     said = getattr(record, "told", {})
-    if "method" in said:
+    if _is_of_a_call(record):
         return str(said["method"]), str(said.get("reason") or said.get("code") or "")
     return record.name, str(record.msg)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -81,6 +81,7 @@ class SelfCalibration:
         self._settings, self._clock = settings or SelfCalibrationSettings(), clock
         if (count := len(self._settings.pages)) > (most := plane.limits.recalibration_pages):
             raise LimitError("calibration pages", count, f"at most {most}")
+        _check_pages(plane, self._settings.pages)
         self._interval_s, self._not_before = self._settings.least_s, -float("inf")
         self._wake, self._stopping = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="lightpage-self-calibration", daemon=True)
@@ -175,3 +176,15 @@ class SelfCalibration:
 
     def _wait(self, seconds: float) -> None:
         self._not_before = self._clock() + seconds
+
+
+def _check_pages(plane: DataPlane, pages: Sequence[int]) -> None:
+    """See that a source that is given no more pages has these.
+
+    Raises:
+        InvalidInputError: it has not.
+    """
+    count = plane.source.page_count() if pages and plane.has_source and plane.source.pages is None else None
+    if count is not None and max(pages) >= count:
+        expected = f"pages of {plane.source.name}, which has 0..{count - 1}"
+        raise InvalidInputError("calibration pages", max(pages), expected)

@@ -66,6 +66,7 @@ def _not_empty(value: Any) -> Any:
 _Text = Annotated[str, Field(min_length=1)]
 _Path = Annotated[Path, Field(strict=False), BeforeValidator(_not_empty)]
 _Port = Annotated[int, Field(ge=0, le=65535)]
+_PageNumber = Annotated[int, Field(ge=0, lt=2**32)]
 _Seconds = Annotated[float, Field(gt=0, le=31e6, allow_inf_nan=False)]
 
 
@@ -129,7 +130,9 @@ class SelfCalibrationTable(SettingsTable):
     """See `SelfCalibrationSettings`; `enabled` left out means: where pages are named."""
 
     enabled: bool | None = None
-    pages: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = SelfCalibrationSettings.pages
+    pages: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**32)], ...], Field(strict=False)] = (
+        SelfCalibrationSettings.pages
+    )
     least_s: _Seconds = SelfCalibrationSettings.least_s
     longest_s: _Seconds = SelfCalibrationSettings.longest_s
     busy_s: _Seconds = SelfCalibrationSettings.busy_s

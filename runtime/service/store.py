@@ -29,6 +29,9 @@ _log = logging.getLogger(__name__)
 
 CURRENT = "current.json"
 
+DAMAGED = "current.damaged.json"
+"""Where a note that cannot be read is kept when a change writes a new one: somebody may read more in it."""
+
 LOCK = ".lock"
 
 UPLOAD = ".upload-"
@@ -211,6 +214,7 @@ class ModelStore:
             }
             try:
                 self._check_folder()
+                self._keep_damaged()
                 replace_text(self.folder / CURRENT, json.dumps(data))
             except OSError as error:
                 raise self.failed(error) from None
@@ -220,6 +224,14 @@ class ModelStore:
             self.note = note
         with self._guard:
             self._failure = None
+
+    def _keep_damaged(self) -> None:
+        """Set a damaged note aside, before a new one takes its place."""
+        with self._guard:
+            damaged = self._damage is not None and self._damage.reason is Reason.NOTE
+        if damaged and self.has_note:
+            os.replace(self.folder / CURRENT, self.folder / DAMAGED)
+            _log.warning("%s: a new note is written; the damaged one is %s now", self._subject, DAMAGED)
 
     def remember(self, path: Path | None) -> None:
         """Note that a bundle came into service after the base, or the base itself (None).

@@ -5,11 +5,14 @@ from __future__ import annotations
 import errno
 import re
 import socket
+from pathlib import Path
 
 from lightpage.errors import InvalidInputError
 
-_HOST_PORT = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+):(\d{1,5})")
+_HOST_PORT = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
+_UNIX = "unix:"
 _LARGEST_PORT = 65535
+_ANSWER_S = 1.0
 
 
 def check_address(name: str, address: str, least_port: int = 1) -> None:
@@ -18,7 +21,9 @@ def check_address(name: str, address: str, least_port: int = 1) -> None:
     Raises:
         InvalidInputError: it is not.
     """
-    if address.startswith("unix:"):
+    if address.startswith(_UNIX):
+        if not address.removeprefix(_UNIX):
+            raise InvalidInputError(name, repr(address), "unix:PATH, or HOST:PORT")
         return
     match = _HOST_PORT.fullmatch(address)
     if match is None or not least_port <= int(match[2]) <= _LARGEST_PORT:
@@ -31,7 +36,8 @@ def check_free(name: str, address: str) -> None:
     Raises:
         InvalidInputError: it cannot; the message says why.
     """
-    if address.startswith("unix:"):
+    if address.startswith(_UNIX):
+        _check_socket_free(f"{name} {address}", address.removeprefix(_UNIX))
         return
     host, _, port = address.rpartition(":")
     try:
@@ -45,3 +51,23 @@ def check_free(name: str, address: str) -> None:
         if code == errno.EAFNOSUPPORT:
             return  # without IPv6, gRPC takes [::] for 0.0.0.0
         raise InvalidInputError(f"{name} {address}", text or error, "a free HOST:PORT of this machine") from None
+
+
+def _check_socket_free(subject: str, path: str) -> None:
+    """Check that no process listens at a socket: gRPC would take it away from one that does."""
+    folder, at = Path(path).parent, Path(path)
+    if not folder.is_dir():
+        raise InvalidInputError(subject, f"no folder {folder}", "a socket's path in a folder that is there")
+    if not at.exists():
+        return
+    if not at.is_socket():
+        raise InvalidInputError(subject, "something that is no socket", "a free path, or a socket that was left behind")
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(_ANSWER_S)
+        try:
+            probe.connect(path)
+        except ConnectionRefusedError:
+            return  # left behind by a process that was killed; gRPC replaces it
+        except OSError as error:
+            raise InvalidInputError(subject, error.strerror or error, "a socket that can be replaced") from None
+    raise InvalidInputError(subject, "a process that listens there", "a free path")

@@ -236,6 +236,10 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
         return LimitError(subject, text, "a smaller or a later request")
     if code == grpc.StatusCode.UNAVAILABLE:
         return LightpageError(subject, f"no connection ({text})", "a running Lightpage service at this address")
+    if code == grpc.StatusCode.UNIMPLEMENTED:
+        return LightpageError(subject, f"no such call ({text})", "a Lightpage service, of this version or a later one")
+    if code == grpc.StatusCode.DEADLINE_EXCEEDED:
+        return LightpageError(subject, "no answer within the call's deadline", "one, or a longer deadline")
     return LightpageError(subject, f"{code.name}: {text}", "an answer")
 
 

@@ -22,7 +22,7 @@ import pytest
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import RESUME_KEY, LazyGroup, lightpage
-from lightpage.errors import CalibrationError
+from lightpage.errors import CalibrationError, LightpageError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, RecordingWriter
@@ -37,6 +37,7 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
 from runtime.service.store import ModelStore
+from runtime.wire.pages import RemotePage
 from tests.runtime import toy
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -569,7 +570,7 @@ def test_recalibrate_waits_for_a_service_as_long_as_it_is_told(
     with LightpageServer(plane, Recalibrator(plane, waits)) as server:  # type: ignore[arg-type]
         arguments = ["recalibrate", "--target", server.target, "--timeout"]
         assert run([*arguments, "0.5"]) == 2
-        assert "DEADLINE_EXCEEDED" in capsys.readouterr().err
+        assert "within the call's deadline" in capsys.readouterr().err
         assert run([*arguments, "0"]) == 2
         go.set()
     assert run(["recalibrate", "--bundle", toy_zip, "--timeout", "5"]) == 2
@@ -590,6 +591,34 @@ def test_an_interrupted_decode_leaves_nothing_half_written(
     where = ["--target", service.target, "--recording", recording[0]]
     assert run(["decode", *where, "--out", tmp_path / "decoded.h5", "--json", tmp_path / "d.json"]) == 130
     assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, LightpageError("service", "no connection", "one")])
+def test_pages_of_the_source_that_came_before_the_end_are_kept(
+    end: BaseException | type[BaseException],
+    service: LightpageServer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """It would show other pages the next time."""
+    read, count = LightpageClient.read_page, iter(range(100))
+
+    def ending(self: LightpageClient, **options: Any) -> RemotePage:
+        if next(count) == 2:
+            raise end
+        return read(self, **options)
+
+    monkeypatch.setattr(LightpageClient, "read_page", ending)
+    out, figures = tmp_path / "decoded.h5", tmp_path / "d.json"
+    arguments = ["decode", "--target", service.target, "--source", "--pages", "5", "--out", out, "--json", figures]
+    assert run(arguments) == (130 if end is KeyboardInterrupt else 2)
+    told = capsys.readouterr()
+    assert "2 of 5 pages came" in told.err
+    assert len(json.loads(figures.read_text())["pages"]) == 2
+    with h5py.File(out) as file:
+        assert file["symbols"].shape[0] == 2
+    assert ("what came before is kept" in told.err) == (end is KeyboardInterrupt)
 
 
 def test_an_interrupted_evaluation_leaves_nothing(

@@ -163,7 +163,7 @@ def test_a_controller_that_says_nothing_costs_its_page(serve: type[Serve]) -> No
     service.client.upload_pages(PAGES, 16)
     with (
         LightpageClient(service.client.target, timeout_s=1.5) as hasty,
-        pytest.raises(Exception, match=r"on display|DEADLINE") as raised,
+        pytest.raises(Exception, match=r"on display|deadline") as raised,
     ):
         hasty.read_page(0)
     if isinstance(raised.value, LostShotError):

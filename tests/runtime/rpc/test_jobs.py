@@ -403,7 +403,7 @@ def test_a_watch_waits_for_nobody_it_has_never_heard_and_not_beyond_its_time(sta
     service = start(fit)
     job = service.client.start_recalibration(count=2)
     assert fit.entered.wait(10)
-    with pytest.raises(LightpageError, match="DEADLINE"):
+    with pytest.raises(LightpageError, match="deadline"):
         list(service.client.watch_job(job.id, 0.5))
     assert service.client.job(job.id).state is JobState.RUNNING
 

@@ -285,4 +285,8 @@ def test_pages_that_cannot_serve_are_refused_at_the_start(make: Make) -> None:
     loop = make()
     with pytest.raises(LimitError, match="calibration pages"):
         SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings(tuple(range(17))))
+    loop.source.page_count = lambda: 102  # type: ignore[method-assign]
+    with pytest.raises(InvalidInputError, match=r"calibration pages: got 102, wanted pages of .* 0\.\.101"):
+        SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings((101, 102)))
+    SelfCalibration(loop.plane, loop.monitor, loop.recalibrator, SelfCalibrationSettings((100, 101)))
     assert np.all(np.diff(loop.source.shown) == 1)

@@ -22,7 +22,7 @@ from runtime.errors import StoreError
 from runtime.service import store as store_module
 from runtime.service.dataplane import DataPlane
 from runtime.service.registry import ModelRegistry
-from runtime.service.store import CURRENT, KEPT_BUNDLES, LOCK, ModelStore, Note, Origin, Reason
+from runtime.service.store import CURRENT, DAMAGED, KEPT_BUNDLES, LOCK, ModelStore, Note, Origin, Reason
 from tests.runtime import toy
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -209,6 +209,8 @@ def test_a_note_that_is_damaged_or_gone_is_said(
     assert figure(plane, "lightpage_store_trouble", reason="note") == 1
     assert note.exists() == (content is not None)  # the next start says it again
     plane.models.activate("toy-1+r2")
+    kept = store.folder / DAMAGED
+    assert (kept.read_text() if kept.exists() else None) == (content and content.replace("BASE", store._base))
     assert plane.store_trouble() == ""
     assert a_plane(decoder, store).registry.current.version == "toy-1+r2"
 

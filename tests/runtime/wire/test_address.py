@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from pathlib import Path
 
 import pytest
 
@@ -16,7 +17,7 @@ def test_host_and_port_are_taken(address: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "address", ["127.0.0.1", "127.0.0.1:", "127.0.0.1:99999", "::1:50051", ":50051", "a b:1", "h:0"]
+    "address", ["127.0.0.1", "127.0.0.1:", "127.0.0.1:99999", "::1:50051", ":50051", "a b:1", "h:0", "h:５０", "unix:"]
 )
 def test_anything_else_is_named(address: str) -> None:
     with pytest.raises(InvalidInputError, match=r"--address.*HOST:PORT"):
@@ -39,3 +40,19 @@ def test_why_an_address_cannot_be_listened_at_is_said() -> None:
         check_free("address", "nohost.invalid:50")
     with pytest.raises(InvalidInputError, match=r"address a+:50: got .*label"):
         check_free("address", f"{'a' * 64}:50")
+
+
+def test_a_socket_that_somebody_listens_at_is_not_taken_away(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    check_free("address", f"unix:{path}")
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(str(path))
+        listening.listen()
+        with pytest.raises(InvalidInputError, match="a process that listens there"):
+            check_free("address", f"unix:{path}")
+    check_free("address", f"unix:{path}")  # left behind
+    (tmp_path / "file").touch()
+    with pytest.raises(InvalidInputError, match="no socket"):
+        check_free("address", f"unix:{tmp_path / 'file'}")
+    with pytest.raises(InvalidInputError, match="no folder"):
+        check_free("address", f"unix:{tmp_path / 'none' / 's'}")
