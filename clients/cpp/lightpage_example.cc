@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <filesystem>
 #include <fstream>
 #include <iostream>
 #include <iterator>
@@ -80,6 +81,7 @@ std::uint32_t whole(const std::string& text) {
 Duration seconds(const std::string& text) { return Duration(number(text, 1e6)); }
 
 std::string read_file(const std::string& path) {
+  if (!std::filesystem::is_regular_file(path)) throw std::runtime_error("cannot read " + path + ": no file");
   std::ifstream file(path, std::ios::binary);
   std::string data((std::istreambuf_iterator<char>(file)), std::istreambuf_iterator<char>());
   if (!file) throw std::runtime_error("cannot read " + path);
@@ -183,7 +185,8 @@ void tell_error(const lightpage::Error& error) {
     std::cerr << ", " << v1::LossReason_Name(error.detail.reason());
   }
   if (error.retry_after) std::cerr << ", again in " << error.retry_after->count() << " s";
-  for (const auto& [field, wrong] : error.bad_fields) std::cerr << ", field " << field;
+  for (const auto& [field, wrong] : error.bad_fields)
+    if (!field.empty()) std::cerr << ", field " << field;
   for (const auto& [name, value] : error.metadata) std::cerr << ", " << name << "=" << value;
   std::cerr << ")\n";
 }
@@ -191,7 +194,9 @@ void tell_error(const lightpage::Error& error) {
 int run(const Arguments& given) {
   const std::string command = given.word(0);
   const Deadline deadline = lightpage::in(seconds(given.option("timeout", "60")));
-  Client client(given.option("target", "127.0.0.1:50051"));
+  const auto target = given.option("target", "127.0.0.1:50051");
+  if (target.empty()) throw UsageError();
+  Client client(target);
   if (command == "describe") return describe(client, deadline);
   if (command == "decode") return decode(client, given, deadline);
   if (command == "read") return read(client, given, deadline);

@@ -99,6 +99,21 @@ def test_it_says_what_the_service_does_not_like(program: Path, target: str, tmp_
     assert "reason INVALID_VALUE, PageError, field levels" in done.stderr
     short = raw(tmp_path / "short.raw", pair.in_phase)
     assert "6144 bytes" in run(program, target, "decode", short, "--out", tmp_path / "symbols").stderr
+    assert "no file" in run(program, target, "decode", tmp_path, "--out", tmp_path / "symbols").stderr
+
+
+def test_it_recalibrates_a_service(program: Path, toy_zip: Path, tmp_path: Path) -> None:
+    device = toy.ToySource(toy.ToyDevice((150.0, 62.0)))
+    plane = DataPlane(ModelRegistry(Decoder.load(toy_zip, threads=1), no_tracker), device)
+    with LightpageServer(plane, Recalibrator(plane, toy.fit_references, tmp_path)) as server:
+        done = run(program, server.target, "recalibrate", "--pages", 2)
+        assert done.returncode == 0, done.stderr
+        assert plane.registry.current.version == "toy-1+r1"
+        assert "toy-1+r1" in done.stdout
+        again = run(program, server.target, "watch", done.stdout.split()[1])
+        assert again.returncode == 0, again.stderr
+        assert "toy-1+r1" in again.stdout
+        assert run(program, server.target, "watch", "nobody").returncode == 2
 
 
 def test_a_page_that_is_asked_for_again_is_the_same_shot(program: Path, target: str, tmp_path: Path) -> None:
