@@ -10,6 +10,7 @@ import zlib
 from pathlib import Path
 
 from lightpage.errors import BundleError
+from runtime.bundle.manifest import MANIFEST
 
 MAX_FILES = 32
 """A bundle has a handful of files; more is something else."""
@@ -60,6 +61,8 @@ def check_name(name: str, subject: str) -> None:
 def _read_folder(path: Path, max_bytes: int) -> dict[str, bytes]:
     subject = f"bundle {path}"
     names = sorted(os.listdir(path))
+    if MANIFEST not in names:
+        raise BundleError(subject, f"a folder without {MANIFEST}", "a bundle: a folder that has one, or a zip file")
     _check_count(len(names), subject)
     files: dict[str, bytes] = {}
     left = max_bytes
