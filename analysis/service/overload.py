@@ -3,9 +3,10 @@
     python -m analysis.service.overload --json FILE
 
 Callers send pairs with a deadline of so many seconds, ten times as often as the service decodes. **Goodput** is the
-rate of answers in time over the rate at which two callers without a deadline are answered, in the same run. A decode is
-wasted if nobody got its answer. Health checks, and an idle probe process that answers the same checks beside the same
-load, are asked meanwhile. All pairs are of one session, as those of a device are: a session's first page takes longer.
+rate of answers in time over the rate at which two callers without a deadline are answered, just before and just after:
+machines change their speed. The median of some rounds is told. A decode is wasted if nobody got its answer. Health
+checks, and an idle probe process that answers the same checks beside the same load, are asked meanwhile. All pairs are
+of one session, as those of a device are: a session's first page takes longer.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ import threading
 import time
 from collections import Counter
 from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
+from statistics import fmean, median
 from typing import Any
 
 import click
@@ -26,6 +29,7 @@ from analysis.service.running import PagesToSend, RunningService, quantiles_ms, 
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
+from lightpage.progress import track
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.health_server import HealthServer
 
@@ -40,13 +44,16 @@ class Checks:
         self._stop, self._targets = threading.Event(), targets
         self.seconds: dict[str, list[float]] = {name: [] for name in targets}
         self.failed: Counter[str] = Counter()
-        self._thread = threading.Thread(target=self._run, name="checks")
+        self._thread: threading.Thread | None = None
 
     def __enter__(self) -> Checks:
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._run, name="checks")
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        assert self._thread is not None  # it was entered
         self._stop.set()
         self._thread.join()
 
@@ -126,7 +133,6 @@ def overload(
         "answered_per_s": ended["OK"] / took,
         "ended": dict(ended),
         "decodes": decoded,
-        "wasted_share": (decoded - ended["OK"]) / max(1.0, decoded),
     }
 
 
@@ -162,10 +168,13 @@ def stalled(service: RunningService, pages: PagesToSend, streams: int, seconds: 
 @click.command()
 @click.option("--times", default=10.0, show_default=True, help="Load over capacity.")
 @click.option("--deadline", "deadline_s", default=2.0, show_default=True, help="Of every call, seconds.")
-@click.option("--seconds", default=30.0, show_default=True, help="Of each part.")
+@click.option("--rounds", default=3, show_default=True, type=click.IntRange(1), help="Of capacity and overload.")
+@click.option("--seconds", default=20.0, show_default=True, help="Of each part.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-def main(times: float, deadline_s: float, seconds: float, threads: int | None, json_path: Path | None) -> None:
+def main(
+    times: float, deadline_s: float, rounds: int, seconds: float, threads: int | None, json_path: Path | None
+) -> None:
     """Print goodput, wasted decodes, and health checks under overload and under stalled streams."""
     pages = PagesToSend()
     own = () if threads is None else ("--threads", str(threads))
@@ -175,27 +184,39 @@ def main(times: float, deadline_s: float, seconds: float, threads: int | None, j
                 stub(channel).DecodeFrames(iter(pages.requests(options=_ONE_DEVICE)), timeout=120)
             stub(channel).Describe(pb.DescribeRequest(), timeout=10)
         targets = {"health_port": service.health, "service_port": service.target, "idle_probe": idle.target}
+        loaded: list[dict[str, Any]] = []
         with Checks(**targets):  # they cost time too
-            alone = capacity(service, pages, seconds / 2)
-        with Checks(**targets) as checks:
-            loaded = overload(service, pages, times * alone, deadline_s, seconds)
+            alone = [capacity(service, pages, seconds / 2)]
+        checks = Checks(**targets)
+        for _ in track(range(rounds), "overload", unit="round"):
+            with checks:
+                loaded.append(overload(service, pages, times * alone[-1], deadline_s, seconds))
+            with Checks(**targets):
+                alone.append(capacity(service, pages, seconds / 2))
         under_load = checks.figures()
         with Checks(**targets) as checks:
             beside = stalled(service, pages, 60, seconds / 2)
         under_stalls = checks.figures()
         resident = service.resident_bytes()
+    goodput = [one["answered_per_s"] / fmean(sides) for one, sides in zip(loaded, pairwise(alone), strict=True)]
+    ended = sum((Counter(one["ended"]) for one in loaded), Counter[str]())
+    decodes = sum(one["decodes"] for one in loaded)
     figures = {
         "capacity_per_s": alone,
         "overload": loaded,
-        "goodput": loaded["answered_per_s"] / alone,
+        "goodput": median(goodput),
+        "goodput_of_rounds": goodput,
+        "wasted_share": (decodes - ended["OK"]) / max(1.0, decodes),
         "health_under_overload": under_load,
         "stalled": beside,
         "health_under_stalls": under_stalls,
         "resident_mb": resident / 1e6,
     }
-    click.echo(f"capacity: {alone:.2f} pages/s; asked {loaded['asked_per_s']:.1f}/s with {deadline_s:g} s to answer")
+    asked = fmean(one["asked_per_s"] for one in loaded)
+    click.echo(f"capacity: {fmean(alone):.2f} pages/s; asked {asked:.1f}/s with {deadline_s:g} s to answer")
+    shown = ", ".join(f"{one:.2f}" for one in goodput)
     click.echo(
-        f"goodput {figures['goodput']:.2f} of it; {loaded['ended']}; wasted decodes {loaded['wasted_share']:.1%}"
+        f"goodput {median(goodput):.2f} of it ({shown}); {dict(ended)}; wasted decodes {figures['wasted_share']:.1%}"
     )
     click.echo(
         f"60 stalled streams: {beside['answered_beside']} pages answered beside, {beside['not_answered_beside']} not"

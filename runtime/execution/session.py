@@ -90,6 +90,8 @@ def open_session(model: bytes, subject: str, threads: int | None = None) -> Sess
     options.intra_op_num_threads = available_cpus() if threads is None else threads
     options.inter_op_num_threads = 1
     options.log_severity_level = _ERRORS_ONLY
+    # Between two runs its threads would go on looking for work, on cores that receive frames and recalibrate meanwhile.
+    options.add_session_config_entry("session.force_spinning_stop", "1")
     # A model that names an outside file for its weights must not read this machine's files.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", _NOWHERE)
     try:

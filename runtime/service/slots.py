@@ -17,7 +17,7 @@ from runtime.service.caller import Caller
 MARGIN = 1.1
 """Of the usual time: a call with less time left than this many times it is not begun."""
 
-SLOW = 0.9
+SLOW = 0.95
 """Nor one with less time left than this share of the last calls took at most."""
 
 REMEMBERED = 20
