@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,8 +19,16 @@ from runtime.recalibration.refit import refit
 from runtime.recalibration.work import WorkFolder, told_step
 
 NICENESS = 10
-"""Beside a busy reader such a process gets a tenth of a core: reads hardly notice it, and it does not starve, as it
-would under SCHED_IDLE."""
+"""Beside reads without a pause such a process gets a tenth of a core, and ends. With a higher niceness it would starve,
+as it would under SCHED_IDLE."""
+
+LOWEST = 19
+"""Its niceness once reads have been found to leave it room: it then does with what they leave."""
+
+ROOM = 0.3
+"""Share of a core that it has had lately, from which on they do."""
+
+_LOOK_S = 1.0
 
 _PARENT_GONE = 3
 
@@ -51,6 +60,31 @@ def yield_to_reads() -> None:
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
+def yield_more(room: float = ROOM, look_s: float = _LOOK_S) -> threading.Thread:
+    """Yield all to reads, from a thread, as soon as they leave room.
+
+    There is no way back: who has not the right to it cannot raise a priority. Where reads leave no pause later on, the
+    work runs into its limit of time, and the next one begins as this one did.
+
+    Args:
+        room: share of a core.
+        look_s: time over which it is taken.
+    """
+
+    def watch() -> None:
+        share = -1.0
+        while share < room:
+            begun, worked = time.monotonic(), time.process_time()
+            time.sleep(look_s)
+            share = (time.process_time() - worked) / (time.monotonic() - begun)
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, os.getpid(), LOWEST)  # of the thread that works, which is the first one
+
+    thread = threading.Thread(target=watch, name="lightpage-priority", daemon=True)
+    thread.start()
+    return thread
+
+
 def end_with_parent(pipe: int) -> None:
     """End this process as soon as the other end of `pipe` is closed, as it is when the parent ends or wants so.
 
@@ -74,6 +108,7 @@ def main(folder: str) -> None:
     """Work at low priority until done, or until the parent is gone."""
     end_with_parent(sys.stdin.fileno())
     yield_to_reads()
+    yield_more()
     work(WorkFolder(Path(folder)))
 
 

@@ -29,7 +29,7 @@ from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.recalibration.recalibration import recalibrate
 from runtime.recalibration.separate_process import recalibrate_apart
 from runtime.recalibration.work import Job, WorkFolder
-from runtime.recalibration.worker import NICENESS
+from runtime.recalibration.worker import LOWEST, NICENESS
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
@@ -82,7 +82,7 @@ def test_it_finds_what_this_process_finds_and_leaves_the_bundle_alone(
     (name,) = [name for name, _ in steps if name.startswith("fit in")]
     process, niceness = map(int, re.findall(r"\d+", name))
     assert process != os.getpid()
-    assert niceness == min(19, os.nice(0) + NICENESS)
+    assert niceness in (min(19, os.nice(0) + NICENESS), LOWEST)
     assert [share for _, share in steps] == sorted(share for _, share in steps)
     assert list(folder.iterdir()) == []
 
@@ -209,3 +209,17 @@ def test_a_drifted_bench_device_is_recalibrated_by_the_service_beside_its_reads(
     assert plane.read_page(None, None, Caller()).answer.model_version == outcome.version
     recalibrator.close()
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(("room", "niceness"), [(0.0, LOWEST), (2.0, NICENESS)])
+def test_it_yields_all_once_reads_leave_it_room(room: float, niceness: int) -> None:
+    """Tried in a process of its own: a priority cannot be raised again."""
+    program = (
+        "import os, time\n"
+        "from runtime.recalibration import worker\n"
+        "worker.yield_to_reads()\n"
+        f"worker.yield_more({room}, 0.05).join(1.0)\n"
+        "print(os.getpriority(os.PRIO_PROCESS, os.getpid()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert int(done.stdout) == min(19, os.nice(0) + niceness)
