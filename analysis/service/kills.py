@@ -71,6 +71,11 @@ class Killed:
         """The next service."""
         return RunningService(*self._arguments, environment={"TMPDIR": str(self.temporary)}).start()
 
+    def begin(self) -> None:
+        """Recalibrate once to the end: without a second model there would be nothing to change between."""
+        with self.start() as service, LightpageClient(service.target) as client:
+            client.recalibrate(count=2)
+
     def check(self, service: RunningService, expected: set[str]) -> str:
         """What the service that came after a kill serves; whatever should not be is noted."""
         with LightpageClient(service.target, 60) as client:
@@ -135,6 +140,7 @@ def main(kills: int, seed: int, longest_s: float, out: Path, json_path: Path | N
     simulated(out / "known.h5")
     killed, chance = Killed(out), random.Random(seed)
     failed: list[str] = []
+    killed.begin()
     for _ in track(range(kills), "kills", total=kills):
         try:
             killed.once(chance, longest_s)
