@@ -100,8 +100,7 @@ def main(minutes: float, warm_up: float, load: float, threads: int | None, json_
     }
     click.echo(
         f"{minutes:g} minutes at {load:.0%} behind a warm-up of {warm_up:g}: {figures['calls']} calls ({dict(ended)}), "
-        f"memory from {first / 1e6:.1f} "
-        f"to {last / 1e6:.1f} MB, {figures['growth']:+.2%}"
+        f"memory from {first / 1e6:.1f} to {last / 1e6:.1f} MB, {figures['growth']:+.2%}"
     )
     if json_path is not None:
         write_json(json_path, figures)

@@ -177,7 +177,7 @@ class LightpageClient:
             FrameError: frames that cannot be sent.
             LightpageError: the whole call ended.
         """
-        failed: list[BaseException] = []
+        failed: list[Exception] = []
         bit_depth = self._bit_depth() if bit_depth is None else bit_depth
 
         def parts() -> Iterator[pb.DecodeFramesRequest]:
@@ -186,9 +186,8 @@ class LightpageClient:
                     header = self._header(pair, levels, bit_depth, black_level, pilots, correlation_id, options)
                     set_fields(header, frame_id=number)
                     yield from _parts(header, _sent_frames(pair))
-            except BaseException as error:  # gRPC would tell of it on stderr, and end the call with UNKNOWN
+            except Exception as error:  # gRPC would tell of it on stderr, and end the call with UNKNOWN
                 failed.append(error)
-                call.cancel()
 
         call = self._stub.DecodePages(parts(), timeout=timeout_s)
         try:
@@ -196,9 +195,10 @@ class LightpageClient:
                 refused = reply.WhichOneof("outcome") == "refused"
                 yield error_from(reply.refused.detail) if refused else remote_page(reply.decoded)
         except grpc.RpcError as error:
+            raise (failed[0] if failed else error_of(error, self.target)) from None
+        else:
             if failed:
-                raise failed[0] from None
-            raise error_of(error, self.target) from None
+                raise failed[0]
         finally:
             call.cancel()
 

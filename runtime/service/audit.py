@@ -91,9 +91,9 @@ class AuditLog:
             OSError: the file cannot be written.
         """
         self._put_aside(path, len(line))
-        is_new = not path.exists()
         with open(path, "ab", buffering=0) as file:
             size = os.fstat(file.fileno()).st_size
+            is_new = not size
             try:
                 if (written := file.write(line)) != len(line):
                     raise OSError(None, f"{written} of {len(line)} bytes written")

@@ -567,7 +567,7 @@ def test_the_health_of_all_services_is_told_by_both_servers(start: Start) -> Non
 
                 names = ("", SERVICE.full_name, "lightpage.store")
                 wanted = dict.fromkeys(names, health_pb2.HealthCheckResponse.SERVING)
-                assert wait_until(lambda: states() == wanted)  # noqa: B023
+                assert wait_until(lambda states=states, wanted=wanted: states() == wanted)
                 for name in names:
                     assert ask.Check(health_pb2.HealthCheckRequest(service=name), timeout=5).status == wanted[name]
         service.server.stop(0.5)
