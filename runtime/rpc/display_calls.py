@@ -54,7 +54,7 @@ class DisplayCalls:
         """Hear from a controller what is shown."""
         kind, display = request.WhichOneof("what"), self._plane.display
         if kind is None:
-            raise InvalidInputError("what", "nothing", "a page, its end, or beams")
+            raise InvalidInputError("report of the display", "nothing", "a page, its end, or beams")
         if kind == "beams":
             display.beams_set(BeamState(request.beams.signal, request.beams.reference))
         else:
