@@ -130,9 +130,7 @@ class SelfCalibrationTable(SettingsTable):
     """See `SelfCalibrationSettings`; `enabled` left out means: where pages are named."""
 
     enabled: bool | None = None
-    pages: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**32)], ...], Field(strict=False)] = (
-        SelfCalibrationSettings.pages
-    )
+    pages: Annotated[tuple[_PageNumber, ...], Field(strict=False)] = SelfCalibrationSettings.pages
     least_s: _Seconds = SelfCalibrationSettings.least_s
     longest_s: _Seconds = SelfCalibrationSettings.longest_s
     busy_s: _Seconds = SelfCalibrationSettings.busy_s
