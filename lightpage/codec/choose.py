@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import nct, poisson
 
-from lightpage.codec.code import MOST_CODED_BITS, Code
+from lightpage.codec.code import Code
 from lightpage.codec.ldpc.code import LdpcCode
 from lightpage.codec.ldpc.decoder import decode
 from lightpage.codec.mapping import bit_information, bit_llrs, decide_in_coset, labels, level_bits
 from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import InvalidInputError
-from lightpage.page.levels import MIN_LEVELS
+from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 
 FEWEST_PAGES = 3
 """Fewer say nothing of how pages differ."""
@@ -34,6 +34,10 @@ _CONFIDENCE = 0.95
 """Share of cases in which the pages that were seen say no more than they know: a one-sided tolerance bound."""
 _RATE_STEP = 2
 """Thousandths."""
+_MOST_BITS = MAX_LEVELS.bit_length() - 1
+_CODED_BITS = 2
+"""Label bits of a level that the inner code protects, where the level has so many: the rest lies in the coset. It
+protects more where wrong upper numbers are more than Reed-Solomon mends."""
 _CORRECTIONS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _PAGE_LOSS = 1e-3
 """Of a page whose upper bits Reed-Solomon does not mend: small beside the loss that the rate allows."""
@@ -107,7 +111,7 @@ def choose(
 
     Args:
         draw: draws the known pages.
-        air_bits: what a symbol carries, bits: level counts near it are tried.
+        air_bits: what a symbol carries, bits: level counts near it are tried, and fewer levels where none carries.
         pilots: bool [ny, nx].
         headroom: share of what a symbol carries that is kept for drift.
         seed: of what is drawn.
@@ -116,29 +120,45 @@ def choose(
         InvalidInputError: too few pages, or no code carries a page.
     """
     tried: list[Choice] = []
-    for bits in range(max(1, int(air_bits) - 1), min(8, int(np.ceil(air_bits)) + 1) + 1):
-        choice = _best_of(draw, 1 << bits, pilots, headroom * air_bits, np.random.default_rng([seed, bits]))
+    near = range(max(1, int(air_bits) - 1), min(_MOST_BITS, int(np.ceil(air_bits)) + 1) + 1)
+    count = 0
+    for bits in [*near, *range(near.start - 1, 0, -1)]:
+        if tried and bits < near.start:
+            break
+        rng = np.random.default_rng([seed, bits])
+        pages = draw(1 << bits, rng)
+        count = len(pages)
+        if count < FEWEST_PAGES:
+            raise InvalidInputError("pages to choose a code by", count, f"at least {FEWEST_PAGES}")
+        choice = _best_of(draw, pages, 1 << bits, pilots, headroom * air_bits, rng)
         if choice is not None:
             tried.append(choice)
     if not tried:
         raise InvalidInputError(
-            "pages to choose a code by", f"{air_bits:.2f} bits a symbol", "pages that some code carries"
+            "pages to choose a code by",
+            f"{count} that carry {air_bits:.2f} bits a symbol",
+            "pages that some code carries: more of them, or a decoder that reads them better",
         )
     return max(tried, key=lambda choice: choice.user_bytes), tried
 
 
 def _best_of(
-    draw: Draw, levels: int, pilots: NDArray[np.bool_], kept_bits: float, rng: np.random.Generator
+    draw: Draw,
+    pages: Sequence[DrawnPage],
+    levels: int,
+    pilots: NDArray[np.bool_],
+    kept_bits: float,
+    rng: np.random.Generator,
 ) -> Choice | None:
     """The best code of a level count that leaves `kept_bits` of a symbol, None where none carries the pages."""
-    coded = min(MOST_CODED_BITS, level_bits(levels))
-    pages = draw(levels, rng)
-    if len(pages) < FEWEST_PAGES:
-        raise InvalidInputError("pages to choose a code by", len(pages), f"at least {FEWEST_PAGES}")
-    seen = [_information(page, levels, coded) for page in pages]
-    information, wrong = np.array([each[0] for each in seen]), np.array([each[1] for each in seen])
-    corrections = _corrections(wrong)
-    if corrections is None:
+    bits = level_bits(levels)
+    for coded in range(min(_CODED_BITS, bits), bits + 1):
+        seen = [_information(page, levels, coded) for page in pages]
+        information, wrong = np.array([each[0] for each in seen]), np.array([each[1] for each in seen])
+        corrections = _corrections(wrong)
+        if corrections is not None:
+            break
+    else:
         return None
     deviation = float(information.std(ddof=1))
     weakest = float(information.mean()) - tolerance_factor(len(pages)) * deviation - kept_bits / coded

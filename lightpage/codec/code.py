@@ -13,9 +13,6 @@ from lightpage.codec.mapping import level_bits
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.files import replace_text
 
-MOST_CODED_BITS = 2
-"""Label bits of a level that the inner code protects, where the level has so many: the rest lies in the coset."""
-
 
 class Code(BaseModel):
     """How user bytes are protected on a page.

@@ -1,0 +1,63 @@
+"""A code is found for what pages are like, whatever the shape of their noise, and pages written with it are read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from lightpage.codec.choose import Choice, DrawnPage, choose
+from lightpage.codec.page_codec import PageCodec
+from lightpage.errors import InvalidInputError
+from lightpage.page.symbols import symbol_phases
+from tests.lightpage.codec.light import header_of, pilot_mask, written
+
+SHAPE = (32, 48)
+PILOTS = pilot_mask(SHAPE)
+KAPPA = 2000.0
+
+
+def light(
+    symbols: np.ndarray, levels: int, kappa: float, lost_share: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Phases and concentrations of symbols, of which a share shows nothing and is known to show nothing."""
+    lost = rng.random(symbols.shape) < lost_share
+    error = np.where(lost, rng.uniform(-np.pi, np.pi, symbols.shape), rng.vonmises(0, kappa, symbols.shape))
+    return symbol_phases(symbols, levels) + error, np.where(lost, 0.01, kappa)
+
+
+def choose_by(pages: int, kappa: float, lost_share: float, air_bits: float) -> tuple[Choice, list[Choice]]:
+    def draw(levels: int, rng: np.random.Generator) -> Sequence[DrawnPage]:
+        count = int(np.count_nonzero(~PILOTS))
+        drawn = [rng.integers(0, levels, count).astype(np.uint8) for _ in range(pages)]
+        return [DrawnPage(*light(each, levels, kappa, lost_share, rng), each) for each in drawn]
+
+    return choose(draw, air_bits, PILOTS)
+
+
+@pytest.mark.parametrize(("lost_share", "some_in_cosets"), [(0.0, True), (0.02, False)])
+def test_pages_are_read_with_the_code_that_was_chosen_by_their_like(lost_share: float, some_in_cosets: bool) -> None:
+    chosen, tried = choose_by(4, KAPPA, lost_share, 4.2)
+    assert (chosen.code.coded_bits < chosen.code.level_bits) == some_in_cosets
+    assert chosen.user_bytes == max(each.user_bytes for each in tried)
+    codec, rng = PageCodec(chosen.code, PILOTS), np.random.default_rng(8)
+    for page in range(5):
+        data, symbols = written(codec, header_of(codec, page=page), rng)
+        assert codec.decode(*light(symbols, chosen.code.levels, KAPPA, lost_share, rng)).data == data
+
+
+def test_fewer_levels_are_tried_where_none_near_the_rate_carries() -> None:
+    chosen, tried = choose_by(4, 50.0, 0.0, 7.5)  # a rate that no such page has
+    assert chosen.code.levels < 64
+    assert len(tried) == 1
+
+
+def test_pages_that_nothing_carries_are_refused_with_what_they_were() -> None:
+    with pytest.raises(InvalidInputError, match=r"got 4 that carry 0\.10 bits a symbol, wanted pages that some code"):
+        choose_by(4, KAPPA, 0.9, 0.1)
+
+
+def test_two_pages_are_too_few() -> None:
+    with pytest.raises(InvalidInputError, match="got 2, wanted at least 3"):
+        choose_by(2, KAPPA, 0.0, 4.0)
