@@ -27,6 +27,7 @@ from runtime.console.server import Console, ConsoleServer
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.errors import LostShotError, SourceError
+from runtime.execution.memory import share_freed_memory
 from runtime.rpc.health_server import HealthServer, next_port
 from runtime.rpc.server import LightpageServer
 from runtime.service.audit import AuditLog
@@ -136,6 +137,7 @@ def serve(context: click.Context, /, config: Path | None, print_config: bool, **
         return
     settings = effective.settings
     settings.check_paths()
+    share_freed_memory()
     logs = settings.logs
     written = logging_to_stderr(logs.format, logs.level, logs.lines_per_second)
     with stop_signals() as wait_for_stop, written, reporting(None):  # what work tells of itself is logged too
