@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import logging
 import warnings
 from typing import Any
@@ -21,6 +22,8 @@ from train.models.twin import RayTwin
 OPSET = 20
 _FOLDED = 20_000
 """Largest constant, elements, that folding may leave in a file: a runtime folds the rest when it loads the graph."""
+_SCOPES = "pkg.torch.onnx.name_scopes"
+"""The exporter's note of a node's modules, the outermost first, and last the node itself."""
 TWIN_INPUTS = ("parameters", "points", "anchors", "camera_places")
 TWIN_OUTPUTS = ("places", "phases", "positions", "pixels")
 
@@ -109,8 +112,20 @@ def _halve(model: onnx.ModelProto, prefixes: tuple[str, ...]) -> None:
         model.graph.node.insert(0, cast)
 
 
+def _module_of(node: onnx.NodeProto) -> list[str]:
+    """Path of the module that a node comes from, e.g. decoder, network, stem."""
+    notes = {note.key: note.value for note in node.metadata_props}
+    scopes = ast.literal_eval(notes.get(_SCOPES, "['']"))
+    return scopes[-2].split(".") if len(scopes) > 1 and scopes[-2] else []
+
+
 def _anonymous(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The model without the exporter's notes: they name the files of the machine that exported it."""
+    """The model without the exporter's notes, which name the files of the machine that exported it.
+
+    Nodes are named after the module that they come from.
+    """
+    for node in model.graph.node:
+        node.name = "/".join([*_module_of(node), node.name])
     graphs: list[Any] = [model.graph, *model.functions]
     parts = [part for graph in graphs for part in (*graph.node, *graph.value_info)]
     noted = [model, *graphs, *parts, *model.graph.input, *model.graph.output, *model.graph.initializer]

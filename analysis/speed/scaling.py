@@ -14,7 +14,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from analysis.speed.speed import at_symbol_pitch, frames_of, seconds_of, session_of
+from analysis.speed.speed import at_symbol_pitch, frames_of, opened, seconds_of
 from analysis.studies.scaling import enlarged
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
@@ -51,7 +51,7 @@ def main(
     click.echo(f"{'symbols':>8} {'ms a page':>10} {'us a symbol':>12} {'over the smallest':>18}")
     for factor in sorted(set(factors)):
         profile = enlarged(smallest, factor)
-        session, feeds = session_of(profile, *at_symbol_pitch(profile, "coherent"), threads), frames_of(profile)
+        session, feeds = opened(profile, *at_symbol_pitch(profile, "coherent"), threads), frames_of(profile)
         session.run(["p"], feeds)
         seconds = [seconds_of(session, feeds) for _ in range(repeats)]
         results.append(Scaled(profile.page.columns * profile.page.rows, float(np.median(seconds))))

@@ -33,10 +33,10 @@ from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.files import write_json
 from lightpage.recording.frame_pair import FramePair
-from runtime.decoding.decoder import inputs_left
+from runtime.decoding.decoder import PAGE_INPUTS
 from runtime.execution.constant_table import GraphFile
 from runtime.execution.cpus import available_cpus
-from runtime.execution.session import Session, open_session
+from runtime.execution.table_graph import TableGraph
 from train.models.decoder import SymbolDecoder
 from train.models.hyperparameters import Hyperparameters
 from train.models.presets import FAST, PRESETS
@@ -98,10 +98,10 @@ class Timed:
     parameters: int
 
 
-def session_of(profile: Profile, graph: Graph, tensors: Tensors, threads: int) -> Session:
-    """The graph in the runtime that serves, its table built in as it does that."""
+def opened(profile: Profile, graph: Graph, tensors: Tensors, threads: int) -> TableGraph:
+    """The graph in the runtime that serves."""
     model = decoder_onnx(graph.eval(), "uint8", profile.frame_shape, tensors)
-    return open_session(GraphFile(model, "speed").built_in({}, inputs_left(profile)), "speed", threads)
+    return TableGraph(GraphFile(model, "speed"), "speed", PAGE_INPUTS, threads)
 
 
 def frames_of(profile: Profile) -> dict[str, np.ndarray]:
@@ -110,11 +110,11 @@ def frames_of(profile: Profile) -> dict[str, np.ndarray]:
     return {name: rng.integers(60, 140, profile.frame_shape, dtype=np.uint8) for name in FRAME_INPUTS}
 
 
-def seconds_of(session: Session, feeds: dict[str, np.ndarray]) -> float:
+def seconds_of(graph: TableGraph, feeds: dict[str, np.ndarray]) -> float:
     """How long one decode takes, the threads of the one before at rest."""
     time.sleep(SETTLE_S)
     start = time.perf_counter()
-    session.run(["p"], feeds)
+    graph.run(["p"], feeds)
     return time.perf_counter() - start
 
 
@@ -139,7 +139,7 @@ def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int |
     sessions, sizes = {}, {}
     for name in dict.fromkeys(names or known):
         graph, tensors = known[name]()
-        sessions[name], sizes[name] = session_of(profile, graph, tensors, threads), weights(graph)
+        sessions[name], sizes[name] = opened(profile, graph, tensors, threads), weights(graph)
     feeds = frames_of(profile)
     taken: dict[str, list[float]] = {name: [] for name in sessions}
     for repeat in range(repeats + 1):

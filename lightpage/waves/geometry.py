@@ -123,7 +123,7 @@ def couplings(geometry: WaveGeometry, xp: Any = np) -> Couplings:
 
 
 def on_facet(factors: Couplings, across: Any, up: Any) -> tuple[Any, Any]:
-    """A point (X, Y') of the oblique facet as Cartesian coordinates of the lens's plane."""
+    """A point (X, Y') of the oblique facet as Cartesian coordinates along the lens's x and y."""
     return factors.x_to_x * across + factors.x_to_y * up, factors.y_to_x * across + factors.y_to_y * up
 
 

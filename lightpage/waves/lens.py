@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lightpage.device.lens_path import IDEAL
-from lightpage.waves.geometry import Complex, Real, WaveGeometry, couplings, facet_axis, on_facet, sine_matrix
-from lightpage.waves.low_rank import Expansion, Interpolation, Phase
+from lightpage.device.lens_path import IDEAL, SeidelTerms
+from lightpage.waves.geometry import (
+    Complex,
+    Couplings,
+    Real,
+    WaveGeometry,
+    couplings,
+    facet_axis,
+    on_facet,
+    sine_matrix,
+)
+from lightpage.waves.low_rank import Expansion
 
 _TOLERANCE = 1e-7
 """Singular values of an ideal lens's expansion are dropped below this share of the largest: less than rounding."""
 
 _TOLERANCE_WITH_PATH = 1e-3
-"""The same for a real lens, a field error of about 0.002; 1e-5 would take twice the terms, a hundred at full size."""
+"""The same for a real lens, a field error of about 0.002; 1e-5 would take twice the terms."""
 
 
 def lens_kernel(geometry: WaveGeometry, rows: Real, columns: Real) -> Complex:
@@ -34,20 +43,64 @@ def entrance_window(
         envelope_m, blur_m: see `WaveChannel`.
         xp: as for `couplings`.
     """
-    t = geometry.pipe_angle
     per_metre = 1 / (geometry.wavelength_m * geometry.focal_length_m)
-    fy = (facet_y_m[:, None] / xp.cos(t) - facet_x_m[None, :] * xp.tan(t)) * per_metre
-    fx = facet_x_m[None, :] * per_metre
+    along = on_facet(couplings(geometry, xp), facet_x_m, facet_y_m[:, None])
+    fx, fy = (place * per_metre for place in along)
     pixel = xp.sinc(fx * envelope_m) * xp.sinc(fy * envelope_m)
     return pixel * xp.exp(-2 * (np.pi * blur_m) ** 2 * (fx**2 + fy**2))
+
+
+@dataclass(frozen=True)
+class LensPath:
+    """A lens's phase between (x, y) on its plane and (X, Y') on the facet beyond three of the couplings, by parts.
+
+    What depends on the facet alone, on x and X, on y and X or on y and Y' has a place in the factors that the couplings
+    have. Only the `rest` needs terms of its own: half as many as all of it would. In numpy or torch.
+
+    Args:
+        geometry: the device.
+        path: beyond an ideal lens's.
+        factors: `couplings` of the geometry.
+    """
+
+    geometry: WaveGeometry
+    path: SeidelTerms
+    factors: Couplings
+
+    def on_facet(self, across: Any, up: Any) -> Any:
+        """Radians of the part that the facet alone decides."""
+        return self._at(0.0, 0.0, across, up)
+
+    def x_to_x(self, x: Any, across: Any) -> Any:
+        """Radians of x and X."""
+        return self._at(x, 0.0, across, 0.0) - self._at(0.0, 0.0, across, 0.0)
+
+    def y_to_x(self, y: Any, across: Any) -> Any:
+        """Radians of y and X."""
+        return self._at(0.0, y, across, 0.0) - self._at(0.0, 0.0, across, 0.0)
+
+    def y_to_y(self, y: Any, up: Any) -> Any:
+        """Radians of y and Y'."""
+        return self._at(0.0, y, 0.0, up) - self._at(0.0, 0.0, 0.0, up)
+
+    def rest(self, x: Any, y: Any, across: Any, up: Any) -> Any:
+        """Radians of what is left, the coupling of x with Y' included, which a roll makes."""
+        rolled = -self.geometry.wave_number / self.geometry.focal_length_m * self.factors.x_to_y * x * up
+        if self.path is IDEAL:
+            return rolled
+        pairs = self.x_to_x(x, across) + self.y_to_x(y, across) + self.y_to_y(y, up)
+        return rolled + self._at(x, y, across, up) - self.on_facet(across, up) - pairs
+
+    def _at(self, x: Any, y: Any, across: Any, up: Any) -> Any:
+        return self.path.of_both(x, y, *on_facet(self.factors, across, up))
 
 
 class FourierLens:
     """A 2f lens between a Cartesian plane (SLM or camera) and the oblique sample grid on a pipe facet.
 
     The kernel exp(-i k/f (x X + y Y)) is a product of four couplings of (x, y) with the facet's (X, Y'). Three of them
-    factor into matrix products; the fourth, x with Y', is there only when the pipe is rolled. It and the path of a real
-    lens beyond the ideal one vary by a few radians and are expanded in few terms.
+    factor into matrix products, and so does much of a real lens's path (`LensPath`). The rest varies by a few radians
+    and is expanded in few terms.
 
     Args:
         geometry: the device.
@@ -58,7 +111,7 @@ class FourierLens:
     Attributes:
         x_to_x, y_and_x, y_to_y: the three couplings that factor, [nx, fx], [ny, fx] and [fy, ny].
         terms: of the rest, between plane and facet.
-        on_plane: phasor of the lens's path that depends on the plane alone, [ny, nx], or one.
+        on_plane, on_facet: phasors of the lens's path that depend on one of them alone, [ny, nx] and [fy, fx], or one.
     """
 
     def __init__(
@@ -68,6 +121,7 @@ class FourierLens:
         facet_y, facet_x = (facet_axis(count, w) for count in cells)
         factors = couplings(geometry)
         path = geometry.lens_path.mirrored() if second else geometry.lens_path
+        path = IDEAL if path == IDEAL else path
 
         def kernel(factor: float, rows: Real, columns: Real) -> Complex:
             return lens_kernel(geometry, factor * rows, columns)
@@ -77,29 +131,17 @@ class FourierLens:
         self.x_to_x = (unitary * kernel(factors.x_to_x, x_m, facet_x)).astype(np.complex64)
         self.y_and_x = kernel(factors.y_to_x, y_m, facet_x).astype(np.complex64)
         self.y_to_y = kernel(factors.y_to_y, facet_y, y_m).astype(np.complex64)
-        tolerance = _TOLERANCE if path == IDEAL else _TOLERANCE_WITH_PATH
-        self._geometry, self._path = geometry, path
-        self._planes = (x_m, y_m), (facet_x, facet_y)
-        self.terms = Expansion.of(self._rest(geometry), *self._planes, tolerance)
+        tolerance = _TOLERANCE if path is IDEAL else _TOLERANCE_WITH_PATH
+        beyond = LensPath(geometry, path, factors)
+        self.terms = Expansion.of(beyond.rest, (x_m, y_m), (facet_x, facet_y), tolerance)
         self.on_plane: Complex = np.ones((1, 1), np.complex64)
-        if path != IDEAL:
-            self.on_plane = np.exp(1j * path.of_field(x_m[None, :], y_m[:, None])).astype(np.complex64)
-
-    def interpolation(self, roll_margin: float, tolerance: float) -> Interpolation:
-        """Of what does not factor, for rolls up to so many radians to either side of the geometry's."""
-        rolls = (self._geometry.pipe_roll + share * roll_margin for share in (-1, 0, 1))
-        phases = [self._rest(replace(self._geometry, pipe_roll=roll)) for roll in rolls]
-        return Interpolation.of(phases, *self._planes, tolerance)
-
-    def _rest(self, geometry: WaveGeometry) -> Phase:
-        """What does not factor, of a geometry with the same lenses."""
-        factors, path = couplings(geometry), self._path
-
-        def phase(x: Real, y: Real, across: Real, up: Real) -> Real:
-            rolled = -geometry.wave_number / geometry.focal_length_m * factors.x_to_y * x * up
-            return np.asarray(rolled + path.of_both(x, y, *on_facet(factors, across, up)))
-
-        return phase
+        self.on_facet: Complex = self.on_plane
+        if path is not IDEAL:
+            self.x_to_x *= _phasor(beyond.x_to_x(x_m[:, None], facet_x))
+            self.y_and_x *= _phasor(beyond.y_to_x(y_m[:, None], facet_x))
+            self.y_to_y *= _phasor(beyond.y_to_y(y_m, facet_y[:, None]))
+            self.on_plane = _phasor(path.of_field(x_m, y_m[:, None]))
+            self.on_facet = _phasor(beyond.on_facet(facet_x, facet_y[:, None]))
 
     def to_facet(self, field: Complex) -> Complex:
         """Field on the plane [ny, nx] to the facet's grid [cells_y - 1, cells_x - 1]."""
@@ -110,11 +152,11 @@ class FourierLens:
             term *= at_facet
             total = term if total is None else total + term
         assert total is not None
-        return total
+        return np.asarray(total * self.on_facet)
 
     def to_plane(self, field: Complex) -> Complex:
         """The adjoint of `to_facet`: a field on the facet's grid to the plane [ny, nx], kernel exp(+i ...)."""
-        field = field.astype(np.complex64)
+        field = field.astype(np.complex64) * self.on_facet.conj()
         total: Complex | None = None
         for at_plane, at_facet in self.terms.terms():
             inner = (self.y_to_y.conj().T @ (field * at_facet.conj())) * self.y_and_x.conj()
@@ -122,6 +164,10 @@ class FourierLens:
             total = term if total is None else total + term
         assert total is not None
         return np.asarray(total * self.on_plane.conj())
+
+
+def _phasor(phase: Real) -> Complex:
+    return np.asarray(np.exp(1j * phase), np.complex64)
 
 
 def modes_of_plane(geometry: WaveGeometry, plane_m: Real, cells: int) -> Complex:

@@ -19,6 +19,8 @@ Phase = Callable[[Real, Real, Real, Real], Real]
 
 _SPARE_DEGREES = 12
 """Degrees beyond the steepest phase along an axis, in radians over half of the axis, that its polynomials need."""
+_SPARE_IN_TILES = 4
+"""The same where a tolerance of a percent serves."""
 _PROBES = 9
 """Places along an axis that are asked how steep the phase is."""
 _FLAT = 1e-9
@@ -72,12 +74,14 @@ class Expansion:
 
 @dataclass(frozen=True)
 class Interpolation:
-    """exp(i phase) on the samples of a plane from its values at few nodes, whatever the place on the other plane.
+    """exp(i phase) on the samples of many alike tiles of a plane from its values at few nodes of each tile.
+
+    It holds whatever the place on the other plane.
 
     Attributes:
-        nodes: places (x, y) on the first plane, [R, 2].
-        weights: polynomial coefficients of each node's weight, [R, y, x].
-        axes: the polynomials at the plane's samples (y, x); an axis on which nothing depends has one sample.
+        nodes: places (x, y) within each tile, [T, R, 2].
+        weights: polynomial coefficients of each node's weight, [T, R, y, x].
+        axes: the polynomials at a tile's samples (y, x).
     """
 
     nodes: Real
@@ -85,19 +89,42 @@ class Interpolation:
     axes: tuple[Real, Real]
 
     @classmethod
-    def of(cls, phases: Sequence[Phase], first: Plane, second: Plane, tolerance: float) -> Interpolation:
-        """For any of the phases and what lies between them; arguments as for `Expansion.of`."""
-        by_axis = zip(*(_axes(phase, first, second) for phase in phases), strict=True)
-        finest = [max(same, key=lambda axis: len(axis.nodes)) for same in by_axis]
-        kernels = np.concatenate([_kernel(phase, finest) for phase in phases], axis=1)
-        basis = _leading_vectors(kernels, tolerance)
-        x, y = finest[:2]
+    def of(cls, phases: Sequence[Sequence[Phase]], tile: Plane, second: Plane, tolerance: float) -> Interpolation:
+        """As few nodes as serve, the same number in each tile.
+
+        Args:
+            phases: of each tile some phases, for these and what lies between them, places told within the tile.
+            tile: sample places of one tile.
+            second: of the other plane.
+            tolerance: root mean square error over all tiles.
+        """
+        by_axis = zip(*(_axes(phase, tile, second, _SPARE_IN_TILES) for some in phases for phase in some), strict=True)
+        axes = [max(same, key=lambda axis: len(axis.nodes)) for same in by_axis]
+        x, y = axes[:2]
+        kernels = [np.concatenate([_kernel(phase, axes) for phase in some], axis=1) for some in phases]
+        orders = [_pivots(kernel) for kernel in kernels]
+        for count in range(1, len(kernels[0]) + 1):
+            fits = [_least_squares(kernel, order[:count]) for kernel, order in zip(kernels, orders, strict=True)]
+            if np.mean([error for _, error in fits]) <= tolerance**2:
+                break
         root = np.sqrt(np.outer(x.weights, y.weights)).reshape(-1, 1)
-        _, _, pivots = scipy.linalg.qr(basis.T, pivoting=True, mode="economic")
-        chosen = pivots[: basis.shape[1]]
-        weights = (basis @ np.linalg.inv(basis[chosen] / root[chosen])).T
         places = np.stack(np.meshgrid(x.places, y.places, indexing="ij"), axis=-1).reshape(-1, 2)
-        return cls(places[chosen], _coefficients(weights, x, y), (_varying(y.at_samples), _varying(x.at_samples)))
+        chosen = [order[:count] for order in orders]
+        weights = [_coefficients((fit * root[own, 0]).T, x, y) for (fit, _), own in zip(fits, chosen, strict=True)]
+        return cls(places[np.stack(chosen)], np.stack(weights), (y.at_samples, x.at_samples))
+
+
+def _pivots(kernel: Complex) -> NDArray[np.intp]:
+    """Rows of a kernel, each the one that those before it say least of."""
+    left, values, _ = np.linalg.svd(kernel, full_matrices=False)
+    return np.asarray(scipy.linalg.qr((left * values).conj().T, pivoting=True, mode="r")[1])
+
+
+def _least_squares(kernel: Complex, rows: NDArray[np.intp]) -> tuple[Complex, float]:
+    """All rows of a kernel by some of them, [N, R], and the share of its power that they leave."""
+    basis = kernel[rows]
+    fit = kernel @ np.linalg.pinv(basis, rcond=1e-6)
+    return fit, float(np.sum(np.abs(fit @ basis - kernel) ** 2) / np.sum(np.abs(kernel) ** 2))
 
 
 @dataclass(frozen=True)
@@ -116,8 +143,8 @@ class _Axis:
     at_samples: Real
 
     @classmethod
-    def of(cls, samples: Real, steepest: float) -> _Axis:
-        degree = 0 if steepest < _FLAT else int(np.ceil(steepest)) + _SPARE_DEGREES
+    def of(cls, samples: Real, steepest: float, spare: int) -> _Axis:
+        degree = 0 if steepest < _FLAT else int(np.ceil(steepest)) + spare
         nodes, weights = leggauss(degree + 1)
         centre, half = _extent(samples)
         return cls(
@@ -136,14 +163,14 @@ def _extent(samples: Real) -> tuple[float, float]:
     return float(samples[0] + samples[-1]) / 2, max(float(np.ptp(samples)) / 2, _POINT)
 
 
-def _axes(phase: Phase, first: Plane, second: Plane) -> list[_Axis]:
+def _axes(phase: Phase, first: Plane, second: Plane, spare: int = _SPARE_DEGREES) -> list[_Axis]:
     """Axes (x, y, X, Y) with as many nodes as the phase needs."""
     samples = [*first, *second]
     probes = np.linspace(-1, 1, _PROBES)
     places = [centre + half * probes for centre, half in map(_extent, samples)]
     seen = np.broadcast_to(phase(*np.meshgrid(*places, indexing="ij", sparse=True)), [_PROBES] * 4)
     slopes = np.gradient(seen, probes[1] - probes[0])
-    return [_Axis.of(axis, float(np.abs(slope).max())) for axis, slope in zip(samples, slopes, strict=True)]
+    return [_Axis.of(axis, float(np.abs(slope).max()), spare) for axis, slope in zip(samples, slopes, strict=True)]
 
 
 def _kernel(phase: Phase, axes: list[_Axis]) -> Complex:

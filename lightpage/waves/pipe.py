@@ -76,6 +76,7 @@ class ParityBasis:
     Args:
         cells: sample intervals.
         lag: phase in radians by which a mode falls behind in a step, over the square of its number.
+        chosen: which modes of each parity, all if left out.
 
     Attributes:
         sine_by_parity: samples of the modes, [2, K, cells - 1], zero where a parity has one mode less.
@@ -84,24 +85,21 @@ class ParityBasis:
             that stay together.
     """
 
-    def __init__(self, cells: int, lag: float) -> None:
-        count = cells - 1
-        size = (count + 1) // 2
-        odd = np.arange(1, count + 1, 2)
-        even = np.arange(2, count + 1, 2)
-        coupling = np.zeros((size, size))
-        m, n = odd[:, None].astype(float), even[None, :].astype(float)
+    def __init__(self, cells: int, lag: float, chosen: slice = slice(None)) -> None:
+        self.mode_numbers = modes_by_parity(cells)[:, chosen]
+        m, n = self.mode_numbers[0, :, None], self.mode_numbers[1, None, :]
         # (2/w) integral of sin(m pi x/w) d/dx sin(n pi x/w), times w
-        coupling[: len(odd), : len(even)] = 4 * m * n / (m**2 - n**2) * _stay_together(lag * (m**2 - n**2))
+        coupling = 4 * m * n / (m**2 - n**2) * _stay_together(lag * (m**2 - n**2))
         left, self.couplings, right = np.linalg.svd(coupling)
         self.singular = np.stack([left, right.T]).astype(np.float32)
-        self.mode_numbers = np.zeros((2, size))
-        self.mode_numbers[0, : len(odd)] = odd
-        self.mode_numbers[1, : len(even)] = even
-        sine = sine_matrix(cells)
-        self.sine_by_parity = np.zeros((2, size, count), dtype=np.float32)
-        self.sine_by_parity[0, : len(odd)] = sine[odd - 1]
-        self.sine_by_parity[1, : len(even)] = sine[even - 1]
+        sine = np.concatenate([np.zeros((1, cells - 1)), sine_matrix(cells)])
+        self.sine_by_parity = sine[self.mode_numbers.astype(int)].astype(np.float32)
+
+
+def modes_by_parity(cells: int) -> Real:
+    """Numbers of all modes of an axis with so many sample intervals, odd and even, [2, K]; 0 where there is none."""
+    numbers = np.arange(1, 2 * (cells // 2) + 1).reshape(-1, 2).T
+    return np.where(numbers < cells, numbers, 0).astype(float)
 
 
 def _stay_together(apart: Real) -> Real:

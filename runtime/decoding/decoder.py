@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.sampling_table import SamplingTable
-from lightpage.device.profile import Profile
 from lightpage.errors import BundleError, FrameError, FramesDisagreeError, InvalidInputError, NoCodeError
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.levels import MAX_LEVELS
@@ -36,16 +35,9 @@ if TYPE_CHECKING:
 
 OUTPUTS = ("p", "phase", "concentration")
 PAGE_INPUTS = frozenset(["registration"])
-"""Table inputs that may differ from page to page, as the image shifts."""
-_LARGE_WITH_REAL_LENSES = frozenset(["parameters"])
-"""Table inputs from which gigabytes follow, with lenses that are not ideal: no sooner read than made again."""
+"""Table inputs that may differ from page to page, as the image shifts. All others are built into the graph."""
 GOLDEN_TOLERANCE = 1e-3
 """Largest error of p on the golden page, relative to its norm: room for another CPU's rounding, not for another net."""
-
-
-def inputs_left(profile: Profile) -> frozenset[str]:
-    """Table inputs of a device's decoder that are not built into its graph."""
-    return PAGE_INPUTS if profile.ideal_lenses else PAGE_INPUTS | _LARGE_WITH_REAL_LENSES
 
 
 @contextmanager
@@ -68,7 +60,7 @@ def open_graph(bundle: Bundle, threads: int | None = None) -> TableGraph:
     if set(file.table_inputs) != set(bundle.manifest.table_inputs):
         raise BundleError(f"{subject}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
     with _table_of(bundle):
-        return TableGraph(file, subject, inputs_left(bundle.profile), threads, bundle.table)
+        return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table)
 
 
 class Decoder:
@@ -287,7 +279,7 @@ class Decoder:
     def _check_graph(self) -> None:
         """Check names, types and shapes of the frames and of what the graph says of them."""
         manifest, profile, subject = self.bundle.manifest, self.bundle.profile, f"{self.bundle.subject}: {DECODER}"
-        inputs = {node.name: Port.of(node) for node in self.graph.session.get_inputs()}
+        inputs = self.graph.inputs
         if set(inputs) != {"in_phase", "quadrature"}:
             raise BundleError(f"{subject}: inputs", sorted(inputs), "in_phase and quadrature")
         for name, port in inputs.items():

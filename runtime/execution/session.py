@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
@@ -70,18 +71,25 @@ class Session(Protocol):
     def run(self, output_names: Sequence[str], input_feed: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """Outputs of the names asked for."""
 
+    def end_profiling(self) -> str:
+        """Path of the profile, where one is kept, with all runs so far."""
+
 
 _ERRORS_ONLY = 3
 _NOWHERE = os.path.join(os.sep, "nonexistent", "lightpage")
 
 
-def open_session(model: bytes, subject: str, threads: int | None = None) -> Session:
+def open_session(
+    model: bytes, subject: str, threads: int | None = None, *, once: bool = False, profile: Path | None = None
+) -> Session:
     """Open an ONNX model held in memory on the CPU.
 
     Args:
         model: the serialised model; weights in other files are not looked for.
         subject: what it is, for the error, e.g. ``"bundle B: decoder.onnx"``.
         threads: threads for one run; by default as many as this process has cores.
+        once: whether it will run a single time: then it is not worth while to prepare much.
+        profile: beginning of the path of a file in which the runtime notes how long each node takes.
 
     Raises:
         BundleError: the bytes are no ONNX model that this onnxruntime can run.
@@ -92,6 +100,11 @@ def open_session(model: bytes, subject: str, threads: int | None = None) -> Sess
     options.log_severity_level = _ERRORS_ONLY
     # Between two runs its threads would go on looking for work, on cores that receive frames and recalibrate meanwhile.
     options.add_session_config_entry("session.force_spinning_stop", "1")
+    if once:
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        options.enable_cpu_mem_arena = False
+    if profile is not None:
+        options.enable_profiling, options.profile_file_prefix = True, str(profile)
     # A model that names an outside file for its weights must not read this machine's files.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", _NOWHERE)
     try:

@@ -1,8 +1,9 @@
-"""A decoder's graph opened with one table: most of the table is built in, a few tensors are fed with each page."""
+"""A decoder's graph opened with one table: what follows from it is computed once, and fed with each page."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,8 @@ class TableGraph:
         fed: names of table inputs that stay inputs, and are fed.
         threads: threads of one run; by default the cores that this process may use.
         table: values instead of the graph's defaults.
+        like: the same graph with another table: what runs for every page is shared with it.
+        profile: see `open_session`.
 
     Raises:
         InvalidInputError: a table that does not fit.
@@ -36,16 +39,40 @@ class TableGraph:
         fed: Collection[str],
         threads: int | None,
         table: SamplingTable | None = None,
+        like: TableGraph | None = None,
+        profile: Path | None = None,
     ) -> None:
         self._file, self._subject, self._fed_names, self._threads = file, subject, fed, threads
         self.table: SamplingTable = table or {}
         self.check(self.table)
-        self._fed = {name: value for name, value in self.table.items() if name in fed}
-        self.session: Session = open_session(file.built_in(self.table, fed), subject, threads)
+        fed_values = {name: value for name, value in self.table.items() if name in fed}
+        parts = file.cut(self.table, fed)
+        self._between: dict[str, NDArray[Any]] = {}
+        if parts.before is not None:  # else nothing follows from the table alone
+            before = open_session(parts.before, subject, threads, once=True)
+            self._between = dict(zip(parts.between, before.run(parts.between, {}), strict=True))
+        self._between |= {name: self.value(name) for name in parts.direct}
+        if like is not None and self._between:
+            self.session: Session = like.session
+        else:
+            self.session = open_session(parts.behind_with(self._between), subject, threads, profile=profile)
+        self._fed = fed_values | self._between
 
     def with_table(self, table: SamplingTable) -> TableGraph:
         """The graph with other tensors in its table, by name; those left out stay. Errors as for the constructor."""
-        return TableGraph(self._file, self._subject, self._fed_names, self._threads, {**self.table, **table})
+        merged = {**self.table, **table}
+        return TableGraph(self._file, self._subject, self._fed_names, self._threads, merged, like=self)
+
+    @property
+    def inputs(self) -> dict[str, Port]:
+        """Type and shape of what must be fed with each page, by name."""
+        nodes = self.session.get_inputs()
+        return {node.name: Port.of(node) for node in nodes if node.name not in self._between}
+
+    @property
+    def between_bytes(self) -> int:
+        """Of all that follows from the table."""
+        return sum(value.nbytes for value in self._between.values())
 
     @property
     def ports(self) -> Mapping[str, Port]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -21,6 +23,40 @@ def parts(stack: Tensor) -> Parts:
     return stack[0], stack[1]
 
 
+class Matrix(NamedTuple):
+    """A complex matrix [..., m, n] for products that take three real ones and not four.
+
+    Attributes:
+        real: its real part.
+        difference, sum: imaginary part less the real one, and both together.
+    """
+
+    real: Tensor
+    difference: Tensor
+    sum: Tensor
+
+    @classmethod
+    def of(cls, value: Parts) -> Matrix:
+        """The matrix with these parts."""
+        return cls(value[0], value[1] - value[0], value[0] + value[1])
+
+    @property
+    def adjoint(self) -> Matrix:
+        """Its conjugate transpose."""
+        real, difference, both = (part.transpose(-1, -2) for part in self)
+        return Matrix(real, -both, -difference)
+
+    def times(self, right: Parts) -> Parts:
+        """This matrix times another one."""
+        both = self.real @ (right[0] + right[1])
+        return both - self.sum @ right[1], both + self.difference @ right[0]
+
+    def behind(self, left: Parts) -> Parts:
+        """Another matrix times this one."""
+        both = (left[0] + left[1]) @ self.real
+        return both - left[1] @ self.sum, both + left[0] @ self.difference
+
+
 def matmul(left: Parts, right: Parts) -> Parts:
     """Matrix product."""
     return left[0] @ right[0] - left[1] @ right[1], left[0] @ right[1] + left[1] @ right[0]
@@ -29,6 +65,16 @@ def matmul(left: Parts, right: Parts) -> Parts:
 def multiply(left: Parts, right: Parts) -> Parts:
     """Product, element by element."""
     return left[0] * right[0] - left[1] * right[1], left[0] * right[1] + left[1] * right[0]
+
+
+def scaled(value: Parts, factor: Tensor) -> Parts:
+    """Times a real factor that broadcasts."""
+    return value[0] * factor, value[1] * factor
+
+
+def phasor(phase: Tensor) -> Parts:
+    """exp(i phase), of radians."""
+    return torch.cos(phase), torch.sin(phase)
 
 
 def conjugate(value: Parts) -> Parts:

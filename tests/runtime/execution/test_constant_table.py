@@ -1,4 +1,4 @@
-"""Tables built into a graph: fewer inputs, the same answers."""
+"""Graphs cut behind what follows from their table: fewer inputs, the same answers."""
 
 from __future__ import annotations
 
@@ -7,16 +7,21 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
+from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import BundleError
 from runtime.execution.constant_table import GraphFile
 from runtime.execution.session import Port, open_session
+from runtime.execution.table_graph import TableGraph
 from tests.runtime import toy
 
 FRAMES = {"in_phase", "quadrature"}
 
 
-def names_of(model: bytes) -> set[str]:
-    return {node.name for node in onnx.load_from_string(model).graph.input}
+def answers(
+    model: bytes, outputs: list[str], table: SamplingTable, fed: tuple[str, ...], **frames: np.ndarray
+) -> list[np.ndarray]:
+    """Of a graph that is given all of its table but what is fed."""
+    return TableGraph(GraphFile(model, "graph"), "graph", fed, 1, table).run(outputs, frames)
 
 
 def test_table_inputs_are_listed_with_type_and_shape() -> None:
@@ -34,12 +39,11 @@ def test_a_graph_with_its_table_built_in_answers_as_one_that_is_fed(fed: tuple[s
     frames = {"in_phase": pair.in_phase, "quadrature": pair.quadrature}
     table = {"homodyne": np.array([3.0, 0.7], np.float32), "reference_in_phase": np.full(toy.SHAPE, 120, np.float32)}
     model = toy.decoder_onnx()
-    built = GraphFile(model, "graph").built_in(table, fed)
-    assert names_of(built) == FRAMES | set(fed)
-    still_fed = {name: value for name, value in table.items() if name in fed}
-    answers = open_session(built, "built in", 1).run(["p", "phase"], {**frames, **still_fed})
+    graph = TableGraph(GraphFile(model, "graph"), "graph", fed, 1, table)
+    assert graph.inputs.keys() == FRAMES
+    found = graph.run(["p", "phase"], frames)
     expected = open_session(model, "fed", 1).run(["p", "phase"], {**frames, **table})
-    for answer, want in zip(answers, expected, strict=True):
+    for answer, want in zip(found, expected, strict=True):
         np.testing.assert_array_equal(answer, want)
 
 
@@ -51,9 +55,70 @@ def test_defaults_that_are_kept_number_by_number_are_replaced_too() -> None:
     output = helper.make_tensor_value_info("y", TensorProto.FLOAT, [2])
     graph = helper.make_graph([helper.make_node("Mul", ["x", "gain"], ["y"])], "g", inputs, [output], [default])
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9)
-    built = GraphFile(model.SerializeToString(), "graph").built_in({"gain": np.array([3, 5], np.float32)}, ())
-    (answer,) = open_session(built, "built in", 1).run(["y"], {"x": np.ones(2, np.float32)})
+    table = {"gain": np.array([3, 5], np.float32)}
+    (answer,) = answers(model.SerializeToString(), ["y"], table, (), x=np.ones(2, np.float32))
     assert answer.tolist() == [3, 5]
+
+
+def small_graph(nodes: list[onnx.NodeProto], outputs: tuple[str, ...] = ("y",)) -> bytes:
+    """y of x and a table of gain, 2, and offset, 1, with a constant 10."""
+    inputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [2]) for name in ("x", "gain", "offset")]
+    made = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [2]) for name in outputs]
+    held = {"gain": 2.0, "offset": 1.0, "ten": 10.0}
+    constants = [helper.make_tensor(name, TensorProto.FLOAT, [2], [value] * 2) for name, value in held.items()]
+    graph = helper.make_graph(nodes, "g", inputs, made, constants)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9).SerializeToString()
+
+
+X = np.ones(2, np.float32)
+THREE = {"gain": np.full(2, 3, np.float32)}
+
+
+def test_what_follows_from_the_table_is_computed_before_the_first_page() -> None:
+    nodes = [
+        helper.make_node("Neg", ["ten"], ["less"]),  # of no table, wanted on either side
+        helper.make_node("Mul", ["gain", "less"], ["made"]),
+        helper.make_node("Mul", ["x", "made"], ["scaled"]),
+        helper.make_node("Add", ["scaled", "less"], ["shifted"]),
+        helper.make_node("Add", ["shifted", "offset"], ["y"]),
+    ]
+    cut = GraphFile(small_graph(nodes), "graph").cut({}, ())
+    assert cut.before is not None
+    assert (cut.between, cut.direct) == (("made",), ("offset",))
+    assert {node.output[0] for node in onnx.load_from_string(cut.before).graph.node} == {"less", "made"}
+    assert "made" not in {node.output[0] for node in cut.behind.graph.node}
+    graph = TableGraph(GraphFile(small_graph(nodes), "graph"), "graph", (), 1)
+    assert graph.run(["y"], {"x": X})[0].tolist() == [-29, -29]
+    other = graph.with_table(THREE)
+    assert other.run(["y"], {"x": X})[0].tolist() == [-39, -39]
+    assert other.session is graph.session  # only what follows from the table was made anew
+    assert graph.run(["y"], {"x": X})[0].tolist() == [-29, -29]
+
+
+def test_an_output_may_follow_from_the_table_alone() -> None:
+    nodes = [helper.make_node("Neg", ["gain"], ["less"]), helper.make_node("Mul", ["x", "less"], ["y"])]
+    found = answers(small_graph(nodes, ("y", "less")), ["y"], THREE, (), x=X)
+    assert found[0].tolist() == [-3, -3]
+
+
+def test_a_graph_with_others_inside_is_not_cut() -> None:
+    """They may use any tensor around them without saying so."""
+    inner = helper.make_graph(
+        [helper.make_node("Neg", ["made"], ["inside"])],
+        "inner",
+        [],
+        [helper.make_tensor_value_info("inside", TensorProto.FLOAT, [2])],
+    )
+    nodes = [
+        helper.make_node("Mul", ["gain", "ten"], ["made"]),
+        helper.make_node("Cast", ["x"], ["flags"], to=TensorProto.BOOL),
+        helper.make_node("ReduceMax", ["x"], ["most"], keepdims=0),
+        helper.make_node("Cast", ["most"], ["flag"], to=TensorProto.BOOL),
+        helper.make_node("If", ["flag"], ["y"], then_branch=inner, else_branch=inner),
+    ]
+    graph = TableGraph(GraphFile(small_graph(nodes), "graph"), "graph", (), 1)
+    assert graph.run(["y"], {"x": X})[0].tolist() == [-20, -20]
+    assert graph.with_table(THREE).run(["y"], {"x": X})[0].tolist() == [-30, -30]
 
 
 def test_weights_that_an_old_graph_lists_as_inputs_are_no_table() -> None:
@@ -61,7 +126,7 @@ def test_weights_that_an_old_graph_lists_as_inputs_are_no_table() -> None:
     model.ir_version = 3
     graph = GraphFile(model.SerializeToString(), "graph")
     assert graph.table_inputs == {}
-    assert names_of(graph.built_in({}, ())) == FRAMES | set(toy.TABLE_INPUTS)
+    assert TableGraph(graph, "graph", (), 1).inputs.keys() == FRAMES
 
 
 @pytest.mark.parametrize("raw", [True, False])

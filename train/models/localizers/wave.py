@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lightpage.device.profile import Profile
-from lightpage.waves.grid import FieldGrid
+from lightpage.waves.grid import FieldGrid, symbol_samples
 from train.models.waves import Real, Waves
 
 
@@ -19,7 +19,7 @@ class WaveLocalizer(nn.Module):
 
     def __init__(self, profile: Profile, parameters: Real, grid: FieldGrid | None = None) -> None:
         super().__init__()
-        self.waves = Waves(profile, parameters, grid=grid)
+        self.waves = Waves(profile, parameters, symbol_samples(profile), grid=grid)
 
     @property
     def light_channels(self) -> int:

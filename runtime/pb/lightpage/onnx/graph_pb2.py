@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1alightpage/onnx/graph.proto\x12\x0elightpage.onnx\"A\n\x05Model\x12\x12\n\nir_version\x18\x01 \x01(\x03\x12$\n\x05graph\x18\x07 \x01(\x0b\x32\x15.lightpage.onnx.Graph\"Z\n\x05Graph\x12+\n\x0binitializer\x18\x05 \x03(\x0b\x32\x16.lightpage.onnx.Tensor\x12$\n\x05input\x18\x0b \x03(\x0b\x32\x15.lightpage.onnx.Input\"\x15\n\x05Input\x12\x0c\n\x04name\x18\x01 \x01(\t\"\xaf\x01\n\x06Tensor\x12\x0c\n\x04\x64ims\x18\x01 \x03(\x03\x12\x11\n\tdata_type\x18\x02 \x01(\x05\x12\x12\n\nfloat_data\x18\x04 \x03(\x02\x12\x12\n\nint32_data\x18\x05 \x03(\x05\x12\x12\n\nint64_data\x18\x07 \x03(\x03\x12\x0c\n\x04name\x18\x08 \x01(\t\x12\x10\n\x08raw_data\x18\t \x01(\x0c\x12\x13\n\x0b\x64ouble_data\x18\n \x03(\x01\x12\x13\n\x0buint64_data\x18\x0b \x03(\x04\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1alightpage/onnx/graph.proto\x12\x0elightpage.onnx\"A\n\x05Model\x12\x12\n\nir_version\x18\x01 \x01(\x03\x12$\n\x05graph\x18\x07 \x01(\x0b\x32\x15.lightpage.onnx.Graph\"\xd0\x01\n\x05Graph\x12\"\n\x04node\x18\x01 \x03(\x0b\x32\x14.lightpage.onnx.Node\x12+\n\x0binitializer\x18\x05 \x03(\x0b\x32\x16.lightpage.onnx.Tensor\x12$\n\x05input\x18\x0b \x03(\x0b\x32\x15.lightpage.onnx.Value\x12%\n\x06output\x18\x0c \x03(\x0b\x32\x15.lightpage.onnx.Value\x12)\n\nvalue_info\x18\r \x03(\x0b\x32\x15.lightpage.onnx.Value\"S\n\x04Node\x12\r\n\x05input\x18\x01 \x03(\t\x12\x0e\n\x06output\x18\x02 \x03(\t\x12,\n\tattribute\x18\x05 \x03(\x0b\x32\x19.lightpage.onnx.Attribute\"&\n\tAttribute\x12\t\n\x01g\x18\x06 \x01(\x0c\x12\x0e\n\x06graphs\x18\x0b \x03(\x0c\"9\n\x05Value\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\"\n\x04type\x18\x02 \x01(\x0b\x32\x14.lightpage.onnx.Type\"7\n\x04Type\x12/\n\x0btensor_type\x18\x01 \x01(\x0b\x32\x1a.lightpage.onnx.TensorType\"E\n\nTensorType\x12\x11\n\telem_type\x18\x01 \x01(\x05\x12$\n\x05shape\x18\x02 \x01(\x0b\x32\x15.lightpage.onnx.Shape\"/\n\x05Shape\x12&\n\x03\x64im\x18\x01 \x03(\x0b\x32\x19.lightpage.onnx.Dimension\"\x1e\n\tDimension\x12\x11\n\tdim_value\x18\x01 \x01(\x03\"\xaf\x01\n\x06Tensor\x12\x0c\n\x04\x64ims\x18\x01 \x03(\x03\x12\x11\n\tdata_type\x18\x02 \x01(\x05\x12\x12\n\nfloat_data\x18\x04 \x03(\x02\x12\x12\n\nint32_data\x18\x05 \x03(\x05\x12\x12\n\nint64_data\x18\x07 \x03(\x03\x12\x0c\n\x04name\x18\x08 \x01(\t\x12\x10\n\x08raw_data\x18\t \x01(\x0c\x12\x13\n\x0b\x64ouble_data\x18\n \x03(\x01\x12\x13\n\x0buint64_data\x18\x0b \x03(\x04\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -34,10 +34,22 @@ if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_MODEL']._serialized_start=46
   _globals['_MODEL']._serialized_end=111
-  _globals['_GRAPH']._serialized_start=113
-  _globals['_GRAPH']._serialized_end=203
-  _globals['_INPUT']._serialized_start=205
-  _globals['_INPUT']._serialized_end=226
-  _globals['_TENSOR']._serialized_start=229
-  _globals['_TENSOR']._serialized_end=404
+  _globals['_GRAPH']._serialized_start=114
+  _globals['_GRAPH']._serialized_end=322
+  _globals['_NODE']._serialized_start=324
+  _globals['_NODE']._serialized_end=407
+  _globals['_ATTRIBUTE']._serialized_start=409
+  _globals['_ATTRIBUTE']._serialized_end=447
+  _globals['_VALUE']._serialized_start=449
+  _globals['_VALUE']._serialized_end=506
+  _globals['_TYPE']._serialized_start=508
+  _globals['_TYPE']._serialized_end=563
+  _globals['_TENSORTYPE']._serialized_start=565
+  _globals['_TENSORTYPE']._serialized_end=634
+  _globals['_SHAPE']._serialized_start=636
+  _globals['_SHAPE']._serialized_end=683
+  _globals['_DIMENSION']._serialized_start=685
+  _globals['_DIMENSION']._serialized_end=715
+  _globals['_TENSOR']._serialized_start=718
+  _globals['_TENSOR']._serialized_end=893
 # @@protoc_insertion_point(module_scope)

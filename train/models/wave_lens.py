@@ -1,0 +1,318 @@
+"""A lens of the wave model, tile by tile of its plane.
+
+A small tile at (a, b) of the plane sees the facet through phases that vary slowly, once the phase of its own centre is
+taken off. So few samples of the facet serve it. A real lens's path and a roll, which factor over no pair of axes, then
+leave little, and few terms of it are needed. Strips of tiles with the same a share a first reduction along X.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lightpage.device.lens_path import IDEAL, SeidelTerms
+from lightpage.waves.geometry import Couplings, WaveGeometry, couplings, on_facet
+from lightpage.waves.low_rank import Interpolation, Phase
+from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
+from train.models.parts import Matrix, Parts, conjugate, multiply, phasor, scaled, stacked
+
+Real = NDArray[np.floating]
+
+OVERSAMPLING = 1.1
+"""Of light on sparse samples: an error of 0.003."""
+_WAVES = 170
+"""Waves that a tile is wide, about: more need more samples of the facet, fewer need more tiles."""
+_PLACES = 3
+"""Places along an axis that are asked how fast the phase varies."""
+
+
+class LensMatrices(NamedTuple):
+    """A lens for given parameters, tiles [Tx, Ty] first.
+
+    Attributes:
+        plane: weights of the terms at a tile's samples, [Tx, Ty, R, ny, nx].
+        x: [Tx, Ty, 1, nx, cx] from a tile's columns to its few samples along X.
+        between: [Tx, Ty, 1, ny, cx].
+        y: [Tx, Ty, 1, cy, ny].
+        facet: the terms on a tile's few samples of the facet, [Tx, Ty, R, cy, cx].
+        tile: phasors of the tiles' centres against their strips', [Tx, Ty, fy, cx].
+        strip: phasors of the strips' centres, with the facet's window, [Tx, fy, fx].
+    """
+
+    plane: Parts
+    x: Matrix
+    between: Parts
+    y: Matrix
+    facet: Parts
+    tile: Parts
+    strip: Parts
+
+
+class TiledLens(nn.Module):
+    """`lightpage.waves.lens.FourierLens` with tensors as geometry, for about the geometry that it is made for.
+
+    Args:
+        geometry: the device.
+        path: of this lens, beyond an ideal one's.
+        plane: its sample positions (x, y), uniform, metres.
+        cells: sample intervals of the pipe along (y', x).
+        roll_margin: radians of roll to either side that are to be served.
+        tolerance: error of the expansion.
+    """
+
+    def __init__(
+        self,
+        geometry: WaveGeometry,
+        path: SeidelTerms,
+        plane: tuple[Real, Real],
+        cells: tuple[int, int],
+        roll_margin: float,
+        tolerance: float,
+    ) -> None:
+        super().__init__()
+        wave = geometry.wavelength_m * geometry.focal_length_m / geometry.pipe_width_m
+        self.shape = len(plane[1]), len(plane[0])
+        self._tiles = tuple(max(1, round(float(np.ptp(axis)) / wave / _WAVES)) for axis in plane)
+        self._sides = tuple(-(-len(axis) // tiles) for axis, tiles in zip(plane, self._tiles, strict=True))
+        pitches = [float(axis[1] - axis[0]) for axis in plane]
+        offsets = [(np.arange(side) - (side - 1) / 2) * pitch for side, pitch in zip(self._sides, pitches, strict=True)]
+        inside = [
+            (np.arange(tiles) * side + (side - 1) / 2) for tiles, side in zip(self._tiles, self._sides, strict=True)
+        ]
+        centres = [axis[0] + at * pitch for axis, at, pitch in zip(plane, inside, pitches, strict=True)]
+        units = [np.arange(1, count) / count - 0.5 for count in reversed(cells)]
+        highest = _highest(geometry, path, centres, offsets)
+        few = [sparse_axis(unit, frequency, OVERSAMPLING) for unit, frequency in zip(units, highest, strict=True)]
+        up_x, up_y = (interpolation(unit, own, OVERSAMPLING) for unit, own in zip(units, few, strict=True))
+        self._thinned = tuple(own is not unit for own, unit in zip(few, units, strict=True))
+        terms = _terms(geometry, path, centres, offsets, roll_margin, tolerance)
+        self.offset_x: Tensor
+        self.offset_y: Tensor
+        self.inside_x: Tensor
+        self.inside_y: Tensor
+        self.few_x: Tensor
+        self.few_y: Tensor
+        self.up_x: Tensor
+        self.up_y: Tensor
+        self.nodes: Tensor
+        self.weights: Tensor
+        self.on_x: Tensor
+        self.on_y: Tensor
+        tiled = (*self._tiles, *terms.nodes.shape[1:])
+        for name, value in {
+            "offset_x": offsets[0],
+            "offset_y": offsets[1],
+            "inside_x": inside[0] * pitches[0],
+            "inside_y": inside[1] * pitches[1],
+            "few_x": few[0],
+            "few_y": few[1],
+            "up_x": up_x.T,
+            "up_y": up_y,
+            "nodes": terms.nodes.reshape(tiled),
+            "on_x": terms.axes[1].T,
+            "on_y": terms.axes[0],
+        }.items():
+            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value)).float(), persistent=False)
+        weights = terms.weights.reshape(*self._tiles, *terms.weights.shape[1:])
+        self.register_buffer("weights", stacked(weights), persistent=False)
+
+    @property
+    def terms(self) -> int:
+        """Of each tile."""
+        return self.nodes.shape[2]
+
+    def matrices(
+        self,
+        geometry: WaveGeometry,
+        path: SeidelTerms,
+        start: tuple[Tensor, Tensor],
+        facet: tuple[Tensor, Tensor],
+        window: Tensor,
+    ) -> LensMatrices:
+        """The lens for parameters as tensors.
+
+        Args:
+            geometry, path: the device, and the lens's path.
+            start: the plane's first sample (x, y), metres.
+            facet: sample positions along the facet's axes, [fx] and [fy].
+            window: transmission of the facet, [fy, fx].
+        """
+        (across, up), width = facet, geometry.pipe_width_m
+        few_x, few_y = self.few_x * width, (self.few_y * width)[:, None]
+        a, b = (start[0] + self.inside_x)[:, None, None, None], (start[1] + self.inside_y)[None, :, None, None]
+        phase = _Phase(geometry, path, couplings(geometry, torch))
+        x, y = self.offset_x, self.offset_y
+        strip = phase.beyond(0.0, 0.0, a[:, 0], 0.0, across, up[:, None]) + phase.of_facet(across, up[:, None])
+        tile = phase.beyond(a, 0.0, 0.0, b, few_x, up[:, None])
+        to_x = phase.beyond(a, b, x[:, None], 0.0, few_x, 0.0)
+        to_both = phase.beyond(a, b, 0.0, y[:, None], few_x, 0.0)
+        to_y = phase.beyond(a, b, 0.0, y, 0.0, few_y)
+        node_x, node_y = (self.nodes[..., axis, None, None] for axis in (0, 1))
+        rest = phase.rest(a[..., None], b[..., None], node_x, node_y, few_x, few_y)
+        area = (x[1] - x[0]) * (y[1] - y[0]) * (few_x[1] - few_x[0]) * (few_y[1, 0] - few_y[0, 0])
+        shear: Any = geometry.pipe_angle  # a tensor here, like all of it
+        unitary = torch.sqrt(area / torch.cos(shear)) / (geometry.wavelength_m * geometry.focal_length_m)
+        plane = self.on_y @ self.weights[0] @ self.on_x, self.on_y @ self.weights[1] @ self.on_x
+        return LensMatrices(
+            scaled(plane, unitary),
+            Matrix.of(phasor(to_x.unsqueeze(2))),
+            phasor(to_both.unsqueeze(2)),
+            Matrix.of(phasor(to_y.unsqueeze(2))),
+            phasor(rest),
+            phasor(tile),
+            scaled(phasor(strip), window),
+        )
+
+    def to_facet(self, lens: LensMatrices, field: Parts) -> Parts:
+        """Field on the plane [ny, nx] to the facet's grid [fy, fx]."""
+        split = [self._split(part) for part in field]
+        total: Parts | None = None
+        for number in range(self._tiles[0]):
+            one = _strip(lens, number)
+            terms = multiply(one.plane, (split[0][number], split[1][number]))
+            terms = multiply(one.x.behind(terms), one.between)
+            light = _summed(multiply(one.y.times(terms), one.facet), 1)
+            light = self._along(self.up_y, light, 1)
+            light = _summed(multiply(light, one.tile), 0)
+            light = multiply(self._across(light, self.up_x), one.strip)
+            total = light if total is None else (total[0] + light[0], total[1] + light[1])
+        assert total is not None
+        return total
+
+    def to_plane(self, lens: LensMatrices, field: Parts) -> Parts:
+        """The adjoint: a field on the facet's grid to the plane."""
+        strips: list[Parts] = []
+        for number in range(self._tiles[0]):
+            one = _strip(lens, number)
+            light = self._across(multiply(field, conjugate(one.strip)), self.up_x.T)
+            light = multiply((light[0][None], light[1][None]), conjugate(one.tile))
+            light = self._along(self.up_y.T, light, 1)
+            terms = multiply((light[0][:, None], light[1][:, None]), conjugate(one.facet))
+            terms = multiply(one.y.adjoint.times(terms), conjugate(one.between))
+            strips.append(_summed(multiply(one.x.adjoint.behind(terms), conjugate(one.plane)), 1))
+        real, imaginary = (self._joined([strip[part] for strip in strips]) for part in (0, 1))
+        return real, imaginary
+
+    def _along(self, matrix: Tensor, light: Parts, axis: int) -> Parts:
+        return (matrix @ light[0], matrix @ light[1]) if self._thinned[axis] else light
+
+    def _across(self, light: Parts, matrix: Tensor) -> Parts:
+        return (light[0] @ matrix, light[1] @ matrix) if self._thinned[0] else light
+
+    def _split(self, part: Tensor) -> Tensor:
+        """[ny, nx] to tiles [Tx, Ty, 1, ny, nx], with zeros where they reach beyond."""
+        (tiles_x, tiles_y), (side_x, side_y) = self._tiles, self._sides
+        part = functional.pad(part, (0, tiles_x * side_x - self.shape[1], 0, tiles_y * side_y - self.shape[0]))
+        return part.reshape(tiles_y, side_y, tiles_x, side_x).permute(2, 0, 1, 3)[:, :, None]
+
+    def _joined(self, strips: list[Tensor]) -> Tensor:
+        """Strips of tiles [Ty, ny, nx] to [ny, nx]."""
+        whole = torch.cat([strip.flatten(0, 1) for strip in strips], dim=-1)
+        return whole[: self.shape[0], : self.shape[1]]
+
+
+class _Phase(NamedTuple):
+    """A lens's phase between (x, y) of its plane and (X, Y') of the facet, but for what the plane alone decides.
+
+    Radians, in numpy or torch.
+    """
+
+    geometry: WaveGeometry
+    path: SeidelTerms
+    factors: Couplings
+
+    def of_facet(self, across: Any, up: Any) -> Any:
+        """What the facet alone decides."""
+        return self.path.of_both(0.0, 0.0, *on_facet(self.factors, across, up))
+
+    def beyond(self, a: Any, b: Any, x: Any, y: Any, across: Any, up: Any) -> Any:
+        """By how much (a + x, b + y) differs from (a, b)."""
+        along, upward = on_facet(self.factors, across, up)
+        per_metre = self.geometry.wave_number / self.geometry.focal_length_m
+        return self._of_path(a, b, x, y, across, up) - per_metre * (x * along + y * upward)
+
+    def rest(self, a: Any, b: Any, x: Any, y: Any, across: Any, up: Any) -> Any:
+        """What of that depends on more than x and X, y and X, or y and Y'."""
+        of_path = partial(self._of_path, a, b)
+        pairs = of_path(x, 0.0, across, 0.0) + of_path(0.0, y, across, 0.0) + of_path(0.0, y, 0.0, up)
+        rolled = -self.geometry.wave_number / self.geometry.focal_length_m * self.factors.x_to_y * x * up
+        return rolled + of_path(x, y, across, up) - pairs
+
+    def _of_path(self, a: Any, b: Any, x: Any, y: Any, across: Any, up: Any) -> Any:
+        if self.path is IDEAL:
+            return 0.0 * (a + b + x + y + across + up)
+        there = on_facet(self.factors, across, up)
+        return self.path.of_both(a + x, b + y, *there) - self.path.of_both(a, b, *there)
+
+
+def _highest(
+    geometry: WaveGeometry, path: SeidelTerms, centres: list[Real], offsets: list[Real]
+) -> tuple[float, float]:
+    """Frequencies along X and Y' that tiles see of a facet, cycles over its width."""
+    half, factors = geometry.pipe_width_m / 2, couplings(geometry)
+    per_metre = geometry.wave_number / geometry.focal_length_m
+    edge = np.linspace(-half, half, _PLACES)
+    across, up = np.meshgrid(edge, edge, indexing="ij")
+
+    def slopes(x: float, y: float) -> tuple[Real, Real]:
+        along, upward = path.slope(x, y, *on_facet(factors, across, up))
+        along, upward = along - per_metre * x, upward - per_metre * y
+        return factors.x_to_x * along + factors.y_to_x * upward, factors.x_to_y * along + factors.y_to_y * upward
+
+    (x_centres, y_centres), most = centres, [0.0, 0.0]
+    for a in x_centres:
+        of_strip = slopes(a, 0.0)[0]
+        for b in y_centres:
+            of_tile = slopes(a, b)[1]
+            for x in (offsets[0][0], offsets[0][-1]):
+                for y in (offsets[1][0], offsets[1][-1]):
+                    here = slopes(a + x, b + y)
+                    most[0] = max(most[0], float(np.abs(here[0] - of_strip).max()))
+                    most[1] = max(most[1], float(np.abs(here[1] - of_tile).max()))
+    along_x, along_y = (slope * geometry.pipe_width_m / (2 * np.pi) for slope in most)
+    return along_x, along_y
+
+
+def _terms(
+    geometry: WaveGeometry,
+    path: SeidelTerms,
+    centres: list[Real],
+    offsets: list[Real],
+    roll_margin: float,
+    tolerance: float,
+) -> Interpolation:
+    """Of the rest, over all tiles."""
+    half = geometry.pipe_width_m / 2
+    rolled = [replace(geometry, pipe_roll=geometry.pipe_roll + share * roll_margin) for share in (-1, 0, 1)]
+    phases = [_Phase(one, path, couplings(one)) for one in rolled]
+
+    def of(phase: _Phase, a: float, b: float) -> Phase:
+        return lambda x, y, across, up: np.asarray(phase.rest(a, b, x, y, across, up))
+
+    tiles = [[of(phase, a, b) for phase in phases] for a in centres[0] for b in centres[1]]
+    edges = np.array([-half, half])
+    return Interpolation.of(tiles, (offsets[0], offsets[1]), (edges, edges), tolerance)
+
+
+def _strip(lens: LensMatrices, number: int) -> LensMatrices:
+    """What belongs to one strip of tiles."""
+
+    def chosen(value: Any) -> Any:
+        return (
+            type(value)(*(part[number] for part in value))
+            if isinstance(value, Matrix)
+            else tuple(part[number] for part in value)
+        )
+
+    return LensMatrices(*map(chosen, lens))
+
+
+def _summed(terms: Parts, axis: int) -> Parts:
+    return terms[0].sum(axis), terms[1].sum(axis)

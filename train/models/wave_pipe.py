@@ -1,0 +1,176 @@
+"""The pipe of the wave model, block by block of its modes.
+
+A shear couples a mode with its neighbours alone: it turns light by less than twice its angle. So a block of modes is
+followed with a rim of neighbours around it, which is then dropped. The blocks of low modes need few splitting steps.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lightpage.waves.geometry import WaveGeometry, detuning
+from lightpage.waves.pipe import ParityBasis, modes_by_parity
+from train.models.parts import Parts, conjugate, multiply, phasor
+
+_BLOCK = 120
+"""Modes of a parity along each side of a block, at least."""
+_RIM = 12
+"""Modes of a parity around a block, beyond those that a mirror of twice the shear couples."""
+_STEPS = 0.48
+"""Steps of a block for an error of one, over the square root of its light's turn: see `TiledPipe`."""
+_FEWEST_STEPS = 2
+
+
+class BlockMatrices(NamedTuple):
+    """Phasors of half a step, and cosine and sine of the turn of each pair of modes."""
+
+    half_step: Parts
+    cos: Tensor
+    sin: Tensor
+
+
+class TiledPipe(nn.Module):
+    """`lightpage.waves.pipe.PipePropagator` with tensors as geometry, for about the geometry that it is made for.
+
+    With t the shear, kx and ky the transverse wave numbers of a block, L the pipe's length and n k the wave number in
+    it, its light is turned by a = t kx ky L / (n k) radians. The error of s steps grows as a s^-1.5 (measured), so that
+    the same sum of steps errs least with s as the square root of a.
+
+    Args:
+        geometry: the device.
+        cells: sample intervals along (y', x).
+        error: of the splitting, wanted.
+    """
+
+    def __init__(self, geometry: WaveGeometry, cells: tuple[int, int], error: float) -> None:
+        super().__init__()
+        self._cells = cells
+        width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
+        sheared = abs(geometry.pipe_angle) > 0
+        counts = [cell // 2 for cell in cells]
+        edges = [np.linspace(0, count, (max(1, count // _BLOCK) if sheared else 1) + 1).astype(int) for count in counts]
+        rims = [math.ceil(abs(geometry.pipe_angle) * other) + _RIM for other in reversed(cells)]
+        blocks = []
+        for y in pairwise(edges[0]):
+            for x in pairwise(edges[1]):
+                turn = (
+                    abs(geometry.pipe_angle) * _mean_wave(y, width) * _mean_wave(x, width) * geometry.pipe_length_m / nk
+                )
+                steps = max(_FEWEST_STEPS, math.ceil(_STEPS * math.sqrt(turn) / error ** (2 / 3))) if sheared else 1
+                blocks.append(_Block(geometry, cells, (y, x), rims, steps, counts))
+        self.blocks = nn.ModuleList(blocks)
+        self._across = len(edges[1]) - 1
+        self.y_numbers: Tensor
+        self.x_numbers: Tensor
+        for name, cell in zip(("y_numbers", "x_numbers"), cells, strict=True):
+            self.register_buffer(name, torch.from_numpy(modes_by_parity(cell)).float(), persistent=False)
+
+    @property
+    def _blocks(self) -> list[_Block]:
+        return [block for block in self.blocks if isinstance(block, _Block)]
+
+    def matrices(self, geometry: WaveGeometry) -> list[BlockMatrices]:
+        """Of each block, for a geometry of tensors."""
+        return [block.matrices(geometry) for block in self._blocks]
+
+    def forward(self, field: Parts, at: list[BlockMatrices], *, backwards: bool) -> Parts:
+        """From facet to facet, [cells_y - 1, cells_x - 1] both.
+
+        Both parts and all parities go through each product as one stack [2, 2, 2, Ky, Kx]: an exported graph is made
+        and run node by node.
+        """
+        y_cells, x_cells = self._cells
+        y_modes, x_modes = _sine_modes(self.y_numbers, y_cells)[:, None], _sine_modes(self.x_numbers, x_cells)[None]
+        modes = y_modes @ torch.stack(field)[:, None, None] @ x_modes.transpose(-1, -2)
+        done = [block(modes, own, backwards=backwards) for block, own in zip(self._blocks, at, strict=True)]
+        rows = [torch.cat(done[first : first + self._across], dim=-1) for first in range(0, len(done), self._across)]
+        real, imaginary = (y_modes.transpose(-1, -2) @ torch.cat(rows, dim=-2) @ x_modes).sum(dim=(1, 2))
+        return real, imaginary
+
+
+class _Block(nn.Module):
+    """Some modes of both parities along either axis, and their neighbours."""
+
+    def __init__(
+        self,
+        geometry: WaveGeometry,
+        cells: tuple[int, int],
+        own: tuple[tuple[int, int], tuple[int, int]],
+        rims: list[int],
+        steps: int,
+        counts: list[int],
+    ) -> None:
+        super().__init__()
+        width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
+        self._steps, self._sheared = steps, abs(geometry.pipe_angle) > 0
+        lag = geometry.pipe_length_m / steps * (np.pi / width) ** 2 / (2 * nk)
+        taken = [
+            slice(max(0, a - rim), min(count, b + rim)) for (a, b), rim, count in zip(own, rims, counts, strict=True)
+        ]
+        self._taken = taken
+        self._own = [slice(a - some.start, b - some.start) for (a, b), some in zip(own, taken, strict=True)]
+        y, x = (ParityBasis(cell, lag, some) for cell, some in zip(cells, taken, strict=True))
+        self.y_numbers: Tensor
+        self.x_numbers: Tensor
+        self.y_couplings: Tensor
+        self.x_couplings: Tensor
+        self.y_singular: Tensor
+        self.x_singular: Tensor
+        self.signs: Tensor
+        for name, value in (
+            ("y_numbers", y.mode_numbers),
+            ("x_numbers", x.mode_numbers),
+            ("y_couplings", y.couplings),
+            ("x_couplings", x.couplings),
+            ("y_singular", y.singular[:, None]),
+            ("x_singular", x.singular[None]),
+            ("signs", np.array([-1.0, 1.0])[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])),
+        ):
+            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value)).float(), persistent=False)
+
+    def matrices(self, geometry: WaveGeometry) -> BlockMatrices:
+        """For a geometry of tensors."""
+        width, nk = geometry.pipe_width_m, geometry.refractive_index * geometry.wave_number
+        step = geometry.pipe_length_m / self._steps
+        squares = self.y_numbers[:, None, :, None] ** 2 + self.x_numbers[None, :, None, :] ** 2
+        slow = detuning(nk, squares * (math.pi / width) ** 2, torch.sqrt)
+        shear: Any = geometry.pipe_angle
+        angle = step / nk * torch.sin(shear) / width**2 * (self.y_couplings[:, None] * self.x_couplings)
+        return BlockMatrices(phasor(0.5 * step * slow), torch.cos(angle), torch.sin(angle))
+
+    def forward(self, modes: Tensor, at: BlockMatrices, *, backwards: bool) -> Tensor:
+        """All modes [2, 2, 2, Ky, Kx] before the pipe to this block's own behind it."""
+        half, sin = (conjugate(at.half_step), -at.sin) if backwards else (at.half_step, at.sin)
+        full, signs = multiply(half, half), self.signs[..., None, None] * sin
+        modes = _times(modes[..., self._taken[0], self._taken[1]], half)
+        for step in range(self._steps):
+            if self._sheared:
+                # what is (p, q) by parity comes from (1 - p, 1 - q), with i and a sign that is one for equal parities
+                inner = self.y_singular.transpose(-1, -2) @ modes @ self.x_singular
+                turned = at.cos * inner + signs * inner.flip(0, 1, 2)
+                modes = self.y_singular @ turned @ self.x_singular.transpose(-1, -2)
+            modes = _times(modes, full if step < self._steps - 1 else half)
+        return modes[..., self._own[0], self._own[1]]
+
+
+def _times(modes: Tensor, phasors: Parts) -> Tensor:
+    real, imaginary = phasors
+    return modes * real + modes.flip(0) * torch.stack([-imaginary, imaginary])
+
+
+def _mean_wave(modes: tuple[int, int], width: float) -> float:
+    """Root mean square wave number of modes of both parities, rad/m."""
+    numbers = np.arange(2 * modes[0] + 1, 2 * modes[1] + 1)
+    return float(np.sqrt(np.mean((numbers * np.pi / width) ** 2)))
+
+
+def _sine_modes(numbers: Tensor, cells: int) -> Tensor:
+    """Samples of the sine modes with these numbers by parity [2, K], [2, K, cells - 1]; a mode 0 is none."""
+    places = torch.arange(1, cells, device=numbers.device)
+    return math.sqrt(2 / cells) * torch.sin(math.pi / cells * torch.remainder(numbers[..., None] * places, 2 * cells))
