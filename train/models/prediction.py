@@ -13,7 +13,6 @@ from train.models.localizers.wave import by_symbol
 from train.models.parts import conjugate, multiply, parts
 from train.models.waves import EXACT, ROUGH, Real, WaveMatrices, Waves
 
-
 _SAMPLES = 2
 """Per symbol and axis, of unexplained light: one loses 0.007 bit, four gain nothing."""
 
