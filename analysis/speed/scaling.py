@@ -1,4 +1,4 @@
-"""Time per symbol of the coherent decoder in the runtime, page and frames growing together, the symbol's size fixed.
+"""Time per symbol of a decoder in the runtime, page and frames growing together, the symbol's size fixed.
 
     python -m analysis.speed.scaling
 
@@ -14,8 +14,9 @@ from pathlib import Path
 import click
 import numpy as np
 
-from analysis.speed.speed import at_symbol_pitch, frames_of, opened, seconds_of
+from analysis.speed.speed import frames_of, makers, opened, seconds_of
 from analysis.studies.scaling import enlarged
+from export.onnx_files import decoder_onnx
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
@@ -38,27 +39,32 @@ class Scaled:
 
 @click.command()
 @click.option("--profile", "profile_name", default="bench", show_default=True, help="The smallest device.")
+@click.option("--decoder", "name", default="coherent", show_default=True, help="As `analysis.speed.speed` names it.")
 @click.option("--factor", "factors", type=click.IntRange(1, 16), multiple=True, default=(1, 2, 4, 8), show_default=True)
 @click.option("--repeats", type=click.IntRange(1, 1000), default=5, show_default=True)
 @click.option("--threads", type=click.IntRange(1), help="Of one decode; the usable cores if left out.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def main(
-    profile_name: str, factors: tuple[int, ...], repeats: int, threads: int | None, json_path: Path | None
+    profile_name: str, name: str, factors: tuple[int, ...], repeats: int, threads: int | None, json_path: Path | None
 ) -> None:
     """Time pages of devices that are so many times as large along each axis."""
     smallest, threads = load_profile(profile_name), threads or available_cpus()
+    if name not in (known := makers(smallest)):
+        raise click.BadParameter(f"{name!r}: wanted one of {', '.join(known)}", param_hint="--decoder")
     results = []
     click.echo(f"{'symbols':>8} {'ms a page':>10} {'us a symbol':>12} {'over the smallest':>18}")
     for factor in sorted(set(factors)):
         profile = enlarged(smallest, factor)
-        session, feeds = opened(profile, *at_symbol_pitch(profile, "coherent"), threads), frames_of(profile)
+        decoder, tensors = makers(profile)[name]()
+        model = decoder_onnx(decoder.eval(), "uint8", profile.frame_shape, tensors)
+        session, feeds = opened(model, threads), frames_of(profile)
         session.run(["p"], feeds)
         seconds = [seconds_of(session, feeds) for _ in range(repeats)]
         results.append(Scaled(profile.page.columns * profile.page.rows, float(np.median(seconds))))
         last, over = results[-1], results[-1].each_us / results[0].each_us
         click.echo(f"{last.symbols:>8,} {1e3 * last.seconds:>10.1f} {last.each_us:>12.2f} {over:>18.3f}")
     if json_path is not None:
-        figures = {"profile": smallest.name, "threads": threads, "repeats": repeats}
+        figures = {"profile": smallest.name, "decoder": name, "threads": threads, "repeats": repeats}
         write_json(json_path, figures | {"pages": [asdict(result) for result in results]})
 
 

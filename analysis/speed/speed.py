@@ -2,21 +2,25 @@
 
     python -m analysis.speed.speed --profile bench
 
-Untrained: time does not depend on weights. Ratios are over the decoder that is named first.
+Untrained: time does not depend on weights. Ratios are over the decoder that is named first. Behind them, where each
+decoder's time goes, part by part (`analysis.speed.parts`).
 """
 
 from __future__ import annotations
 
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 from torch import nn
 
+from analysis.speed.parts import Machine, Part, lines, measured_machine, parts_of
 from export.graph import (
     FRAME_INPUTS,
     DecoderGraph,
@@ -47,6 +51,8 @@ from train.published.training import PublishedChoices
 Tensors = dict[str, np.ndarray]
 SETTLE_S = 0.2
 """Pause before a decode: the threads of the one before spin for a while, and would be in its way."""
+_PROFILED = 3
+"""Runs with a profile, which takes a little time itself."""
 FIRST_LOOK = Hyperparameters()
 WIDTHS = {"ray 16/32": (16, 32), "ray 32/64": (32, 64), "ray 64/128": (64, 128)}
 """The published decoder with its ray grid, by the channels of its U-Net."""
@@ -98,10 +104,18 @@ class Timed:
     parameters: int
 
 
-def opened(profile: Profile, graph: Graph, tensors: Tensors, threads: int) -> TableGraph:
-    """The graph in the runtime that serves."""
-    model = decoder_onnx(graph.eval(), "uint8", profile.frame_shape, tensors)
-    return TableGraph(GraphFile(model, "speed"), "speed", PAGE_INPUTS, threads)
+def opened(model: bytes, threads: int, profile: Path | None = None) -> TableGraph:
+    """An exported decoder in the runtime that serves; `profile` as for `open_session`."""
+    return TableGraph(GraphFile(model, "speed"), "speed", PAGE_INPUTS, threads, profile=profile)
+
+
+def profiled(model: bytes, feeds: dict[str, np.ndarray], threads: int, machine: Machine) -> list[Part]:
+    """Where an exported decoder's time goes."""
+    with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
+        graph = opened(model, threads, Path(folder) / "profile")
+        for _ in range(_PROFILED):
+            seconds_of(graph, feeds)
+        return parts_of(model, Path(graph.session.end_profiling()), _PROFILED, machine)
 
 
 def frames_of(profile: Profile) -> dict[str, np.ndarray]:
@@ -127,8 +141,11 @@ def weights(graph: nn.Module) -> int:
 @click.option("--decoder", "names", multiple=True, help="Only these; ratios are over the first of them.")
 @click.option("--repeats", type=click.IntRange(1, 1000), default=15, show_default=True)
 @click.option("--threads", type=click.IntRange(1), help="Of one decode; the usable cores if left out.")
+@click.option("--parts/--no-parts", default=True, show_default=True, help="Show where each decoder's time goes.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int | None, json_path: Path | None) -> None:
+def main(
+    profile_name: str, names: tuple[str, ...], repeats: int, threads: int | None, parts: bool, json_path: Path | None
+) -> None:
     """Time all decoders side by side and print medians and ratios."""
     profile = load_profile(profile_name)
     known = makers(profile)
@@ -136,10 +153,11 @@ def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int |
         if name not in known:
             raise click.BadParameter(f"{name!r}: wanted one of {', '.join(known)}", param_hint="--decoder")
     threads = threads or available_cpus()
-    sessions, sizes = {}, {}
+    models, sessions, sizes = {}, {}, {}
     for name in dict.fromkeys(names or known):
         graph, tensors = known[name]()
-        sessions[name], sizes[name] = opened(profile, graph, tensors, threads), weights(graph)
+        models[name], sizes[name] = decoder_onnx(graph.eval(), "uint8", profile.frame_shape, tensors), weights(graph)
+        sessions[name] = opened(models[name], threads)
     feeds = frames_of(profile)
     taken: dict[str, list[float]] = {name: [] for name in sessions}
     for repeat in range(repeats + 1):
@@ -153,9 +171,19 @@ def main(profile_name: str, names: tuple[str, ...], repeats: int, threads: int |
     click.echo(f"{'decoder':<12} {'ms a page':>10} {'ratio':>7} {'weights':>10}")
     for result in results:
         click.echo(f"{result.decoder:<12} {1e3 * result.seconds:>10.1f} {result.ratio:>7.2f} {result.parameters:>10,}")
+    figures: dict[str, Any] = {"profile": profile.name, "threads": threads, "repeats": repeats}
+    figures["decoders"] = [asdict(result) for result in results]
+    if parts:
+        machine = measured_machine(threads)
+        click.echo(f"\nthis machine: {machine.flops_per_s / 1e9:.0f} GFLOP/s, {machine.bytes_per_s / 1e9:.0f} GB/s")
+        sessions.clear()
+        figures |= {"machine": asdict(machine), "parts": {}}
+        for name, model in models.items():
+            found = profiled(model, feeds, threads, machine)
+            click.echo("\n".join([f"\n{name}", *lines(found)]))
+            figures["parts"][name] = [asdict(part) for part in found]
     if json_path is not None:
-        figures = {"profile": profile.name, "threads": threads, "repeats": repeats}
-        write_json(json_path, figures | {"decoders": [asdict(result) for result in results]})
+        write_json(json_path, figures)
 
 
 if __name__ == "__main__":
