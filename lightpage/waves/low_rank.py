@@ -96,7 +96,7 @@ class Interpolation:
             phases: of each tile some phases, for these and what lies between them, places told within the tile.
             tile: sample places of one tile.
             second: of the other plane.
-            tolerance: root mean square error over all tiles.
+            tolerance: root mean square error over all tiles, as an integral over them.
         """
         by_axis = zip(*(_axes(phase, tile, second, _SPARE_IN_TILES) for some in phases for phase in some), strict=True)
         axes = [max(same, key=lambda axis: len(axis.nodes)) for same in by_axis]

@@ -16,7 +16,7 @@ OVERSAMPLING = 1.3
 """Samples, over two for each period of the highest frequency."""
 _REACH = 14
 """Samples to either side that a place is interpolated from."""
-_STEEPNESS = 0.82
+_STEEPNESS = 0.84
 """b of the window, over what would let it fall within half of the room that oversampling leaves."""
 
 

@@ -31,6 +31,13 @@ def test_light_of_the_band_is_interpolated_everywhere_on_the_axis(finer: int) ->
     assert error.max() < WORST
 
 
+def test_few_samples_serve_where_less_will_do() -> None:
+    sparse = sparse_axis(PLACES, HIGHEST, 1.1)
+    assert len(sparse) < len(sparse_axis(PLACES, HIGHEST))
+    error = interpolation(PLACES, sparse, 1.1) @ waves(sparse) - waves(PLACES)
+    assert np.linalg.norm(error) < 0.003 * np.linalg.norm(waves(PLACES))
+
+
 def test_samples_are_uniform_and_reach_beyond_both_ends() -> None:
     sparse = sparse_axis(PLACES, HIGHEST)
     assert sparse[0] < PLACES[0] < PLACES[-1] < sparse[-1]
