@@ -153,7 +153,7 @@ class _Block(nn.Module):
             if self._sheared:
                 # what is (p, q) by parity comes from (1 - p, 1 - q), with i and a sign that is one for equal parities
                 inner = self.y_singular.transpose(-1, -2) @ modes @ self.x_singular
-                turned = at.cos * inner + signs * inner.flip(0, 1, 2)
+                turned = at.cos * inner + signs * _reversed(inner.flatten(0, 2)).reshape(inner.shape)
                 modes = self.y_singular @ turned @ self.x_singular.transpose(-1, -2)
             modes = _times(modes, full if step < self._steps - 1 else half)
         return modes[..., self._own[0], self._own[1]]
@@ -161,7 +161,12 @@ class _Block(nn.Module):
 
 def _times(modes: Tensor, phasors: Parts) -> Tensor:
     real, imaginary = phasors
-    return modes * real + modes.flip(0) * torch.stack([-imaginary, imaginary])
+    return modes * real + _reversed(modes) * torch.stack([-imaginary, imaginary])
+
+
+def _reversed(stack: Tensor) -> Tensor:
+    """A stack in the opposite order: taken up by index, whole pieces of memory are copied."""
+    return stack.index_select(0, torch.arange(len(stack) - 1, -1, -1, device=stack.device))
 
 
 def _mean_wave(modes: tuple[int, int], width: float) -> float:
