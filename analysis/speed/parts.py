@@ -42,6 +42,15 @@ _PARTS = (
 )
 """Beginnings of the names of a part's nodes, the first that fits counts."""
 FIELD = "field"
+_ORDER = (
+    FIELD,
+    "sampling",
+    "sampling: pipe",
+    "network",
+    *(part for _, part in _PARTS if part.startswith("second")),
+    OTHER,
+)
+"""In which a page passes them."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +144,7 @@ def parts_of(model: bytes, profile: Path, runs: int, machine: Machine) -> list[P
         weights[part] += float(event["args"].get("parameter_size", 0)) * share
     crossing = _crossing(model)
     all_parts = []
-    for name in sorted(seconds, key=_order):
+    for name in sorted(seconds, key=_ORDER.index):
         moved = weights[name] + crossing[name]
         floor = max(flops[name] / machine.flops_per_s, moved / machine.bytes_per_s)
         all_parts.append(Part(name, seconds[name], flops[name], moved, floor))
@@ -155,13 +164,6 @@ def lines(parts: Sequence[Part]) -> list[str]:
             f"{1e3 * part.floor_s:>10.1f} {ratio:>6.2f}"
         )
     return rows
-
-
-def _order(name: str) -> int:
-    names = [FIELD, *dict.fromkeys(part for _, part in _PARTS)]
-    order = [FIELD, "sampling", "sampling: pipe", "network"]
-    order += [other for other in names if other.startswith("second")]
-    return order.index(name) if name in order else len(order)
 
 
 def _part(name: str) -> str:

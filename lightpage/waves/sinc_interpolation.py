@@ -17,7 +17,7 @@ OVERSAMPLING = 1.3
 _REACH = 14
 """Samples to either side that a place is interpolated from."""
 _STEEPNESS = 0.84
-"""b of the window, over what would let it fall within half of the room that oversampling leaves."""
+"""b of the window over pi times the reach times 1 - 1/oversampling."""
 
 
 def sparse_axis(places_m: Real, highest: float, oversampling: float = OVERSAMPLING) -> Real:

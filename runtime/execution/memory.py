@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
+from lightpage.allocator import set_options
 
 _ARENA_MAX = -8
 """Number of glibc's option, from its malloc.h."""
@@ -18,8 +18,4 @@ def share_freed_memory() -> bool:
     Returns:
         Whether the C library could be told: only glibc can.
     """
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):
-        return False
-    return bool(mallopt(_ARENA_MAX, _ARENAS))
+    return set_options((_ARENA_MAX, _ARENAS))

@@ -70,11 +70,6 @@ class TableGraph:
         return {node.name: Port.of(node) for node in nodes if node.name not in self._between}
 
     @property
-    def between_bytes(self) -> int:
-        """Of all that follows from the table."""
-        return sum(value.nbytes for value in self._between.values())
-
-    @property
     def ports(self) -> Mapping[str, Port]:
         """Type and shape of every tensor of the table, by name."""
         return self._file.table_inputs

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
+from lightpage.allocator import set_options
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4
 """Numbers of glibc's options, from its malloc.h."""
@@ -19,8 +19,4 @@ def keep_freed_memory() -> bool:
     Returns:
         Whether the C library could be told: only glibc can.
     """
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):
-        return False
-    return all([mallopt(_TRIM_THRESHOLD, -1), mallopt(_TOP_PAD, _TAKEN_AT_ONCE), mallopt(_MMAP_MAX, 0)])
+    return set_options((_TRIM_THRESHOLD, -1), (_TOP_PAD, _TAKEN_AT_ONCE), (_MMAP_MAX, 0))

@@ -179,7 +179,7 @@ class TiledLens(nn.Module):
             terms = multiply(one.plane, (split[0][number], split[1][number]))
             terms = multiply(one.x.behind(terms), one.between)
             light = _summed(multiply(one.y.times(terms), one.facet), 1)
-            light = self._along(self.up_y, light, 1)
+            light = self._along(self.up_y, light)
             light = _summed(multiply(light, one.tile), 0)
             light = multiply(self._across(light, self.up_x), one.strip)
             total = light if total is None else (total[0] + light[0], total[1] + light[1])
@@ -193,15 +193,15 @@ class TiledLens(nn.Module):
             one = _strip(lens, number)
             light = self._across(multiply(field, conjugate(one.strip)), self.up_x.T)
             light = multiply((light[0][None], light[1][None]), conjugate(one.tile))
-            light = self._along(self.up_y.T, light, 1)
+            light = self._along(self.up_y.T, light)
             terms = multiply((light[0][:, None], light[1][:, None]), conjugate(one.facet))
             terms = multiply(one.y.adjoint.times(terms), conjugate(one.between))
             strips.append(_summed(multiply(one.x.adjoint.behind(terms), conjugate(one.plane)), 1))
         real, imaginary = (self._joined([strip[part] for strip in strips]) for part in (0, 1))
         return real, imaginary
 
-    def _along(self, matrix: Tensor, light: Parts, axis: int) -> Parts:
-        return (matrix @ light[0], matrix @ light[1]) if self._thinned[axis] else light
+    def _along(self, matrix: Tensor, light: Parts) -> Parts:
+        return (matrix @ light[0], matrix @ light[1]) if self._thinned[1] else light
 
     def _across(self, light: Parts, matrix: Tensor) -> Parts:
         return (light[0] @ matrix, light[1] @ matrix) if self._thinned[0] else light
