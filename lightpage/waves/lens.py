@@ -52,10 +52,10 @@ def entrance_window(
 
 @dataclass(frozen=True)
 class LensPath:
-    """A lens's phase between (x, y) on its plane and (X, Y') on the facet beyond three of the couplings, by parts.
+    """A lens's phase between (x, y) on its plane and (X, Y') on the facet, by parts. Radians, in numpy or torch.
 
     What depends on the facet alone, on x and X, on y and X or on y and Y' has a place in the factors that the couplings
-    have. Only the `rest` needs terms of its own: half as many as all of it would. In numpy or torch.
+    have. Only the `rest` needs terms of its own: half as many as all of it would. Places are told from (a, b).
 
     Args:
         geometry: the device.
@@ -68,31 +68,28 @@ class LensPath:
     factors: Couplings
 
     def on_facet(self, across: Any, up: Any) -> Any:
-        """Radians of the part that the facet alone decides."""
-        return self._at(0.0, 0.0, across, up)
+        """What the facet alone decides."""
+        return self.path.of_both(0.0, 0.0, *on_facet(self.factors, across, up))
 
-    def x_to_x(self, x: Any, across: Any) -> Any:
-        """Radians of x and X."""
-        return self._at(x, 0.0, across, 0.0) - self._at(0.0, 0.0, across, 0.0)
-
-    def y_to_x(self, y: Any, across: Any) -> Any:
-        """Radians of y and X."""
-        return self._at(0.0, y, across, 0.0) - self._at(0.0, 0.0, across, 0.0)
-
-    def y_to_y(self, y: Any, up: Any) -> Any:
-        """Radians of y and Y'."""
-        return self._at(0.0, y, 0.0, up) - self._at(0.0, 0.0, 0.0, up)
-
-    def rest(self, x: Any, y: Any, across: Any, up: Any) -> Any:
-        """Radians of what is left, the coupling of x with Y' included, which a roll makes."""
-        rolled = -self.geometry.wave_number / self.geometry.focal_length_m * self.factors.x_to_y * x * up
+    def beyond(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
+        """By how much the path at (x, y) differs from that at (a, b)."""
         if self.path is IDEAL:
-            return rolled
-        pairs = self.x_to_x(x, across) + self.y_to_x(y, across) + self.y_to_y(y, up)
-        return rolled + self._at(x, y, across, up) - self.on_facet(across, up) - pairs
+            return 0.0 * (a + b + x + y + across + up)
+        there = on_facet(self.factors, across, up)
+        return self.path.of_both(a + x, b + y, *there) - self.path.of_both(a, b, *there)
 
-    def _at(self, x: Any, y: Any, across: Any, up: Any) -> Any:
-        return self.path.of_both(x, y, *on_facet(self.factors, across, up))
+    def phase(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
+        """The same of the whole lens, the ideal one included."""
+        along, upward = on_facet(self.factors, across, up)
+        per_metre = self.geometry.wave_number / self.geometry.focal_length_m
+        return self.beyond(x, y, across, up, a, b) - per_metre * (x * along + y * upward)
+
+    def rest(self, x: Any, y: Any, across: Any, up: Any, a: Any = 0.0, b: Any = 0.0) -> Any:
+        """What of that has no such place, the coupling of x with Y' included, which a roll makes."""
+        rolled = -self.geometry.wave_number / self.geometry.focal_length_m * self.factors.x_to_y * x * up
+        to_x, to_both = self.beyond(x, 0.0, across, 0.0, a, b), self.beyond(0.0, y, across, 0.0, a, b)
+        to_y = self.beyond(0.0, y, 0.0, up, a, b)
+        return rolled + self.beyond(x, y, across, up, a, b) - to_x - to_both - to_y
 
 
 class FourierLens:
@@ -132,16 +129,17 @@ class FourierLens:
         self.y_and_x = kernel(factors.y_to_x, y_m, facet_x).astype(np.complex64)
         self.y_to_y = kernel(factors.y_to_y, facet_y, y_m).astype(np.complex64)
         tolerance = _TOLERANCE if path is IDEAL else _TOLERANCE_WITH_PATH
-        beyond = LensPath(geometry, path, factors)
-        self.terms = Expansion.of(beyond.rest, (x_m, y_m), (facet_x, facet_y), tolerance)
+        parts = LensPath(geometry, path, factors)
+        beyond = parts.beyond
+        self.terms = Expansion.of(parts.rest, (x_m, y_m), (facet_x, facet_y), tolerance)
         self.on_plane: Complex = np.ones((1, 1), np.complex64)
         self.on_facet: Complex = self.on_plane
         if path is not IDEAL:
-            self.x_to_x *= _phasor(beyond.x_to_x(x_m[:, None], facet_x))
-            self.y_and_x *= _phasor(beyond.y_to_x(y_m[:, None], facet_x))
-            self.y_to_y *= _phasor(beyond.y_to_y(y_m, facet_y[:, None]))
+            self.x_to_x *= _phasor(beyond(x_m[:, None], 0.0, facet_x, 0.0))
+            self.y_and_x *= _phasor(beyond(0.0, y_m[:, None], facet_x, 0.0))
+            self.y_to_y *= _phasor(beyond(0.0, y_m, 0.0, facet_y[:, None]))
             self.on_plane = _phasor(path.of_field(x_m, y_m[:, None]))
-            self.on_facet = _phasor(beyond.on_facet(facet_x, facet_y[:, None]))
+            self.on_facet = _phasor(parts.on_facet(facet_x, facet_y[:, None]))
 
     def to_facet(self, field: Complex) -> Complex:
         """Field on the plane [ny, nx] to the facet's grid [cells_y - 1, cells_x - 1]."""

@@ -8,7 +8,6 @@ leave little, and few terms of it are needed. Strips of tiles with the same a sh
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lightpage.device.lens_path import IDEAL, SeidelTerms
-from lightpage.waves.geometry import Couplings, WaveGeometry, couplings, on_facet
+from lightpage.device.lens_path import SeidelTerms
+from lightpage.waves.geometry import WaveGeometry, couplings, on_facet
+from lightpage.waves.lens import LensPath
 from lightpage.waves.low_rank import Interpolation, Phase
 from lightpage.waves.sinc_interpolation import interpolation, sparse_axis
 from train.models.parts import Matrix, Parts, conjugate, multiply, phasor, scaled, stacked
@@ -147,15 +147,15 @@ class TiledLens(nn.Module):
         (across, up), width = facet, geometry.pipe_width_m
         few_x, few_y = self.few_x * width, (self.few_y * width)[:, None]
         a, b = (start[0] + self.inside_x)[:, None, None, None], (start[1] + self.inside_y)[None, :, None, None]
-        phase = _Phase(geometry, path, couplings(geometry, torch))
+        whole = LensPath(geometry, path, couplings(geometry, torch))
         x, y = self.offset_x, self.offset_y
-        strip = phase.beyond(0.0, 0.0, a[:, 0], 0.0, across, up[:, None]) + phase.of_facet(across, up[:, None])
-        tile = phase.beyond(a, 0.0, 0.0, b, few_x, up[:, None])
-        to_x = phase.beyond(a, b, x[:, None], 0.0, few_x, 0.0)
-        to_both = phase.beyond(a, b, 0.0, y[:, None], few_x, 0.0)
-        to_y = phase.beyond(a, b, 0.0, y, 0.0, few_y)
+        strip = whole.phase(a[:, 0], 0.0, across, up[:, None]) + whole.on_facet(across, up[:, None])
+        tile = whole.phase(0.0, b, few_x, up[:, None], a)
+        to_x = whole.phase(x[:, None], 0.0, few_x, 0.0, a, b)
+        to_both = whole.phase(0.0, y[:, None], few_x, 0.0, a, b)
+        to_y = whole.phase(0.0, y, 0.0, few_y, a, b)
         node_x, node_y = (self.nodes[..., axis, None, None] for axis in (0, 1))
-        rest = phase.rest(a[..., None], b[..., None], node_x, node_y, few_x, few_y)
+        rest = whole.rest(node_x, node_y, few_x, few_y, a[..., None], b[..., None])
         area = (x[1] - x[0]) * (y[1] - y[0]) * (few_x[1] - few_x[0]) * (few_y[1, 0] - few_y[0, 0])
         shear: Any = geometry.pipe_angle  # a tensor here, like all of it
         unitary = torch.sqrt(area / torch.cos(shear)) / (geometry.wavelength_m * geometry.focal_length_m)
@@ -218,40 +218,6 @@ class TiledLens(nn.Module):
         return whole[: self.shape[0], : self.shape[1]]
 
 
-class _Phase(NamedTuple):
-    """A lens's phase between (x, y) of its plane and (X, Y') of the facet, but for what the plane alone decides.
-
-    Radians, in numpy or torch.
-    """
-
-    geometry: WaveGeometry
-    path: SeidelTerms
-    factors: Couplings
-
-    def of_facet(self, across: Any, up: Any) -> Any:
-        """What the facet alone decides."""
-        return self.path.of_both(0.0, 0.0, *on_facet(self.factors, across, up))
-
-    def beyond(self, a: Any, b: Any, x: Any, y: Any, across: Any, up: Any) -> Any:
-        """By how much (a + x, b + y) differs from (a, b)."""
-        along, upward = on_facet(self.factors, across, up)
-        per_metre = self.geometry.wave_number / self.geometry.focal_length_m
-        return self._of_path(a, b, x, y, across, up) - per_metre * (x * along + y * upward)
-
-    def rest(self, a: Any, b: Any, x: Any, y: Any, across: Any, up: Any) -> Any:
-        """What of that depends on more than x and X, y and X, or y and Y'."""
-        of_path = partial(self._of_path, a, b)
-        pairs = of_path(x, 0.0, across, 0.0) + of_path(0.0, y, across, 0.0) + of_path(0.0, y, 0.0, up)
-        rolled = -self.geometry.wave_number / self.geometry.focal_length_m * self.factors.x_to_y * x * up
-        return rolled + of_path(x, y, across, up) - pairs
-
-    def _of_path(self, a: Any, b: Any, x: Any, y: Any, across: Any, up: Any) -> Any:
-        if self.path is IDEAL:
-            return 0.0 * (a + b + x + y + across + up)
-        there = on_facet(self.factors, across, up)
-        return self.path.of_both(a + x, b + y, *there) - self.path.of_both(a, b, *there)
-
-
 def _highest(
     geometry: WaveGeometry, path: SeidelTerms, centres: list[Real], offsets: list[Real]
 ) -> tuple[float, float]:
@@ -291,10 +257,10 @@ def _terms(
     """Of the rest, over all tiles."""
     half = geometry.pipe_width_m / 2
     rolled = [replace(geometry, pipe_roll=geometry.pipe_roll + share * roll_margin) for share in (-1, 0, 1)]
-    phases = [_Phase(one, path, couplings(one)) for one in rolled]
+    phases = [LensPath(one, path, couplings(one)) for one in rolled]
 
-    def of(phase: _Phase, a: float, b: float) -> Phase:
-        return lambda x, y, across, up: np.asarray(phase.rest(a, b, x, y, across, up))
+    def of(phase: LensPath, a: float, b: float) -> Phase:
+        return lambda x, y, across, up: np.asarray(phase.rest(x, y, across, up, a, b))
 
     tiles = [[of(phase, a, b) for phase in phases] for a in centres[0] for b in centres[1]]
     edges = np.array([-half, half])
