@@ -24,7 +24,7 @@ from lightpage.device.profile import Profile
 from lightpage.errors import InvalidInputError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import FieldGrid, field_grid
-from train.models.filters import SeparableFilter
+from train.models.filters import BLOCK, SeparableFilter
 
 ROUNDS = 6
 """Of descent; beyond these the band filter's ripple adds up."""
@@ -57,24 +57,37 @@ class Measured(NamedTuple):
     amplitude: Tensor
     lit: Tensor
 
-    def left(self, e: Tensor) -> tuple[Tensor, Tensor]:
+    def left(self, e: Tensor) -> Tensor:
         """What is left of the two equations at e, [2, ny, nx] real and imaginary part."""
-        real, imaginary = e[0], e[1]
-        half_power = (real * real + imaginary * imaginary) / 2
-        return self.a - real - half_power, self.b - self.cos * real - self.sin * imaginary - half_power
+        in_phase, turned = self._brightness(e, 0.0)
+        return torch.stack([self.a + (1 - in_phase) / 2, self.b + (1 - turned) / 2])
 
-    def pull(self, e: Tensor, floor: Tensor | float) -> Tensor:
-        """How the measurements pull at e: the gradient of their likelihood, [2, ny, nx].
+    def pull(self, e: Tensor, floor: Tensor | float, share: float = 1.0) -> Tensor:
+        """How the measurements pull at e: the gradient of their likelihood, or a share of it, [2, ny, nx].
 
         An equation's variance is that of its camera's photons, |1 + e|^2 or |exp(i turn) + e|^2, and of its
         electronics, the `floor`. The first is also the squared length of its gradient, so a step along the sum needs
-        no matrix.
+        no matrix. What is left of an equation is half of what its brightness lacks, see `left`.
         """
-        left_a, left_b = self.left(e)
-        a_re, a_im, b_re, b_im = 1 + e[0], e[1], self.cos + e[0], self.sin + e[1]
-        pull_a = left_a / (a_re * a_re + a_im * a_im + floor)
-        pull_b = left_b / (b_re * b_re + b_im * b_im + floor)
-        return torch.stack([a_re * pull_a + b_re * pull_b, a_im * pull_a + b_im * pull_b])
+        in_phase, turned = self._brightness(e, floor)
+        pull_a = share * (self.a + (1 + floor) / 2) / in_phase - share / 2
+        pull_b = share * (self.b + (1 + floor) / 2) / turned - share / 2
+        both, (real, imaginary) = pull_a + pull_b, e.unbind()
+        return torch.stack([both * real + pull_a + self.cos * pull_b, both * imaginary + self.sin * pull_b])
+
+    def _brightness(self, e: Tensor, floor: Tensor | float) -> tuple[Tensor, Tensor]:
+        """|1 + e|^2 and |exp(i turn) + e|^2, each with the floor on it, [ny, nx]."""
+        real, imaginary = e.unbind()
+        beside = real + 1
+        in_phase = beside * beside + imaginary * imaginary + floor
+        return in_phase, in_phase + (2 * (self.cos - 1) * real + 2 * self.sin * imaginary)
+
+    def in_blocks(self, side: int) -> Measured:
+        """The same on whole blocks of samples; what was not measured lies at the right and below, and is dark."""
+        ny, nx = self.a.shape
+        missing = (0, -nx % side, 0, -ny % side)
+        a, b, amplitude, lit = (functional.pad(plane, missing) for plane in (self.a, self.b, self.amplitude, self.lit))
+        return self._replace(a=a, b=b, amplitude=amplitude, lit=lit)
 
 
 class FieldRecovery(nn.Module):
@@ -117,12 +130,9 @@ class FieldRecovery(nn.Module):
         self.band = SeparableFilter(grid.band)
         self.u: Tensor
         self.v: Tensor
-        self.between_x: Tensor
-        self.between_y: Tensor
-        for power_name, between, axis in (("u", "between_x", grid.x_m), ("v", "between_y", grid.y_m)):
+        for power_name, axis in (("u", grid.x_m), ("v", grid.y_m)):
             powers = np.stack([(axis / corner) ** power for power in range(_CUBIC + 1)])
             self.register_buffer(power_name, torch.tensor(powers, dtype=torch.float32))
-            self.register_buffer(between, torch.tensor(_interpolation(len(axis)), dtype=torch.float32))
 
     def forward(self, *seen: Tensor) -> tuple[Tensor, Tensor]:
         """Recover the field; arguments as for `measure`, results as of `solve`."""
@@ -172,9 +182,13 @@ class FieldRecovery(nn.Module):
             residual: [2, ny, nx], what is left of the two equations inside the pipe's band, over the mean reference
                 amplitude; large against the field when the frames do not belong to this calibration.
         """
-        e = self._solve(measured)
-        residual = self.band(torch.stack(measured.left(e)) * measured.amplitude)
-        return e * measured.amplitude, residual
+        ny, nx = self.grid.shape
+        blocks = measured.in_blocks(BLOCK)
+        # dark samples outside the grid stay dark
+        brighten = functional.pad(1 / measured.amplitude, (0, -nx % BLOCK, 0, -ny % BLOCK))
+        e = self._solve(blocks, brighten)
+        residual = self.band(blocks.left(e) * blocks.amplitude)
+        return (e * blocks.amplitude)[:, :ny, :nx], residual[:, :ny, :nx]
 
     def innovation(self, measured: Measured, field: Tensor, floor: Tensor | float) -> Tensor:
         """What was measured beyond what a predicted field would show, as a change of the field.
@@ -190,15 +204,15 @@ class FieldRecovery(nn.Module):
         pull = measured.lit * measured.pull(field / measured.amplitude, floor)
         return torch.as_tensor(self.band(pull * measured.amplitude))
 
-    def _solve(self, measured: Measured) -> Tensor:
-        """Solve the two equations for e, [2, ny, nx].
+    def _solve(self, measured: Measured, brighten: Tensor) -> Tensor:
+        """Solve the two equations for e, [2, ny, nx]; `brighten` is one over the amplitude, where there is any.
 
         Each sample alone is a quadratic with two roots, which meet where the signal outshines the reference. So: the
         closed root nearer to the linear estimate, then descent with momentum towards the most likely field in the
         pipe's band.
         """
         a, b, cos, sin, amplitude, _ = measured
-        start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) / amplitude
+        start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) * brighten
         if not self.with_signal_power:
             return torch.as_tensor(start)
         # Im e = slope Re e - offset, from the difference of the equations; then a quadratic in Re e
@@ -207,12 +221,13 @@ class FieldRecovery(nn.Module):
         linear = 1 - slope * offset
         discriminant = linear * linear - quadratic * (offset * offset - 2 * a)
         middle = -linear / quadratic
-        real = middle + torch.sign(start[0] - middle) * torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
-        before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) / amplitude
+        root = torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
+        real = middle + torch.where(start[0] < middle, -root, root)
+        before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) * brighten
         for _ in range(self.rounds):
             ahead = estimate + _MOMENTUM * (estimate - before)
-            step = _STEP * measured.pull(ahead, READ_NOISE)
-            before, estimate = estimate, self.band((ahead + step) * amplitude) / amplitude
+            step = measured.pull(ahead, READ_NOISE, _STEP)
+            before, estimate = estimate, self.band((ahead + step) * amplitude) * brighten
         return torch.as_tensor(estimate)
 
     def _where(self, registration: Tensor, side: int, step: int = 1) -> Tensor:
@@ -238,7 +253,10 @@ class FieldRecovery(nn.Module):
         """Binned references on the grid, [2, ny, nx]: beams are smooth, so few places are looked at."""
         coarse = self._where(registration, _REFERENCE_BLOCK_PX, _REFERENCE_STEP)
         blocks = _block_means(references, _REFERENCE_BLOCK_PX // self.binning)
-        return self.between_y @ _sampled(blocks, coarse) @ self.between_x.T
+        seen = _sampled(blocks, coarse)
+        ny, nx = self.grid.shape
+        rows = _between(seen.transpose(1, 2), ny).transpose(1, 2)
+        return _between(rows, nx)
 
 
 def _block_means(images: Tensor, side: int) -> Tensor:
@@ -254,10 +272,20 @@ def _sampled(images: Tensor, where: Tensor) -> Tensor:
     return seen[:, 0]
 
 
-def _interpolation(count: int) -> NDArray[np.float64]:
-    """Linear interpolation from every `_REFERENCE_STEP`-th of so many samples to all, [count, coarse]."""
-    coarse = np.arange(0, count, _REFERENCE_STEP)
-    return np.stack([np.interp(np.arange(count), coarse, unit) for unit in np.eye(len(coarse))], axis=1)
+def _between(coarse: Tensor, count: int) -> Tensor:
+    """Every `_REFERENCE_STEP`-th of so many samples [C, H, coarse] to all of them, linearly; constant behind the last.
+
+    By blocks, as a `SeparableFilter` works.
+    """
+    blocks, each = -(-count // BLOCK), BLOCK // _REFERENCE_STEP
+    shares = np.stack(
+        [np.interp(np.arange(BLOCK) / _REFERENCE_STEP, np.arange(each + 1), unit) for unit in np.eye(each + 1)]
+    )
+    weights = torch.tensor(shares.T, dtype=coarse.dtype, device=coarse.device)[:, None, None]
+    channels, rows, known = coarse.shape
+    behind = coarse[..., -1:].expand(-1, -1, blocks * each + 1 - known)
+    split = functional.conv2d(torch.cat([coarse, behind], dim=-1)[:, None], weights, stride=(1, each))
+    return split.permute(0, 2, 3, 1).reshape(channels, rows, blocks * BLOCK)[..., :count]
 
 
 def relative_power(residual: Tensor, field: Tensor) -> Tensor:
