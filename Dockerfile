@@ -1,5 +1,5 @@
 # The decoder as a service: `runtime` without torch, `camera` with the drivers of cameras and of a modulator on a monitor,
-# `deep` with torch, to train and export in the device.
+# `deep` with torch, to train and export in the device, `gpu` that decodes on an NVIDIA GPU.
 #
 #   docker build --target runtime -t lightpage:runtime .
 #   docker run --read-only --tmpfs /tmp -v bundles:/bundles -v state:/state -p 50051:50051 lightpage:runtime
@@ -35,7 +35,7 @@ COPY analysis analysis
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt .
+    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu]'
 
 FROM base AS runtime
 COPY --from=build /opt/lightpage /opt/lightpage
@@ -61,7 +61,7 @@ FROM build AS build-camera
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[camera,screen]'
+    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu,camera,screen]'
 
 FROM runtime AS camera
 USER 0:0
@@ -75,10 +75,23 @@ FROM build AS build-deep
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[train]'
+    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu,train]'
 
 FROM runtime AS deep
 COPY --from=build-deep /opt/lightpage /opt/lightpage
+
+# An environment of its own: onnxruntime-gpu and onnxruntime are one module, and whichever came last would count.
+FROM build AS build-gpu
+RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
+    --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
+    --mount=type=bind,from=packages,target=/run/packages \
+    rm -rf /opt/lightpage \
+    && python3 -m venv /opt/lightpage \
+    && /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[gpu]'
+
+FROM runtime AS gpu
+COPY --from=build-gpu /opt/lightpage /opt/lightpage
+ENV LIGHTPAGE_SERVICE__PROVIDER=cuda
 
 # What a plain `docker build .` makes.
 FROM runtime

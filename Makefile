@@ -30,7 +30,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("make: Python 3.11 or newer wanted, got " + sys.version if sys.version_info < (3, 11) else 0)'
 	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) 2>/dev/null || \
 	  { $(PYTHON) -m venv --clear --without-pip $(VENV) && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; }
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[train,dev]'
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[cpu,train,dev]'
 	@touch $@
 
 demo: $(STAMP)  ## run the whole main job on a simulated device, into out/demo
@@ -134,7 +134,7 @@ results: $(STAMP)  ## write docs/results.md from analysis/results: RESULTS_ARGS=
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
 	$(BIN)/python proto/generate.py
 
-image:  ## build the container image (IMAGE_TARGET=runtime, camera or deep)
+image:  ## build the container image (IMAGE_TARGET=runtime, camera, deep or gpu)
 	packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
 
 check-image:  ## start the image that buildah built, and see whether it keeps its promises

@@ -38,20 +38,24 @@ __all__ = [
 ]
 
 
-def load(name_or_path: str, threads: int | None = None) -> Decoder:
+def load(name_or_path: str, threads: int | None = None, provider: str = "cpu") -> Decoder:
     """The decoder of a bundle.
 
     Args:
         name_or_path: of a bundle, or the name of a shipped one.
         threads: of an inference; by default all cores.
+        provider: what pages are computed with: ``cpu``, ``cuda``, ``tensorrt``, or ``cuda:1`` for the second GPU.
 
     Raises:
         BundleError: there is none, or it is damaged.
+        InvalidInputError: the text names no provider.
+        ProviderError: there is no such provider here.
     """
     from runtime.bundle.shipped import bundle_path
     from runtime.decoding.decoder import Decoder
+    from runtime.execution.providers import Provider
 
-    return Decoder.load(bundle_path(name_or_path), threads)
+    return Decoder.load(bundle_path(name_or_path), threads, Provider.parse(provider))
 
 
 def __getattr__(name: str) -> Any:

@@ -33,6 +33,10 @@ class WorkerError(LightpageError):
     """A process that the service had started was killed, broke, or took too long; what it worked on is as before."""
 
 
+class ProviderError(BundleError):
+    """The execution provider that was asked for is not here, so nothing can be decoded with it."""
+
+
 class CallerLeft(Exception):
     """The caller has gone away; the work is dropped."""
 

@@ -32,6 +32,8 @@ EXIT_LOST = 3
 EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
 """128 + SIGINT, 128 + SIGTERM, as shells have it."""
 
+RUNTIME = "onnxruntime"
+"""What computes pages; either of two extras brings it."""
 EXTRAS = {
     "train": frozenset({"torch", "torchmetrics", "lightning", "tensorboard", "jinja2", "onnx", "onnxscript"}),
     "camera": frozenset({"harvesters", "genicam"}),
@@ -118,6 +120,9 @@ def _checked(command: click.Command) -> click.Command:
 def missing(subject: str, error: ModuleNotFoundError) -> LightpageError:
     """The error that says which extra to install for a module that is not there."""
     top = (error.name or "").partition(".")[0]
+    if top == RUNTIME:
+        expected = "the extra cpu, or gpu where it shall use one: pip install 'lightpage[cpu]'"
+        return LightpageError(subject, f"no module {top}", expected)
     for extra, modules in EXTRAS.items():
         if top in modules:
             return LightpageError(subject, f"no module {top}", f"the extra {extra}: pip install 'lightpage[{extra}]'")
@@ -159,7 +164,7 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
     except LightpageError as error:
         return _fail(error)
     except ModuleNotFoundError as error:
-        if not any((error.name or "").partition(".")[0] in modules for modules in EXTRAS.values()):
+        if not any((error.name or "").partition(".")[0] in modules for modules in ({RUNTIME}, *EXTRAS.values())):
             raise
         return _fail(missing("lightpage", error))
     except MemoryError as error:

@@ -12,9 +12,8 @@ import numpy as np
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
-from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.client.client import LightpageClient
-from runtime.decoding.decoder import Decoder
+from runtime.commands.execution import Load, decoder_options
 from runtime.execution.cpus import available_cpus
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
@@ -26,13 +25,12 @@ WARM_UP = 2
 
 
 @click.command()
-@click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+@decoder_options
 @click.option("--rounds", default=20, show_default=True, type=click.IntRange(3, 1000), help="Timed rounds.")
-@click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-def bench(bundle: str, rounds: int, threads: int | None, json_path: Path | None) -> None:
+def bench(load: Load, rounds: int, json_path: Path | None) -> None:
     """Time one page three ways in turn, so that a machine whose speed drifts does not tilt the comparison."""
-    decoder = Decoder.load(bundle_path(bundle), threads)
+    decoder = load()
     pair = decoder.bundle.golden.pair
     plane = DataPlane(ModelRegistry(decoder))
     with LightpageServer(plane, Recalibrator(plane)) as server, LightpageClient(server.target) as client:
@@ -52,7 +50,8 @@ def bench(bundle: str, rounds: int, threads: int | None, json_path: Path | None)
     median = {name: float(np.median(values)) for name, values in seconds.items()}
     figures = {
         "bundle_version": decoder.version,
-        "threads": threads or available_cpus(),
+        "threads": decoder.threads or available_cpus(),
+        "provider": str(decoder.graph.provider),
         "rounds": rounds,
         **{f"{name}_p50_seconds": value for name, value in median.items()},
         "decode_over_inference": median["decode"] / median["inference"],

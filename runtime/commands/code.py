@@ -14,13 +14,12 @@ from lightpage.files import write_json
 from lightpage.recording.reader import Recording
 from runtime.bulk.coded_pages import choose_code
 from runtime.bundle.bundle import write_bundle
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
+from runtime.commands.execution import Load, decoder_options
 from runtime.decoding.image_tracker import tracker_for
 
 
 @click.command()
-@click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+@decoder_options
 @click.option("--recording", required=True, type=click.Path(), help="HDF5 recording with known symbols.")
 @click.option("--out", type=OutputFile(), help="Write the code to this TOML file.")
 @click.option("--out-bundle", type=NewPath(), help="Write the bundle with this code in it: a folder, or a .zip.")
@@ -33,16 +32,14 @@ from runtime.decoding.image_tracker import tracker_for
     help="Share of what a symbol carries that is kept for drift.",
 )
 @click.option("--json", "json_path", type=OutputFile(), help="Write the choices to this file.")
-@click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 def code(
-    bundle: str,
+    load: Load,
     recording: str,
     out: Path | None,
     out_bundle: Path | None,
     version: str | None,
     headroom: float,
     json_path: Path | None,
-    threads: int | None,
 ) -> None:
     """Choose levels and rate of a device's page code by pages of a recording that the bundle has not seen.
 
@@ -52,7 +49,7 @@ def code(
         raise InvalidInputError("options", "neither --out nor --out-bundle", "at least one of them")
     if (version is None) != (out_bundle is None):
         raise InvalidInputError("options", "one of --out-bundle and --version", "both or neither")
-    decoder = Decoder.load(bundle_path(bundle), threads)
+    decoder = load()
     with Recording.open(recording) as pages:
         best, tried = choose_code(decoder, pages, tracker_for(decoder), headroom)
     if out is not None:

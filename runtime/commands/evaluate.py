@@ -13,25 +13,23 @@ from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import Evaluation, NothingReadError
 from runtime.bulk.evaluation import evaluate as evaluate_recording
 from runtime.bulk.refused import WORTH_NOTHING, refusal, unconfirmed
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
+from runtime.commands.execution import Load, decoder_options
 from runtime.decoding.image_tracker import tracker_for
 from runtime.decoding.tracking import NoTracker
 
 
 @click.command()
-@click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+@decoder_options
 @click.option("--recording", required=True, type=click.Path(), help="HDF5 recording with known symbols.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-@click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
-def evaluate(bundle: str, recording: str, json_path: Path | None, threads: int | None, tracking: bool) -> None:
+def evaluate(load: Load, recording: str, json_path: Path | None, tracking: bool) -> None:
     """Measure a bundle on the pages of a recording that it has not seen.
 
     Pages that cannot be decoded, or whose pilots do not confirm the result, are left out of the figures, named, and
     make the exit status 2.
     """
-    decoder = Decoder.load(bundle_path(bundle), threads)
+    decoder = load()
     with Recording.open(recording) as pages:
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
         try:

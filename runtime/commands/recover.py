@@ -15,31 +15,28 @@ from lightpage.progress import warn
 from lightpage.recording.reader import Recording
 from runtime.bulk.recovery import Recovery, code_of, lost_data, told_losses
 from runtime.bulk.recovery import recover as recover_file
-from runtime.bundle.shipped import DEFAULT, bundle_path
-from runtime.decoding.decoder import Decoder
+from runtime.commands.execution import Load, decoder_options
 from runtime.decoding.image_tracker import tracker_for
 from runtime.decoding.tracking import NoTracker
 
 
 @click.command()
-@click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+@decoder_options
 @click.option("--recording", required=True, type=click.Path(), help="HDF5 recording of the file's pages.")
 @click.option("--code", "code_path", type=click.Path(path_type=Path), help="Code; the recording's or the bundle's.")
 @click.option("--out", required=True, type=OutputFile(), help="The file.")
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Which volume, where the recording holds several.")
 @click.option("--holes", is_flag=True, help="Write zeros where data are lost, in place of no file.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-@click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
 def recover(
-    bundle: str,
+    load: Load,
     recording: str,
     code_path: Path | None,
     out: Path,
     volume: str | None,
     holes: bool,
     json_path: Path | None,
-    threads: int | None,
     tracking: bool,
 ) -> None:
     """Read a file back from recorded pages.
@@ -47,7 +44,7 @@ def recover(
     Pages that cannot be read are restored from parity pages. Where too many are lost, each is named, no file is written
     and the exit status is 3.
     """
-    decoder = Decoder.load(bundle_path(bundle), threads)
+    decoder = load()
     with Recording.open(recording) as pages:
         code = code_of(pages, decoder.bundle) if code_path is None else load_code(code_path)
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)

@@ -22,12 +22,15 @@ from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import FrameSource
 from runtime.acquisition.sources import open_source
 from runtime.bundle.shipped import DEFAULT, bundle_path
+from runtime.commands.execution import ENGINE_CACHE, PROVIDER, THREADS
 from runtime.console.history import History
 from runtime.console.server import Console, ConsoleServer
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.errors import LostShotError, SourceError
 from runtime.execution.memory import share_freed_memory
+from runtime.execution.providers import Provider
+from runtime.execution.session import VERSION as RUNTIME_VERSION
 from runtime.rpc.health_server import HealthServer, next_port
 from runtime.rpc.server import LightpageServer
 from runtime.service.audit import AuditLog
@@ -59,6 +62,8 @@ _KEYS = {
     "incoming": ("service", "incoming"),
     "recordings": ("service", "recordings"),
     "threads": ("service", "threads"),
+    "provider": ("service", "provider"),
+    "engine_cache": ("service", "engine_cache"),
     "tracking": ("service", "tracking"),
     "self_calibrate": ("self_calibration", "enabled"),
     "calibration_pages": ("self_calibration", "pages"),
@@ -106,7 +111,9 @@ _KEYS = {
     type=click.Path(exists=True, file_okay=False, path_type=Path),
     help="Folder whose recordings a caller may name to recalibrate with.",
 )
-@click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
+@THREADS
+@PROVIDER
+@ENGINE_CACHE
 @click.option(
     "--tracking/--no-tracking", default=None, show_default="tracking", help="Follow the image, and find it again."
 )
@@ -154,7 +161,8 @@ def _given(context: click.Context) -> list[Option]:
 def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], None]) -> None:
     settings = effective.settings
     service, audit = settings.service, settings.audit
-    base = Decoder.load(bundle_path(service.bundle), service.threads)
+    provider = Provider.parse(service.provider, service.engine_cache)
+    base = Decoder.load(bundle_path(service.bundle), service.threads, provider)
     registry = ModelRegistry(base, tracker_for) if service.tracking else ModelRegistry(base)
     metrics = ServiceMetrics()
     monitor = Monitor(metrics=metrics)
@@ -206,7 +214,8 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
 
 
 def _log_start(model: str, source: str, address: str, given: int) -> None:
-    versions = {name: installed_version(name) for name in ("lightpage", "onnxruntime", "grpcio", "numpy")}
+    versions = {name: installed_version(name) for name in ("lightpage", "grpcio", "numpy")}
+    versions["onnxruntime"] = RUNTIME_VERSION
     versions["python"] = platform.python_version()
     text = "serving %s from %s at %s, %d settings given"
     _log.info(text, model, source, address, given, extra={"told": versions})

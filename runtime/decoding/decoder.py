@@ -27,6 +27,7 @@ from runtime.decoding.frames import check_pair
 from runtime.decoding.page import DecodedPage, Inference, Timings
 from runtime.decoding.phase_refit import PhaseRefit
 from runtime.execution.constant_table import GraphFile
+from runtime.execution.providers import ON_CPU, Provider
 from runtime.execution.session import Port
 from runtime.execution.table_graph import TableGraph
 
@@ -49,18 +50,19 @@ def _table_of(bundle: Bundle) -> Iterator[None]:
         raise BundleError(f"{bundle.subject}: {error.subject}", error.got, error.expected) from None
 
 
-def open_graph(bundle: Bundle, threads: int | None = None) -> TableGraph:
+def open_graph(bundle: Bundle, threads: int | None = None, provider: Provider = ON_CPU) -> TableGraph:
     """The graph of a bundle's decoder with the bundle's table.
 
     Raises:
         BundleError: no ONNX model, or its table is not the one of the manifest, or does not fit.
+        ProviderError: there is no such provider here.
     """
     subject = f"{bundle.subject}: {DECODER}"
     file = GraphFile(bundle.files[DECODER], subject)
     if set(file.table_inputs) != set(bundle.manifest.table_inputs):
         raise BundleError(f"{subject}: table inputs", sorted(file.table_inputs), sorted(bundle.manifest.table_inputs))
     with _table_of(bundle):
-        return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table)
+        return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table, provider=provider)
 
 
 class Decoder:
@@ -70,15 +72,23 @@ class Decoder:
         bundle: an opened bundle.
         threads: threads of one inference; by default the cores that this process may use.
         graph: of the bundle, where it is open already; then neither it nor the golden page is looked at.
+        provider: what pages are computed with; all else is computed on the CPU.
 
     Raises:
+        ProviderError: there is no such provider here.
         BundleError: the graph is not a decoder of this profile, table or pilots do not fit it, or the golden page
             comes out differently.
     """
 
-    def __init__(self, bundle: Bundle, threads: int | None = None, graph: TableGraph | None = None) -> None:
+    def __init__(
+        self,
+        bundle: Bundle,
+        threads: int | None = None,
+        graph: TableGraph | None = None,
+        provider: Provider = ON_CPU,
+    ) -> None:
         self.bundle, self.threads = bundle, threads
-        self.graph = graph or open_graph(bundle, threads)
+        self.graph = graph or open_graph(bundle, threads, provider)
         residual = bundle.manifest.residual_output
         self._outputs = [*OUTPUTS, *([residual] if residual else [])]
         self._pilots: dict[int, Pilots] = {}
@@ -90,9 +100,13 @@ class Decoder:
             self._check_golden()
 
     @classmethod
-    def load(cls, path: str | Path, threads: int | None = None) -> Decoder:
+    def load(cls, path: str | Path, threads: int | None = None, provider: Provider = ON_CPU) -> Decoder:
         """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
-        return cls(Bundle.open(path), threads)
+        return cls(Bundle.open(path), threads, provider=provider)
+
+    def load_another(self, path: str | Path) -> Decoder:
+        """The decoder of another bundle, on the same threads and provider; raises as `load` does."""
+        return Decoder.load(path, self.threads, self.graph.provider)
 
     def with_table(self, table: SamplingTable) -> Decoder:
         """This decoder with other tensors in its table, by name; those left out stay. The golden page is not looked at.

@@ -107,13 +107,15 @@ class GraphFile:
 
         Args:
             table: values instead of the defaults, of their types and shapes.
-            fed: names of table inputs that stay inputs, their defaults as they are.
+            fed: names of table inputs that stay inputs, and have no default any more.
         """
         model = pb.Model.FromString(self._model)
         graph, fixed = model.graph, self.table_inputs.keys() - set(fed)
         inputs = [entry for entry in graph.input if entry.name not in fixed]
-        del graph.input[:]
-        graph.input.extend(inputs)
+        held = [tensor for tensor in graph.initializer if tensor.name not in self.table_inputs.keys() - fixed]
+        for field, values in (("input", inputs), ("initializer", held)):
+            graph.ClearField(field)
+            getattr(graph, field).extend(values)
         for tensor in graph.initializer:
             if tensor.name in table and tensor.name in fixed:
                 for field in ("float_data", "int32_data", "int64_data", "double_data", "uint64_data"):

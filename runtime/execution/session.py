@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 # onnxruntime reads this once, on import, and would otherwise send usage data from 1.29 on.
@@ -16,7 +17,9 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 import onnxruntime  # type: ignore[import-untyped]
 
 from lightpage.errors import BundleError
+from runtime.errors import ProviderError
 from runtime.execution.cpus import available_cpus
+from runtime.execution.providers import ON_CPU, Provider
 
 
 class Node(Protocol):
@@ -71,28 +74,46 @@ class Session(Protocol):
     def run(self, output_names: Sequence[str], input_feed: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """Outputs of the names asked for."""
 
+    def io_binding(self) -> Any:
+        """Where one run takes its inputs from and puts its outputs, see `BoundSession`."""
+
+    def run_with_iobinding(self, iobinding: Any) -> None:
+        """One run of what is bound."""
+
+    def get_providers(self) -> Sequence[str]:
+        """Execution providers that it was opened with, the preferred one first."""
+
     def end_profiling(self) -> str:
         """Path of the profile, where one is kept, with all runs so far."""
 
 
+VERSION: str = onnxruntime.__version__
 _ERRORS_ONLY = 3
 _NOWHERE = os.path.join(os.sep, "nonexistent", "lightpage")
 
 
 def open_session(
-    model: bytes, subject: str, threads: int | None = None, *, once: bool = False, profile: Path | None = None
+    model: bytes,
+    subject: str,
+    threads: int | None = None,
+    *,
+    once: bool = False,
+    profile: Path | None = None,
+    provider: Provider = ON_CPU,
 ) -> Session:
-    """Open an ONNX model held in memory on the CPU.
+    """Open an ONNX model held in memory.
 
     Args:
         model: the serialised model; weights in other files are not looked for.
         subject: what it is, for the error, e.g. ``"bundle B: decoder.onnx"``.
-        threads: threads for one run; by default as many as this process has cores.
+        threads: threads for one run on the CPU; by default as many as this process has cores.
         once: whether it will run a single time: then it is not worth while to prepare much.
         profile: beginning of the path of a file in which the runtime notes how long each node takes.
+        provider: what it runs on.
 
     Raises:
         BundleError: the bytes are no ONNX model that this onnxruntime can run.
+        ProviderError: there is no such provider here.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = available_cpus() if threads is None else threads
@@ -109,8 +130,64 @@ def open_session(
         options.enable_profiling, options.profile_file_prefix = True, str(profile)
     # A model that names an outside file for its weights must not read this machine's files.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", _NOWHERE)
+    check_provider(provider)
+    if provider.memory != ON_CPU.memory:  # its libraries may be packages of this environment, which no linker looks in
+        onnxruntime.preload_dlls()
     try:
-        session: Session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        session: Session = onnxruntime.InferenceSession(model, options, providers=provider.chain())
     except Exception as error:  # onnxruntime's errors share no base class
         raise BundleError(subject, str(error).splitlines()[0], "an ONNX model of a Lightpage bundle") from None
+    if (found := session.get_providers()[0]) != provider.runtime_name:  # it says so in its log alone
+        raise ProviderError(
+            f"provider {provider}", f"{found} in its place", "a GPU of that number, its driver and its libraries"
+        )
     return session
+
+
+def check_provider(provider: Provider) -> None:
+    """Check that this onnxruntime was built for a provider.
+
+    Raises:
+        ProviderError: it was not.
+    """
+    available = onnxruntime.get_available_providers()
+    if provider.runtime_name not in available:
+        raise ProviderError(
+            f"provider {provider}",
+            f"an onnxruntime with {', '.join(available)}",
+            "onnxruntime-gpu in place of onnxruntime (docs/gpu.md), or provider cpu",
+        )
+
+
+class BoundSession:
+    """A session and tensors that it is run with every time: they lie where it computes, and are not sent again.
+
+    It never changes; `run` may be called from many threads at once.
+
+    Args:
+        session: opened with this provider.
+        provider: what it runs on.
+        constants: by input.
+    """
+
+    def __init__(self, session: Session, provider: Provider, constants: Mapping[str, NDArray[Any]]) -> None:
+        self.session = session
+        self._constants = {
+            name: onnxruntime.OrtValue.ortvalue_from_numpy(
+                np.ascontiguousarray(value), provider.memory, provider.device
+            )
+            for name, value in constants.items()
+        }
+
+    def run(self, outputs: Iterable[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+        """Outputs of the names asked for; `feeds` holds the other inputs, and may stand in for constants."""
+        binding = self.session.io_binding()
+        for name, value in self._constants.items():
+            if name not in feeds:
+                binding.bind_ortvalue_input(name, value)
+        for name, array in feeds.items():
+            binding.bind_cpu_input(name, np.ascontiguousarray(array))
+        for name in outputs:
+            binding.bind_output(name, "cpu")
+        self.session.run_with_iobinding(binding)
+        return [np.asarray(value) for value in binding.copy_outputs_to_cpu()]

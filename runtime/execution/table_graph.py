@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import InvalidInputError
 from runtime.execution.constant_table import GraphFile
-from runtime.execution.session import Port, Session, open_session
+from runtime.execution.providers import ON_CPU, Provider
+from runtime.execution.session import BoundSession, Port, Session, open_session
 
 
 class TableGraph:
@@ -25,11 +26,12 @@ class TableGraph:
         threads: threads of one run; by default the cores that this process may use.
         table: values instead of the graph's defaults.
         like: the same graph with another table: what runs for every page is shared with it.
-        profile: see `open_session`.
+        profile, provider: see `open_session`; what is computed once is computed on the CPU.
 
     Raises:
         InvalidInputError: a table that does not fit.
         BundleError: the graph cannot be run.
+        ProviderError: there is no such provider here.
     """
 
     def __init__(
@@ -41,33 +43,39 @@ class TableGraph:
         table: SamplingTable | None = None,
         like: TableGraph | None = None,
         profile: Path | None = None,
+        provider: Provider = ON_CPU,
     ) -> None:
         self._file, self._subject, self._fed_names, self._threads = file, subject, fed, threads
+        self.provider = provider
         self.table: SamplingTable = table or {}
         self.check(self.table)
-        fed_values = {name: value for name, value in self.table.items() if name in fed}
         parts = file.cut(self.table, fed)
-        self._between: dict[str, NDArray[Any]] = {}
+        between: dict[str, NDArray[Any]] = {}
         if parts.before is not None:  # else nothing follows from the table alone
             before = open_session(parts.before, subject, threads, once=True)
-            self._between = dict(zip(parts.between, before.run(parts.between, {}), strict=True))
-        self._between |= {name: self.value(name) for name in parts.direct}
-        if like is not None and self._between:
+            between = dict(zip(parts.between, before.run(parts.between, {}), strict=True))
+        between |= {name: self.value(name) for name in parts.direct}
+        fed_values = {name: self.value(name) for name in self.ports.keys() & set(fed)}
+        if like is not None and between:
             self.session: Session = like.session
         else:
-            self.session = open_session(parts.behind_with(self._between), subject, threads, profile=profile)
-        self._fed = fed_values | self._between
+            model = parts.behind_with(between)
+            self.session = open_session(model, subject, threads, profile=profile, provider=provider)
+        held = fed_values | between
+        self._held = held.keys()
+        self._bound = BoundSession(self.session, provider, held)
 
     def with_table(self, table: SamplingTable) -> TableGraph:
         """The graph with other tensors in its table, by name; those left out stay. Errors as for the constructor."""
         merged = {**self.table, **table}
-        return TableGraph(self._file, self._subject, self._fed_names, self._threads, merged, like=self)
+        names, threads = self._fed_names, self._threads
+        return TableGraph(self._file, self._subject, names, threads, merged, like=self, provider=self.provider)
 
     @property
     def inputs(self) -> dict[str, Port]:
         """Type and shape of what must be fed with each page, by name."""
         nodes = self.session.get_inputs()
-        return {node.name: Port.of(node) for node in nodes if node.name not in self._between}
+        return {node.name: Port.of(node) for node in nodes if node.name not in self._held}
 
     @property
     def ports(self) -> Mapping[str, Port]:
@@ -101,4 +109,4 @@ class TableGraph:
 
     def run(self, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """Run the graph; `feeds` holds the frames, and table tensors for this run alone."""
-        return self.session.run(outputs, {**self._fed, **feeds})
+        return self._bound.run(outputs, feeds)

@@ -268,7 +268,7 @@ class Models:
         if store is None:
             raise StoreError("model store", "none", "a service started with --store")
         try:
-            decoder = Decoder.load(path, self.registry.current.decoder.threads)
+            decoder = self.registry.current.decoder.load_another(path)
             self.registry.check(decoder)
         except BundleError as error:
             subject = error.subject.replace(f"bundle {path}", "new bundle")

@@ -129,7 +129,7 @@ class ModelRegistry:
     """
 
     def __init__(self, first: Decoder, make_tracker: TrackerFactory = no_tracker, kept: int = KEPT_MODELS) -> None:
-        self._make_tracker, self._kept, self._threads = make_tracker, kept, first.threads
+        self._make_tracker, self._kept = make_tracker, kept
         self._changing = threading.Lock()
         """Held from the checks of a change to its end, its note included; taken before the lock below."""
         self._lock = threading.Lock()
@@ -274,7 +274,7 @@ class ModelRegistry:
             held = self._loaded.get(place.version)
         if held is not None:
             return held
-        decoder = Decoder.load(place.path, self._threads)
+        decoder = self.current.decoder.load_another(place.path)
         if decoder.version != place.version:
             raise BundleError(f"{decoder.bundle.subject}: version", decoder.version, place.version)
         return self._tracked(decoder)

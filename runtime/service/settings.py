@@ -28,6 +28,7 @@ from lightpage.device.problems import WANTED, expected_of, problem_of
 from lightpage.device.profile import TomlTable, toml_value
 from lightpage.errors import InvalidInputError
 from runtime.bundle.shipped import DEFAULT
+from runtime.execution.providers import CPU, Provider
 from runtime.recalibration.known_pages import MIN_PAGES
 from runtime.service.audit import AUDIT_BYTES, AUDIT_KEPT
 from runtime.service.flight_recorder import PAGES, RING_BYTES, FlightSettings
@@ -93,6 +94,8 @@ class ServiceTable(SettingsTable):
         incoming: folder whose bundles are taken into the store.
         recordings: folder whose recordings a caller may name to recalibrate with.
         threads: of one inference; without, all cores.
+        provider: what computes pages: `cpu`, `cuda` or `tensorrt`, with `:N` for another GPU than the first.
+        engine_cache: folder where TensorRT keeps its engines; without, it builds them at each start.
         tracking: whether the image is followed and searched for.
     """
 
@@ -105,6 +108,8 @@ class ServiceTable(SettingsTable):
     incoming: _Path | None = None
     recordings: _Path | None = None
     threads: Annotated[int, Field(ge=1, le=4096)] | None = None
+    provider: str = CPU
+    engine_cache: _Path | None = None
     tracking: bool = True
 
     @field_validator("address", "health_address")
@@ -117,6 +122,15 @@ class ServiceTable(SettingsTable):
         except InvalidInputError as error:
             raise ValueError(error.expected) from None
         return address
+
+    @field_validator("provider")
+    @classmethod
+    def _is_provider(cls, provider: str) -> str:
+        try:
+            Provider.parse(provider)
+        except InvalidInputError as error:
+            raise ValueError(error.expected) from None
+        return provider
 
 
 class MetricsTable(SettingsTable):

@@ -1,0 +1,41 @@
+"""Options of commands that decode: the bundle, threads, execution provider, and where TensorRT keeps its engines."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from runtime.bundle.shipped import DEFAULT, bundle_path
+from runtime.decoding.decoder import Decoder
+from runtime.execution.providers import CPU, WANTED, Provider
+
+Load = Callable[[], Decoder]
+"""Opens the decoder that the options name; raises as `Decoder.load` does."""
+THREADS = click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
+PROVIDER = click.option("--provider", show_default=CPU, help=f"What computes pages: {WANTED}.")
+ENGINE_CACHE = click.option(
+    "--engine-cache",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder where TensorRT keeps its engines; without, it builds them each time, for minutes.",
+)
+
+
+def decoder_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Gives a command these options; it is called with a `Load` as `load` in their place."""
+
+    @click.option("--bundle", default=DEFAULT, show_default=True, help="A bundle's path, or the name of a shipped one.")
+    @THREADS
+    @PROVIDER
+    @ENGINE_CACHE
+    @functools.wraps(command)
+    def with_decoder(
+        *, bundle: str, threads: int | None, provider: str | None, engine_cache: Path | None, **others: Any
+    ) -> Any:
+        chosen = Provider.parse(provider or CPU, engine_cache)
+        return command(load=lambda: Decoder.load(bundle_path(bundle), threads, chosen), **others)
+
+    return with_decoder
