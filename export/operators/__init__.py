@@ -1,0 +1,1 @@
+"""What execution providers can run: their operators by version and type, and which nodes of a graph they lack."""
