@@ -1,0 +1,285 @@
+"""The exported decoders run on CUDA and TensorRT but for the nodes named here, and a planted one is found."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from click.testing import CliRunner
+from onnx import TensorProto, helper, parser
+
+from export.graph import DecoderGraph, table_tensors
+from export.onnx_files import OPSET, decoder_onnx
+from export.operators.check import Fallback, fallbacks, page_part, shape_computations
+from export.operators.collect import collect
+from export.operators.operator_list import PROVIDERS, OperatorList
+from lightpage.calibration.sampling_table import sampling_table
+from lightpage.device.state import Device
+from lightpage.errors import InvalidInputError
+from lightpage.simulator.simulator import Simulator
+from lightpage.simulator.true_optics import true_parameters
+from tests.lightpage.small import small_profile
+from train.models.decoder import SymbolDecoder
+from train.models.presets import ACCURATE, FAST, PRESETS, STANDARD
+from train.models.twin import RayTwin, TorchTwin
+
+ORIGIN = "someone/project docs/file.md at 0000000 (1.0)"
+KNOWN = {"cuda": ["Atan"], "tensorrt": ["Unsqueeze", "Unsqueeze", "Concat"]}
+"""What falls back today, by provider: the angle of p on CUDA; the stack of integer frames on TensorRT."""
+SMALL = "agraph (float[1, 2, 6, 8] x, float[1, 4, 4, 2] grid) => (float[1, 2, 4, 4] y)"
+
+
+def exported(localizer: str, preset: str) -> bytes:
+    """A small device's decoder; what operators it has does not depend on the network's size."""
+    profile, device = small_profile(), Device()
+    parameters = true_parameters(profile, device)
+    choices = replace(PRESETS[preset], channels=8, blocks=1)
+    graph = DecoderGraph(profile, SymbolDecoder(profile, parameters, localizer, choices), 1.0).eval()
+    table = sampling_table(TorchTwin(RayTwin(profile)), parameters, device.homodyne.turn_rad, profile)
+    tensors = table_tensors(graph, table, Simulator(profile, device, seed=1).references())
+    return decoder_onnx(graph, "uint8", profile.frame_shape, tensors)
+
+
+@pytest.fixture(scope="module")
+def fast() -> bytes:
+    """What runs for every page of a fast decoder."""
+    return page_part(exported("coherent", FAST))
+
+
+def operators(found: list[Fallback]) -> list[str]:
+    """Operators of nodes, in order."""
+    return [one.operator for one in found]
+
+
+def small(body: str, header: str = SMALL, opset: int = OPSET) -> bytes:
+    """A graph in ONNX's own words."""
+    text = f'<ir_version: 10, opset_import: ["" : {opset}, "com.microsoft" : 1]>\n{header} {{\n{body}\n}}'
+    return bytes(parser.parse_model(text).SerializeToString())
+
+
+def test_a_fast_decoder_leaves_the_provider_at_the_known_nodes_alone(fast: bytes) -> None:
+    for provider in PROVIDERS:
+        assert operators(fallbacks(fast, provider)) == KNOWN[provider], provider
+    assert shape_computations(fast) == []
+    assert all("of uint8" in one.got for one in fallbacks(fast, "tensorrt"))
+
+
+@pytest.mark.parametrize(
+    ("localizer", "preset"),
+    [
+        ("coherent", ACCURATE),  # holds the operators of the two below
+        pytest.param("coherent", STANDARD, marks=pytest.mark.long),
+        pytest.param("wave", STANDARD, marks=pytest.mark.long),
+    ],
+)
+def test_so_does_every_other(localizer: str, preset: str) -> None:
+    part = page_part(exported(localizer, preset))
+    for provider in PROVIDERS:
+        assert operators(fallbacks(part, provider)) == KNOWN[provider], provider
+    assert shape_computations(part) == []
+
+
+def test_a_cast_planted_before_the_sampling_is_found_and_named(fast: bytes) -> None:
+    model = onnx.load_from_string(fast)
+    nodes = model.graph.node
+    place = next(number for number, node in enumerate(nodes) if node.op_type == "GridSample")
+    sampler, planted, seen = nodes[place], nodes[place].input[0], nodes[place].output[0]
+    sampler.input[0], sampler.output[0] = "planted", "half"
+    nodes.insert(place + 1, helper.make_node("Cast", ["half"], [seen], to=TensorProto.FLOAT))
+    nodes.insert(place, helper.make_node("Cast", [planted], ["planted"], to=TensorProto.FLOAT16))
+    found = fallbacks(model.SerializeToString(), "cuda")
+    (new,) = set(found) - set(fallbacks(fast, "cuda"))
+    assert (new.node, new.operator, new.version) == (sampler.name, "GridSample", 20)
+    assert new.got == "planted of float16, half of float16"
+    assert new.expected.startswith("one of float32")
+    assert fallbacks(model.SerializeToString(), "tensorrt") == fallbacks(fast, "tensorrt")  # that samples in halves too
+
+
+def test_a_network_in_half_precision_stays_on_the_provider() -> None:
+    halves = small(
+        """h = Cast <to: int = 10> (x)
+        w = Cast <to: int = 10> (weights)
+        c = Conv (h, w)
+        g = Gelu (c)
+        s = Add (g, c)
+        y = Cast <to: int = 1> (s)""",
+        "agraph (float[1, 2, 6, 8] x) => (float[1, 2, 6, 8] y) <float[2, 2, 1, 1] weights = {1, 0, 0, 1}>",
+    )
+    assert [fallbacks(halves, provider) for provider in PROVIDERS] == [[], []]
+
+
+@pytest.mark.parametrize(
+    ("provider", "model", "operator", "got"),
+    [
+        ("cuda", small("y = MatMul (a, a)", "agraph (int64[4, 4] a) => (int64[4, 4] y)"), "MatMul", "of int64"),
+        ("tensorrt", small("y = Add (a, a)", "agraph (double[4] a) => (double[4] y)"), "Add", "of float64"),
+        ("tensorrt", small("y = Pow (a, a)", "agraph (int64[4] a) => (int64[4] y)"), "Pow", "of int64"),
+        ("cuda", small("y = Det (a)", "agraph (float[4, 4] a) => (float y)"), "Det", "operator Det"),
+        (
+            "cuda",
+            small("y = com.microsoft.Unheard (a)", "agraph (float[4] a) => (float[4] y)"),
+            "com.microsoft:Unheard",
+            "operator com.microsoft:Unheard",
+        ),
+        (
+            "cuda",
+            small("y = com.microsoft.BiasGelu (a, a)", "agraph (int32[4] a) => (int32[4] y)"),
+            "com.microsoft:BiasGelu",
+            "of int32",
+        ),
+        (
+            "tensorrt",
+            small("y = Slice (a, b, b, b)", "agraph (float[4, 4] a, int64[1] b) => (float[n, m] y)"),
+            "Slice",
+            "axes that is computed",
+        ),
+        (
+            "tensorrt",
+            small(
+                "y = GridSample (x, grid)",
+                "agraph (float[1, 1, 4, 4, 4] x, float[1, 2, 2, 2, 3] grid) => (float[1, 1, 2, 2, 2] y)",
+            ),
+            "GridSample",
+            "x of 5 axes",
+        ),
+        ("tensorrt", small("y = Neg (a)", "agraph (float[4] a) => (float[4] y)", opset=21), "Neg", "opset 21"),
+    ],
+)
+def test_what_a_provider_lacks_is_found(provider: str, model: bytes, operator: str, got: str) -> None:
+    (found,) = fallbacks(model, provider)
+    assert found.operator == operator
+    assert got in found.got
+
+
+def test_a_type_that_nobody_knows_is_not_taken_for_a_right_one() -> None:
+    model = small(
+        "b = com.microsoft.Unheard (a)\ny = Neg (b)",
+        "agraph (float[4] a) => (float[4] y)",
+    )
+    unheard, negated = fallbacks(model, "cuda")
+    assert (unheard.operator, negated.operator) == ("com.microsoft:Unheard", "Neg")
+    assert negated.got == "b of unknown"
+
+
+def test_what_depends_on_constants_alone_is_not_asked_for() -> None:
+    header = "agraph (float[3] x) => (float[3] y) <float[3] table = {1, 2, 3}>"
+    assert fallbacks(small("t = Atan (table)\ny = Mul (x, t)", header), "cuda") == []
+    (found,) = fallbacks(small("t = Atan (x)\ny = Mul (x, t)", header), "cuda")
+    assert (found.node, found.operator, found.version) == ("t", "Atan", 7)
+
+
+def test_computations_of_shapes_are_told_apart() -> None:
+    model = small(
+        """s = Shape (x)
+        n = Gather (s, first)
+        k = BitwiseNot (n)
+        y = ConstantOfShape (k)""",
+        "agraph (float[a, b] x) => (float[c] y) <int64[1] first = {0}>",
+    )
+    assert shape_computations(model) == ["n", "k"]
+    assert fallbacks(model, "cuda") == []
+
+
+def test_a_graph_within_a_node_is_refused() -> None:
+    inner = helper.make_graph([], "inner", [], [])
+    node = helper.make_node("If", ["x"], ["y"], name="choice", then_branch=inner, else_branch=inner)
+    model = helper.make_model(helper.make_graph([node], "outer", [], []))
+    with pytest.raises(InvalidInputError, match=r"node choice: got a graph within it, wanted .*without inner graphs"):
+        fallbacks(model.SerializeToString(), "cuda")
+
+
+def test_the_committed_lists_say_where_they_are_from() -> None:
+    for provider in PROVIDERS:
+        listed = OperatorList.load(provider)
+        assert re.fullmatch(r"[\w-]+/[\w-]+ docs/\w+\.md at [0-9a-f]{40} \(.+\)", listed.origin)
+        assert {domain for domain, _ in listed.operators} <= {"", "com.microsoft"}
+        assert len(listed.operators) > 100
+    with pytest.raises(InvalidInputError, match=r"execution provider: got 'abacus', wanted one of cuda, tensorrt"):
+        OperatorList.load("abacus")
+
+
+def made(document: str, provider: str, folder: Path) -> OperatorList:
+    """The list of a document, by way of the command and its file."""
+    (folder / "D.md").write_text(document)
+    out = folder / "L.json"
+    options = [str(folder / "D.md"), "--provider", provider, "--origin", ORIGIN, "--out", str(out)]
+    CliRunner().invoke(collect, options, standalone_mode=False, catch_exceptions=False)
+    return OperatorList.from_json(out.read_text())
+
+
+KERNELS = """
+<a name="cpuexecutionprovider"/>
+|**Operator Domain:** *ai.onnx*||||
+|Atan|*in* input:**T**<br> *out* output:**T**|7+|**T** = tensor(float)|
+<a name="cudaexecutionprovider"/>
+| Op Name | Parameters | OpSet Version | Types Supported |
+|---------|------------|---------------|-----------------|
+|**Operator Domain:** *ai.onnx*||||
+|Conv|*in* X:**T**<br> *out* Y:**T**|11+|**T** = tensor(double), tensor(float)|
+|||[1, 10]|**T** = tensor(float)|
+|GridSample|*in* X:**T1**<br> *in* grid:**T2**|16+|**T1** = tensor(float)<br/> **T2** = tensor(float)|
+| |
+|**Operator Domain:** *ai.onnx.ml*||||
+|Scaler|*in* X:**T**<br> *out* Y:**T**|1+|**T** = tensor(float)|
+|**Operator Domain:** *com.microsoft*||||
+|Fused|*in* X:**T**<br> *in* W:**T1**<br> *out* Y:**T**<br><br>or<br><br>*in* X:**T**|1+|**T** = tensor(float)|
+<a name="dmlexecutionprovider"/>
+|Atan|*in* input:**T**<br> *out* output:**T**|7+|**T** = tensor(float)|
+"""
+
+
+def test_cudas_list_is_read_from_its_projects_document(tmp_path: Path) -> None:
+    listed = made(KERNELS, "cuda", tmp_path)
+    assert (listed.provider, listed.origin, listed.opsets) == ("CUDAExecutionProvider", ORIGIN, None)
+    assert set(listed.operators) == {("", "Conv"), ("", "GridSample"), ("com.microsoft", "Fused")}
+    newest, older = listed.operators["", "Conv"].kernels
+    assert (newest.since, newest.until, set(newest.types["T"])) == (11, None, {"float32", "float64"})
+    assert (older.since, older.until) == (1, 10)
+    fused = listed.operators["com.microsoft", "Fused"]
+    assert (fused.inputs, fused.outputs) == (("T", "T1"), ("T",))
+
+
+def test_a_kernel_without_a_last_version_is_taken_for_its_first_alone(tmp_path: Path) -> None:
+    """So onnxruntime before 1.25 does with GridSample as this project exports it."""
+    listed = made(KERNELS, "cuda", tmp_path)
+    assert fallbacks(small("y = GridSample (x, grid)", opset=19), listed) == []
+    (found,) = fallbacks(small("y = GridSample (x, grid)"), listed)
+    assert (found.got, found.expected) == ("version 20", "version 16")
+    assert fallbacks(small("y = GridSample (x, grid)"), "cuda") == []
+
+
+def test_tensorrts_list_is_read_from_its_projects_document(tmp_path: Path) -> None:
+    document = """
+TensorRT 10.0 supports operators in the inclusive range of opset 9 to opset 20.
+| Operator   | Supported | Supported Types   | Restrictions |
+|------------|-----------|-------------------|--------------|
+| Acos       | Y         | FP32, FP16, |
+| Det        | N         |
+| GridSample | Y         | FP32, BOOL | Input must be 4D input.
+| Slice      | Y         | FP32, INT64 | `axes` must be an initializer   |
+"""
+    listed = made(document, "tensorrt", tmp_path)
+    assert (listed.provider, listed.opsets) == ("TensorrtExecutionProvider", (9, 20))
+    assert {name for _, name in listed.operators} == {"Acos", "GridSample", "Slice"}
+    assert listed.operators["", "GridSample"].rank == 4
+    assert listed.operators["", "Slice"].constant == ("axes",)
+    with pytest.raises(InvalidInputError, match=r"types of Acos: got FP33"):
+        made(document.replace("FP32, FP16", "FP33"), "tensorrt", tmp_path)
+
+
+@pytest.mark.parametrize("provider", PROVIDERS)
+def test_another_document_is_refused(provider: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="operator document: got no "):
+        made("# Something else", provider, tmp_path)
+
+
+def test_the_cut_part_takes_what_the_table_gives_with_its_types(fast: bytes) -> None:
+    inputs = {value.name: value.type.tensor_type for value in onnx.load_from_string(fast).graph.input}
+    assert {"in_phase", "quadrature", "registration"} < set(inputs)
+    assert all(described.elem_type for described in inputs.values())
+    shape = [size.dim_value for size in inputs["in_phase"].shape.dim]
+    np.testing.assert_array_equal(shape, small_profile().frame_shape)
