@@ -20,6 +20,7 @@ from export.graph import (
     published_tensors,
     table_tensors,
 )
+from export.half import FLOAT16, FLOAT32, PRECISIONS, check_deviation, in_half, rounded
 from export.onnx_files import decoder_onnx, field_onnx, twin_onnx
 from export.parity import check_parity, torch_answer
 from lightpage.calibration.sampling_table import sampling_table
@@ -34,7 +35,7 @@ from runtime.bulk.coded_pages import choose_code
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.bundle import Bundle, npz, write_bundle
 from runtime.bundle.manifest import DECODER, FIELD, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version, sha256
-from runtime.decoding.decoder import Decoder
+from runtime.decoding.decoder import PAGE_INPUTS, Decoder
 from runtime.decoding.frames import narrow
 from runtime.decoding.image_tracker import tracker_for
 from runtime.execution.session import open_session
@@ -57,9 +58,22 @@ _LEAST_CONTRAST = 2.0
 @click.option("--name", default=None, help="Name of the bundle; the profile's if left out.")
 @click.option("--version", "version", default=None, help="Of the bundle; its name, the time and a hash if left out.")
 @click.option("--recording", type=click.Path(path_type=Path), help="Choose the code of user bytes by its unseen pages.")
+@click.option(
+    "--precision",
+    type=click.Choice(PRECISIONS),
+    default=FLOAT32,
+    show_default=True,
+    help="Of network and waves; float16 pays on a GPU alone.",
+)
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def export(
-    run: Path, out: Path, name: str | None, version: str | None, recording: Path | None, json_path: Path | None
+    run: Path,
+    out: Path,
+    name: str | None,
+    version: str | None,
+    recording: Path | None,
+    precision: str,
+    json_path: Path | None,
 ) -> None:
     """Export a training run, proving the bundle against torch with the runtime's own decoder.
 
@@ -67,7 +81,7 @@ def export(
     choose it by the pages of the recording that the run was not trained on.
     """
     with percent_bar() as progress:
-        bundle, error = export_run(run, out, name, version, progress, recording)
+        bundle, error = export_run(run, out, name, version, progress, recording, precision)
     if bundle.code is None:
         note("the bundle has no code for user bytes: export with --recording, or see `lightpage code`")
     size = sum(len(data) for data in bundle.files.values())
@@ -85,6 +99,7 @@ def export_run(
     version: str | None = None,
     progress: Progress = lambda step, share: None,
     recording: Path | None = None,
+    precision: str = FLOAT32,
 ) -> tuple[Bundle, float]:
     """Write the bundle of a run.
 
@@ -94,12 +109,13 @@ def export_run(
         name, version: of it.
         progress: told of every step.
         recording: with pages that the run has not seen, to choose the code of user bytes by; no code without.
+        precision: of network and waves, one of `PRECISIONS`.
 
     Returns:
         The bundle as opened again, and the relative error of p against torch on the golden page.
 
     Raises:
-        InvalidInputError: the run is unfinished.
+        InvalidInputError: the run is unfinished, or of a published decoder, which has no half precision.
         RecordingError: the recording is of another device.
         BundleError: `version` is none, or the exported decoder does not say what torch says; nothing stays at `out`.
     """
@@ -108,6 +124,8 @@ def export_run(
     if out.exists():
         raise BundleError(f"--out {out}", "something that exists", "a new path: bundles are never overwritten")
     run = load_run(folder)
+    if precision != FLOAT32 and isinstance(run.hyperparameters, PublishedChoices):
+        raise InvalidInputError("--precision", f"{precision} for a published decoder", FLOAT32)
     profile, calibration = run.profile, run.calibration
     twin = RayTwin(profile)
     kept, golden = load_arrays(folder / REFERENCES), load_arrays(folder / RUN_GOLDEN)
@@ -121,9 +139,14 @@ def export_run(
     progress("decoder to ONNX", 0.2)
     decoder = decoder_onnx(graph, frame_dtype, profile.frame_shape, defaults)
     progress("ask ONNX Runtime", 0.6)
-    session = open_session(decoder, f"{out}: {DECODER}")
+    asked = decoder
+    if precision == FLOAT16:
+        decoder, asked = in_half(decoder, PAGE_INPUTS), rounded(decoder, PAGE_INPUTS)
+    session = open_session(asked, f"{out}: {DECODER}", once=precision == FLOAT16)
     (answer,) = session.run(["p"], dict(zip(FRAME_INPUTS, (pair.in_phase, pair.quadrature), strict=True)))
     error = check_parity(expected["p"], np.asarray(answer), str(out))
+    if precision == FLOAT16:
+        check_deviation(expected["p"], np.asarray(answer), str(out))
     name, created = name or profile.name, datetime.now(UTC)
     manifest = Manifest(
         name=name,
@@ -133,7 +156,11 @@ def export_run(
         calibration=run.calibration_toml,
         camera_bit_depth=run.camera_bit_depth,
         frame_dtype="uint8" if frame_dtype == "uint8" else "uint16",
-        metrics={"validation_air_bits_per_symbol": run.validation_air, "training_seconds": run.seconds},
+        metrics={
+            "validation_air_bits_per_symbol": run.validation_air,
+            "training_seconds": run.seconds,
+            **({} if precision == FLOAT32 else {"precision": precision}),
+        },
         calibrated_pages=calibration.calibrated_pages,
         trained_pages=run.trained_pages,
         table_inputs=tuple(defaults),

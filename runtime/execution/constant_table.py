@@ -18,7 +18,7 @@ from lightpage.errors import BundleError
 from runtime.execution.session import Port
 from runtime.pb.lightpage.onnx import graph_pb2 as pb
 
-_DTYPES = {1: "float32", 2: "uint8", 4: "uint16", 6: "int32", 7: "int64", 11: "float64"}
+_DTYPES = {1: "float32", 2: "uint8", 4: "uint16", 6: "int32", 7: "int64", 10: "float16", 11: "float64"}
 """numpy's names of ONNX's element types."""
 _NUMBERS = {name: number for number, name in _DTYPES.items()} | {"bool": 9}
 _LISTS = {"float32": "float_data", "int64": "int64_data", "float64": "double_data"}

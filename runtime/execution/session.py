@@ -32,6 +32,7 @@ class Node(Protocol):
 
 _TYPES = {
     "tensor(float)": "float32",
+    "tensor(float16)": "float16",
     "tensor(double)": "float64",
     "tensor(int32)": "int32",
     "tensor(int64)": "int64",

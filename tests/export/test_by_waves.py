@@ -10,7 +10,9 @@ import pytest
 from click.testing import CliRunner
 from scipy import ndimage
 
-from export.command import export_run
+from export.command import export, export_run
+from export.operators.check import fallbacks, page_part
+from export.operators.operator_list import PROVIDERS
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.device.state import Device
 from lightpage.metrics.measures import measure
@@ -20,6 +22,8 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
+from runtime.bundle.bundle import Bundle
+from runtime.bundle.manifest import DECODER
 from runtime.commands.evaluate import evaluate
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_drift import SHIFT, DriftModel
@@ -56,6 +60,21 @@ def test_the_bundle_decodes_without_torch_what_the_run_decoded(
     # of the same light as the validation page, with calibrated concentrations on top; a dozen pilots show the piston
     found = json.loads((tmp_path / "E.json").read_text())["air_bits_per_symbol"]
     assert found > load_run(run).validation_air - 0.6 > 1
+
+
+def test_half_precision_reads_as_much(made: tuple[Path, Path, float], small_device: list[str], tmp_path: Path) -> None:
+    run, bundle, _ = made
+    half = tmp_path / "half.zip"
+    result = CliRunner().invoke(export, [str(run), "--out", str(half), "--precision", "float16"])
+    assert result.exit_code == 0, result.output
+    rates = []
+    for one in (bundle, half):
+        asked = ["--bundle", str(one), "--recording", small_device[3], "--json", str(tmp_path / "E.json")]
+        CliRunner().invoke(evaluate, asked, standalone_mode=False, catch_exceptions=False)
+        rates.append(json.loads((tmp_path / "E.json").read_text())["air_bits_per_symbol"])
+    assert abs(rates[1] - rates[0]) < 0.01
+    for provider in PROVIDERS:
+        assert fallbacks(page_part(Bundle.open(half).files[DECODER]), provider) == [], provider
 
 
 def test_with_the_drifted_devices_table_it_decodes_the_drifted_device(made: tuple[Path, Path, float]) -> None:

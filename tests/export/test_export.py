@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from export import command as cli_export
 from export.command import export, export_run
-from export.graph import TABLE_INPUTS
+from export.graph import TABLE_INPUTS, angle
 from export.parity import check_parity
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
@@ -263,3 +263,13 @@ def test_a_run_of_earlier_names_is_read(run_folder: Path, tmp_path: Path) -> Non
 def test_an_unfinished_run_is_named(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"run\.json"):
         load_run(tmp_path)
+
+
+def test_the_angle_is_the_arc_tangent_in_every_octant() -> None:
+    turns = torch.linspace(-np.pi, np.pi, 10_001, dtype=torch.float64)
+    for length in (1e-12, 1.0, 1e6):
+        x, y = ((length * part(turns)).to(torch.float32) for part in (torch.cos, torch.sin))
+        assert (angle(x, y) - torch.atan2(y, x)).abs().max() < 3e-7
+    dark = torch.zeros(3)
+    assert (angle(dark, dark) == 0).all()
+    assert angle(torch.full((1,), torch.nan), dark[:1]).isnan().all()

@@ -156,10 +156,8 @@ class FieldRecovery(nn.Module):
                 the page's corner radius.
             homodyne: [2], cosine and sine of the turn between the two arms.
         """
-        frames = _block_means(torch.stack([in_phase, quadrature]).to(torch.float32), self.binning)
-        references = _block_means(
-            torch.stack([reference_in_phase, reference_quadrature]).to(torch.float32), self.binning
-        )
+        frames = _block_means(_both(in_phase, quadrature), self.binning)
+        references = _block_means(_both(reference_in_phase, reference_quadrature), self.binning)
         where = self._where(registration, self.binning)
         beyond = frames - references
         if self.binning == 1:
@@ -257,6 +255,11 @@ class FieldRecovery(nn.Module):
         ny, nx = self.grid.shape
         rows = _between(seen.transpose(1, 2), ny).transpose(1, 2)
         return _between(rows, nx)
+
+
+def _both(in_phase: Tensor, quadrature: Tensor) -> Tensor:
+    """Two frames as one [2, H, W] of float32: each alone, since TensorRT does nothing with integers but this."""
+    return torch.stack([in_phase.to(torch.float32), quadrature.to(torch.float32)])
 
 
 def _block_means(images: Tensor, side: int) -> Tensor:
