@@ -20,9 +20,9 @@ from export.graph import (
     published_tensors,
     table_tensors,
 )
-from export.half import FLOAT16, FLOAT32, PRECISIONS, check_deviation, in_half, rounded
+from export.half import PRECISIONS, check_deviation, in_half, rounded
 from export.onnx_files import decoder_onnx, field_onnx, twin_onnx
-from export.parity import check_parity, torch_answer
+from export.parity import TOLERANCE, check_parity, torch_answer
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.cli.progress_bar import percent_bar
@@ -34,7 +34,19 @@ from lightpage.recording.reader import Recording
 from runtime.bulk.coded_pages import choose_code
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.bundle import Bundle, npz, write_bundle
-from runtime.bundle.manifest import DECODER, FIELD, GOLDEN, PILOTS, TWIN, Manifest, Provenance, check_version, sha256
+from runtime.bundle.manifest import (
+    DECODER,
+    FIELD,
+    FLOAT16,
+    FLOAT32,
+    GOLDEN,
+    PILOTS,
+    TWIN,
+    Manifest,
+    Provenance,
+    check_version,
+    sha256,
+)
 from runtime.decoding.decoder import PAGE_INPUTS, Decoder
 from runtime.decoding.frames import narrow
 from runtime.decoding.image_tracker import tracker_for
@@ -144,9 +156,9 @@ def export_run(
         decoder, asked = in_half(decoder, PAGE_INPUTS), rounded(decoder, PAGE_INPUTS)
     session = open_session(asked, f"{out}: {DECODER}", once=precision == FLOAT16)
     (answer,) = session.run(["p"], dict(zip(FRAME_INPUTS, (pair.in_phase, pair.quadrature), strict=True)))
-    error = check_parity(expected["p"], np.asarray(answer), str(out))
     if precision == FLOAT16:
         check_deviation(expected["p"], np.asarray(answer), str(out))
+    error = check_parity(expected["p"], np.asarray(answer), str(out), TOLERANCE[precision])
     name, created = name or profile.name, datetime.now(UTC)
     manifest = Manifest(
         name=name,
@@ -156,11 +168,8 @@ def export_run(
         calibration=run.calibration_toml,
         camera_bit_depth=run.camera_bit_depth,
         frame_dtype="uint8" if frame_dtype == "uint8" else "uint16",
-        metrics={
-            "validation_air_bits_per_symbol": run.validation_air,
-            "training_seconds": run.seconds,
-            **({} if precision == FLOAT32 else {"precision": precision}),
-        },
+        metrics={"validation_air_bits_per_symbol": run.validation_air, "training_seconds": run.seconds},
+        precision=FLOAT16 if precision == FLOAT16 else FLOAT32,
         calibrated_pages=calibration.calibrated_pages,
         trained_pages=run.trained_pages,
         table_inputs=tuple(defaults),

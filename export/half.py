@@ -17,8 +17,8 @@ from onnx import TensorProto, helper, shape_inference
 
 from export.graph import FRAME_INPUTS
 from lightpage.errors import BundleError
+from runtime.bundle.manifest import FLOAT16, FLOAT32
 
-FLOAT32, FLOAT16 = "float32", "float16"
 PRECISIONS = (FLOAT32, FLOAT16)
 LARGEST_DEVIATION = 1e-2
 """Of p, over its length, that the 99th percentile of a page's symbols may have in half precision."""

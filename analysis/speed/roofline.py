@@ -23,13 +23,14 @@ from onnx import helper, shape_inference
 
 from analysis.speed.speed import makers
 from export.graph import FRAME_INPUTS
-from export.half import FLOAT16, PRECISIONS, in_half
+from export.half import PRECISIONS, in_half
 from export.onnx_files import decoder_onnx
 from export.operators.check import page_part
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
 from lightpage.files import write_json
+from runtime.bundle.manifest import FLOAT16
 from runtime.decoding.decoder import PAGE_INPUTS
 
 CONVOLUTIONS, PRODUCTS, SAMPLING, LAYOUT, POINTWISE = (

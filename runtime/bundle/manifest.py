@@ -21,6 +21,8 @@ TABLE = "table.npz"
 PILOTS = "pilots.npz"
 REQUIRED_FILES = frozenset({DECODER, TWIN, GOLDEN})
 OPTIONAL_FILES = frozenset({FIELD, TABLE, PILOTS})
+FLOAT32: Literal["float32"] = "float32"
+FLOAT16: Literal["float16"] = "float16"
 _SELF_HASH = "manifest_sha256"
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
@@ -68,13 +70,16 @@ class Manifest(BaseModel):
     """A pair with a larger residual is refused: swapped frames, or frames of two shots."""
     code: str | None = None
     """How user bytes are protected on this device's pages, TOML of a `lightpage.codec.code.Code`; None: not chosen."""
+    precision: Literal["float32", "float16"] = FLOAT32
+    """In which decoder.onnx computes its network and waves."""
     provenance: Provenance = Provenance()
 
     def to_json(self) -> bytes:
         """The manifest as JSON with a hash of itself, so that a damaged manifest is noticed like any other file."""
         data = self.model_dump(mode="json")
-        if data["code"] is None:  # programs of before know no such key
-            del data["code"]
+        for key, usual in (("code", None), ("precision", FLOAT32)):
+            if data[key] == usual:  # programs of before know no such key
+                del data[key]
         return (json.dumps(data | {_SELF_HASH: _digest(data)}, indent=2, sort_keys=True) + "\n").encode()
 
 
