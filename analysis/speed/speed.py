@@ -54,6 +54,13 @@ SETTLE_S = 0.2
 _PROFILED = 3
 """Runs with a profile, which takes a little time itself."""
 FIRST_LOOK = Hyperparameters()
+OWN = {
+    "coherent": ("coherent", FIRST_LOOK),
+    "refined": ("coherent", Hyperparameters(refinements=1)),
+    FAST: ("coherent", PRESETS[FAST]),
+    "wave": ("wave", FIRST_LOOK),
+}
+"""Decoders at symbol pitch: localizer and choices by name."""
 WIDTHS = {"ray 16/32": (16, 32), "ray 32/64": (32, 64), "ray 64/128": (64, 128)}
 """The published decoder with its ray grid, by the channels of its U-Net."""
 
@@ -64,7 +71,7 @@ def reference(profile: Profile) -> FramePair:
     return FramePair(frame, frame)
 
 
-def at_symbol_pitch(profile: Profile, localizer: str, choices: Hyperparameters = FIRST_LOOK) -> tuple[Graph, Tensors]:
+def at_symbol_pitch(profile: Profile, localizer: str, choices: Hyperparameters) -> tuple[Graph, Tensors]:
     """A decoder of ours, at an angle of -0.6 degree: a square pipe would need no splitting steps."""
     parameters = nominal()
     parameters[0] = np.deg2rad(-0.6)
@@ -84,11 +91,9 @@ def published(profile: Profile, localizer: str, channels: tuple[int, int]) -> tu
 def makers(profile: Profile) -> dict[str, Callable[[], tuple[Graph, Tensors]]]:
     """Every decoder by name; the others are compared with the first."""
     rays = {name: lambda width=width: published(profile, "ray", width) for name, width in WIDTHS.items()}
+    own = {name: lambda chosen=chosen: at_symbol_pitch(profile, *chosen) for name, chosen in OWN.items()}
     return {
-        "coherent": lambda: at_symbol_pitch(profile, "coherent"),
-        "refined": lambda: at_symbol_pitch(profile, "coherent", Hyperparameters(refinements=1)),
-        FAST: lambda: at_symbol_pitch(profile, "coherent", PRESETS[FAST]),
-        "wave": lambda: at_symbol_pitch(profile, "wave"),
+        **own,
         **rays,
         "mode 32/64": lambda: published(profile, "mode", (32, 64)),
     }
