@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import hashlib
 import logging
+import math
 import warnings
 from typing import Any
 
@@ -22,6 +24,8 @@ from train.models.twin import RayTwin
 OPSET = 20
 _FOLDED = 20_000
 """Largest constant, elements, that folding may leave in a file: a runtime folds the rest when it loads the graph."""
+_SHARED = 1_000
+"""Smallest constant, elements, that is kept once where several are alike."""
 _SCOPES = "pkg.torch.onnx.name_scopes"
 """The exporter's note of a node's modules, the outermost first, and last the node itself."""
 TWIN_INPUTS = ("parameters", "points", "anchors", "camera_places")
@@ -97,7 +101,24 @@ def _export(
         # all that pays of the exporter's optimiser, whose rewriter takes minutes over a pipe's unrolled steps
         optimizer.fold_constants(program.model, output_size_limit=_FOLDED)
         optimizer.remove_unused_nodes(program.model)
-    return _anonymous(program.model_proto)
+    return _anonymous(_sharing(program.model_proto))
+
+
+def _sharing(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The model with each large constant once: both ways of a wave model have many that are alike."""
+    graph, instead = model.graph, dict[str, str]()
+    first: dict[tuple[int, tuple[int, ...], bytes], str] = {}
+    for held in graph.initializer:
+        if math.prod(held.dims) >= _SHARED:
+            content = held.data_type, tuple(held.dims), hashlib.sha256(numpy_helper.to_array(held).tobytes()).digest()
+            if (name := first.setdefault(content, held.name)) != held.name:
+                instead[held.name] = name
+    kept = [held for held in graph.initializer if held.name not in instead]
+    del graph.initializer[:]
+    graph.initializer.extend(kept)
+    for node in graph.node:
+        node.input[:] = [instead.get(name, name) for name in node.input]
+    return model
 
 
 def _halve(model: onnx.ModelProto, prefixes: tuple[str, ...]) -> None:
