@@ -23,6 +23,11 @@ SAMPLING_TABLE = ("registration", "homodyne", "parameters", "places", "place_gra
 """Names of the table's tensors, as inputs of an exported decoder."""
 
 _FIT_POINTS = 9
+_PLACE_BITS = 14
+"""Binary places of what is added to a place: the last of a place itself, thousands of grid samples, is the 12th."""
+_PHASE_BITS = 16
+"""Binary places of phases, radians, which are followed to 1e-3. Random digits behind them would be most of what a
+compressed table weighs."""
 
 
 def monomial_powers() -> list[tuple[int, int]]:
@@ -98,17 +103,21 @@ def sampling_table(twin: Twin, parameters: Real, quadrature_phase: float, profil
         4 * (phases[0, 1] - 2 * value + phases[0, -1]),
     ]
 
-    def as_maps(stack: Real) -> NDArray[np.float32]:
-        """[B, N, C] to [B, C, ny, nx]."""
-        return np.moveaxis(stack, -1, 1).reshape(len(stack), -1, rows, columns).astype(np.float32)
+    def as_maps(stack: Real, bits: int) -> NDArray[np.float32]:
+        """[B, N, C] to [B, C, ny, nx], with so many binary places."""
+        return _rounded(np.moveaxis(stack, -1, 1).reshape(len(stack), -1, rows, columns), bits)
 
     gradients = np.stack([along_x[..., 0], along_y[..., 0], along_x[..., 1], along_y[..., 1]], axis=-1)
     return {
         "registration": registration_coefficients(twin, parameters, profile),
         "homodyne": np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32),
         "parameters": parameters.astype(np.float32),
-        "places": as_maps(middle),
-        "place_gradients": as_maps(gradients),
-        "phases": as_maps(np.stack(taylor, axis=-1)),
+        "places": as_maps(middle, _PLACE_BITS),
+        "place_gradients": as_maps(gradients, _PLACE_BITS),
+        "phases": as_maps(np.stack(taylor, axis=-1), _PHASE_BITS),
         "positions": np.ascontiguousarray(positions.T.reshape(2, rows, columns), dtype=np.float32),
     }
+
+
+def _rounded(values: Real, bits: int) -> NDArray[np.float32]:
+    return np.asarray(np.rint(values * 2.0**bits) / 2.0**bits, dtype=np.float32)

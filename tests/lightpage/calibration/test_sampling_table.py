@@ -104,3 +104,11 @@ def test_a_cubic_has_ten_terms_each_once() -> None:
     powers = monomial_powers()
     assert len(set(powers)) == len(powers) == 10
     assert max(i + j for i, j in powers) == 3
+
+
+def test_what_it_holds_of_symbols_has_no_digits_that_nobody_needs() -> None:
+    profile = small_profile()
+    table = sampling_table(TorchTwin(RayTwin(profile)), some_device(), TURN, profile)
+    for name, bits in (("places", 14), ("place_gradients", 14), ("phases", 16)):
+        scaled = table[name].astype(np.float64) * 2.0**bits
+        np.testing.assert_array_equal(scaled, np.rint(scaled), err_msg=name)
