@@ -34,6 +34,7 @@ from lightpage.recording.reader import Recording
 from runtime.bulk.coded_pages import choose_code
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.bundle import Bundle, npz, write_bundle
+from runtime.bundle.golden import in_few_counts, shows_page
 from runtime.bundle.manifest import (
     DECODER,
     FIELD,
@@ -147,7 +148,7 @@ def export_run(
     frame_dtype = pair.in_phase.dtype.name
     graph, defaults = _graph(folder, run, references, twin)
     progress("ask torch", 0.0)
-    expected = torch_answer(graph, pair, defaults)
+    limit, pair, expected = _golden(graph, pair, defaults, run.camera_bit_depth)
     progress("decoder to ONNX", 0.2)
     decoder = decoder_onnx(graph, frame_dtype, profile.frame_shape, defaults)
     progress("ask ONNX Runtime", 0.6)
@@ -174,7 +175,7 @@ def export_run(
         trained_pages=run.trained_pages,
         table_inputs=tuple(defaults),
         residual_output="residual" if "residual" in graph.outputs else None,
-        residual_limit=_residual_limit(graph, pair, defaults),
+        residual_limit=limit,
         provenance=Provenance(**run.provenance),
     )
     files = {
@@ -227,11 +228,25 @@ def _graph(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tupl
     return graph, table_tensors(graph, table, references)
 
 
-def _residual_limit(graph: Graph, pair: FramePair, defaults: Tensors) -> float | None:
+def _golden(
+    graph: Graph, pair: FramePair, defaults: Tensors, bit_depth: int
+) -> tuple[float | None, FramePair, dict[str, NDArray[np.float32]]]:
+    """The residual's limit by a page of a run, the frames of the golden page, and what torch says to them."""
+    answer = torch_answer(graph, pair, defaults)
+    limit, coarse = _residual_limit(graph, pair, defaults, answer), in_few_counts(pair, bit_depth)
+    to_coarse = torch_answer(graph, coarse, defaults)
+    if limit is not None and not shows_page(float(to_coarse["residual"]), float(answer["residual"]), limit):
+        return limit, pair, answer
+    return limit, coarse, to_coarse
+
+
+def _residual_limit(
+    graph: Graph, pair: FramePair, defaults: Tensors, answer: dict[str, NDArray[np.float32]]
+) -> float | None:
     """Half way, in ratio, between the residuals of right and of swapped frames; None where both are alike."""
     if "residual" not in graph.outputs:
         return None
-    right = float(torch_answer(graph, pair, defaults)["residual"])
+    right = float(answer["residual"])
     swapped = float(torch_answer(graph, FramePair(pair.quadrature, pair.in_phase), defaults)["residual"])
     return float(np.sqrt(right * swapped)) if swapped > _LEAST_CONTRAST * right else None
 

@@ -189,8 +189,8 @@ class Decoder:
             raise InvalidInputError("table of a page", ", ".join(sorted(others)), f"only {', '.join(PAGE_INPUTS)}")
         feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
         p, phase, concentration, *rest = self.graph.run(self._outputs, feeds)
-        limit = self.bundle.manifest.residual_limit
-        if rest and limit is not None and not (residual := float(np.max(rest[0]))) <= limit:
+        limit, residual = self.bundle.manifest.residual_limit, float(np.max(rest[0])) if rest else 0.0
+        if limit is not None and not residual <= limit:
             seen = np.isfinite(residual)
             got = f"frames that contradict each other (residual {residual:.3g})"
             raise (FramesDisagreeError if seen else FrameError)(
@@ -199,7 +199,7 @@ class Decoder:
                 f"an in-phase and a quadrature frame of one shot, not swapped, cameras and exposure as they were "
                 f"calibrated (residual up to {limit:.3g}; where frames are right, recalibrate)",
             )
-        return Inference(p, phase, concentration)
+        return Inference(p, phase, concentration, residual)
 
     @cached_property
     def field_solver(self) -> BundleFieldSolver:

@@ -13,17 +13,21 @@ from runtime.decoding.image_position import ImagePosition
 
 @dataclass(frozen=True)
 class Inference:
-    """What the graph says of a page: p float32 [2, ny, nx], its angle and its length [ny, nx]; piston still in it."""
+    """What the graph says of a page: p float32 [2, ny, nx], its angle and its length [ny, nx]; piston still in it.
+
+    `residual` is the power that is left of the homodyne equations over the field's, zero where the graph tells none.
+    """
 
     p: NDArray[np.float32]
     phase: NDArray[np.float32]
     concentration: NDArray[np.float32]
+    residual: float = 0.0
 
     def turned(self, by: NDArray[np.floating]) -> Inference:
         """The same with `by` (radians [ny, nx]) added to the phases."""
         phase = (self.phase + by).astype(np.float32)
         p = self.concentration * np.stack([np.cos(phase), np.sin(phase)])
-        return Inference(p, phase, self.concentration)
+        return Inference(p, phase, self.concentration, self.residual)
 
 
 @dataclass(frozen=True)

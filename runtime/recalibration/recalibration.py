@@ -12,10 +12,15 @@ from functools import partial
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedError
 from lightpage.progress import Progress
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
 from runtime.bundle.bundle import Bundle, npz, write_bundle
+from runtime.bundle.golden import in_few_counts, shows_page
 from runtime.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
@@ -80,11 +85,9 @@ def recalibrate(
     after = fmean(page.air for page in judged)
     judge(before, judged, pages.levels)
     progress("write the new bundle", 0.95)
-    golden, bundle = held_back.pairs[0], refitted.bundle
-    files = {
-        **bundle.files,
-        GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=refitted.infer(golden).p),
-    }
+    bundle = refitted.bundle
+    golden, p = _golden(refitted, held_back.pairs[0])
+    files = {**bundle.files, GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=p)}
     write_bundle(out, _new_manifest(bundle.manifest, pages, version, before, after), files)
     return RecalibrationOutcome(
         path=out,
@@ -98,6 +101,19 @@ def recalibrate(
         pages_held_back=len(held_back.pairs),
         seconds=time.perf_counter() - start,
     )
+
+
+def _golden(decoder: Decoder, pair: FramePair) -> tuple[FramePair, NDArray[np.float32]]:
+    """The golden page's frames, in few counts where they still show a page, and the answer to them."""
+    manifest = decoder.bundle.manifest
+    coarse, answer, limit = in_few_counts(pair, manifest.camera_bit_depth), decoder.infer(pair), manifest.residual_limit
+    try:
+        to_coarse = decoder.infer(coarse)
+    except FrameError:
+        return pair, answer.p
+    if limit is not None and not shows_page(to_coarse.residual, answer.residual, limit):
+        return pair, answer.p
+    return coarse, to_coarse.p
 
 
 def next_version(version: str, taken: Sequence[str] = ()) -> str:

@@ -29,7 +29,8 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid
-from runtime.bundle.bundle import Bundle, write_bundle
+from runtime.bundle.bundle import Bundle, npz, write_bundle
+from runtime.bundle.golden import in_few_counts
 from runtime.bundle.manifest import DECODER, FIELD, TWIN
 from runtime.decoding.decoder import Decoder
 from runtime.execution.session import open_session
@@ -125,6 +126,31 @@ def test_the_bundle_does_not_tell_where_it_was_made(exported: tuple[Bundle, floa
 
 def test_the_bundle_says_what_torch_says(exported: tuple[Bundle, float, Path]) -> None:
     assert exported[1] <= 1e-3
+
+
+def test_the_golden_page_is_the_runs_own_in_few_counts(exported: tuple[Bundle, float, Path], run_folder: Path) -> None:
+    bundle = exported[0]
+    with np.load(run_folder / GOLDEN) as kept:
+        page = FramePair(kept["in_phase"], kept["quadrature"])
+    np.testing.assert_array_equal(bundle.golden.pair.in_phase, in_few_counts(page, 8).in_phase)
+    assert len(bundle.files["golden.npz"]) < len(npz(in_phase=page.in_phase, quadrature=page.quadrature)) / 3
+    decoder = Decoder.load(exported[2])
+    own, coarse = decoder.infer(page), decoder.infer(bundle.golden.pair)
+    limit = bundle.manifest.residual_limit
+    assert limit is not None
+    assert 0 < own.residual < coarse.residual < limit
+    together = np.vdot(own.p, coarse.p) / np.linalg.norm(own.p) / np.linalg.norm(coarse.p)
+    assert together > 0.9
+
+
+def test_a_page_of_which_few_counts_are_too_few_is_kept_as_it_is(
+    run_folder: Path, tmp_path: Path, frame_types: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli_export, "shows_page", lambda *_: False)
+    bundle, error = export_run(run_folder, tmp_path / "plain.zip")
+    with np.load(run_folder / GOLDEN) as kept:
+        np.testing.assert_array_equal(bundle.golden.pair.quadrature, kept["quadrature"])
+    assert error <= 1e-3
 
 
 def test_the_fields_own_graph_shows_the_decoders_field(
