@@ -24,6 +24,7 @@ from export.command import export_run
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording
+from runtime.bundle.golden import in_few_counts
 from runtime.commands.evaluate import evaluate
 from runtime.decoding.decoder import Decoder
 from tests.analysis.report.pages import check_whole, page_of, run
@@ -194,7 +195,7 @@ def test_a_golden_page_comes_from_the_bundle_that_was_evaluated_or_not_at_all(
     own = report_of_run(coherent).golden
     assert not isinstance(shown, str)
     assert not isinstance(own, str)
-    assert np.array_equal(shown.pair.in_phase, own.pair.in_phase)
+    assert np.array_equal(shown.pair.in_phase, in_few_counts(own.pair, 8).in_phase)
     decoded = Decoder.load(evaluation.with_name("small.zip")).decode(shown.pair)
     network = decoded.phase + decoded.phase_error  # the report shows what the network says
     assert np.abs(np.exp(1j * shown.phase) - np.exp(1j * network)).max() < 0.01
