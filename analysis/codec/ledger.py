@@ -37,6 +37,8 @@ from runtime.bulk.recovery import Recovery, recover
 from runtime.bundle.shipped import bundle_path
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
+from train.models.decoder import COHERENT
+from train.models.presets import FAST
 
 WEIGHTS = Path("analysis/weights")
 LOSS = 1e-6
@@ -66,11 +68,11 @@ class DataSet:
     pages: int
 
 
-def _kept(folder: str) -> Callable[[Path], Path]:
+def _kept(folder: str, method: str = COHERENT, refinements: int = 1) -> Callable[[Path], Path]:
     def made(work: Path) -> Path:
         out = work / "kept.zip"
         if not out.exists():
-            export_kept(WEIGHTS / folder, work / "kept", out)
+            export_kept(WEIGHTS / folder, work / "kept", out, method, refinements)
         return out
 
     return made
@@ -79,14 +81,16 @@ def _kept(folder: str) -> Callable[[Path], Path]:
 def data_sets(pages: int) -> dict[str, DataSet]:
     """Every data set by name; `pages` are those of the bench device."""
 
-    def kept(name: str, folder: str, known: int, pages: int) -> DataSet:
+    def kept(name: str, folder: str, known: int, pages: int, *method: Any) -> DataSet:
         profile, device, _ = data_set_of(WEIGHTS / folder)
-        return DataSet(name, _kept(folder), profile, device, known, pages)
+        return DataSet(name, _kept(folder, *method), profile, device, known, pages)
 
     sets = [
         DataSet("bright", lambda _: bundle_path("bench"), load_profile("bench"), Device(), 120, pages),
         kept("32e", "bench/-0.6deg-32e-4px", 120, pages),
         kept("full-size 4x4", "paper/-0.6deg-32e-4px", 8, 4),
+        kept("full-size 4x4 standard", "paper/-0.6deg-32e-4px", 8, 4, COHERENT, 0),
+        kept("full-size 4x4 fast", "paper/-0.6deg-32e-4px", 8, 4, FAST, 0),
         kept("full-size 2x2", "paper/-0.6deg-32e-2px", 8, 4),
     ]
     return {each.name: each for each in sets}
@@ -162,7 +166,7 @@ def line(name: str, figures: dict[str, Any]) -> str:
     """A data set for people."""
     share, k, m = figures["outer_share"], figures["outer_data_pages"], figures["outer_parity_pages"]
     return (
-        f"{name:<14} {figures['pages']:>6} {figures['pages_unread']:>7} {figures['page_failure_rate_bound_95']:>8.4f} "
+        f"{name:<22} {figures['pages']:>6} {figures['pages_unread']:>7} {figures['page_failure_rate_bound_95']:>8.4f} "
         f"{figures['user_bytes_per_page']:>8} {figures['air_bytes_per_page']:>8.0f} {figures['share_of_air']:>7.4f} "
         f"{share * figures['share_of_air']:>7.4f} {f'({k + m}, {k})':>11} {figures['Q']:>6.3f} {figures['q']:>6.3f} "
         f"{figures['margin_bits_least']:>7.3f} {1e3 * figures['code_seconds_per_page']:>8.1f} "
@@ -171,7 +175,7 @@ def line(name: str, figures: dict[str, Any]) -> str:
 
 
 HEADER = (
-    f"{'data set':<14} {'pages':>6} {'unread':>7} {'bound':>8} {'bytes':>8} {'AIR':>8} {'share':>7} {'outer':>7} "
+    f"{'data set':<22} {'pages':>6} {'unread':>7} {'bound':>8} {'bytes':>8} {'AIR':>8} {'share':>7} {'outer':>7} "
     f"{'(n, k)':>11} {'Q':>6} {'q':>6} {'margin':>7} {'code ms':>8} {'page ms':>9}"
 )
 """Pages, those that gave no bytes and the 95% bound of their rate; user bytes of a page, bytes of its AIR, their ratio,

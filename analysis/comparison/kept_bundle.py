@@ -40,6 +40,7 @@ from train.fitting.fitted import FITTED, FITTED_WEIGHTS
 from train.fitting.validation import without_piston
 from train.models.decoder import COHERENT, SymbolDecoder
 from train.models.hyperparameters import Hyperparameters
+from train.models.presets import FAST
 from train.models.twin import RayTwin, TorchTwin
 from train.runs import BEGUN, GOLDEN, REFERENCES, Run, renamed, save_arrays, save_weights
 from train.trainers.refinement import fit_prediction
@@ -64,23 +65,24 @@ def data_set_of(kept: Path) -> tuple[Profile, Device, int]:
         raise InvalidInputError(f"--kept {kept}", error, f"the folder of a kept data set with its {BEGUN}") from None
 
 
-def export_kept(kept: Path, work: Path, out: Path, localizer: str = COHERENT, refinements: int = 1) -> None:
+def export_kept(kept: Path, work: Path, out: Path, method: str = COHERENT, refinements: int = 1) -> None:
     """Write the bundle of a method.
 
     Args:
         kept: folder of the data set.
         work: folder for pages and run; made, and gone on with if it is there.
         out: new bundle.
-        localizer: of the method.
+        method: fast, or the localizer of a method.
         refinements: passes behind the first, 0 or 1.
 
     Raises:
         InvalidInputError: no such method is kept.
     """
     profile, device, seed = data_set_of(kept)
-    trained = next((folder for folder in sorted((kept / localizer).glob("*")) if (folder / FITTED).exists()), None)
+    trained = next((folder for folder in sorted((kept / method).glob("*")) if (folder / FITTED).exists()), None)
     if trained is None:
-        raise InvalidInputError(f"--kept {kept}", f"no trained {localizer}", "a localizer that is kept there")
+        raise InvalidInputError(f"--kept {kept}", f"no trained {method}", "a method that is kept there")
+    localizer = COHERENT if method == FAST else method
     work.mkdir(parents=True, exist_ok=True)
     calibration = load_calibration(kept / CALIBRATION)
     path = work / "recording.h5"
@@ -162,13 +164,13 @@ def _kappa_scale(
 
 @click.command()
 @click.option("--kept", required=True, type=click.Path(path_type=Path, exists=True, file_okay=False))
-@click.option("--localizer", default=COHERENT, show_default=True)
+@click.option("--method", default=COHERENT, show_default=True, help="fast, or the localizer of a method.")
 @click.option("--refinements", default=1, show_default=True, type=click.IntRange(0, 1))
 @click.option("--work", default=Path("runs/kept-bundle"), show_default=True, type=OutputFolder())
 @click.option("--out", required=True, type=NewPath())
-def main(kept: Path, localizer: str, refinements: int, work: Path, out: Path) -> None:
+def main(kept: Path, method: str, refinements: int, work: Path, out: Path) -> None:
     """Export a kept method of the comparison as a bundle."""
-    export_kept(kept, work / kept.name, out, localizer, refinements)
+    export_kept(kept, work / kept.name, out, method, refinements)
     click.echo(out)
 
 
