@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from runtime.bulk.coded_pages import air_bits
 from runtime.bulk.evaluation import check_recording
+from runtime.bulk.frames_ahead import frames_ahead
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
@@ -211,8 +213,8 @@ def recover(
     reader = PageReader(codec, lambda pair: tracker.decode(pair, code.levels, pilots))
     pages: list[RecoveredPage] = []
     with VolumeFiles(out) as files:
-        for index in track(range(recording.pages), "recover"):
-            pages += [_read_page(reader, recording, index, files)]
+        for index, read in track(frames_ahead(recording), "recover", total=recording.pages):
+            pages += [_read_page(reader, recording, index, read, files)]
         file = files.chosen(volume_id, checksum)
         done = Restored((), ()) if file is None else file.restore()
         if file is not None and (holes or not done.lost):
@@ -277,11 +279,13 @@ class PageReader:
         self._next = self._next.after()
 
 
-def _read_page(reader: PageReader, recording: Recording, index: int, files: VolumeFiles) -> RecoveredPage:
+def _read_page(
+    reader: PageReader, recording: Recording, index: int, read: Future[FramePair], files: VolumeFiles
+) -> RecoveredPage:
     """Read one page of a recording into the files."""
     expected = reader.expected
     try:
-        pair = narrow(recording.frames(index), recording.bit_depth)
+        pair = narrow(read.result(), recording.bit_depth)
         page, found, seconds, code_seconds = reader.read(pair)
     except (InvalidInputError, LostPageError) as error:
         reader.skip()
