@@ -11,7 +11,7 @@ from lightpage.waves.grid import FieldGrid, symbol_samples
 from train.models.field import FieldRecovery, Measured
 from train.models.localizers.wave import by_symbol
 from train.models.parts import conjugate, multiply, parts
-from train.models.waves import EXACT, ROUGH, Real, WaveMatrices, Waves
+from train.models.waves import EXACT, ROUGH, Fidelity, Real, WaveMatrices, Waves
 
 
 class Prediction(nn.Module):
@@ -21,16 +21,24 @@ class Prediction(nn.Module):
         profile: the nominal device.
         parameters: [P] fitted.
         grid: the common grid, where it is not the usual one.
+        to_camera, to_page: how exactly either way is followed.
 
     Attributes:
         illumination: real and imaginary parts of the factors of `illumination_terms`, [2, 6]; even until fitted.
         floor: see `Measured.pull`; one until it is fitted (`fit_prediction`).
     """
 
-    def __init__(self, profile: Profile, parameters: Real, grid: FieldGrid | None = None) -> None:
+    def __init__(
+        self,
+        profile: Profile,
+        parameters: Real,
+        grid: FieldGrid | None = None,
+        to_camera: Fidelity = EXACT,
+        to_page: Fidelity = ROUGH,
+    ) -> None:
         super().__init__()
-        self.waves = Waves(profile, parameters, 1, EXACT, filled=True, grid=grid)
-        self.back = Waves(profile, parameters, symbol_samples(profile), ROUGH, filled=True, grid=grid)
+        self.waves = Waves(profile, parameters, 1, to_camera, filled=True, grid=grid)
+        self.back = Waves(profile, parameters, symbol_samples(profile), to_page, filled=True, grid=grid)
         self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
         self.illumination: Tensor
         self.floor: Tensor

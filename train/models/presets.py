@@ -13,5 +13,4 @@ PRESETS = {
 }
 """One quick pass, one pass, two passes.
 
-A second pass adds more than anything else does. With ideal lenses it takes twice the time a page; with real ones its
-waves pass each of them in fifty terms, which takes much longer at the full size."""
+A second pass adds more than anything else does, and takes about as long as a first."""
