@@ -2,7 +2,8 @@
 
     python -m analysis.comparison.fidelity --kept analysis/weights/bench/-0.6deg-32e-4px --out runs/fidelity
 
-New pages of the data set's device are simulated, and every form decodes them. The times are of decodes in turns.
+New pages of the data set's device are simulated, and every form decodes them as a service would. The times are of
+decodes in turns.
 `float16` is what `lightpage export --precision float16` makes, each number rounded as a GPU would round it; its time on
 a CPU says nothing, and none is given.
 """
@@ -28,20 +29,20 @@ from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFolder
 from lightpage.files import write_json
 from lightpage.metrics.information import achievable_rate
-from lightpage.page.symbols import pilot_mask, symbol_phases
+from lightpage.page.pilots import Pilots
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
 from lightpage.simulator.recording_job import RecordingJob
-from runtime.decoding.decoder import PAGE_INPUTS
+from runtime.decoding.decoder import PAGE_INPUTS, Decoder
+from runtime.decoding.image_tracker import tracker_for
 from runtime.execution.cpus import available_cpus
-from runtime.execution.session import open_session
-from train.fitting.validation import without_piston
 from train.models.decoder import SymbolDecoder
 from train.models.prediction import Prediction
 from train.models.twin import RayTwin, TorchTwin
 from train.models.waves import EXACT, ROUGH, Fidelity
 from train.runs import Run, load_decoder, load_run
 
+Complex = NDArray[np.complexfloating]
 HALF = "float16"
 _SEED = 70_000
 FORMS: tuple[tuple[Fidelity, Fidelity], ...] = (
@@ -107,38 +108,46 @@ def _with(run: Run, folder: Path, form: tuple[Fidelity, Fidelity]) -> SymbolDeco
 
 
 def measured(
-    models: Mapping[str, bytes], half: bytes, recording: Recording, mask: NDArray[np.bool_], repeats: int, usual: str
+    decoder: Decoder, models: Mapping[str, bytes], half: bytes, recording: Recording, repeats: int, usual: str
 ) -> list[Form]:
-    """Rates, times and deviations of all forms on the pages of a recording, whose pilots lie at `mask`; 256 levels."""
-    sessions = {name: opened(model, available_cpus()) for name, model in models.items()}
-    rounding = open_session(half, HALF, available_cpus(), once=True)
-    rates: dict[str, list[float]] = {name: [] for name in (*models, HALF)}
-    answers: dict[str, list[np.ndarray]] = {name: [] for name in rates}
-    taken: dict[str, list[float]] = {name: [] for name in models}
-    for page in track(range(recording.pages), "decode"):
-        pair, symbols = recording.frames(page), recording.symbols(page)
+    """Rates, times and deviations of all forms on the pages of a recording.
+
+    Args:
+        decoder: of the run, for all but its graph; each form follows the image by itself, as a service does.
+        models: every form's decoder.onnx by name.
+        half: the one in half precision.
+        recording: pages with symbols.
+        repeats: rounds of timing.
+        usual: name of the form that p is compared with.
+    """
+    graphs = {name: opened(model, available_cpus()) for name, model in (models | {HALF: half}).items()}
+    trackers = {name: tracker_for(Decoder(decoder.bundle, graph=graph)) for name, graph in graphs.items()}
+    data, levels = ~decoder.bundle.pilot_mask, recording.levels
+    rates: dict[str, list[float]] = {name: [] for name in graphs}
+    answers: dict[str, list[Complex]] = {name: [] for name in graphs}
+    for index in track(range(recording.pages), "decode"):
+        pair, symbols = recording.frames(index), recording.symbols(index)
         assert symbols is not None
-        truth = symbol_phases(symbols, LEVELS).astype(np.float32)
-        feeds = dict(zip(FRAME_INPUTS, (pair.in_phase, pair.quadrature), strict=True))
-        for name in rates:
-            p = (rounding if name == HALF else sessions[name]).run(["p"], feeds)[0]
-            answers[name].append(p)
-            at_rest = without_piston(p, truth, mask)[:, ~mask]
-            kappa = np.linalg.norm(at_rest, axis=0)
-            rate = achievable_rate(np.arctan2(at_rest[1], at_rest[0]), kappa, symbols[~mask], LEVELS)
+        pilots = Pilots.of_symbols(~data, symbols, levels)
+        for name, tracker in trackers.items():
+            page = tracker.decode(pair, levels, pilots)
+            answers[name].append((page.concentration * np.exp(1j * page.phase))[data])
+            rate = achievable_rate(page.phase[data], page.concentration[data], symbols[data], levels)
             rates[name].append(float(rate.mean()))
+    feeds = dict(zip(FRAME_INPUTS, (pair.in_phase, pair.quadrature), strict=True))
+    taken: dict[str, list[float]] = {name: [] for name in models}
     for _ in track(range(repeats), "time", unit="round"):
-        for name, session in sessions.items():
-            taken[name].append(seconds_of(session, feeds))
-    whole = {name: np.concatenate(found, axis=1) for name, found in answers.items()}
+        for name in taken:  # taking turns: a slow moment meets all of them
+            taken[name].append(seconds_of(graphs[name], feeds))
+    whole = {name: np.concatenate(found) for name, found in answers.items()}
     return [
         Form(
             name,
             float(np.mean(rates[name])),
             float(np.median(taken[name])) if taken.get(name) else float("nan"),
-            deviation(whole[usual], whole[name]),
+            deviation(np.stack([whole[usual].real, whole[usual].imag]), np.stack([whole[name].real, whole[name].imag])),
         )
-        for name in rates
+        for name in graphs
     ]
 
 
@@ -151,8 +160,9 @@ def main(kept: Path, pages: int, repeats: int, out: Path) -> None:
     """Print what a kept decoder of two passes reads and takes with other waves, and in half precision."""
     profile, device, _ = data_set_of(kept)
     work = out / kept.name
-    if not (work / "bundle.zip").exists():
-        export_kept(kept, work, work / "bundle.zip")
+    bundle = work / "bundle.zip"
+    if not bundle.exists():
+        export_kept(kept, work, bundle)
     models, half = graphs(work)
     shown = work / f"pages-{pages}.h5"
     if not shown.exists():
@@ -160,7 +170,7 @@ def main(kept: Path, pages: int, repeats: int, out: Path) -> None:
         job.claim(force=False)
         job.run(pages)
     with Recording.open(shown) as recording:
-        forms = measured(models, half, recording, pilot_mask(profile), repeats, name_of((EXACT, ROUGH)))
+        forms = measured(Decoder.load(bundle), models, half, recording, repeats, name_of((EXACT, ROUGH)))
     click.echo(f"{'to the cameras; back':<28} {'AIR':>7} {'ms':>8} {'p off, p99':>11}")
     for form in forms:
         milliseconds = f"{1e3 * form.seconds:.1f}" if np.isfinite(form.seconds) else "-"

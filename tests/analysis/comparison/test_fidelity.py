@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 
 from analysis.comparison.fidelity import FORMS, HALF, measured, name_of
-from lightpage.page.symbols import pilot_mask
 from lightpage.recording.reader import Recording
+from runtime.decoding.decoder import Decoder
 from tests.runtime import toy
 
 
 def test_rates_deviations_and_times_of_each_form(tmp_path: Path) -> None:
     toy.write_toy_recording(tmp_path / "r.h5", toy.ToyDevice(), 256, 3)
     usual, doubtful = toy.decoder_onnx(), toy.decoder_onnx(kappa=100.0)
+    decoder = Decoder.load(toy.write_toy_bundle(tmp_path / "toy.zip"))
     with Recording.open(tmp_path / "r.h5") as recording:
         models = {"usual": usual, "doubtful": doubtful}
-        forms = {form.name: form for form in measured(models, usual, recording, pilot_mask(toy.PROFILE), 2, "usual")}
+        forms = {form.name: form for form in measured(decoder, models, usual, recording, 2, "usual")}
     assert list(forms) == ["usual", "doubtful", HALF]
     assert forms[HALF].air == forms["usual"].air > forms["doubtful"].air > 4
     assert forms[HALF].deviation == forms["usual"].deviation == 0
