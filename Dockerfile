@@ -37,8 +37,7 @@ RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=bind,from=packages,target=/run/packages \
     /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu]'
 
-FROM base AS runtime
-COPY --from=build /opt/lightpage /opt/lightpage
+FROM base AS service
 # The root file system is read-only in service: no byte code is written, and what must be written goes to /state or /tmp.
 # MPLCONFIGDIR: matplotlib insists on a folder of its own.
 ENV PATH=/opt/lightpage/bin:$PATH \
@@ -56,6 +55,9 @@ HEALTHCHECK --interval=10s --timeout=5s --start-period=60s --retries=3 \
     CMD ["python", "-m", "runtime.commands.healthcheck"]
 ENTRYPOINT ["lightpage", "serve"]
 CMD ["--source", "simulator:bench", "--address", "0.0.0.0:50051"]
+
+FROM service AS runtime
+COPY --from=build /opt/lightpage /opt/lightpage
 
 FROM build AS build-camera
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
@@ -89,7 +91,7 @@ RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     && python3 -m venv /opt/lightpage \
     && /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[gpu]'
 
-FROM runtime AS gpu
+FROM service AS gpu
 COPY --from=build-gpu /opt/lightpage /opt/lightpage
 ENV LIGHTPAGE_SERVICE__PROVIDER=cuda
 

@@ -22,7 +22,7 @@ from export.graph import (
 )
 from export.half import PRECISIONS, check_deviation, in_half, rounded
 from export.onnx_files import decoder_onnx, field_onnx, twin_onnx
-from export.parity import TOLERANCE, check_parity, torch_answer
+from export.parity import check_parity, torch_answer
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.cli.progress_bar import percent_bar
@@ -44,11 +44,12 @@ from runtime.bundle.manifest import (
     PILOTS,
     TWIN,
     Manifest,
+    Precision,
     Provenance,
     check_version,
     sha256,
 )
-from runtime.decoding.decoder import PAGE_INPUTS, Decoder
+from runtime.decoding.decoder import GOLDEN_TOLERANCE, PAGE_INPUTS, Decoder
 from runtime.decoding.frames import narrow
 from runtime.decoding.image_tracker import tracker_for
 from runtime.execution.session import open_session
@@ -85,7 +86,7 @@ def export(
     name: str | None,
     version: str | None,
     recording: Path | None,
-    precision: str,
+    precision: Precision,
     json_path: Path | None,
 ) -> None:
     """Export a training run, proving the bundle against torch with the runtime's own decoder.
@@ -112,7 +113,7 @@ def export_run(
     version: str | None = None,
     progress: Progress = lambda step, share: None,
     recording: Path | None = None,
-    precision: str = FLOAT32,
+    precision: Precision = FLOAT32,
 ) -> tuple[Bundle, float]:
     """Write the bundle of a run.
 
@@ -152,14 +153,14 @@ def export_run(
     progress("decoder to ONNX", 0.2)
     decoder = decoder_onnx(graph, frame_dtype, profile.frame_shape, defaults)
     progress("ask ONNX Runtime", 0.6)
-    asked = decoder
+    checked = decoder
     if precision == FLOAT16:
-        decoder, asked = in_half(decoder, PAGE_INPUTS), rounded(decoder, PAGE_INPUTS)
-    session = open_session(asked, f"{out}: {DECODER}", once=precision == FLOAT16)
+        decoder, checked = in_half(decoder, PAGE_INPUTS), rounded(decoder, PAGE_INPUTS)
+    session = open_session(checked, f"{out}: {DECODER}", once=precision == FLOAT16)
     (answer,) = session.run(["p"], dict(zip(FRAME_INPUTS, (pair.in_phase, pair.quadrature), strict=True)))
     if precision == FLOAT16:
         check_deviation(expected["p"], np.asarray(answer), str(out))
-    error = check_parity(expected["p"], np.asarray(answer), str(out), TOLERANCE[precision])
+    error = check_parity(expected["p"], np.asarray(answer), str(out), GOLDEN_TOLERANCE[precision])
     name, created = name or profile.name, datetime.now(UTC)
     manifest = Manifest(
         name=name,
@@ -170,7 +171,7 @@ def export_run(
         camera_bit_depth=run.camera_bit_depth,
         frame_dtype="uint8" if frame_dtype == "uint8" else "uint16",
         metrics={"validation_air_bits_per_symbol": run.validation_air, "training_seconds": run.seconds},
-        precision=FLOAT16 if precision == FLOAT16 else FLOAT32,
+        precision=precision,
         calibrated_pages=calibration.calibrated_pages,
         trained_pages=run.trained_pages,
         table_inputs=tuple(defaults),

@@ -2,7 +2,7 @@
 
 The field's recovery stays as it is, since frames hold counts up to 65,535. So does the sampling: CUDA samples in
 float32 alone. So does the last step to p, which grows with the light beyond what float16 holds. And so does the pipe on
-the way to the cameras: its steps add up what each of them rounds, which alone turns p by a hundredth.
+the way to the cameras, whose accumulated rounding alone changes p by 1%.
 """
 
 from __future__ import annotations
@@ -16,15 +16,17 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, shape_inference
 
 from export.graph import FRAME_INPUTS
-from lightpage.errors import BundleError
-from runtime.bundle.manifest import FLOAT16, FLOAT32
+from lightpage.errors import BundleError, InvalidInputError
+from runtime.bundle.manifest import FLOAT16, FLOAT32, Precision
 
-PRECISIONS = (FLOAT32, FLOAT16)
+PRECISIONS: tuple[Precision, ...] = (FLOAT32, FLOAT16)
 LARGEST_DEVIATION = 1e-2
 """Of p, over its length, that the 99th percentile of a page's symbols may have in half precision."""
 _PERCENTILE = 99
-_HALVED = re.compile(r"decoder/(network/\w+/|refiners/\d+/unet/\w+/|prediction/(back/|waves/(?!_pipe/)))")
+_IN_FLOAT16 = re.compile(r"decoder/(network/\w+/|refiners/\d+/unet/\w+/|prediction/(back/|waves/(?!_pipe/)))")
 """Beginnings of the names of nodes that are computed in float16."""
+_IN_FLOAT32 = frozenset(["Resize"])
+"""Operators that take sizes as float32, whatever their data are."""
 
 
 def in_half(model: bytes, fed: Collection[str]) -> bytes:
@@ -35,6 +37,9 @@ def in_half(model: bytes, fed: Collection[str]) -> bytes:
     Args:
         model: serialised, its nodes named after the modules that they come from (`export.onnx_files`).
         fed: table inputs that may differ from page to page.
+
+    Raises:
+        InvalidInputError: no node belongs to a network.
     """
     graph = _Graph(model, fed)
     casts: dict[tuple[str, int], str] = {}
@@ -56,8 +61,11 @@ def in_half(model: bytes, fed: Collection[str]) -> bytes:
         if chosen:
             halved.update(filter(graph.is_float, node.output))
             for attribute in node.attribute if node.op_type == "Cast" else ():
-                attribute.i = TensorProto.FLOAT16 if attribute.i == TensorProto.FLOAT else attribute.i
+                if attribute.name == "to" and attribute.i == TensorProto.FLOAT:
+                    attribute.i = TensorProto.FLOAT16
         graph.keep(node)
+    if not halved:
+        raise InvalidInputError("decoder.onnx", "no node of a network", "nodes named after their modules")
     return graph.made(halved)
 
 
@@ -107,7 +115,8 @@ class _Graph:
             of_page = not varying.isdisjoint(node.input)
             varying.update(node.output if of_page else ())
             copied = onnx.NodeProto.FromString(node.SerializeToString())
-            yield copied, of_page and _HALVED.match(node.name) is not None
+            named = _IN_FLOAT16.match(node.name) is not None
+            yield copied, of_page and named and node.op_type not in _IN_FLOAT32
 
     def is_float(self, name: str) -> bool:
         return self._types.get(name) == TensorProto.FLOAT

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from export.graph import Graph
 from lightpage.errors import BundleError
 from lightpage.recording.frame_pair import FramePair
-from runtime.bundle.manifest import FLOAT16, FLOAT32
-
-TOLERANCE = {FLOAT32: 1e-3, FLOAT16: 1e-2}
-"""Largest error of p relative to its norm, by precision."""
+from runtime.bundle.manifest import FLOAT32
+from runtime.decoding.decoder import GOLDEN_TOLERANCE
 
 
 def torch_answer(
@@ -29,7 +27,7 @@ def torch_answer(
 
 
 def check_parity(
-    expected: NDArray[np.float32], got: NDArray[np.float32], subject: str, tolerance: float = TOLERANCE[FLOAT32]
+    expected: NDArray[np.float32], got: NDArray[np.float32], subject: str, tolerance: float = GOLDEN_TOLERANCE[FLOAT32]
 ) -> float:
     """Relative error of p.
 

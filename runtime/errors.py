@@ -33,8 +33,8 @@ class WorkerError(LightpageError):
     """A process that the service had started was killed, broke, or took too long; what it worked on is as before."""
 
 
-class ProviderError(BundleError):
-    """The execution provider that was asked for is not here, so nothing can be decoded with it."""
+class ProviderError(LightpageError):
+    """The execution provider that was asked for is not here, or failed: nothing is wrong with the bundle."""
 
 
 class CallerLeft(Exception):

@@ -120,7 +120,7 @@ def measured(
         repeats: rounds of timing.
         usual: name of the form that p is compared with.
     """
-    graphs = {name: opened(model, available_cpus()) for name, model in (models | {HALF: half}).items()}
+    graphs = {name: opened(model, available_cpus()) for name, model in {**models, HALF: half}.items()}
     trackers = {name: tracker_for(Decoder(decoder.bundle, graph=graph)) for name, graph in graphs.items()}
     data, levels = ~decoder.bundle.pilot_mask, recording.levels
     rates: dict[str, list[float]] = {name: [] for name in graphs}

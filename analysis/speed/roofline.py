@@ -4,7 +4,8 @@
 
 Flops and bytes of every node that runs for a page, by kind. A node takes the longer of its flops at the peak and of its
 bytes, all that it reads and writes, at the memory's bandwidth; both at a share of what the data sheet says. To that
-come the launches of all nodes, and the frames over the bus, which another page's arithmetic can hide.
+come the launches of all nodes, and the frames over the bus. At best all three overlap, page behind page: the longest
+of them bounds the rate. What the host does behind the graph is not counted.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ CONVOLUTIONS, PRODUCTS, SAMPLING, LAYOUT, POINTWISE = (
     "pointwise",
 )
 _KINDS = {
-    **dict.fromkeys(("Conv", "ConvTranspose", "FusedConv"), CONVOLUTIONS),
+    "Conv": CONVOLUTIONS,
     **dict.fromkeys(("MatMul", "Gemm"), PRODUCTS),
     "GridSample": SAMPLING,
     **dict.fromkeys(("Concat", "Gather", "GatherND", "Pad", "Slice", "Split", "Transpose"), LAYOUT),
@@ -128,7 +129,7 @@ def loads(decoder: bytes, gpu: Gpu, share: float) -> dict[str, Load]:
 
 
 def estimate(by_kind: dict[str, Load], frame_bytes: int, gpu: Gpu) -> dict[str, float]:
-    """Seconds a page on the GPU: the work, the launches, the frames over the bus; and pages a second behind each other.
+    """Seconds a page on the GPU: the work, the launches, the frames over the bus; and pages a second at best.
 
     Args:
         by_kind: see `loads`.

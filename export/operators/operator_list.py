@@ -11,8 +11,9 @@ from typing import Any
 
 from lightpage.errors import InvalidInputError
 from lightpage.files import replace_text
+from runtime.execution.providers import CUDA, TENSORRT
 
-PROVIDERS = ("cuda", "tensorrt")
+PROVIDERS = (CUDA, TENSORRT)
 """Providers whose lists lie beside this file."""
 FLOATING = "*"
 """Stands for every type variable that ONNX lets be floating point, where a list gives an operator's types in one."""

@@ -24,9 +24,9 @@ SAMPLING_TABLE = ("registration", "homodyne", "parameters", "places", "place_gra
 
 _FIT_POINTS = 9
 _PLACE_BITS = 14
-"""Binary places of what is added to a place: the last of a place itself, thousands of grid samples, is the 12th."""
+"""Fractional bits of places and gradients, grid samples. A float32 of thousands of samples has 12."""
 _PHASE_BITS = 16
-"""Binary places of phases, radians, which are followed to 1e-3. Random digits behind them would be most of what a
+"""Fractional bits of phases, radians, which are followed to 1e-3. Random digits behind them would be most of what a
 compressed table weighs."""
 
 

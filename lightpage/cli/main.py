@@ -121,7 +121,7 @@ def missing(subject: str, error: ModuleNotFoundError) -> LightpageError:
     """The error that says which extra to install for a module that is not there."""
     top = (error.name or "").partition(".")[0]
     if top == RUNTIME:
-        expected = "the extra cpu, or gpu where it shall use one: pip install 'lightpage[cpu]'"
+        expected = "the extra cpu, or the extra gpu on a machine with an NVIDIA GPU: pip install 'lightpage[cpu]'"
         return LightpageError(subject, f"no module {top}", expected)
     for extra, modules in EXTRAS.items():
         if top in modules:

@@ -167,6 +167,10 @@ class Recording:
         """
         return FramePair(*(self._read(name, ()) for name in REFERENCES))
 
+    def shown(self, index: int) -> tuple[FramePair, NDArray[np.uint8] | None]:
+        """Frames and symbols of a page; see `frames` and `symbols`."""
+        return self.frames(index), self.symbols(index)
+
     def symbols(self, page: int) -> NDArray[np.uint8] | None:
         """The symbols [ny, nx] of one page, or None when the file holds none.
 

@@ -15,7 +15,7 @@ from lightpage.page.symbols import symbol_phases
 from lightpage.progress import track
 from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import check_recording, was_seen
-from runtime.bulk.frames_ahead import frames_ahead
+from runtime.bulk.read_ahead import read_ahead
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
 from runtime.decoding.page import DecodedPage
@@ -60,8 +60,8 @@ def choose_code(
     mask = decoder.bundle.pilot_mask if own is None else own
     errors: list[NDArray[np.float32]] = []
     concentrations: list[NDArray[np.float32]] = []
-    for index, read in track(frames_ahead(recording), "choose a code", total=recording.pages):
-        frames, symbols = read.result(), recording.symbols(index)
+    for _, read in track(read_ahead(recording.shown, recording.pages), "choose a code", total=recording.pages):
+        frames, symbols = read.result()
         if symbols is None or was_seen(decoder, frames):
             continue
         try:

@@ -17,7 +17,7 @@ from lightpage.page.pilots import Pilots, estimate_piston
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, page_hashes
-from runtime.bulk.frames_ahead import frames_ahead
+from runtime.bulk.read_ahead import read_ahead
 from runtime.bulk.refused import RefusedPage, refusal, unconfirmed
 from runtime.bundle.manifest import GOLDEN
 from runtime.decoding.decoder import Decoder
@@ -165,10 +165,10 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     refused: list[RefusedPage] = []
     due = 0
     before: list[float] = []
-    for index, read in track(frames_ahead(recording), "evaluate", total=recording.pages):
+    for index, read in track(read_ahead(recording.shown, recording.pages), "evaluate", total=recording.pages):
         page = None
         try:
-            frames, symbols = read.result(), recording.symbols(index)
+            frames, symbols = read.result()
             if symbols is not None and not was_seen(decoder, frames):
                 pair, pilots = narrow(frames, recording.bit_depth), Pilots.of_symbols(mask, symbols, levels)
                 page = tracker.decode(pair, levels, pilots)

@@ -25,7 +25,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from runtime.bulk.coded_pages import air_bits
 from runtime.bulk.evaluation import check_recording
-from runtime.bulk.frames_ahead import frames_ahead
+from runtime.bulk.read_ahead import read_ahead
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
@@ -213,7 +213,7 @@ def recover(
     reader = PageReader(codec, lambda pair: tracker.decode(pair, code.levels, pilots))
     pages: list[RecoveredPage] = []
     with VolumeFiles(out) as files:
-        for index, read in track(frames_ahead(recording), "recover", total=recording.pages):
+        for index, read in track(read_ahead(recording.frames, recording.pages), "recover", total=recording.pages):
             pages += [_read_page(reader, recording, index, read, files)]
         file = files.chosen(volume_id, checksum)
         done = Restored((), ()) if file is None else file.restore()

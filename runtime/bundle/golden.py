@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from lightpage.recording.frame_pair import FramePair
 
 _SIDE_PX = 2
-"""Side of the blocks of pixels that get one count: the finest fringes of the field are at least eight pixels wide."""
+"""Side of the blocks of pixels that get one count: a sample of the usual grid, which still has all fringes."""
 _COUNTS = 32
-"""Counts that are left of a camera's. At 15,000 electrons a step is six times a bright pixel's own noise."""
+"""Counts that are left of a camera's. At 15,000 electrons a step is about four times a bright pixel's own noise."""
 
 
 def shows_page(coarse: float, residual: float, limit: float) -> bool:
@@ -30,7 +30,7 @@ def shows_page(coarse: float, residual: float, limit: float) -> bool:
 
 
 def in_few_counts(pair: FramePair, bit_depth: int) -> FramePair:
-    """Means of blocks of 2 x 2 pixels, each one of 32 counts: compressed, they take a sixth of the room or less.
+    """Means of blocks of 2 x 2 pixels, each one of 32 counts: compressed, they take about a sixth of the room.
 
     Args:
         pair: counts [H, W].

@@ -21,8 +21,9 @@ TABLE = "table.npz"
 PILOTS = "pilots.npz"
 REQUIRED_FILES = frozenset({DECODER, TWIN, GOLDEN})
 OPTIONAL_FILES = frozenset({FIELD, TABLE, PILOTS})
-FLOAT32: Literal["float32"] = "float32"
-FLOAT16: Literal["float16"] = "float16"
+Precision = Literal["float32", "float16"]
+FLOAT32: Precision = "float32"
+FLOAT16: Precision = "float16"
 _SELF_HASH = "manifest_sha256"
 
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
@@ -70,7 +71,7 @@ class Manifest(BaseModel):
     """A pair with a larger residual is refused: swapped frames, or frames of two shots."""
     code: str | None = None
     """How user bytes are protected on this device's pages, TOML of a `lightpage.codec.code.Code`; None: not chosen."""
-    precision: Literal["float32", "float16"] = FLOAT32
+    precision: Precision = FLOAT32
     """In which decoder.onnx computes its network and waves."""
     provenance: Provenance = Provenance()
 

@@ -35,7 +35,7 @@ def decoder_options(command: Callable[..., Any]) -> Callable[..., Any]:
     def with_decoder(
         *, bundle: str, threads: int | None, provider: str | None, engine_cache: Path | None, **others: Any
     ) -> Any:
-        chosen = Provider.parse(provider or CPU, engine_cache)
+        chosen = Provider.parse(CPU if provider is None else provider, engine_cache)
         return command(load=lambda: Decoder.load(bundle_path(bundle), threads, chosen), **others)
 
     return with_decoder

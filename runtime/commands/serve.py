@@ -206,19 +206,19 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         if settings.self_calibrates:
             stack.enter_context(SelfCalibration(plane, monitor, recalibrator, settings.self_calibration.settings()))
         click.echo(f"serving {registry.current.version} from {source_name} at {server.target}")
-        _log_start(registry.current.version, source_name, server.target, len(effective.origins))
+        _log_start(registry.current.version, source_name, server.target, provider, len(effective.origins))
         wait_for_stop()
         click.echo("stopping")
         _log.info("stopping with model %s", registry.current.version)
     _log.info("stopped")
 
 
-def _log_start(model: str, source: str, address: str, given: int) -> None:
+def _log_start(model: str, source: str, address: str, provider: Provider, given: int) -> None:
     versions = {name: installed_version(name) for name in ("lightpage", "grpcio", "numpy")}
     versions["onnxruntime"] = RUNTIME_VERSION
     versions["python"] = platform.python_version()
-    text = "serving %s from %s at %s, %d settings given"
-    _log.info(text, model, source, address, given, extra={"told": versions})
+    text = "serving %s from %s at %s on %s, %d settings given"
+    _log.info(text, model, source, address, provider, given, extra={"told": versions})
 
 
 def _source(name: str, pages_file: Path | None, base: Decoder) -> FrameSource:

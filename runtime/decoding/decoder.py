@@ -26,6 +26,7 @@ from runtime.decoding.field_solver import BundleFieldSolver
 from runtime.decoding.frames import check_pair
 from runtime.decoding.page import DecodedPage, Inference, Timings
 from runtime.decoding.phase_refit import PhaseRefit
+from runtime.errors import ProviderError
 from runtime.execution.constant_table import GraphFile
 from runtime.execution.providers import ON_CPU, Provider
 from runtime.execution.session import Port
@@ -315,7 +316,7 @@ class Decoder:
         try:
             self.check(golden.pair)
             p = self.infer(golden.pair).p
-        except BundleError:
+        except (BundleError, ProviderError):
             raise
         except Exception as error:  # onnxruntime's errors share no base class
             raise BundleError(subject, error, "a golden page that decodes") from None

@@ -35,11 +35,15 @@ class Provider:
         """The provider that a text like ``cuda:1`` names.
 
         Raises:
-            InvalidInputError: it names none.
+            InvalidInputError: it names none, or keeps no engines and is given a folder for them.
         """
         match = _TEXT.fullmatch(text)
         if match is None or (match[1] == CPU and match[2] is not None):
             raise InvalidInputError("provider", repr(text), WANTED)
+        if cache is not None and match[1] != TENSORRT:
+            raise InvalidInputError(
+                "engine cache", f"{cache} with provider {text}", f"provider {TENSORRT}, or no folder"
+            )
         return cls(match[1], int(match[2] or 0), cache)
 
     def __str__(self) -> str:
@@ -55,11 +59,14 @@ class Provider:
         """Where its tensors lie, as ONNX Runtime calls it."""
         return "cpu" if self.name == CPU else "cuda"
 
-    def chain(self) -> list[tuple[str, dict[str, Any]]]:
+    def chain(self, version: str) -> list[tuple[str, dict[str, Any]]]:
         """ONNX Runtime's names with their options, the preferred one first; a node goes to the first that has it.
 
         Single precision stays single: a GPU would round the factors of a product to eleven bits unless it is told not
         to. A bundle in half precision has chosen that itself.
+
+        Args:
+            version: of the model. TensorRT finds an engine by the model's names alone, whatever its weights are.
         """
         cpu: tuple[str, dict[str, Any]] = (_NAMES[CPU], {})
         if self.name == CPU:
@@ -71,6 +78,7 @@ class Provider:
         if self.cache is not None:
             folder = str(self.cache)
             options |= {"trt_engine_cache_enable": True, "trt_engine_cache_path": folder}
+            options |= {"trt_engine_cache_prefix": f"lightpage-{version}"}
             options |= {"trt_timing_cache_enable": True, "trt_timing_cache_path": folder}
         return [(_NAMES[TENSORRT], options), cuda, cpu]
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -89,6 +91,8 @@ class Session(Protocol):
 
 
 VERSION: str = onnxruntime.__version__
+_USABLE = "a GPU of that number with room for the model, its driver and its libraries"
+_VERSION_DIGITS = 16
 _ERRORS_ONLY = 3
 _NOWHERE = os.path.join(os.sep, "nonexistent", "lightpage")
 
@@ -132,16 +136,22 @@ def open_session(
     # A model that names an outside file for its weights must not read this machine's files.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", _NOWHERE)
     check_provider(provider)
-    if provider.memory != ON_CPU.memory:  # its libraries may be packages of this environment, which no linker looks in
-        onnxruntime.preload_dlls()
+    if provider.memory != ON_CPU.memory:
+        os.environ.setdefault("NVIDIA_TF32_OVERRIDE", "0")  # TensorRT would round float32, and has no option against it
+        onnxruntime.preload_dlls()  # they may be packages of this environment, where no linker looks
+    version = sha256(model).hexdigest()[:_VERSION_DIGITS]
     try:
-        session: Session = onnxruntime.InferenceSession(model, options, providers=provider.chain())
-    except Exception as error:  # onnxruntime's errors share no base class
-        raise BundleError(subject, str(error).splitlines()[0], "an ONNX model of a Lightpage bundle") from None
-    if (found := session.get_providers()[0]) != provider.runtime_name:  # it says so in its log alone
-        raise ProviderError(
-            f"provider {provider}", f"{found} in its place", "a GPU of that number, its driver and its libraries"
+        # by default it would print the cause, and compute elsewhere
+        session: Session = onnxruntime.InferenceSession(
+            model, options, providers=provider.chain(version), enable_fallback=0
         )
+    except Exception as error:  # onnxruntime's errors share no base class
+        cause = str(error).splitlines()[0]
+        if provider != ON_CPU:
+            raise ProviderError(f"provider {provider}", cause, _USABLE) from None
+        raise BundleError(subject, cause, "an ONNX model of a Lightpage bundle") from None
+    if (found := session.get_providers()[0]) != provider.runtime_name:
+        raise ProviderError(f"provider {provider}", f"{found} in its place", _USABLE)
     return session
 
 
@@ -169,26 +179,46 @@ class BoundSession:
         session: opened with this provider.
         provider: what it runs on.
         constants: by input.
+
+    Raises:
+        ProviderError: a GPU has no room for them.
     """
 
     def __init__(self, session: Session, provider: Provider, constants: Mapping[str, NDArray[Any]]) -> None:
-        self.session = session
-        self._constants = {
-            name: onnxruntime.OrtValue.ortvalue_from_numpy(
-                np.ascontiguousarray(value), provider.memory, provider.device
-            )
-            for name, value in constants.items()
-        }
+        self.session, self._provider = session, provider
+        with self._told():
+            self._constants = {
+                name: onnxruntime.OrtValue.ortvalue_from_numpy(
+                    np.asarray(value, order="C"), provider.memory, provider.device
+                )
+                for name, value in constants.items()
+            }
 
     def run(self, outputs: Iterable[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-        """Outputs of the names asked for; `feeds` holds the other inputs, and may stand in for constants."""
-        binding = self.session.io_binding()
-        for name, value in self._constants.items():
-            if name not in feeds:
-                binding.bind_ortvalue_input(name, value)
-        for name, array in feeds.items():
-            binding.bind_cpu_input(name, np.ascontiguousarray(array))
-        for name in outputs:
-            binding.bind_output(name, "cpu")
-        self.session.run_with_iobinding(binding)
-        return [np.asarray(value) for value in binding.copy_outputs_to_cpu()]
+        """Outputs of the names asked for; `feeds` holds the other inputs, and may stand in for constants.
+
+        Raises:
+            ProviderError: a GPU failed, or has no room.
+        """
+        with self._told():
+            binding = self.session.io_binding()
+            for name, value in self._constants.items():
+                if name not in feeds:
+                    binding.bind_ortvalue_input(name, value)
+            for name, array in feeds.items():
+                binding.bind_cpu_input(name, np.asarray(array, order="C"))
+            for name in outputs:
+                binding.bind_output(name, "cpu")
+            self.session.run_with_iobinding(binding)
+            return [np.asarray(value) for value in binding.copy_outputs_to_cpu()]
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """A GPU's failures by name; on the CPU a failure is the graph's."""
+        try:
+            yield
+        except Exception as error:  # onnxruntime's errors share no base class
+            if self._provider == ON_CPU:
+                raise
+            cause = str(error).splitlines()[0]
+            raise ProviderError(f"provider {self._provider}", cause, _USABLE) from None

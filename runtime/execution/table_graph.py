@@ -26,7 +26,8 @@ class TableGraph:
         threads: threads of one run; by default the cores that this process may use.
         table: values instead of the graph's defaults.
         like: the same graph with another table: what runs for every page is shared with it.
-        profile, provider: see `open_session`; what is computed once is computed on the CPU.
+        profile: see `open_session`.
+        provider: what pages are computed with; what is computed once is computed on the CPU.
 
     Raises:
         InvalidInputError: a table that does not fit.
@@ -62,11 +63,14 @@ class TableGraph:
             model = parts.behind_with(between)
             self.session = open_session(model, subject, threads, profile=profile, provider=provider)
         held = fed_values | between
-        self._held = held.keys()
+        self._held = frozenset(held)
         self._bound = BoundSession(self.session, provider, held)
 
     def with_table(self, table: SamplingTable) -> TableGraph:
-        """The graph with other tensors in its table, by name; those left out stay. Errors as for the constructor."""
+        """The graph with other tensors in its table, by name; those left out stay. It raises as the constructor does.
+
+        On a GPU the new table's tensors lie beside those of this one, as long as both are held.
+        """
         merged = {**self.table, **table}
         names, threads = self._fed_names, self._threads
         return TableGraph(self._file, self._subject, names, threads, merged, like=self, provider=self.provider)

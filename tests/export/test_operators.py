@@ -31,7 +31,7 @@ ORIGIN = "someone/project docs/file.md at 0000000 (1.0)"
 SMALL = "agraph (float[1, 2, 6, 8] x, float[1, 4, 4, 2] grid) => (float[1, 2, 4, 4] y)"
 
 
-def exported(localizer: str, preset: str) -> bytes:
+def exported(localizer: str, preset: str, frame_dtype: str = "uint8") -> bytes:
     """A small device's decoder; what operators it has does not depend on the network's size."""
     profile, device = small_profile(), Device()
     parameters = true_parameters(profile, device)
@@ -39,7 +39,10 @@ def exported(localizer: str, preset: str) -> bytes:
     graph = DecoderGraph(profile, SymbolDecoder(profile, parameters, localizer, choices), 1.0).eval()
     table = sampling_table(TorchTwin(RayTwin(profile)), parameters, device.homodyne.turn_rad, profile)
     tensors = table_tensors(graph, table, Simulator(profile, device, seed=1).references())
-    return decoder_onnx(graph, "uint8", profile.frame_shape, tensors)
+    wide = {
+        name: value.astype(frame_dtype) if name.startswith("reference") else value for name, value in tensors.items()
+    }
+    return decoder_onnx(graph, frame_dtype, profile.frame_shape, wide)
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +76,13 @@ def test_nor_does_one_of_the_others(localizer: str, preset: str) -> None:
     for provider in PROVIDERS:
         assert fallbacks(part, provider) == [], provider
     assert shape_computations(part) == []
+
+
+def test_frames_of_16_bits_are_converted_elsewhere_by_tensorrt_alone() -> None:
+    part = page_part(exported("coherent", FAST, "uint16"))
+    assert fallbacks(part, "cuda") == []
+    found = fallbacks(part, "tensorrt")
+    assert [(one.operator, "uint16" in one.got) for one in found] == [("Cast", True), ("Cast", True)]
 
 
 def test_a_cast_planted_before_the_sampling_is_found_and_named(fast: bytes) -> None:
@@ -236,7 +246,7 @@ def test_cudas_list_is_read_from_its_projects_document(tmp_path: Path) -> None:
 
 
 def test_a_kernel_without_a_last_version_is_taken_for_its_first_alone(tmp_path: Path) -> None:
-    """So onnxruntime before 1.25 does with GridSample as this project exports it."""
+    """So onnxruntime before 1.26 did with GridSample as this project exports it."""
     listed = made(KERNELS, "cuda", tmp_path)
     assert fallbacks(small("y = GridSample (x, grid)", opset=19), listed) == []
     (found,) = fallbacks(small("y = GridSample (x, grid)"), listed)

@@ -72,18 +72,18 @@ class Measured(NamedTuple):
         in_phase, turned = self._brightness(e, floor)
         pull_a = share * (self.a + (1 + floor) / 2) / in_phase - share / 2
         pull_b = share * (self.b + (1 + floor) / 2) / turned - share / 2
-        both, (real, imaginary) = pull_a + pull_b, e.unbind()
-        return torch.stack([both * real + pull_a + self.cos * pull_b, both * imaginary + self.sin * pull_b])
+        total, (real, imaginary) = pull_a + pull_b, e.unbind()
+        return torch.stack([total * real + pull_a + self.cos * pull_b, total * imaginary + self.sin * pull_b])
 
     def _brightness(self, e: Tensor, floor: Tensor | float) -> tuple[Tensor, Tensor]:
         """|1 + e|^2 and |exp(i turn) + e|^2, each with the floor on it, [ny, nx]."""
         real, imaginary = e.unbind()
-        beside = real + 1
-        in_phase = beside * beside + imaginary * imaginary + floor
+        real_plus_one = real + 1
+        in_phase = real_plus_one * real_plus_one + imaginary * imaginary + floor
         return in_phase, in_phase + (2 * (self.cos - 1) * real + 2 * self.sin * imaginary)
 
     def in_blocks(self, side: int) -> Measured:
-        """The same on whole blocks of samples; what was not measured lies at the right and below, and is dark."""
+        """The same on whole blocks of so many samples a side, zeros at the right and below where there are none."""
         ny, nx = self.a.shape
         missing = (0, -nx % side, 0, -ny % side)
         a, b, amplitude, lit = (functional.pad(plane, missing) for plane in (self.a, self.b, self.amplitude, self.lit))
@@ -156,8 +156,8 @@ class FieldRecovery(nn.Module):
                 the page's corner radius.
             homodyne: [2], cosine and sine of the turn between the two arms.
         """
-        frames = _block_means(_both(in_phase, quadrature), self.binning)
-        references = _block_means(_both(reference_in_phase, reference_quadrature), self.binning)
+        frames = _block_means(_stacked(in_phase, quadrature), self.binning)
+        references = _block_means(_stacked(reference_in_phase, reference_quadrature), self.binning)
         where = self._where(registration, self.binning)
         beyond = frames - references
         if self.binning == 1:
@@ -182,9 +182,9 @@ class FieldRecovery(nn.Module):
         """
         ny, nx = self.grid.shape
         blocks = measured.in_blocks(BLOCK)
-        # dark samples outside the grid stay dark
-        brighten = functional.pad(1 / measured.amplitude, (0, -nx % BLOCK, 0, -ny % BLOCK))
-        e = self._solve(blocks, brighten)
+        # zero outside the grid, as the amplitude is
+        inverse_amplitude = functional.pad(1 / measured.amplitude, (0, -nx % BLOCK, 0, -ny % BLOCK))
+        e = self._solve(blocks, inverse_amplitude)
         residual = self.band(blocks.left(e) * blocks.amplitude)
         return (e * blocks.amplitude)[:, :ny, :nx], residual[:, :ny, :nx]
 
@@ -202,15 +202,15 @@ class FieldRecovery(nn.Module):
         pull = measured.lit * measured.pull(field / measured.amplitude, floor)
         return torch.as_tensor(self.band(pull * measured.amplitude))
 
-    def _solve(self, measured: Measured, brighten: Tensor) -> Tensor:
-        """Solve the two equations for e, [2, ny, nx]; `brighten` is one over the amplitude, where there is any.
+    def _solve(self, measured: Measured, inverse_amplitude: Tensor) -> Tensor:
+        """Solve the two equations for e, [2, ny, nx]; `inverse_amplitude` is zero where the amplitude is, [ny, nx].
 
         Each sample alone is a quadratic with two roots, which meet where the signal outshines the reference. So: the
         closed root nearer to the linear estimate, then descent with momentum towards the most likely field in the
         pipe's band.
         """
         a, b, cos, sin, amplitude, _ = measured
-        start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) * brighten
+        start = self.band(torch.stack([a, (b - cos * a) / sin]) * amplitude) * inverse_amplitude
         if not self.with_signal_power:
             return torch.as_tensor(start)
         # Im e = slope Re e - offset, from the difference of the equations; then a quadratic in Re e
@@ -221,11 +221,11 @@ class FieldRecovery(nn.Module):
         middle = -linear / quadratic
         root = torch.sqrt(torch.clamp(discriminant, min=0)) / quadratic
         real = middle + torch.where(start[0] < middle, -root, root)
-        before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) * brighten
+        before = estimate = self.band(torch.stack([real, slope * real - offset]) * amplitude) * inverse_amplitude
         for _ in range(self.rounds):
             ahead = estimate + _MOMENTUM * (estimate - before)
             step = measured.pull(ahead, READ_NOISE, _STEP)
-            before, estimate = estimate, self.band((ahead + step) * amplitude) * brighten
+            before, estimate = estimate, self.band((ahead + step) * amplitude) * inverse_amplitude
         return torch.as_tensor(estimate)
 
     def _where(self, registration: Tensor, side: int, step: int = 1) -> Tensor:
@@ -253,11 +253,11 @@ class FieldRecovery(nn.Module):
         blocks = _block_means(references, _REFERENCE_BLOCK_PX // self.binning)
         seen = _sampled(blocks, coarse)
         ny, nx = self.grid.shape
-        rows = _between(seen.transpose(1, 2), ny).transpose(1, 2)
-        return _between(rows, nx)
+        rows = _interpolated(seen.transpose(1, 2), ny).transpose(1, 2)
+        return _interpolated(rows, nx)
 
 
-def _both(in_phase: Tensor, quadrature: Tensor) -> Tensor:
+def _stacked(in_phase: Tensor, quadrature: Tensor) -> Tensor:
     """Two frames as one [2, H, W] of float32: each alone, since TensorRT does nothing with integers but this."""
     return torch.stack([in_phase.to(torch.float32), quadrature.to(torch.float32)])
 
@@ -275,7 +275,7 @@ def _sampled(images: Tensor, where: Tensor) -> Tensor:
     return seen[:, 0]
 
 
-def _between(coarse: Tensor, count: int) -> Tensor:
+def _interpolated(coarse: Tensor, count: int) -> Tensor:
     """Every `_REFERENCE_STEP`-th of so many samples [C, H, coarse] to all of them, linearly; constant behind the last.
 
     By blocks, as a `SeparableFilter` works.

@@ -19,11 +19,11 @@ def test_rates_deviations_and_times_of_each_form(tmp_path: Path) -> None:
     decoder = Decoder.load(toy.write_toy_bundle(tmp_path / "toy.zip"))
     with Recording.open(tmp_path / "r.h5") as recording:
         models = {"usual": usual, "doubtful": doubtful}
-        forms = {form.name: form for form in measured(decoder, models, usual, recording, 2, "usual")}
+        forms = {form.name: form for form in measured(decoder, models, doubtful, recording, 2, "usual")}
     assert list(forms) == ["usual", "doubtful", HALF]
-    assert forms[HALF].air == forms["usual"].air > forms["doubtful"].air > 4
-    assert forms[HALF].deviation == forms["usual"].deviation == 0
-    assert forms["doubtful"].deviation == pytest.approx(0.75, abs=1e-3)
+    assert forms["usual"].air > forms["doubtful"].air == forms[HALF].air > 4
+    assert forms["usual"].deviation == 0
+    assert forms["doubtful"].deviation == forms[HALF].deviation == pytest.approx(0.75, abs=1e-3)
     assert forms["usual"].seconds > 0
     assert np.isnan(forms[HALF].seconds)
 

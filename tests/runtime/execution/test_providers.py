@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
 import pytest
+from onnx import parser
 
 from lightpage.cli.main import lightpage, run
 from lightpage.errors import InvalidInputError
+from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.errors import ProviderError
 from runtime.execution.providers import ON_CPU, Provider
-from runtime.execution.session import BoundSession, open_session
+from runtime.execution.session import BoundSession, Session, open_session
 from tests.runtime import toy
 
 
@@ -38,16 +41,17 @@ def test_a_text_that_names_none_is_refused(text: str) -> None:
 
 
 def test_tensorrt_leaves_what_it_lacks_to_cuda_and_keeps_its_engines(tmp_path: Path) -> None:
-    chain = Provider.parse("tensorrt:1", tmp_path).chain()
+    chain = Provider.parse("tensorrt:1", tmp_path).chain("0a1b")
     names = ["TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider"]
     assert [name for name, _ in chain] == names
     assert [options.get("device_id") for _, options in chain] == [1, 1, None]
     assert chain[0][1]["trt_engine_cache_path"] == str(tmp_path)
-    assert "trt_engine_cache_enable" not in Provider.parse("tensorrt").chain()[0][1]
+    assert chain[0][1]["trt_engine_cache_prefix"] == "lightpage-0a1b"  # else another model's engine would be taken
+    assert "trt_engine_cache_enable" not in Provider.parse("tensorrt").chain("0a1b")[0][1]
 
 
 def test_a_gpu_does_not_round_single_precision() -> None:
-    assert Provider.parse("cuda").chain()[0][1]["use_tf32"] == 0
+    assert Provider.parse("cuda").chain("0a1b")[0][1]["use_tf32"] == 0
 
 
 @pytest.mark.parametrize("name", ["cuda", "tensorrt"])
@@ -78,6 +82,51 @@ def test_constants_stay_bound_and_a_feed_stands_in_for_one() -> None:
         for one, other in zip(got, expected, strict=True):
             np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(bound.run(["p"], {})[0], session.run(["p"], others)[0])
+
+
+def test_a_number_without_axes_stays_one() -> None:
+    text = """<ir_version: 10, opset_import: ["" : 20]> g (float x, float[2] y) => (float[1, 2] z)
+    { axis = Constant<value = int64[1] {0}>() long = Unsqueeze(x, axis) z = Mul(long, y) z2 = Identity(z) }"""
+    model = parser.parse_model(text.replace("float[1, 2] z)", "float[2] z)"))
+    session = open_session(model.SerializeToString(), "numbers", 1)
+    for constants, feeds in (({"x": np.float32(3)}, {"y": np.ones(2, np.float32)}), ({}, {"x": np.float32(3)})):
+        bound = BoundSession(session, ON_CPU, {name: np.asarray(value) for name, value in constants.items()})
+        found = bound.run(["z"], {"y": np.ones(2, np.float32)} | {name: np.asarray(one) for name, one in feeds.items()})
+        np.testing.assert_array_equal(found[0], [3, 3])
+
+
+def test_what_a_gpu_says_is_told_and_a_graph_s_own_failure_is_not_the_gpus() -> None:
+    session = open_session(toy.decoder_onnx(), "toy", 1)
+    in_vain = {"in_phase": np.zeros((3, 3), np.uint8)}
+    with pytest.raises(ProviderError, match=r"provider cuda:1: got .*, wanted a GPU of that number with room"):
+        BoundSession(session, Provider("cuda", 1), in_vain).run(["p"], {})
+    with pytest.raises(RuntimeError):
+        BoundSession(session, ON_CPU, in_vain).run(["p"], {})
+
+
+def test_a_folder_for_engines_goes_with_tensorrt_alone(tmp_path: Path) -> None:
+    for text in ("cpu", "cuda"):
+        with pytest.raises(InvalidInputError, match=rf"engine cache: got .* with provider {text}, wanted provider"):
+            Provider.parse(text, tmp_path)
+
+
+def test_models_behind_the_first_are_computed_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Provider] = []
+    own = open_session
+
+    def noted(model: bytes, subject: str, threads: int | None, **options: Any) -> Session:
+        asked.append(options.pop("provider", ON_CPU))
+        return own(model, subject, threads, **options)
+
+    monkeypatch.setattr("runtime.execution.table_graph.open_session", noted)
+    on_second = Provider("cpu", 1)  # no GPU is here: the number alone tells it from the default
+    decoder = Decoder.load(toy.write_toy_bundle(tmp_path / "b.zip"), 1, on_second)
+    other = toy.write_toy_bundle(tmp_path / "c.zip", version="toy-2")
+    gain = {"homodyne": np.array([2.0, 1.0], np.float32)}
+    for one in (decoder, decoder.load_another(other), decoder.with_table(gain), decoder.of_bundle(Bundle.open(other))):
+        assert one.graph.provider == on_second
+        assert one.threads == 1
+    assert asked.count(on_second) == 2
 
 
 def test_a_command_refuses_a_provider_before_it_opens_a_recording(
