@@ -104,7 +104,7 @@ def test_a_network_that_halves_its_resolution_runs_in_half_precision() -> None:
     for part in ("network", "refiners", "prediction/waves", "prediction/back"):
         made = [node.output[0] for node in onnx.load_from_string(half).graph.node if f"decoder/{part}" in node.name]
         assert any(types.get(name) == TensorProto.FLOAT16 for name in made), part
-    pair = simulator.page(random_symbols(profile, 4, 1, np.random.default_rng(0))[0], 4).frames
+    pair = simulator.page(random_symbols(profile, 256, 1, np.random.default_rng(0))[0])
     feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature}
     exact = open_session(model, "exact", 1, once=True).run(["p"], feeds)[0]
     for one in (half, rounded(model, PAGE_INPUTS)):
