@@ -6,6 +6,7 @@ What most users need is here by name: `runtime.load("bench")`. Each name is impo
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -38,24 +39,28 @@ __all__ = [
 ]
 
 
-def load(name_or_path: str, threads: int | None = None, provider: str = "cpu") -> Decoder:
+def load(
+    name_or_path: str, threads: int | None = None, provider: str = "cpu", engine_cache: str | Path | None = None
+) -> Decoder:
     """The decoder of a bundle.
 
     Args:
         name_or_path: of a bundle, or the name of a shipped one.
         threads: of an inference; by default all cores.
         provider: what pages are computed with: ``cpu``, ``cuda``, ``tensorrt``, or ``cuda:1`` for the second GPU.
+        engine_cache: folder where TensorRT keeps its engines; without, it builds them each time.
 
     Raises:
         BundleError: there is none, or it is damaged.
-        InvalidInputError: the text names no provider.
+        InvalidInputError: the text names no provider, or one that keeps no engines.
         ProviderError: there is no such provider here.
     """
     from runtime.bundle.shipped import bundle_path
     from runtime.decoding.decoder import Decoder
     from runtime.execution.providers import Provider
 
-    return Decoder.load(bundle_path(name_or_path), threads, Provider.parse(provider))
+    cache = None if engine_cache is None else Path(engine_cache)
+    return Decoder.load(bundle_path(name_or_path), threads, Provider.parse(provider, cache))
 
 
 def __getattr__(name: str) -> Any:

@@ -152,7 +152,12 @@ def measured(
 
 
 @click.command()
-@click.option("--kept", required=True, type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option(
+    "--kept",
+    required=True,
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="Folder of a data set in analysis/weights.",
+)
 @click.option("--pages", default=8, show_default=True, type=click.IntRange(1, 1000), help="New pages of its device.")
 @click.option("--repeats", default=7, show_default=True, type=click.IntRange(0, 1000), help="Timed rounds.")
 @click.option("--out", required=True, type=OutputFolder(), help="Folder for run, pages and fidelity.json.")

@@ -61,7 +61,10 @@ def data_set_of(kept: Path) -> tuple[Profile, Device, int]:
         begun = json.loads((kept / BEGUN).read_text())
         profile = parse_profile(begun["--profile"], f"{kept / BEGUN}: profile")
         return profile, Device.model_validate(begun["device"]), int(begun["--seed"])
-    except (OSError, ValueError, KeyError) as error:
+    except KeyError as error:
+        expected = "that of a data set, as analysis/weights has them"
+        raise InvalidInputError(f"{kept / BEGUN}", f"no key {error}", expected) from None
+    except (OSError, ValueError) as error:
         raise InvalidInputError(f"--kept {kept}", error, f"the folder of a kept data set with its {BEGUN}") from None
 
 

@@ -48,6 +48,7 @@ _KINDS = {
     **dict.fromkeys(("Concat", "Gather", "GatherND", "Pad", "Slice", "Split", "Transpose"), LAYOUT),
 }
 """Of operators; all others work number by number, or sum."""
+_DECODERS = "As `analysis.speed.speed` names it: coherent is the preset standard, refined is accurate."
 _FREE = frozenset(["Constant", "Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"])
 """Operators that move nothing."""
 
@@ -172,7 +173,7 @@ def exported(profile: Profile, name: str, precision: str, known: dict[str, Calla
 
 @click.command()
 @click.option("--profile", "profile_name", default="paper", show_default=True, help="Shipped profile or TOML file.")
-@click.option("--decoder", "names", multiple=True, default=("refined",), show_default=True)
+@click.option("--decoder", "names", multiple=True, default=("refined",), show_default=True, help=_DECODERS)
 @click.option("--precision", "precisions", multiple=True, type=click.Choice(PRECISIONS), default=PRECISIONS)
 @click.option("--share", type=click.FloatRange(0.01, 1), default=0.4, show_default=True, help="Of the peaks reached.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")

@@ -12,10 +12,11 @@ from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.pilots import Pilots, remove_piston
 from lightpage.page.symbols import symbol_phases
-from lightpage.progress import track
+from lightpage.progress import track, warn
 from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import check_recording, was_seen
 from runtime.bulk.read_ahead import read_ahead
+from runtime.bulk.refused import RefusedPage, refusal
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
 from runtime.decoding.page import DecodedPage
@@ -60,17 +61,22 @@ def choose_code(
     mask = decoder.bundle.pilot_mask if own is None else own
     errors: list[NDArray[np.float32]] = []
     concentrations: list[NDArray[np.float32]] = []
-    for _, read in track(read_ahead(recording.shown, recording.pages), "choose a code", total=recording.pages):
-        frames, symbols = read.result()
-        if symbols is None or was_seen(decoder, frames):
-            continue
+    refused: list[RefusedPage] = []
+    for index, read in track(read_ahead(recording.shown, recording.pages), "choose a code", total=recording.pages):
         try:
+            frames, symbols = read.result()
+            if symbols is None or was_seen(decoder, frames):
+                continue
             pair, pilots = narrow(frames, recording.bit_depth), Pilots.of_symbols(mask, symbols, levels)
             page = tracker.decode(pair, levels, pilots)
-        except (InvalidInputError, LostPageError):
-            continue  # a page that is lost to the optics is lost to every code
+        except (InvalidInputError, LostPageError) as error:
+            refused.append(RefusedPage.of(index, error))  # a page that is lost to the optics is lost to every code
+            continue
         errors.append(phase_errors(page, symbols, levels))
         concentrations.append(page.concentration)
+    if refused:
+        lost = refusal(f"recording {recording.path}", refused, recording.pages)
+        warn(f"{lost.subject}: {lost.got}; they do not count")
     data = ~mask
     rates = [
         achievable_rate(error[data], kappa[data], np.zeros(int(data.sum()), np.int64), AIR_LEVELS).mean()

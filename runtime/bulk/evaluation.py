@@ -221,6 +221,8 @@ def _describe(decoder: Decoder, levels: int) -> dict[str, Any]:
     return {
         "path": str(bundle.path.resolve()),
         "name": manifest.name,
+        "precision": manifest.precision,
+        "provider": str(decoder.graph.provider),
         "profile": manifest.profile,
         "calibration": manifest.calibration,
         "metrics": manifest.metrics,

@@ -16,10 +16,18 @@ from runtime.execution.providers import CPU, WANTED, Provider
 Load = Callable[[], Decoder]
 """Opens the decoder that the options name; raises as `Decoder.load` does."""
 THREADS = click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
-PROVIDER = click.option("--provider", show_default=CPU, help=f"What computes pages: {WANTED}.")
+PROVIDER = click.option(
+    "--provider",
+    envvar="LIGHTPAGE_SERVICE__PROVIDER",
+    show_envvar=True,
+    show_default=CPU,
+    help=f"What computes pages: {WANTED}.",
+)
 ENGINE_CACHE = click.option(
     "--engine-cache",
     type=click.Path(file_okay=False, path_type=Path),
+    envvar="LIGHTPAGE_SERVICE__ENGINE_CACHE",
+    show_envvar=True,
     help="Folder where TensorRT keeps its engines; without, it builds them each time, for minutes.",
 )
 

@@ -13,7 +13,7 @@ CPU, CUDA, TENSORRT = "cpu", "cuda", "tensorrt"
 _NAMES = {CPU: "CPUExecutionProvider", CUDA: "CUDAExecutionProvider", TENSORRT: "TensorrtExecutionProvider"}
 """ONNX Runtime's own names."""
 WANTED = "cpu, cuda or tensorrt, with :N behind it for another GPU than the first"
-_TEXT = re.compile(r"(cpu|cuda|tensorrt)(?::(\d{1,3}))?")
+_TEXT = re.compile(r"(cpu|cuda|tensorrt)(?::([0-9]{1,3}))?")
 
 
 @dataclass(frozen=True)
