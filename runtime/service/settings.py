@@ -18,7 +18,6 @@ from pydantic import (
     SecretStr,
     TypeAdapter,
     ValidationError,
-    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -29,7 +28,7 @@ from lightpage.device.problems import WANTED, expected_of, problem_of
 from lightpage.device.profile import TomlTable, toml_value
 from lightpage.errors import InvalidInputError
 from runtime.bundle.shipped import DEFAULT
-from runtime.execution.providers import CPU, TENSORRT, Provider
+from runtime.execution.providers import CPU, Provider
 from runtime.recalibration.known_pages import MIN_PAGES
 from runtime.service.audit import AUDIT_BYTES, AUDIT_KEPT
 from runtime.service.flight_recorder import PAGES, RING_BYTES, FlightSettings
@@ -132,13 +131,6 @@ class ServiceTable(SettingsTable):
         except InvalidInputError as error:
             raise ValueError(error.expected) from None
         return provider
-
-    @field_validator("engine_cache")
-    @classmethod
-    def _has_engines(cls, cache: Path | None, info: ValidationInfo) -> Path | None:
-        if cache is not None and not str(info.data.get("provider", TENSORRT)).startswith(TENSORRT):
-            raise ValueError(f"no folder, or provider {TENSORRT}")
-        return cache
 
 
 class MetricsTable(SettingsTable):

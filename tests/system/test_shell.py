@@ -129,18 +129,29 @@ def stages() -> dict[str, str]:
 
 
 def test_the_image_is_not_root_quiet_and_checked() -> None:
-    runtime = stages()["runtime"]
+    runtime = stages()["service"]
     assert "USER 10001:10001" in runtime
     assert "ORT_DISABLE_TELEMETRY=1" in runtime
     assert "PYTHONDONTWRITEBYTECODE=1" in runtime
     assert 'CMD ["python", "-m", "runtime.commands.healthcheck"]' in runtime
     assert 'ENTRYPOINT ["lightpage", "serve"]' in runtime
+    text = (ROOT / "Dockerfile").read_text()
+    for name in ("runtime", "gpu"):  # whatever is installed, it is run alike
+        assert f"FROM service AS {name}" in text
 
 
 def test_only_the_deep_image_installs_the_train_extra() -> None:
-    assert [name for name, text in stages().items() if "[train]" in text] == ["build-deep"]
+    assert [name for name, text in stages().items() if "train]" in text] == ["build-deep"]
     assert "--from=build-deep" in stages()["deep"]
     assert "--from=build-deep" not in stages()["runtime"]
+
+
+def test_no_image_installs_both_runtimes() -> None:
+    installed = {name: re.findall(r"'\.\[(.*?)\]'", text) for name, text in stages().items()}
+    extras = {name: set(",".join(found).split(",")) for name, found in installed.items() if found}
+    assert [name for name, some in extras.items() if "gpu" in some] == ["build-gpu"]
+    assert "cpu" not in extras["build-gpu"]
+    assert all("cpu" in some for name, some in extras.items() if name != "build-gpu")
 
 
 def test_the_image_is_built_of_what_the_wheel_is_built_of() -> None:
@@ -208,7 +219,7 @@ NEED_AN_EXTRA = {"runtime.modulator.present": "xcffib", "runtime.modulator.x_win
 
 @pytest.fixture(scope="module")
 def torchless(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scripts folder of a fresh environment with lightpage in it and no extra, as the runtime image has it."""
+    """The scripts folder of a fresh environment with lightpage in it as the runtime image has it: no torch."""
     folder = tmp_path_factory.mktemp("torchless")
     source = folder / "source"
     source.mkdir()
@@ -220,7 +231,9 @@ def torchless(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = run([sys.executable, "-m", "venv", folder / "environment"])
     assert made.returncode == 0, made.stderr
     scripts = folder / "environment" / "bin"
-    installed = run([scripts / "pip", "install", "--constraint", "constraints.txt", "."], cwd=source, timeout_s=500)
+    installed = run(
+        [scripts / "pip", "install", "--constraint", "constraints.txt", ".[cpu]"], cwd=source, timeout_s=500
+    )
     assert installed.returncode == 0, installed.stderr
     return scripts
 

@@ -105,6 +105,10 @@ def test_a_missing_extra_is_named(
     assert "pip install 'lightpage[train]'" in capsys.readouterr().err
     assert run(["x"], group_of(x=f"{HERE}:needs_torch")) == 2
     assert "pip install 'lightpage[train]'" in capsys.readouterr().err
+    (tmp_path / "wants_a_runtime.py").write_text("import onnxruntime\n")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    assert run(["serve"], group_of(serve="wants_a_runtime:serve")) == 2
+    assert "wanted the extra cpu, or the extra gpu on a machine with an NVIDIA GPU" in capsys.readouterr().err
 
 
 def test_ctrl_c_ends_with_130_and_says_how_to_go_on(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.comparison.fidelity import FORMS, HALF, measured, name_of
+from analysis.speed.fidelity import FORMS, HALF, measured, name_of
 from lightpage.recording.reader import Recording
 from runtime.decoding.decoder import Decoder
 from tests.runtime import toy

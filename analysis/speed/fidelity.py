@@ -1,6 +1,6 @@
 """What a second pass reads and takes, by how exactly it follows light: weights stay, waves and precision change.
 
-    python -m analysis.comparison.fidelity --kept analysis/weights/bench/-0.6deg-32e-4px --out runs/fidelity
+    python -m analysis.speed.fidelity --kept analysis/weights/bench/-0.6deg-32e-4px --out runs/fidelity
 
 New pages of the data set's device are simulated, and every form decodes them as a service would. The times are of
 decodes in turns.
@@ -187,4 +187,4 @@ def main(kept: Path, pages: int, repeats: int, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run_command(main, name="python -m analysis.comparison.fidelity"))
+    sys.exit(run_command(main, name="python -m analysis.speed.fidelity"))
