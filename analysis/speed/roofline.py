@@ -22,7 +22,7 @@ import click
 import onnx
 from onnx import helper, shape_inference
 
-from analysis.speed.speed import makers
+from analysis.speed.speed import makers_of
 from export.graph import FRAME_INPUTS
 from export.half import PRECISIONS, in_half
 from export.onnx_files import decoder_onnx
@@ -182,10 +182,7 @@ def main(
 ) -> None:
     """Print flops and bytes a page by kind, and what a data sheet makes of them. Nothing is run: an estimate."""
     profile = load_profile(profile_name)
-    known = makers(profile)
-    for name in names:
-        if name not in known:
-            raise click.BadParameter(f"{name!r}: wanted one of {', '.join(known)}", param_hint="--decoder")
+    known = makers_of(profile, names)
     frame_bytes = len(FRAME_INPUTS) * math.prod(profile.frame_shape)
     click.echo(f"estimate, nothing was run: {H100.name} at {share:.0%} of its data sheet, profile {profile.name}")
     figures: dict[str, Any] = {"profile": profile.name, "gpu": asdict(H100), "share": share, "estimate": True}

@@ -14,7 +14,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from analysis.speed.speed import frames_of, makers, opened, seconds_of
+from analysis.speed.speed import frames_of, makers, makers_of, opened, seconds_of
 from analysis.studies.scaling import enlarged
 from export.onnx_files import decoder_onnx
 from lightpage.cli.main import run
@@ -49,8 +49,7 @@ def main(
 ) -> None:
     """Time pages of devices that are so many times as large along each axis."""
     smallest, threads = load_profile(profile_name), threads or available_cpus()
-    if name not in (known := makers(smallest)):
-        raise click.BadParameter(f"{name!r}: wanted one of {', '.join(known)}", param_hint="--decoder")
+    makers_of(smallest, [name])
     results = []
     click.echo(f"{'symbols':>8} {'ms a page':>10} {'us a symbol':>12} {'over the smallest':>18}")
     for factor in sorted(set(factors)):

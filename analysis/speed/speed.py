@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,19 @@ def makers(profile: Profile) -> dict[str, Callable[[], tuple[Graph, Tensors]]]:
     }
 
 
+def makers_of(profile: Profile, names: Collection[str]) -> dict[str, Callable[[], tuple[Graph, Tensors]]]:
+    """The `makers`, among which somebody asks for some.
+
+    Raises:
+        click.BadParameter: a name that is none.
+    """
+    known = makers(profile)
+    for name in names:
+        if name not in known:
+            raise click.BadParameter(f"{name!r}: wanted one of {', '.join(known)}", param_hint="--decoder")
+    return known
+
+
 @dataclass(frozen=True)
 class Timed:
     """Median seconds of one decoder, and over the first one's."""
@@ -153,10 +166,7 @@ def main(
 ) -> None:
     """Time all decoders side by side and print medians and ratios."""
     profile = load_profile(profile_name)
-    known = makers(profile)
-    for name in names:
-        if name not in known:
-            raise click.BadParameter(f"{name!r}: wanted one of {', '.join(known)}", param_hint="--decoder")
+    known = makers_of(profile, names)
     threads = threads or available_cpus()
     models, sessions, sizes = {}, {}, {}
     for name in dict.fromkeys(names or known):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 T = TypeVar("T")
 
 
-def read_ahead(read: Callable[[int], T], pages: int) -> Iterator[tuple[int, Future[T]]]:
+def read_ahead(read: Callable[[int], T], pages: int) -> Generator[tuple[int, Future[T]], None, None]:
     """Every page's number and what is read of it, in order; the next page is read while the caller works on one.
 
     One page is held beside the caller's, whatever a page weighs. A recording has one lock for all that is read of it,

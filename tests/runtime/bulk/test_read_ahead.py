@@ -47,7 +47,7 @@ def test_whoever_stops_early_waits_for_no_page_that_has_not_begun() -> None:
     next(pages)
     assert first.wait(PATIENCE_S)
     threading.Timer(0.05, go.set).start()
-    pages.close()  # type: ignore[attr-defined]
+    pages.close()
     assert read == [0]
 
 
