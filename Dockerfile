@@ -2,7 +2,8 @@
 # `deep` with torch, to train and export in the device, `gpu` that decodes on an NVIDIA GPU.
 #
 #   docker build --target runtime -t lightpage:runtime .
-#   docker run --read-only --tmpfs /tmp -v bundles:/bundles -v state:/state -p 50051:50051 lightpage:runtime
+#   docker run --read-only --tmpfs /tmp -v bundles:/bundles -v state:/state -p 127.0.0.1:50051:50051 \
+#       -e LIGHTPAGE_SERVICE__INSECURE=true lightpage:runtime
 #
 # Two optional build secrets carry the builder's own package settings in without leaving them in a layer:
 # `pip_conf` (a pip configuration file) and `ca_bundle` (trusted certificates, where the registry needs its own). A build

@@ -37,6 +37,10 @@ class ProviderError(LightpageError):
     """The execution provider that was asked for is not here, or failed: nothing is wrong with the bundle."""
 
 
+class NotAllowedError(LightpageError):
+    """The caller's certificate does not allow this."""
+
+
 class CallerLeft(Exception):
     """The caller has gone away; the work is dropped."""
 

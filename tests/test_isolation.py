@@ -57,6 +57,7 @@ ROOMS = (
     "runtime.wire",
     "runtime.client",
     "runtime.service",
+    "runtime.identity",
     "runtime.console",
     "runtime.rpc",
     "runtime.demo",

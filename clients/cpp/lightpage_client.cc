@@ -14,7 +14,8 @@ constexpr int kReplyBytes = 64 << 20;  // the service's largest reply
 constexpr std::size_t kChunkBytes = 1 << 20;
 constexpr milliseconds kFirstPause{100}, kLongestPause{1000};  // between attempts where the service does not answer
 
-std::shared_ptr<grpc::Channel> open_channel(const std::string& target) {
+std::shared_ptr<grpc::Channel> open_channel(const std::string& target,
+                                            const std::shared_ptr<grpc::ChannelCredentials>& credentials) {
   grpc::ChannelArguments options;
   options.SetMaxReceiveMessageSize(kReplyBytes);
   options.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);  // the device is on the local network
@@ -22,7 +23,7 @@ std::shared_ptr<grpc::Channel> open_channel(const std::string& target) {
   options.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, 100);
   options.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 1000);
   options.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, 2000);  // an attempt to connect may take so long
-  return grpc::CreateCustomChannel(target, grpc::InsecureChannelCredentials(), options);
+  return grpc::CreateCustomChannel(target, credentials, options);
 }
 
 std::string trailer(const grpc::ClientContext& context, const char* key) {
@@ -113,7 +114,12 @@ Error::Error(grpc::StatusCode status_code, const std::string& message, const std
   }
 }
 
-Client::Client(const std::string& target) : stub_(v1::Lightpage::NewStub(open_channel(target))) {}
+Client::Client(const std::string& target)
+    : stub_(v1::Lightpage::NewStub(open_channel(target, grpc::InsecureChannelCredentials()))) {}
+
+Client::Client(const std::string& target, const Certificates& own)
+    : stub_(v1::Lightpage::NewStub(
+          open_channel(target, grpc::SslCredentials({own.ca, own.key, own.certificate})))) {}
 
 v1::DescribeReply Client::describe(Deadline deadline) {
   return retried(deadline, unavailable, [&] {

@@ -56,10 +56,20 @@ class Error : public std::runtime_error {
   v1::ErrorDetail detail;
 };
 
+// What a client proves with who it is, and believes a service by: contents of PEM files.
+struct Certificates {
+  std::string ca;           // of the authorities that the service's certificate may come from
+  std::string certificate;  // of the client
+  std::string key;          // its private key
+};
+
 class Client {
  public:
   // `target` is HOST:PORT. It connects at the first call, and again whenever the connection was lost.
   explicit Client(const std::string& target);
+
+  // The same with TLS.
+  Client(const std::string& target, const Certificates& certificates);
 
   // What the service is: camera, page, model, limits.
   v1::DescribeReply describe(Deadline deadline);

@@ -20,7 +20,8 @@ using lightpage::Deadline;
 using lightpage::Duration;
 namespace v1 = lightpage::v1;
 
-constexpr char kUsage[] = R"(usage: lightpage_example [--target HOST:PORT] [--timeout SECONDS] COMMAND ...
+constexpr char kUsage[] = R"(usage: lightpage_example [--target HOST:PORT] [--timeout SECONDS]
+                         [--ca FILE --certificate FILE --key FILE] COMMAND ...
   describe                                       what the service is
   decode FRAMES.raw --out FILE [--levels M]      decode the pixels of both frames, in-phase first; FILE gets the symbols
   read PAGE --request-id ID [--out FILE] [--attempt SECONDS]
@@ -191,12 +192,26 @@ void tell_error(const lightpage::Error& error) {
   std::cerr << ")\n";
 }
 
+std::string contents(const std::string& path) {
+  std::ifstream file(path, std::ios::binary);
+  std::ostringstream text;
+  if (!file || !(text << file.rdbuf())) throw std::runtime_error(path + ": got no file, wanted one that can be read");
+  return text.str();
+}
+
+Client connected(const Arguments& given) {
+  const auto target = given.option("target", "127.0.0.1:50051");
+  if (target.empty()) throw UsageError();
+  const std::size_t files = given.options.count("ca") + given.options.count("certificate") + given.options.count("key");
+  if (files == 0) return Client(target);
+  return Client(target, {contents(given.option("ca")), contents(given.option("certificate")),
+                         contents(given.option("key"))});
+}
+
 int run(const Arguments& given) {
   const std::string command = given.word(0);
   const Deadline deadline = lightpage::in(seconds(given.option("timeout", "60")));
-  const auto target = given.option("target", "127.0.0.1:50051");
-  if (target.empty()) throw UsageError();
-  Client client(target);
+  Client client = connected(given);
   if (command == "describe") return describe(client, deadline);
   if (command == "decode") return decode(client, given, deadline);
   if (command == "read") return read(client, given, deadline);

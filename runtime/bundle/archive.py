@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
 import stat
 import struct
 import zipfile
 import zlib
 from pathlib import Path
+from typing import IO
 
 from lightpage.errors import BundleError
 from runtime.bundle.manifest import MANIFEST
@@ -31,21 +33,24 @@ _DAMAGE = (
 """What zipfile raises on damaged, encrypted or exotic archives."""
 
 
-def read_files(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, bytes]:
+def read_files(path: Path, max_bytes: int = MAX_BYTES, content: bytes | None = None) -> dict[str, bytes]:
     """All files of the folder or zip at `path`, by their plain names.
 
     Args:
         path: a folder or a zip file.
         max_bytes: most bytes taken into memory.
+        content: of the zip, where it has been read.
 
     Raises:
         BundleError: nothing there, not a zip, a name that is a path, a link, a folder inside, or too much data.
     """
+    if content is not None:
+        return _read_zip(path, max_bytes, io.BytesIO(content))
     if path.is_dir():
         return _read_folder(path, max_bytes)
     if not path.is_file():
         raise BundleError(f"bundle {path}", "nothing", "a folder or a zip file")
-    return _read_zip(path, max_bytes)
+    return _read_zip(path, max_bytes, path)
 
 
 def check_name(name: str, subject: str) -> None:
@@ -82,12 +87,12 @@ def _read_folder(path: Path, max_bytes: int) -> dict[str, bytes]:
     return files
 
 
-def _read_zip(path: Path, max_bytes: int) -> dict[str, bytes]:
+def _read_zip(path: Path, max_bytes: int, source: Path | IO[bytes]) -> dict[str, bytes]:
     subject = f"bundle {path}"
     files: dict[str, bytes] = {}
     left = max_bytes
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(source) as archive:
             entries = archive.infolist()
             _check_count(len(entries), subject)
             for entry in entries:

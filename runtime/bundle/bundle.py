@@ -39,6 +39,7 @@ from runtime.bundle.manifest import (
     parse_manifest,
     sha256,
 )
+from runtime.bundle.signature import BundleKey, read_signature
 
 MAX_ARRAY_BYTES = MAX_BYTES
 """All arrays of one .npz file, unpacked: it is compressed by itself, and may be a bomb inside a small bundle."""
@@ -68,14 +69,24 @@ class Bundle:
     files: Mapping[str, bytes]
 
     @classmethod
-    def open(cls, path: str | Path, max_bytes: int = MAX_BYTES) -> Bundle:
+    def open(
+        cls, path: str | Path, max_bytes: int = MAX_BYTES, key: BundleKey | None = None, signature: bytes = b""
+    ) -> Bundle:
         """Read the folder or zip at `path` and check every file against the manifest.
 
+        Args:
+            path: of it.
+            max_bytes: most bytes taken into memory.
+            key: that a zip must be signed with; None for any or none.
+            signature: of the zip; empty for that in the file beside it.
+
         Raises:
-            BundleError: a missing, extra, changed or misplaced file, a newer schema, or no bundle at all.
+            BundleError: a missing, extra, changed or misplaced file, a newer schema, or no bundle at all; or with a
+                key, no zip that is signed with it.
         """
         path = Path(path)
-        files = read_files(path, max_bytes)
+        content = None if key is None else _signed(path, key, signature or read_signature(path), max_bytes)
+        files = read_files(path, max_bytes, content)
         subject = f"bundle {path}"
         if MANIFEST not in files:
             raise BundleError(subject, f"no {MANIFEST}", f"a bundle with its {MANIFEST}")
@@ -316,6 +327,20 @@ def _write_file(path: Path, data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
+
+
+def _signed(path: Path, key: BundleKey, signature: bytes, max_bytes: int) -> bytes:
+    """The contents of a zip whose signature was checked."""
+    subject = f"bundle {path}"
+    try:
+        with path.open("rb") as file:
+            content = file.read(max_bytes + 1)
+    except OSError as error:
+        raise BundleError(subject, error, "a zip file: a folder has no signature") from None
+    if len(content) > max_bytes:
+        raise BundleError(subject, f"more than {max_bytes} bytes", f"at most {max_bytes}")
+    key.check(content, signature, subject)
+    return content
 
 
 def _check_listing(names: set[str], subject: str) -> None:

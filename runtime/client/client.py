@@ -40,6 +40,7 @@ from runtime.wire.page_options import PageOptions, options_message
 from runtime.wire.pages import RemotePage, remote_page
 from runtime.wire.sizes import CHUNK_BYTES
 from runtime.wire.status import error_from, error_of, is_lost_connection
+from runtime.wire.tls import TlsFiles
 
 CALL_S = 60.0
 """Deadline of a call where none is given."""
@@ -69,12 +70,16 @@ class LightpageClient:
     Args:
         target: where the service is.
         timeout_s: deadline of a call.
+        tls: certificates to connect with; None for a service without TLS.
+
+    Raises:
+        InvalidInputError: no address, or certificates that are no good.
     """
 
-    def __init__(self, target: str, timeout_s: float = CALL_S) -> None:
+    def __init__(self, target: str, timeout_s: float = CALL_S, tls: TlsFiles | None = None) -> None:
         check_address("target", target)
         self.target, self._timeout = target, timeout_s
-        self._channel = open_channel(target)
+        self._channel = open_channel(target, tls)
         self._stub = pb_grpc.LightpageStub(self._channel)  # type: ignore[no-untyped-call]
         self._description: Description | None = None
 
@@ -597,6 +602,8 @@ class LightpageClient:
     def upload_model(self, path: str | Path, timeout_s: float = UPLOAD_S) -> ModelInfo:
         """Give the service a bundle, a zip file. It is kept in the store, not put in service.
 
+        A signature beside it, in a file with `.sig` behind its name, goes along.
+
         Raises:
             InvalidInputError: no file that can be read.
             ModelExistsError: the service has a model of its version.
@@ -605,10 +612,13 @@ class LightpageClient:
             LimitError: it is too large.
         """
         path = Path(path)
+        signature = path.with_name(f"{path.name}.sig")
         try:
             with path.open("rb") as file:
                 header = pb.UploadModelHeader(
-                    bytes=os.fstat(file.fileno()).st_size, sha256=hashlib.file_digest(file, "sha256").digest()
+                    bytes=os.fstat(file.fileno()).st_size,
+                    sha256=hashlib.file_digest(file, "sha256").digest(),
+                    signature=signature.read_bytes() if signature.is_file() else b"",
                 )
                 file.seek(0)
 

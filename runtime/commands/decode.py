@@ -24,15 +24,18 @@ from lightpage.recording.reader import Recording
 from runtime.bulk.refused import WORTH_NOTHING, RefusedPage, refusal, unconfirmed
 from runtime.client.client import LightpageClient
 from runtime.client.decoded_file import DecodedWriter
+from runtime.commands.connection import TARGET, with_tls
 from runtime.decoding.frames import narrow
 from runtime.decoding.image_drift import LEAST_COHERENCE
 from runtime.errors import LostPageError, SourceError
 from runtime.wire.messages import KnownPilots
 from runtime.wire.pages import RemotePage
+from runtime.wire.tls import TlsFiles
 
 
 @click.command()
-@click.option("--target", metavar="HOST:PORT", required=True, help="The running service.")
+@TARGET
+@with_tls
 @click.option("--recording", type=click.Path(), help="Send the pages of this recording.")
 @click.option("--source", is_flag=True, help="Have the service read pages from its own source.")
 @click.option("--pages", type=click.IntRange(1), help="How many pages; all of a recording, or one of the source.")
@@ -41,6 +44,7 @@ from runtime.wire.pages import RemotePage
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def decode(
     target: str,
+    tls: TlsFiles | None,
     recording: str | None,
     source: bool,
     pages: int | None,
@@ -59,7 +63,7 @@ def decode(
     results: list[dict[str, Any]] = []
     refused: list[RefusedPage] = []
     with ExitStack() as stack:
-        client = stack.enter_context(LightpageClient(target))
+        client = stack.enter_context(LightpageClient(target, tls=tls))
         if recording is not None:
             file = stack.enter_context(Recording.open(recording))
             if pages is not None and pages > file.pages:

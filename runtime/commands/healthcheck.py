@@ -9,19 +9,23 @@ import click
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
+from runtime.commands.connection import with_tls
 from runtime.wire.channel import open_channel
+from runtime.wire.tls import TlsFiles
 
 DEFAULT_TARGET = "127.0.0.1:50052"
 
 
-def is_serving(target: str, *, service: str = "", timeout_s: float = 3.0) -> tuple[bool, str]:
+def is_serving(
+    target: str, *, service: str = "", timeout_s: float = 3.0, tls: TlsFiles | None = None
+) -> tuple[bool, str]:
     """Ask `target` (HOST:PORT) for the health of `service`, "" being the server as a whole.
 
     Returns whether it serves, and one line that says what was heard. An unreachable, silent or unknowing server is not
     healthy; it raises nothing, since to find that out is the question.
     Source: the gRPC health checking protocol, grpc.health.v1.
     """
-    with open_channel(target) as channel:
+    with open_channel(target, tls) as channel:
         stub = health_pb2_grpc.HealthStub(channel)
         try:
             response = stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=timeout_s)
@@ -40,9 +44,10 @@ def is_serving(target: str, *, service: str = "", timeout_s: float = 3.0) -> tup
 )
 @click.option("--service", default="", help="A full gRPC service name; empty asks for the server as a whole.")
 @click.option("--timeout", "timeout_s", default=3.0, show_default=True, help="Seconds to wait for the answer.")
-def main(target: str, service: str, timeout_s: float) -> None:
+@with_tls
+def main(target: str, service: str, timeout_s: float, tls: TlsFiles | None) -> None:
     """Exit with 0 when the service answers SERVING, else with 1."""
-    serving, said = is_serving(target, service=service, timeout_s=timeout_s)
+    serving, said = is_serving(target, service=service, timeout_s=timeout_s, tls=tls)
     click.echo(said, err=not serving)
     sys.exit(0 if serving else 1)
 

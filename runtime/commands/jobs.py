@@ -12,11 +12,14 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.errors import InvalidInputError
 from runtime.client.answers import JobInfo, JobState
 from runtime.client.client import RECALIBRATION_S, LightpageClient
+from runtime.commands.connection import TARGET, with_tls
 from runtime.commands.recalibrate import summary, table, watched
+from runtime.wire.tls import TlsFiles
 
 
 @click.command()
-@click.option("--target", metavar="HOST:PORT", required=True, help="The running service.")
+@TARGET
+@with_tls
 @click.option("--watch", metavar="ID", help="Follow this job to its end and show its result.")
 @click.option("--cancel", metavar="ID", help="Stop this job at its next step.")
 @click.option(
@@ -27,11 +30,11 @@ from runtime.commands.recalibrate import summary, table, watched
     type=FiniteRange(0, min_open=True),
     help="With --watch: seconds to wait for the end; the job goes on after them.",
 )
-def jobs(target: str, watch: str | None, cancel: str | None, timeout_s: float) -> None:
+def jobs(target: str, tls: TlsFiles | None, watch: str | None, cancel: str | None, timeout_s: float) -> None:
     """Show, follow or cancel the recalibrations of a service; without an option all that it remembers, newest first."""
     if watch is not None and cancel is not None:
         raise InvalidInputError("options", "--watch and --cancel", "one of them")
-    with LightpageClient(target) as client:
+    with LightpageClient(target, tls=tls) as client:
         if watch is not None:
             again = f"job {watch} goes on; lightpage jobs --watch {watch} follows it again"
             click.get_current_context().meta[RESUME_KEY] = again

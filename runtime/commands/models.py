@@ -8,17 +8,20 @@ import click
 
 from runtime.client.answers import ModelInfo
 from runtime.client.client import LightpageClient
+from runtime.commands.connection import TARGET, with_tls
+from runtime.wire.tls import TlsFiles
 
 _EXPECT = click.option("--expect", metavar="VERSION", default="", help="Only if this version is in service.")
 _VERSION = click.argument("version")
 
 
 @click.group(invoke_without_command=True)
-@click.option("--target", metavar="HOST:PORT", required=True, help="The running service.")
+@TARGET
+@with_tls
 @click.pass_context
-def models(ctx: click.Context, target: str) -> None:
+def models(ctx: click.Context, target: str, tls: TlsFiles | None) -> None:
     """List, add and change the models of a running service; without a command, list those that are loaded."""
-    ctx.obj = ctx.with_resource(LightpageClient(target))
+    ctx.obj = ctx.with_resource(LightpageClient(target, tls=tls))
     if ctx.invoked_subcommand is None:
         ctx.invoke(list_models)
 

@@ -21,6 +21,7 @@ from runtime.bundle.manifest import check_version
 from runtime.bundle.shipped import bundle_path
 from runtime.client.answers import JobInfo, Recalibrated
 from runtime.client.client import RECALIBRATION_S, LightpageClient
+from runtime.commands.connection import TARGET, with_tls
 from runtime.decoding.decoder import Decoder
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome
@@ -28,6 +29,7 @@ from runtime.recalibration.recalibration import next_version
 from runtime.recalibration.recalibration import recalibrate as recalibrate_bundle
 from runtime.recalibration.refit import refit
 from runtime.service.recalibrator import read_recorded
+from runtime.wire.tls import TlsFiles
 
 DEFAULT_PAGES = 2
 
@@ -40,6 +42,7 @@ DEFAULT_PAGES = 2
 )
 @click.option("--out", type=NewPath(), help="Offline: where the new bundle goes; a zip where it ends in .zip.")
 @click.option("--target", metavar="HOST:PORT", help="Recalibrate this running service instead of a bundle.")
+@with_tls
 @click.option("--pages", default=DEFAULT_PAGES, show_default=True, type=click.IntRange(2), help="Known pages to use.")
 @click.option(
     "--timeout",
@@ -57,6 +60,7 @@ def recalibrate(
     recording: str | None,
     out: Path | None,
     target: str | None,
+    tls: TlsFiles | None,
     pages: int,
     timeout_s: float | None,
     version: str | None,
@@ -78,13 +82,13 @@ def recalibrate(
             raise InvalidInputError("--send", "without --recording", "a file whose frames are sent")
         wait_s = RECALIBRATION_S if timeout_s is None else timeout_s
         if detach:
-            with LightpageClient(target) as client:
+            with LightpageClient(target, tls=tls) as client:
                 job = _start(client, recording, pages, send, wait_s)
             if json_path is not None:
                 write_json(json_path, {"job": job.id})
             click.echo(job.id)
             return
-        result: RecalibrationOutcome | Recalibrated = _remote(target, recording, pages, send, wait_s)
+        result: RecalibrationOutcome | Recalibrated = _remote(target, tls, recording, pages, send, wait_s)
     else:
         if send or detach:
             raise InvalidInputError("--send" if send else "--detach", "without --target", "a service")
@@ -126,8 +130,10 @@ def table(data: dict[str, str | float | None]) -> str:
     return "\n".join(f"{name:<20} {value}" for name, value in data.items() if value is not None)
 
 
-def _remote(target: str, recording: str | None, pages: int, send: bool, timeout_s: float) -> Recalibrated:
-    with LightpageClient(target) as client, percent_bar() as progress:
+def _remote(
+    target: str, tls: TlsFiles | None, recording: str | None, pages: int, send: bool, timeout_s: float
+) -> Recalibrated:
+    with LightpageClient(target, tls=tls) as client, percent_bar() as progress:
         if not send:
             return client.recalibrate(count=pages, recording=recording, progress=progress, timeout_s=timeout_s)
         until = time.monotonic() + timeout_s
@@ -191,10 +197,11 @@ def _read(decoder: Decoder, recording: str, pages: int) -> KnownPages:
 
 
 @click.command()
-@click.option("--target", metavar="HOST:PORT", required=True, help="The running service.")
+@TARGET
+@with_tls
 @click.option("--expect", metavar="VERSION", default="", help="Only if this version is in service.")
-def rollback(target: str, expect: str) -> None:
+def rollback(target: str, tls: TlsFiles | None, expect: str) -> None:
     """Put a service's previous model back in service; `lightpage models forward` undoes it."""
-    with LightpageClient(target) as client:
+    with LightpageClient(target, tls=tls) as client:
         current, before = client.rollback(expect)
     click.echo(f"{current} is in service again, {before} is not")

@@ -21,8 +21,11 @@ from lightpage.recording.pages import Pages
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.source import FrameSource
 from runtime.acquisition.sources import open_source
+from runtime.bundle.bundle import Bundle
 from runtime.bundle.shipped import DEFAULT, bundle_path
+from runtime.bundle.signature import BundleKey
 from runtime.commands.execution import ENGINE_CACHE, PROVIDER, THREADS
+from runtime.console.actions import Actions
 from runtime.console.history import History
 from runtime.console.server import Console, ConsoleServer
 from runtime.decoding.decoder import Decoder
@@ -31,6 +34,7 @@ from runtime.errors import LostShotError, SourceError
 from runtime.execution.memory import share_freed_memory
 from runtime.execution.providers import Provider
 from runtime.execution.session import VERSION as RUNTIME_VERSION
+from runtime.identity.certificates import Certificates
 from runtime.rpc.health_server import HealthServer, next_port
 from runtime.rpc.server import LightpageServer
 from runtime.service.audit import AuditLog
@@ -42,20 +46,24 @@ from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.observation import Observer
 from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
+from runtime.service.registry import ModelRegistry, no_tracker
 from runtime.service.self_calibration import SelfCalibration
 from runtime.service.settings import ADDRESS, OFF, STORE_VARIABLE, Effective, Option, ServiceSettings, service_settings
 from runtime.service.store import ModelStore
-from runtime.wire.address import check_free
+from runtime.wire.address import check_free, is_local
 
 _log = logging.getLogger(__name__)
 
 _KEYS = {
     "bundle": ("service", "bundle"),
+    "bundle_key": ("service", "bundle_key"),
     "source": ("service", "source"),
     "pages_file": ("service", "pages"),
     "address": ("service", "address"),
     "health_address": ("service", "health_address"),
+    "ca": ("tls", "ca"),
+    "certificate": ("tls", "certificate"),
+    "key": ("tls", "key"),
     "metrics_port": ("metrics", "port"),
     "metrics_host": ("metrics", "host"),
     "store": ("service", "store"),
@@ -84,6 +92,9 @@ _KEYS = {
 @click.option("--print-config", is_flag=True, help="Print the settings in effect and where they come from, and end.")
 @click.option("--bundle", show_default=DEFAULT, help="A bundle's path, or the name of a shipped one.")
 @click.option(
+    "--bundle-key", type=click.Path(path_type=Path), help="Public key, PEM, that bundles must be signed with."
+)
+@click.option(
     "--source", help="simulator:PROFILE, recording:FILE, camera:CONFIG.toml; without it only sent frames decode."
 )
 @click.option(
@@ -94,6 +105,9 @@ _KEYS = {
     "--health-address",
     help="HOST:PORT of health checks, answered by a process of their own; by default the next port. off: none.",
 )
+@click.option("--ca", type=click.Path(path_type=Path), help="TLS: authorities of the callers' certificates, PEM.")
+@click.option("--certificate", type=click.Path(path_type=Path), help="TLS: certificate of the service, PEM.")
+@click.option("--key", type=click.Path(path_type=Path), help="TLS: its private key, PEM.")
 @click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show metrics and console on this port.")
 @click.option("--metrics-host", show_default="127.0.0.1", help="Where the figures are shown.")
 @click.option(
@@ -161,9 +175,12 @@ def _given(context: click.Context) -> list[Option]:
 def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], None]) -> None:
     settings = effective.settings
     service, audit = settings.service, settings.audit
+    files = settings.tls.files()
+    certificates = None if files is None else Certificates(files)
     provider = Provider.parse(service.provider, service.engine_cache)
-    base = Decoder.load(bundle_path(service.bundle), service.threads, provider)
-    registry = ModelRegistry(base, tracker_for) if service.tracking else ModelRegistry(base)
+    key = None if service.bundle_key is None else BundleKey(service.bundle_key)
+    base = Decoder(Bundle.open(bundle_path(service.bundle), key=key), service.threads, provider=provider)
+    registry = ModelRegistry(base, tracker_for if service.tracking else no_tracker, key=key)
     metrics = ServiceMetrics()
     monitor = Monitor(metrics=metrics)
     with ExitStack() as stack:
@@ -191,14 +208,16 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         )
         plane.models.resume()
         source_name = pages.name if pages is not None else "no source"
-        console = Console(metrics, history, registry, monitor, source_name)
-        stack.enter_context(_shown(console, settings.metrics.port, settings.metrics.host))
         recalibrator = Recalibrator(plane, recordings=service.recordings)
-        server = LightpageServer(plane, recalibrator, service.address)
+        actions = Actions(plane, recalibrator)
+        console = Console(metrics, history, registry, monitor, source_name, actions)
+        stack.enter_context(_shown(console, settings.metrics.port, settings.metrics.host, certificates))
+        server = LightpageServer(plane, recalibrator, service.address, certificates=certificates)
         check_free("address", service.address)  # before anything else takes a port
         if service.health_address != OFF:  # entered first: it says NOT_SERVING until the last call has ended
             address = service.health_address or next_port(service.address)
-            health = stack.enter_context(HealthServer(address, server.health))
+            plain = settings.tls.plain_health or (is_local(address) and service.health_address is None)
+            health = stack.enter_context(HealthServer(address, server.health, None if plain else files))
             click.echo(f"health checks at {health.target}")
         stack.enter_context(server)
         if service.incoming is not None:
@@ -280,15 +299,16 @@ def stop_signals() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def _shown(console: Console, port: int | None, host: str) -> Iterator[None]:
+def _shown(console: Console, port: int | None, host: str, certificates: Certificates | None) -> Iterator[None]:
     if port is None:
         yield
         return
     try:
-        server = ConsoleServer(console, port, host)
+        server = ConsoleServer(console, port, host, certificates)
     except OSError as error:
         got, expected = error.strerror or error, "an address of this machine and a free port"
         raise InvalidInputError(f"metrics at {host}:{port}", got, expected) from None
-    click.echo(f"metrics at http://{host}:{server.port}/metrics, console at http://{host}:{server.port}/")
+    root = f"{'http' if certificates is None else 'https'}://{host}:{server.port}"
+    click.echo(f"metrics at {root}/metrics, console at {root}/")
     with server:
         yield

@@ -1,9 +1,10 @@
-"""The HTTP server of a service: metrics for Prometheus, and the console for people. It changes nothing."""
+"""The HTTP server of a service: metrics for Prometheus, and the console for people."""
 
 from __future__ import annotations
 
 import json
 import logging
+import ssl
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -14,17 +15,28 @@ from wsgiref.simple_server import WSGIRequestHandler, make_server
 from prometheus_client import make_wsgi_app
 from prometheus_client.exposition import ThreadingWSGIServer
 
+from lightpage.errors import InvalidInputError, LightpageError
+from runtime.console.actions import ROLE, Actions
 from runtime.console.history import History, PageRow
 from runtime.console.pictures import confidence_png, frame_png
+from runtime.errors import NotAllowedError
+from runtime.identity.certificates import Certificates
+from runtime.identity.roles import Identity, Role, identity_of
+from runtime.service.caller import Actor
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.registry import Model, ModelRegistry
+from runtime.wire.status import without_folders
 
 if TYPE_CHECKING:
     from _typeshed.wsgi import StartResponse, WSGIEnvironment
 
 _log = logging.getLogger(__name__)
 
+IDENTITY = "lightpage.identity"
+"""Key of a request's caller, an `Identity`, in its environment; it is not there without TLS."""
+_ACTION_BYTES = 1000
+_DRAINED_BYTES = 1 << 16
 POINTS = 600
 """Most points of a series."""
 RECENT = 50
@@ -63,11 +75,19 @@ class Console:
         registry: the models.
         monitor: says whether a recalibration is due.
         source: of the pages, for people.
+        actions: what callers may do who prove that they may; None for nothing.
     """
 
     def __init__(
-        self, metrics: ServiceMetrics, history: History, registry: ModelRegistry, monitor: Monitor, source: str
+        self,
+        metrics: ServiceMetrics,
+        history: History,
+        registry: ModelRegistry,
+        monitor: Monitor,
+        source: str,
+        actions: Actions | None = None,
     ) -> None:
+        self._actions = actions
         self._metrics = make_wsgi_app(metrics.registry)
         self._history, self._registry, self._monitor, self._source = history, registry, monitor, source
         self._begun = time.time()
@@ -75,13 +95,18 @@ class Console:
     def __call__(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         """Answer a request; see PEP 3333."""
         path, method = environ.get("PATH_INFO", "/"), environ.get("REQUEST_METHOD", "")
+        identity: Identity | None = environ.get(IDENTITY)
+        if method == "POST" and path == "/actions":
+            return self._act(environ, start_response, identity)
+        if identity is not None and not identity.may(Role.READ):
+            return _refused(start_response, "403 Forbidden", f"{identity.name} has no role")
         if method not in ("GET", "HEAD"):
             return _answer(start_response, "405 Method Not Allowed", "text/plain", b"GET and HEAD only\n", method)
         if path == "/metrics":
             answer: Iterable[bytes] = self._metrics(environ, start_response)
             return answer
         try:
-            found = self._content(path)
+            found = self._content(path, identity)
         except Exception:
             _log.exception("console: %s", path)
             return _answer(start_response, "500 Internal Server Error", "text/plain", b"see the log\n", method)
@@ -89,12 +114,46 @@ class Console:
             return _answer(start_response, "404 Not Found", "text/plain", b"not found\n", method)
         return _answer(start_response, "200 OK", found[1], found[0], method)
 
-    def _content(self, path: str) -> tuple[bytes, str] | None:
+    def _act(
+        self, environ: WSGIEnvironment, start_response: StartResponse, identity: Identity | None
+    ) -> Iterable[bytes]:
+        """Do what an administrator asks for.
+
+        A page of somebody else's cannot ask for it in the administrator's name: a browser sends no JSON across origins
+        without asking first, which is refused, and says where a request comes from.
+        """
+        told = environ.get("CONTENT_LENGTH") or "0"
+        size = int(told) if told.isdecimal() else 0
+        content = environ["wsgi.input"].read(min(size, _DRAINED_BYTES))  # whoever is still sending hears no refusal
+        if identity is None or self._actions is None:
+            return _refused(start_response, "403 Forbidden", "actions need TLS, and a certificate with role admin")
+        if environ.get("HTTP_ORIGIN", own := f"https://{environ.get('HTTP_HOST', '')}") != own:
+            return _refused(start_response, "403 Forbidden", "actions are asked for from the console's own page")
+        if environ.get("CONTENT_TYPE", "") != "application/json":
+            return _refused(start_response, "415 Unsupported Media Type", "application/json only")
+        if not 0 < size <= _ACTION_BYTES:
+            return _refused(start_response, "413 Content Too Large", f"1 to {_ACTION_BYTES} bytes only")
+        name = f"{identity.name} at {environ.get('REMOTE_ADDR', '')}"
+        try:
+            identity.check(ROLE, "an action of the console", time.time())
+            outcome = self._actions.do(content, Actor(name, "console"))
+        except NotAllowedError as error:
+            return _refused(start_response, "403 Forbidden", str(error))
+        except InvalidInputError as error:
+            return _refused(start_response, "400 Bad Request", str(error))
+        except LightpageError as error:
+            return _refused(start_response, "409 Conflict", without_folders(str(error)))
+        except Exception:
+            _log.exception("console: action of %s", name)
+            return _refused(start_response, "500 Internal Server Error", "see the log")
+        return _answer(start_response, "200 OK", "text/plain; charset=utf-8", f"{outcome}\n".encode(), "POST")
+
+    def _content(self, path: str, identity: Identity | None) -> tuple[bytes, str] | None:
         if path in _STATIC:
             name, kind = _STATIC[path]
             return resources.files("runtime.console").joinpath("static", name).read_bytes(), kind
         if path == "/state.json":
-            return json.dumps(self.state(), allow_nan=False).encode(), "application/json"
+            return json.dumps(self.state(identity), allow_nan=False).encode(), "application/json"
         _, pair, confidence = self._history.pictures()
         depth = self._registry.current.decoder.bundle.manifest.camera_bit_depth
         pictures: dict[str, Callable[[], bytes] | None] = {
@@ -105,8 +164,9 @@ class Console:
         picture = pictures.get(path)
         return None if picture is None else (picture(), "image/png")
 
-    def state(self) -> dict[str, Any]:
-        """All that the page shows, as JSON has it."""
+    def state(self, identity: Identity | None = None) -> dict[str, Any]:
+        """All that the page shows to a caller, as JSON has it."""
+        acts = self._actions if identity is not None and identity.may(ROLE) else None
         rows, now = self._history.rows(), time.time()
         thinned = rows[:: max(1, -(-len(rows) // POINTS))]
         if rows and thinned[-1] is not rows[-1]:
@@ -125,6 +185,9 @@ class Console:
             "series": {name: [row[name] for row in told] for name in ("time_s", *_SERIES)},
             "losses": [vars(loss) for loss in self._history.losses()],
             "models": [_model(model, model is self._registry.current) for model in self._registry.models],
+            "caller": "" if identity is None else identity.name,
+            "actions": [] if acts is None else acts.available(),
+            "job": None if acts is None else acts.job(),
             "recent": [row.to_json() for row in rows[-RECENT:]][::-1],
         }
 
@@ -136,13 +199,17 @@ class ConsoleServer:
         console: what to serve.
         port: 0 takes a free one.
         host: to listen on.
+        certificates: with which it meets its callers, who must have some too; None for no TLS.
 
     Raises:
         OSError: the port is taken.
     """
 
-    def __init__(self, console: Console, port: int, host: str = "127.0.0.1") -> None:
-        self._server = make_server(host, port, console, ThreadingWSGIServer, handler_class=_QuietHandler)
+    def __init__(
+        self, console: Console, port: int, host: str = "127.0.0.1", certificates: Certificates | None = None
+    ) -> None:
+        self._server = make_server(host, port, console, _Server, handler_class=_Handler)
+        self._server.certificates = certificates
         self._thread = threading.Thread(target=self._server.serve_forever, name="lightpage-console", daemon=True)
         self._thread.start()
 
@@ -164,11 +231,45 @@ class ConsoleServer:
         self.close()
 
 
-class _QuietHandler(WSGIRequestHandler):
-    """Logs no requests: there is one a second for each browser."""
+class _Server(ThreadingWSGIServer):
+    """Takes each connection in a thread of its own, TLS included: a caller that says nothing holds up nobody."""
+
+    certificates: Certificates | None = None
+    """With which callers are met; None for no TLS."""
+
+    def finish_request(self, request: Any, client_address: Any) -> None:
+        """Answer the requests of a connection."""
+        if self.certificates is None:
+            super().finish_request(request, client_address)
+            return
+        request.settimeout(_Handler.timeout)
+        try:
+            secured = self.certificates.context().wrap_socket(request, server_side=True)
+        except (OSError, ValueError) as error:  # an SSLError is an OSError
+            _log.info("console: no TLS with %s: %s", client_address[0], getattr(error, "reason", None) or error)
+            return
+        with secured:
+            super().finish_request(secured, client_address)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A connection broke."""
+        _log.debug("console: connection of %s", client_address[0], exc_info=True)
+
+
+class _Handler(WSGIRequestHandler):
+    """Says who calls. Logs no requests: there is one a second for each browser."""
 
     timeout = 20
     """A caller that says nothing is hung up on, seconds."""
+
+    def get_environ(self) -> WSGIEnvironment:
+        """See `WSGIRequestHandler`."""
+        environ = super().get_environ()
+        if isinstance(self.connection, ssl.SSLSocket):
+            certificate = self.connection.getpeercert(binary_form=True)
+            assert certificate is not None  # without one there is no connection
+            environ[IDENTITY] = identity_of(certificate)
+        return environ
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing."""
@@ -195,6 +296,10 @@ def _model(model: Model, current: bool) -> dict[str, Any]:
         "air_before": metrics.get("recalibration_air_bits_per_symbol_before"),
         "air_after": metrics.get("recalibration_air_bits_per_symbol"),
     }
+
+
+def _refused(start: StartResponse, status: str, why: str) -> Iterable[bytes]:
+    return _answer(start, status, "text/plain; charset=utf-8", f"{why}\n".encode(), "POST")
 
 
 def _answer(start: StartResponse, status: str, kind: str, content: bytes, method: str) -> Iterable[bytes]:

@@ -106,9 +106,9 @@ class Decoder:
         """Open the bundle at `path` and its decoder; raises as `Bundle.open` and the constructor do."""
         return cls(Bundle.open(path), threads, provider=provider)
 
-    def load_another(self, path: str | Path) -> Decoder:
-        """The decoder of another bundle, on the same threads and provider; raises as `load` does."""
-        return Decoder.load(path, self.threads, self.graph.provider)
+    def of_another(self, bundle: Bundle) -> Decoder:
+        """The decoder of another bundle, on the same threads and provider; raises as the constructor does."""
+        return Decoder(bundle, self.threads, provider=self.graph.provider)
 
     def with_table(self, table: SamplingTable) -> Decoder:
         """This decoder with other tensors in its table, by name; those left out stay. The golden page is not looked at.

@@ -22,6 +22,7 @@ import grpc
 from google.protobuf.message import DecodeError, Message
 
 from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError
+from runtime.identity.roles import LOCAL, NEEDED, Identity, Role, identity_of
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call_log import CallLog
 from runtime.service.caller import Actor, Caller
@@ -55,6 +56,7 @@ class Call:
         caller: who waits for the answer.
         pool: threads for what blocks.
         peer: address and connection that it came from.
+        identity: who calls.
         correlation_id: the caller's own text for the log, empty where it gave none.
         begun: when its first byte came, by `time.perf_counter`.
     """
@@ -63,13 +65,18 @@ class Call:
     caller: Caller
     pool: Executor
     peer: str = ""
+    identity: Identity = LOCAL
     correlation_id: str = ""
     begun: float = field(default_factory=time.perf_counter)
 
     @property
     def actor(self) -> Actor:
         """Who calls, for records."""
-        return Actor(self.peer, self.correlation_id)
+        return Actor(f"{self.identity.name} at {self.peer}" if self.identity.name else self.peer, self.correlation_id)
+
+    def own(self, name: str) -> str:
+        """A name that the caller gave to a session or a request, where other callers' are others; empty for none."""
+        return f"{self.identity.name}/{name}" if name and self.identity.name else name
 
     @property
     def is_watch(self) -> bool:
@@ -219,7 +226,8 @@ class Dispatcher:
     @asynccontextmanager
     async def _call(self, name: str, context: Any) -> AsyncIterator[Call]:
         """Admit a call, count it, and turn what it raises into its status."""
-        call = Call(name, Caller(partial(_seconds_left, context)), self._pool, context.peer())
+        caller = Caller(partial(_seconds_left, context))
+        call = Call(name, caller, self._pool, context.peer(), _identity(context))
         task = asyncio.current_task()
         assert task is not None  # calls run in tasks
         mine = self._watching if call.is_watch else self._active
@@ -228,6 +236,7 @@ class Dispatcher:
         try:
             if self._refuses:
                 raise _stopping(name)
+            call.identity.check(NEEDED.get(name, Role.ADMIN), f"call {name}", time.time())
             if not call.is_watch and len(self._active) > self._limits.concurrent_calls:
                 got, expected = f"{len(self._active) - 1} at once", f"at most {self._limits.concurrent_calls}"
                 raise OverloadedError("calls", got, f"{expected}; try again later", retry_s=1.0)
@@ -265,6 +274,12 @@ def _parsed(parse: Callable[[bytes], Any], data: bytes, call: Call) -> Any:
     call.correlation_id = getattr(message, "correlation_id", "") or call.correlation_id
     call.caller.actor = call.actor
     return message
+
+
+def _identity(context: Any) -> Identity:
+    """Who calls, by the certificate of the connection."""
+    found = context.auth_context().get("x509_pem_cert")
+    return identity_of(found[0]) if found else LOCAL
 
 
 def _stopping(name: str) -> StoppingError:

@@ -223,7 +223,7 @@ def _header(first: pb.DecodeFramesRequest | None, call: Call) -> pb.DecodeHeader
 
 def _caller(header: pb.DecodeHeader, call: Call) -> Caller:
     """The caller, whose pages without a session of their own are those of its connection."""
-    session = header.options.session or f"connection {call.peer}"
+    session = call.own(header.options.session) or f"connection {call.peer}"
     return call.caller.in_session(session, header.options.tracking == pb.TRACKING_STATELESS)
 
 

@@ -1,8 +1,8 @@
-"""A process that answers health checks: ``python -m runtime.rpc.health_process HOST:PORT``, a socket on its stdin.
+"""A process that answers health checks: ``python -m runtime.rpc.health_process HOST:PORT [CA CERTIFICATE KEY]``.
 
-The service writes a line of JSON every half second: names of services, and whether each serves. Where no line comes any
-more, nothing serves, whatever the service still holds. The process is idle, so it answers at once where the service is
-busy with decoding. It ends when the socket's other end does.
+Its stdin is a socket. The service writes a line of JSON every half second: names of services, and whether each serves.
+Where no line comes any more, nothing serves, whatever the service still holds. The process is idle, so it answers at
+once where the service is busy with decoding. It ends when the socket's other end does.
 """
 
 from __future__ import annotations
@@ -11,18 +11,23 @@ import asyncio
 import json
 import socket
 import sys
+from pathlib import Path
 
 import grpc
 from grpc_health.v1 import health_pb2_grpc
 
+from lightpage.errors import InvalidInputError
 from runtime.helper_process import parent_link
+from runtime.identity.certificates import Certificates
 from runtime.rpc.health_servicer import HealthServicer
+from runtime.wire.channel import add_port
+from runtime.wire.tls import TlsFiles
 
 SILENCE_S = 3.0
 """A service that says nothing for so long has stopped."""
 
 
-async def serve(address: str, link: socket.socket) -> None:
+async def serve(address: str, link: socket.socket, tls: TlsFiles | None = None) -> None:
     """Answer health checks at an address until the link is closed; says first at which port, or why not."""
     reader, writer = await asyncio.open_connection(sock=link)
     server = grpc.aio.server(options=(("grpc.so_reuseport", 0),))
@@ -30,9 +35,10 @@ async def serve(address: str, link: socket.socket) -> None:
     health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
     await servicer.tell({"": False})
     try:
-        port = server.add_insecure_port(address)
+        credentials = None if tls is None else Certificates(tls).server_credentials(callers_too=False)
+        port = add_port(server, address, credentials)
         await server.start()
-    except RuntimeError as error:
+    except (InvalidInputError, RuntimeError) as error:
         writer.write(json.dumps({"error": str(error)}).encode() + b"\n")
         await writer.drain()
         return
@@ -54,4 +60,5 @@ async def serve(address: str, link: socket.socket) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(serve(sys.argv[1], parent_link()))
+    files = [Path(path) for path in sys.argv[2:]]
+    asyncio.run(serve(sys.argv[1], parent_link(), TlsFiles(*files) if files else None))

@@ -14,7 +14,8 @@ from typing import Self
 
 from lightpage.errors import InvalidInputError
 from runtime.helper_process import HelperProcess
-from runtime.wire.address import check_address, check_free
+from runtime.wire.address import check_address, check_free, is_local
+from runtime.wire.tls import TlsFiles
 
 _PROCESS = "runtime.rpc.health_process"
 _BEAT_S = 0.5
@@ -27,10 +28,14 @@ _log = logging.getLogger(__name__)
 
 
 def next_port(address: str) -> str:
-    """Where health checks are answered for a service at `address`: the next port, a free one for port 0."""
+    """Where health checks are answered for a service at `address`: the next port, a free one for port 0.
+
+    Of a service that others reach, the next port of this machine alone.
+    """
     if address.startswith("unix:"):
         return f"{address}.health"
     host, _, port = address.rpartition(":")
+    host = host if is_local(address) else "127.0.0.1"
     return f"{host}:{int(port) + 1 if 0 < int(port) < 65535 else 0}"
 
 
@@ -40,11 +45,13 @@ class HealthServer:
     Args:
         address: HOST:PORT; port 0 takes a free one.
         states: called twice a second: each service by name, and whether it serves. Where it hangs, nothing does.
+        tls: with which it answers, whoever asks; None for no TLS.
     """
 
-    def __init__(self, address: str, states: Callable[[], Mapping[str, bool]]) -> None:
+    def __init__(self, address: str, states: Callable[[], Mapping[str, bool]], tls: TlsFiles | None = None) -> None:
         check_address("health address", address, least_port=0)
         self._address, self._states = address, states
+        self._files = [] if tls is None else [str(path) for path in (tls.ca, tls.certificate, tls.key)]
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="lightpage-heartbeat", daemon=True)
         self._process: HelperProcess | None = None
@@ -78,7 +85,7 @@ class HealthServer:
         subject = f"health address {address}"
         process: HelperProcess | None = None
         try:
-            process = HelperProcess(_PROCESS, address, subject="the process of health checks")
+            process = HelperProcess(_PROCESS, address, *self._files, subject="the process of health checks")
             answer = json.loads(process.line(time.monotonic() + _START_S))
             if "port" in answer:
                 return process, int(answer["port"])

@@ -56,7 +56,7 @@ class ModelCalls:
         call.correlation_id = header.correlation_id or call.correlation_id
         call.caller.actor = call.actor
         with self._plane.uploads.held_at_once():
-            upload = self._models.upload(header.bytes, header.sha256, call.caller)
+            upload = self._models.upload(header.bytes, header.sha256, call.caller, header.signature)
             try:
                 async with asyncio.timeout(limit_s):
                     await self._receive(upload, requests, call)

@@ -33,7 +33,7 @@ class PageCalls:
     def ReadPage(self, request: pb.ReadPageRequest, call: Call) -> pb.ReadPageReply:
         """Read a page from the source and decode it; with a request id at most once."""
         check_options(request.options)
-        caller = _caller(request.options, call.caller)
+        caller = _caller(request.options, call)
         if not request.request_id:
             return self._read(request, caller)
         limit_s = self._plane.limits.deadline_s
@@ -48,7 +48,7 @@ class PageCalls:
         same.CopyFrom(request)
         same.correlation_id = ""
         asked = same.SerializeToString(deterministic=True)
-        answer, replayed = self._plane.replays.once(request.request_id, asked, caller, work)
+        answer, replayed = self._plane.replays.once(call.own(request.request_id), asked, caller, work)
         reply = pb.ReadPageReply.FromString(answer)
         reply.replayed, reply.decoded.correlation_id = replayed, request.correlation_id
         return reply
@@ -57,7 +57,7 @@ class PageCalls:
         """Read several pages; a lost one ends nothing."""
         check_options(request.options)
         self._check_count("pages" if request.pages else "count", len(request.pages) or request.count)
-        caller = _caller(request.options, call.caller)
+        caller = _caller(request.options, call)
         numbers: list[int | None] = list(request.pages) or [None] * request.count
         with self._plane.ranges.held(caller):
             for number in numbers:
@@ -96,6 +96,6 @@ class PageCalls:
             raise LimitError(subject, count, f"at most {most}")
 
 
-def _caller(options: pb.DecodeOptions, caller: Caller) -> Caller:
+def _caller(options: pb.DecodeOptions, call: Call) -> Caller:
     """The caller with its session; without one, the pages are those of the device."""
-    return caller.in_session(options.session, options.tracking == pb.TRACKING_STATELESS)
+    return call.caller.in_session(call.own(options.session), options.tracking == pb.TRACKING_STATELESS)

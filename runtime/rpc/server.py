@@ -15,6 +15,7 @@ from grpc_health.v1 import health, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from lightpage.errors import InvalidInputError
+from runtime.identity.certificates import Certificates
 from runtime.rpc.call import SERVICE, Dispatcher
 from runtime.rpc.handlers import handlers
 from runtime.rpc.health_servicer import HealthServicer
@@ -22,6 +23,7 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.store_health import StoreHealth
 from runtime.wire.address import check_free
+from runtime.wire.channel import add_port
 
 _KEEPALIVE_MS = 30_000
 """A connection silent for so long is asked for a sign of life, so that a dead client's call ends."""
@@ -50,6 +52,7 @@ class LightpageServer:
         recalibrator: what recalibrates it.
         address: HOST:PORT; port 0 takes a free one.
         more: further handlers.
+        certificates: with which it meets its callers, who must have some too; None for no TLS.
     """
 
     def __init__(
@@ -58,8 +61,10 @@ class LightpageServer:
         recalibrator: Recalibrator,
         address: str = "127.0.0.1:0",
         more: Sequence[object] = (),
+        certificates: Certificates | None = None,
     ) -> None:
         self._plane, self._recalibrator, self._address = plane, recalibrator, address
+        self._credentials = None if certificates is None else certificates.server_credentials()
         self._handlers = (*more, *handlers(plane, recalibrator))
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, name="lightpage-rpc", daemon=True)
@@ -143,7 +148,7 @@ class LightpageServer:
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         names = (SERVICE.full_name, health.SERVICE_NAME, reflection.SERVICE_NAME)
         reflection.enable_server_reflection(names, self._server)
-        self.port = self._server.add_insecure_port(self._address)
+        self.port = add_port(self._server, self._address, self._credentials)
         await self._server.start()
         await self._say(True)
         self._started = True

@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Self
 
 from lightpage.errors import BusyError, LightpageError
+from runtime.bundle.signature import read_signature, signature_path
 from runtime.errors import CallerLeft, StoreError
 from runtime.service.caller import Actor, Caller
 from runtime.service.dataplane import DataPlane
@@ -92,7 +93,8 @@ class Incoming:
     def _take_in(self, path: Path) -> str:
         """Move a bundle to the store; returns its version."""
         with path.open("rb") as file, self._plane.uploads.held_at_once():
-            upload = self._plane.models.upload(os.fstat(file.fileno()).st_size, b"", self._caller)
+            size, signature = os.fstat(file.fileno()).st_size, read_signature(path)
+            upload = self._plane.models.upload(size, b"", self._caller, signature)
             try:
                 upload.begin()
                 while chunk := file.read(CHUNK_BYTES):
@@ -101,6 +103,7 @@ class Incoming:
             finally:
                 upload.drop()
         path.unlink(missing_ok=True)
+        signature_path(path).unlink(missing_ok=True)
         return entry.manifest.version
 
 

@@ -17,6 +17,7 @@ from lightpage.errors import BundleError, InvalidInputError, LimitError
 from lightpage.files import sync_folder
 from runtime.bundle.bundle import read_manifest
 from runtime.bundle.manifest import Manifest, check_version
+from runtime.bundle.signature import MOST_BYTES, signature_path
 from runtime.decoding.decoder import Decoder
 from runtime.errors import CallerLeft, ModelExistsError, StoreError
 from runtime.service.audit import AuditLog
@@ -229,18 +230,19 @@ class Models:
         """
         return None if self.store is None else self.store.trouble(self._room_bytes)
 
-    def upload(self, size: int, digest: bytes, caller: Caller) -> Upload:
+    def upload(self, size: int, digest: bytes, caller: Caller, signature: bytes = b"") -> Upload:
         """A bundle that is about to come.
 
         Args:
             size: bytes of its zip.
             digest: SHA-256 of it, empty where that is not known.
             caller: who sends it.
+            signature: of the zip; empty for none.
 
         Raises:
             StoreError: there is no store.
             LimitError: it is too large.
-            InvalidInputError: an impossible size or hash.
+            InvalidInputError: an impossible size, hash or signature.
         """
         if self.store is None:
             raise StoreError("model store", "none", "a service started with --store")
@@ -250,25 +252,28 @@ class Models:
             raise LimitError("uploaded model", f"{size} bytes", f"at most {self._most_bytes}")
         if len(digest) not in (0, 32):
             raise InvalidInputError("header.sha256", f"{len(digest)} bytes", "32, or none")
-        return Upload(self, self.store, size, digest, caller)
+        if len(signature) > MOST_BYTES:
+            raise InvalidInputError("header.signature", f"{len(signature)} bytes", f"at most {MOST_BYTES}")
+        return Upload(self, self.store, size, digest, caller, signature)
 
-    def take_in(self, path: Path, here: Callable[[], None] = lambda: None) -> ModelEntry:
+    def take_in(self, path: Path, here: Callable[[], None] = lambda: None, signature: bytes = b"") -> ModelEntry:
         """Check a bundle that lies in the store under another name, and give it its own.
 
         Args:
             path: of the zip.
             here: called before it gets its name; what it raises leaves it as it is.
+            signature: of the zip, which is kept beside it; empty for none.
 
         Raises:
             StoreError: there is no store, or it cannot be written.
             ModelExistsError: there is a model of its version.
-            BundleError: it is damaged, or for another device.
+            BundleError: it is damaged, for another device, or lacks the signature that it needs.
         """
         store = self.store
         if store is None:
             raise StoreError("model store", "none", "a service started with --store")
         try:
-            decoder = self.registry.current.decoder.load_another(path)
+            decoder = self.registry.opened(path, signature)
             self.registry.check(decoder)
         except BundleError as error:
             subject = error.subject.replace(f"bundle {path}", "new bundle")
@@ -280,6 +285,11 @@ class Models:
                 raise ModelExistsError("new bundle: version", version, "one that the service does not have")
             here()
             try:
+                if signature:
+                    with signature_path(final).open("wb") as file:
+                        file.write(signature)
+                        file.flush()
+                        os.fsync(file.fileno())
                 os.link(path, final)  # fails where a rename would replace what came in the meantime
                 sync_folder(store.folder)
             except FileExistsError:
@@ -292,6 +302,7 @@ class Models:
                 self._remember(origins=self._origins(version, Origin.UPLOADED))
         except BaseException:
             final.unlink(missing_ok=True)
+            signature_path(final).unlink(missing_ok=True)
             raise
         path.unlink(missing_ok=True)
         self.prune(store, [final])
@@ -408,10 +419,14 @@ class Upload:
         size: bytes that are to come.
         digest: SHA-256 of them, or empty.
         caller: who sends them.
+        signature: of them, or empty.
     """
 
-    def __init__(self, models: Models, store: ModelStore, size: int, digest: bytes, caller: Caller) -> None:
+    def __init__(
+        self, models: Models, store: ModelStore, size: int, digest: bytes, caller: Caller, signature: bytes
+    ) -> None:
         self._models, self._store, self._size, self._digest, self._caller = models, store, size, digest, caller
+        self._signature = signature
         self._hash, self._come = hashlib.sha256(), 0
         self._file: IO[bytes] | None = None
         self._path: Path | None = None
@@ -464,7 +479,7 @@ class Upload:
             self._file.flush()
             os.fsync(self._file.fileno())
             try:
-                entry = self._models.take_in(self._path, self._check_here)
+                entry = self._models.take_in(self._path, self._check_here, self._signature)
             except Exception as error:
                 self._models.record_upload("", self._caller.actor, error)
                 raise

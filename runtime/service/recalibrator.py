@@ -24,6 +24,7 @@ from lightpage.recording.reader import Recording
 from runtime.acquisition.source import FrameSource, own_fault
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.archive import check_name
+from runtime.bundle.bundle import Bundle
 from runtime.decoding.frames import narrow
 from runtime.errors import CallerLeft, JobCancelledError, NoSourceError, OtherModelError, SourceError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -298,7 +299,7 @@ class Recalibrator:
         try:
             progress("put the new model in service", 1.0)
             self.jobs.foretell(outcome)
-            decoder = model.decoder.load_another(path)
+            decoder = model.decoder.of_another(Bundle.open(path))
             plane.adopt(decoder, expected=model, actor=actor)
         except BaseException:
             path.unlink(missing_ok=True)

@@ -9,7 +9,9 @@ from functools import cached_property
 from pathlib import Path
 
 from lightpage.errors import BundleError, CalibrationError, RecalibrationRefusedError
+from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import Manifest
+from runtime.bundle.signature import BundleKey, signature_path
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker, Tracker
 from runtime.errors import ModelExistsError, OtherModelError
@@ -126,10 +128,17 @@ class ModelRegistry:
         first: the decoder to start with.
         make_tracker: makes the tracker of each model.
         kept: models held loaded at most; others of the history are loaded again when they are gone to.
+        key: that bundles must be signed with which come from elsewhere; None for none.
     """
 
-    def __init__(self, first: Decoder, make_tracker: TrackerFactory = no_tracker, kept: int = KEPT_MODELS) -> None:
-        self._make_tracker, self._kept = make_tracker, kept
+    def __init__(
+        self,
+        first: Decoder,
+        make_tracker: TrackerFactory = no_tracker,
+        kept: int = KEPT_MODELS,
+        key: BundleKey | None = None,
+    ) -> None:
+        self._make_tracker, self._kept, self._key = make_tracker, kept, key
         self._changing = threading.Lock()
         """Held from the checks of a change to its end, its note included; taken before the lock below."""
         self._lock = threading.Lock()
@@ -253,6 +262,18 @@ class ModelRegistry:
                 with self._lock:
                     self._history = history
 
+    def opened(self, path: Path, signature: bytes = b"") -> Decoder:
+        """The decoder of a bundle that comes from elsewhere.
+
+        Args:
+            path: of it.
+            signature: of it; empty for that in the file beside it.
+
+        Raises:
+            BundleError: it is damaged, or lacks the signature that it needs.
+        """
+        return self.current.decoder.of_another(Bundle.open(path, key=self._key, signature=signature))
+
     def check(self, decoder: Decoder) -> None:
         """Check that a decoder could be put in service.
 
@@ -274,7 +295,10 @@ class ModelRegistry:
             held = self._loaded.get(place.version)
         if held is not None:
             return held
-        decoder = self.current.decoder.load_another(place.path)
+        if place == self.base or signature_path(place.path).exists():
+            decoder = self.opened(place.path)
+        else:  # what the service has made itself has no signature
+            decoder = self.current.decoder.of_another(Bundle.open(place.path))
         if decoder.version != place.version:
             raise BundleError(f"{decoder.bundle.subject}: version", decoder.version, place.version)
         return self._tracked(decoder)

@@ -34,7 +34,8 @@ from runtime.service.audit import AUDIT_BYTES, AUDIT_KEPT
 from runtime.service.flight_recorder import PAGES, RING_BYTES, FlightSettings
 from runtime.service.limits import Limits
 from runtime.service.self_calibration import SelfCalibrationSettings
-from runtime.wire.address import check_address
+from runtime.wire.address import check_address, is_local
+from runtime.wire.tls import TlsFiles
 
 PREFIX = "LIGHTPAGE_"
 """Of variables of the environment: LIGHTPAGE_TABLE__KEY."""
@@ -86,10 +87,13 @@ class ServiceTable(SettingsTable):
 
     Attributes:
         bundle: path of a bundle, or the name of a shipped one.
+        bundle_key: public key that bundles from elsewhere must be signed with.
         source: where pages are read from; without one only sent frames decode.
         pages: file of pages that the source is to show.
         address: HOST:PORT to listen on; port 0 takes a free one.
-        health_address: HOST:PORT of health checks; without, the next port; `off` for none.
+        insecure: whether addresses that others reach may do without TLS, as in a container whose ports are published
+            on its own machine alone.
+        health_address: HOST:PORT of health checks; without, the next port of this machine; `off` for none.
         store: folder of recalibrated and uploaded bundles.
         incoming: folder whose bundles are taken into the store.
         recordings: folder whose recordings a caller may name to recalibrate with.
@@ -100,9 +104,11 @@ class ServiceTable(SettingsTable):
     """
 
     bundle: _Text = DEFAULT
+    bundle_key: _Path | None = None
     source: _Text | None = None
     pages: _Path | None = None
     address: str = ADDRESS
+    insecure: bool = False
     health_address: str | None = None
     store: _Path | None = None
     incoming: _Path | None = None
@@ -131,6 +137,28 @@ class ServiceTable(SettingsTable):
         except InvalidInputError as error:
             raise ValueError(error.expected) from None
         return provider
+
+
+class TlsTable(SettingsTable):
+    """Certificates, PEM; all three or none. With them, callers of the service and of its console need some too.
+
+    Attributes:
+        ca: authorities that callers' certificates may come from.
+        certificate: of the service.
+        key: its private key.
+        plain_health: whether health checks are answered without TLS, for those who ask that know none.
+    """
+
+    ca: _Path | None = None
+    certificate: _Path | None = None
+    key: _Path | None = None
+    plain_health: bool = False
+
+    def files(self) -> TlsFiles | None:
+        """The three files, None for none."""
+        if self.ca is None or self.certificate is None or self.key is None:
+            return None
+        return TlsFiles(self.ca, self.certificate, self.key)
 
 
 class MetricsTable(SettingsTable):
@@ -200,6 +228,7 @@ class ServiceSettings(TomlTable):
     """The whole file."""
 
     service: ServiceTable = ServiceTable()
+    tls: TlsTable = TlsTable()
     metrics: MetricsTable = MetricsTable()
     self_calibration: SelfCalibrationTable = SelfCalibrationTable()
     flight_recorder: FlightRecorderTable = FlightRecorderTable()
@@ -219,6 +248,26 @@ class ServiceSettings(TomlTable):
         if self.audit.file is not None or self.service.store is None:
             return self.audit.file
         return self.service.store / AUDIT_FILE
+
+    @model_validator(mode="after")
+    def _reached_by_few(self) -> Self:
+        files = {name: getattr(self.tls, name) for name in ("ca", "certificate", "key")}
+        lacking = [f"tls.{name}" for name, path in files.items() if path is None]
+        for name, path in files.items():
+            _want(path is None or not lacking, f"tls.{name}", str(path), f"{' and '.join(lacking)} too")
+        listening = {
+            "service.address": self.service.address,
+            "service.health_address": self.service.health_address or OFF,
+            "metrics.host": OFF if self.metrics.port is None else self.metrics.host,
+        }
+        for key, address in listening.items():
+            _want(
+                address == OFF or is_local(address) or not lacking or self.service.insecure,
+                key,
+                address,
+                "[tls], since others reach it; or an address of this machine alone; or service.insecure = true",
+            )
+        return self
 
     @model_validator(mode="after")
     def _fit_together(self) -> Self:

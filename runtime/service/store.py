@@ -22,6 +22,7 @@ from lightpage.errors import BundleError, InvalidInputError
 from lightpage.files import replace_text
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import sha256
+from runtime.bundle.signature import signature_path
 from runtime.errors import StoreError
 from runtime.recalibration.separate_process import SCRATCH
 
@@ -194,6 +195,7 @@ class ModelStore:
         dropped = self.surplus(held)
         for path in dropped:
             path.unlink(missing_ok=True)
+            signature_path(path).unlink(missing_ok=True)
         return dropped
 
     def change(self, **changes: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import ipaddress
 import re
 import socket
 from pathlib import Path
@@ -13,6 +14,17 @@ _HOST_PORT = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
 _UNIX = "unix:"
 _LARGEST_PORT = 65535
 _ANSWER_S = 1.0
+
+
+def is_local(address: str) -> bool:
+    """Whether nobody beyond this machine can reach an address (HOST:PORT, HOST or unix:PATH)."""
+    if address.startswith(_UNIX):
+        return True
+    host = (match[1] if (match := _HOST_PORT.fullmatch(address)) else address).strip("[]")
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def check_address(name: str, address: str, least_port: int = 1) -> None:

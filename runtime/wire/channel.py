@@ -1,4 +1,4 @@
-"""The connection to a service, one way for all who call it."""
+"""Both ends of a connection, one way for all who call a service and for all that serve."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import grpc
 
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.wire.sizes import REPLY_BYTES
+from runtime.wire.tls import TlsFiles
 
 REPEATABLE = ("Describe", "ListModels", "ListJobs", "GetJob", "WatchJob", "WatchDisplay")
 """Calls that change nothing: gRPC repeats them by itself where the service did not answer."""
@@ -21,8 +22,16 @@ CONNECT_MS = 2000
 are all at work takes its time to answer, and a host that is being switched on drops what it is sent."""
 
 
-def open_channel(target: str) -> grpc.Channel:
-    """A channel to `target` (HOST:PORT); it connects at the first call, and again whenever the connection was lost."""
+def open_channel(target: str, tls: TlsFiles | None = None) -> grpc.Channel:
+    """A channel to `target` (HOST:PORT); it connects at the first call, and again whenever the connection was lost.
+
+    Args:
+        target: where.
+        tls: certificates to connect with; None for no TLS.
+
+    Raises:
+        InvalidInputError: see `TlsFiles.read`.
+    """
     first_ms, most_ms = RECONNECT_MS
     options: tuple[tuple[str, Any], ...] = (
         ("grpc.max_receive_message_length", REPLY_BYTES),
@@ -32,7 +41,20 @@ def open_channel(target: str) -> grpc.Channel:
         ("grpc.min_reconnect_backoff_ms", CONNECT_MS),
         ("grpc.service_config", _service_config()),
     )
-    return grpc.insecure_channel(target, options=options)
+    if tls is None:
+        return grpc.insecure_channel(target, options=options)
+    return grpc.secure_channel(target, tls.channel_credentials(), options=options)
+
+
+def add_port(server: grpc.aio.Server, address: str, credentials: grpc.ServerCredentials | None) -> int:
+    """Have a server listen at an address (HOST:PORT or unix:PATH); returns the port.
+
+    Raises:
+        RuntimeError: it cannot.
+    """
+    if credentials is None:
+        return server.add_insecure_port(address)
+    return server.add_secure_port(address, credentials)
 
 
 def _service_config() -> str:

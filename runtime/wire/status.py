@@ -37,6 +37,7 @@ from runtime.errors import (
     ModelExistsError,
     NoSourceError,
     NoSuchJobError,
+    NotAllowedError,
     OtherModelError,
     OverloadedError,
     ProviderError,
@@ -85,6 +86,7 @@ _MEANINGS: tuple[tuple[type[BaseException], grpc.StatusCode, pb.ErrorReason], ..
     (CalibrationError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_RECALIBRATION_REFUSED),
     (NoSuchJobError, _Code.NOT_FOUND, pb.ERROR_REASON_NO_SUCH_JOB),
     (JobCancelledError, _Code.CANCELLED, pb.ERROR_REASON_JOB_CANCELLED),
+    (NotAllowedError, _Code.PERMISSION_DENIED, pb.ERROR_REASON_NOT_ALLOWED),
     (StalledError, _Code.CANCELLED, pb.ERROR_REASON_STALLED),
     (CallerLeft, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),
     (grpc.RpcError, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),  # while reading from a sender who has gone

@@ -20,6 +20,7 @@ from google.protobuf.duration_pb2 import Duration
 from google.rpc import error_details_pb2, status_pb2
 
 from runtime.decoding.decoder import Decoder
+from runtime.identity.certificates import Certificates
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.server import LightpageServer
@@ -27,6 +28,7 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry, no_tracker
 from tests.runtime import toy
+from tests.runtime.identity.authority import Authority
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = ("cmake", "c++", "pkg-config", "protoc", "grpc_cpp_plugin")
@@ -71,6 +73,17 @@ def target(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 def raw(path: Path, *frames: np.ndarray) -> Path:
     path.write_bytes(b"".join(frame.tobytes() for frame in frames))
     return path
+
+
+def test_it_connects_with_certificates(program: Path, toy_zip: Path, tmp_path: Path) -> None:
+    authority = Authority(tmp_path / "certificates")
+    plane = DataPlane(ModelRegistry(Decoder.load(toy_zip, threads=1), no_tracker))
+    with LightpageServer(plane, Recalibrator(plane), certificates=Certificates(authority.service())) as server:
+        for roles, status, told in ((["read"], 0, "model toy toy-1"), ([], 2, "NOT_ALLOWED")):
+            files = vars(authority.caller("caller", roles))
+            options = [word for name, path in files.items() for word in (f"--{name}", path)]
+            done = run(program, server.target, *options, "describe")
+            assert (done.returncode, told in done.stdout + done.stderr) == (status, True), done.stderr
 
 
 def test_it_describes_the_service(program: Path, target: str) -> None:

@@ -6,5 +6,6 @@ from lightpage_client.lightpage.recording.frame_pair import FramePair
 from lightpage_client.runtime.client.client import LightpageClient
 from lightpage_client.runtime.wire.messages import KnownPilots
 from lightpage_client.runtime.wire.pages import RemotePage
+from lightpage_client.runtime.wire.tls import TlsFiles
 
-__all__ = ["FramePair", "KnownPilots", "LightpageClient", "LightpageError", "RemotePage", "errors"]
+__all__ = ["FramePair", "KnownPilots", "LightpageClient", "LightpageError", "RemotePage", "TlsFiles", "errors"]

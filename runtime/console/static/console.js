@@ -1,5 +1,5 @@
 "use strict";
-// Asks for /state.json about once a second and shows it. It sends nothing else and changes nothing.
+// Asks for /state.json about once a second and shows it. Administrators may recalibrate and roll back; else it changes nothing.
 
 const CHARTS = [
   { title: "Margin", unit: "bit a symbol", digits: 3, lines: [["margin_bits", "margin"]], limit: 0, zero: true,
@@ -20,7 +20,7 @@ const W = 420, H = 150, LEFT = 46, RIGHT = 8, TOP = 10, BOTTOM = 22;
 const at = (id) => document.getElementById(id);
 const clock = (s) => new Date(1000 * s).toLocaleTimeString("en-GB");
 const shown = (value, digits) => (value === null || value === undefined ? "–" : value.toFixed(digits));
-let picture = -1, wait = 1000, answered = null;
+let picture = -1, wait = 1000, answered = null, inService = null;
 
 function element(name, attributes = {}, text) {
   const made = name === "svg" || element.svg.has(name)
@@ -123,6 +123,8 @@ function show(state) {
   badge.className = `badge ${CONDITIONS[state.condition] || ""}`;
   const current = state.models.find((model) => model.current);
   at("facts").textContent = `${state.source} · model ${current ? current.version : "–"} · up ${span(state.uptime_s)} · ${state.pages} pages`;
+  inService = current ? current.version : null;
+  showActions(state);
   at("reasons").hidden = !state.reasons.length;
   at("reasons").textContent = state.reasons.length ? `Recalibration is due: ${state.reasons.join("; ")}.` : "";
   if (state.picture.number !== picture) {
@@ -141,6 +143,32 @@ function show(state) {
   rows("recent", state.recent.map((page) => [[clock(page.time_s)], [page.page_index === null ? page.subject : String(page.page_index)],
     page.lost || page.unread ? [page.lost || page.unread, "bad"] : [page.recalibration_due ? "read, recalibration due" : "read"],
     [shown(page.margin_bits, 3), "number"], [shown(page.air_bits, 3), "number"], [shown(1000 * page.seconds, 0), "number"]]), "none yet", 6);
+}
+
+function showActions(state) {
+  at("actions").hidden = !state.actions.length;
+  at("caller").textContent = state.caller;
+  const running = state.job !== null && state.job.state === "RUNNING";
+  at("recalibrate").disabled = running || !state.actions.includes("recalibrate");
+  at("roll-back").disabled = !state.actions.includes("roll back");
+  if (state.job !== null) {
+    const done = running ? ` ${Math.round(100 * state.job.fraction)}%` : "";
+    at("outcome").textContent = `Recalibration ${state.job.id}: ${state.job.state.toLowerCase()}${done}${state.job.told ? `, ${state.job.told}` : ""}`;
+  }
+}
+
+async function act(action, question) {
+  const expected = inService;
+  if (expected === null || !confirm(question(expected))) return;
+  try {
+    const reply = await fetch("/actions", { method: "POST", headers: { "Content-Type": "application/json" },
+      body: JSON.stringify({ action, expected }), signal: AbortSignal.timeout(60000) });
+    const told = (await reply.text()).trim();
+    if (reply.ok) at("outcome").textContent = told;
+    else alert(`Not done: ${told}`);
+  } catch {
+    alert("No answer from the service.");
+  }
 }
 
 async function turn() {
@@ -170,4 +198,6 @@ const charts = CHARTS.map((chart) => {
   at("charts").append(card);
   return { ...chart, svg, now };
 });
+at("recalibrate").onclick = () => act("recalibrate", (version) => `Recalibrate ${version} with the source's next two known pages?`);
+at("roll-back").onclick = () => act("roll back", (version) => `Take ${version} out of service, and put the model before back?`);
 turn();

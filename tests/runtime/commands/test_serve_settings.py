@@ -65,7 +65,7 @@ def test_settings_come_from_the_file_the_environment_and_options(tmp_path: Path)
         (("--no-tracking",), "service", "tracking", False),
         (("--tracking",), "service", "tracking", True),
         (("--metrics-port", "0"), "metrics", "port", 0),
-        (("--metrics-host", "h"), "metrics", "host", "h"),
+        (("--metrics-host", "127.0.0.2"), "metrics", "host", "127.0.0.2"),
         (("--source", "recording:a", "--self-calibrate"), "self_calibration", "enabled", True),
         (("--no-self-calibrate",), "self_calibration", "enabled", False),
         (("--flight-recorder", "f"), "flight_recorder", "folder", "f"),
@@ -78,7 +78,7 @@ def test_every_option_is_above_the_environment(option: tuple[str, ...], table: s
         "LIGHTPAGE_SERVICE__STORE": "other",
         "LIGHTPAGE_SERVICE__THREADS": "1",
         "LIGHTPAGE_METRICS__PORT": "1",
-        "LIGHTPAGE_METRICS__HOST": "other",
+        "LIGHTPAGE_METRICS__HOST": "127.0.0.7",
         "LIGHTPAGE_FLIGHT_RECORDER__FOLDER": "other",
         "LIGHTPAGE_FLIGHT_RECORDER__PAGES": "1",
     }

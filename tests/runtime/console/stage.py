@@ -9,15 +9,19 @@ from pathlib import Path
 
 from runtime.acquisition.source import SHOT_S, Shot
 from runtime.bundle.bundle import Bundle
+from runtime.console.actions import Actions
 from runtime.console.history import History
 from runtime.console.server import Console, ConsoleServer
 from runtime.decoding.decoder import Decoder
 from runtime.errors import LostPageError, LostShotError, Reason
+from runtime.identity.certificates import Certificates
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
+from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
+from runtime.wire.tls import TlsFiles
 from tests.runtime import toy
 
 
@@ -37,10 +41,11 @@ class Stage:
     history: History
     console: Console
     server: ConsoleServer
+    secured: bool = False
 
     @property
     def url(self) -> str:
-        return f"http://127.0.0.1:{self.server.port}"
+        return f"{'https' if self.secured else 'http'}://localhost:{self.server.port}"
 
     def read(self, pages: int) -> None:
         for _ in range(pages):
@@ -49,10 +54,11 @@ class Stage:
 
 
 @contextmanager
-def stage(bundle: Path) -> Iterator[Stage]:
+def stage(bundle: Path, tls: TlsFiles | None = None) -> Iterator[Stage]:
     history, monitor, metrics = History(), Monitor(), ServiceMetrics()
     registry = ModelRegistry(Decoder(Bundle.open(bundle), threads=1))
     plane = DataPlane(registry, Losing(toy.ToyDevice()), metrics=metrics, observers=[history], monitor=monitor)
-    console = Console(metrics, history, registry, monitor, "toy:device")
-    with ConsoleServer(console, 0) as server:
-        yield Stage(plane, history, console, server)
+    recalibrator = Recalibrator(plane, toy.fit_references)
+    console = Console(metrics, history, registry, monitor, "toy:device", Actions(plane, recalibrator))
+    with ConsoleServer(console, 0, certificates=None if tls is None else Certificates(tls)) as server:
+        yield Stage(plane, history, console, server, tls is not None)

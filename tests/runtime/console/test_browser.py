@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
+from tests.runtime import toy
 from tests.runtime.console.stage import stage
+from tests.runtime.identity.authority import Authority
 
 WIDE, NARROW = 1400, 420
 _WAIT_MS = 20_000
@@ -72,3 +74,28 @@ def test_the_console_says_when_nobody_answers(browser: Browser, toy_zip: Path) -
     expect(page.locator("#silence")).to_contain_text("No answer from the service since", timeout=_WAIT_MS)
     expect(page.locator("#condition")).to_have_text("no answer")
     page.close()
+
+
+def test_an_administrator_rolls_back_and_others_see_no_button(browser: Browser, toy_zip: Path, tmp_path: Path) -> None:
+    authority = Authority(tmp_path / "certificates")
+    with stage(toy_zip, authority.service()) as running:
+        other = toy.write_toy_bundle(tmp_path / "c.zip", version="toy-2")
+        running.plane.adopt(running.plane.registry.opened(other))
+        for name, role in (("watcher", "read"), ("operator 7", "admin")):
+            tls = authority.caller(name, [role])
+            own = {"origin": running.url, "certPath": str(tls.certificate), "keyPath": str(tls.key)}
+            context = browser.new_context(ignore_https_errors=True, client_certificates=[own])
+            page = context.new_page()
+            page.on("dialog", lambda dialog: dialog.accept())
+            page.goto(running.url)
+            expect(page.locator("#models")).to_contain_text("toy-2 (in service)", timeout=_WAIT_MS)
+            if role == "read":
+                expect(page.locator("#actions")).to_be_hidden()
+            else:
+                expect(page.locator("#caller")).to_have_text(name)
+                page.screenshot(path=str(tmp_path / "actions.png"), full_page=True)
+                page.locator("#roll-back").click()
+                expect(page.locator("#models")).to_contain_text("toy-1 (in service)", timeout=_WAIT_MS)
+                expect(page.locator("#outcome")).to_have_text("toy-1 is in service again, toy-2 is not")
+                expect(page.locator("#roll-back")).to_be_disabled()
+            context.close()

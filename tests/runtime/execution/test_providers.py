@@ -123,7 +123,8 @@ def test_models_behind_the_first_are_computed_where_it_is(tmp_path: Path, monkey
     decoder = Decoder.load(toy.write_toy_bundle(tmp_path / "b.zip"), 1, on_second)
     other = toy.write_toy_bundle(tmp_path / "c.zip", version="toy-2")
     gain = {"homodyne": np.array([2.0, 1.0], np.float32)}
-    for one in (decoder, decoder.load_another(other), decoder.with_table(gain), decoder.of_bundle(Bundle.open(other))):
+    bundle = Bundle.open(other)
+    for one in (decoder, decoder.of_another(bundle), decoder.with_table(gain), decoder.of_bundle(bundle)):
         assert one.graph.provider == on_second
         assert one.threads == 1
     assert asked.count(on_second) == 2

@@ -203,3 +203,37 @@ def test_a_secret_is_never_shown(tmp_path: Path) -> None:
         with pytest.raises(InvalidInputError) as raised:
             read_settings(Toy, file, {})
         assert "5012345" not in str(raised.value)
+
+
+TLS = {"ca": "ca.pem", "certificate": "service.pem", "key": "service.key"}
+"""What may be set for TLS."""
+
+
+@pytest.mark.parametrize("lacking", list(TLS))
+def test_certificates_go_together(tmp_path: Path, lacking: str) -> None:
+    text = "".join(f"{name} = '{path}'\n" for name, path in TLS.items() if name != lacking)
+    assert refused(tmp_path, f"[tls]\n{text}").expected == f"tls.{lacking} too"
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("[service]\naddress = '0.0.0.0:50051'\n", "service.address"),
+        ("[service]\naddress = 'device.example:50051'\n", "service.address"),
+        ("[service]\naddress = '[::]:50051'\n", "service.address"),
+        ("[service]\nhealth_address = '0.0.0.0:50052'\n", "service.health_address"),
+        ("[metrics]\nhost = '0.0.0.0'\nport = 9100\n", "metrics.host"),
+    ],
+)
+def test_what_others_reach_needs_certificates(tmp_path: Path, text: str, key: str) -> None:
+    error = refused(tmp_path, text)
+    assert key in error.got
+    assert "[tls]" in error.expected
+    secured = of_file(tmp_path, text + "[tls]\n" + "".join(f"{name} = '{path}'\n" for name, path in TLS.items()))
+    assert secured.settings.tls.files() is not None
+    assert of_file(tmp_path, text, LIGHTPAGE_SERVICE__INSECURE="true").settings.service.insecure
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:0", "localhost:50051", "[::1]:50051", "127.3.2.1:50051", "unix:/run/a"])
+def test_this_machine_alone_needs_none(tmp_path: Path, address: str) -> None:
+    assert of_file(tmp_path, f"[service]\naddress = '{address}'\n").settings.service.address == address

@@ -97,6 +97,7 @@ class ErrorReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ERROR_REASON_REQUEST_ID: _ClassVar[ErrorReason]
     ERROR_REASON_INTERNAL: _ClassVar[ErrorReason]
     ERROR_REASON_JOB_CANCELLED: _ClassVar[ErrorReason]
+    ERROR_REASON_NOT_ALLOWED: _ClassVar[ErrorReason]
 
 class LossReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -181,6 +182,7 @@ ERROR_REASON_WORKER: ErrorReason
 ERROR_REASON_REQUEST_ID: ErrorReason
 ERROR_REASON_INTERNAL: ErrorReason
 ERROR_REASON_JOB_CANCELLED: ErrorReason
+ERROR_REASON_NOT_ALLOWED: ErrorReason
 LOSS_REASON_UNSPECIFIED: LossReason
 LOSS_REASON_PILOTS_DISAGREE: LossReason
 LOSS_REASON_IMAGE_NOT_FOUND: LossReason
@@ -847,14 +849,16 @@ class UploadModelRequest(_message.Message):
     def __init__(self, header: _Optional[_Union[UploadModelHeader, _Mapping]] = ..., chunk: _Optional[bytes] = ...) -> None: ...
 
 class UploadModelHeader(_message.Message):
-    __slots__ = ("bytes", "sha256", "correlation_id")
+    __slots__ = ("bytes", "sha256", "correlation_id", "signature")
     BYTES_FIELD_NUMBER: _ClassVar[int]
     SHA256_FIELD_NUMBER: _ClassVar[int]
     CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
+    SIGNATURE_FIELD_NUMBER: _ClassVar[int]
     bytes: int
     sha256: bytes
     correlation_id: str
-    def __init__(self, bytes: _Optional[int] = ..., sha256: _Optional[bytes] = ..., correlation_id: _Optional[str] = ...) -> None: ...
+    signature: bytes
+    def __init__(self, bytes: _Optional[int] = ..., sha256: _Optional[bytes] = ..., correlation_id: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class UploadModelReply(_message.Message):
     __slots__ = ("model",)

@@ -1,0 +1,80 @@
+"""Detached signatures of bundles: a file beside a zip says that whoever has the private key has seen it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from lightpage.errors import BundleError, InvalidInputError
+
+SUFFIX = ".sig"
+"""Behind the name of a bundle, the name of its signature."""
+
+MOST_BYTES = 1 << 10
+"""A signature is less than a hundred bytes."""
+
+
+def signature_path(bundle: Path) -> Path:
+    """Where the signature of a bundle lies."""
+    return bundle.with_name(bundle.name + SUFFIX)
+
+
+def read_signature(bundle: Path) -> bytes:
+    """The signature beside a bundle; empty where there is none.
+
+    Raises:
+        BundleError: it cannot be read.
+    """
+    path = signature_path(bundle)
+    try:
+        with path.open("rb") as file:
+            return file.read(MOST_BYTES)
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise BundleError(f"signature {path}", error, "a file that can be read") from None
+
+
+class BundleKey:
+    """A public key of an elliptic curve. Signatures are ECDSA over SHA-256, as ``openssl dgst -sha256 -sign`` has them.
+
+    Args:
+        path: of the key, PEM.
+
+    Raises:
+        InvalidInputError: there is no such key.
+    """
+
+    def __init__(self, path: Path) -> None:
+        subject, expected = f"bundle key {path}", "a public key of an elliptic curve, PEM"
+        try:
+            key = serialization.load_pem_public_key(path.read_bytes())
+        except OSError as error:
+            raise InvalidInputError(subject, error, "a file that can be read") from None
+        except (ValueError, UnsupportedAlgorithm):
+            raise InvalidInputError(subject, "no public key", expected) from None
+        if not isinstance(key, ec.EllipticCurvePublicKey):
+            raise InvalidInputError(subject, "a key of another kind", expected)
+        self._key = key
+
+    def check(self, content: bytes, signature: bytes, subject: str) -> None:
+        """Check that a bundle is signed.
+
+        Args:
+            content: of its zip.
+            signature: of that; empty for none.
+            subject: the bundle, for errors.
+
+        Raises:
+            BundleError: it is not.
+        """
+        expected = f"one that the bundle key confirms; it is the file with {SUFFIX} behind the bundle's name"
+        if not signature:
+            raise BundleError(f"{subject}: signature", "none", expected)
+        try:
+            self._key.verify(signature, content, ec.ECDSA(hashes.SHA256()))
+        except InvalidSignature:
+            raise BundleError(f"{subject}: signature", "one of another bundle or key", expected) from None

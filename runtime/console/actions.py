@@ -1,0 +1,78 @@
+"""What a person may do with the console: recalibrate, and go back to the model before."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from lightpage.errors import InvalidInputError
+from runtime.client.answers import job_info
+from runtime.identity.roles import Role
+from runtime.service.caller import Actor
+from runtime.service.dataplane import DataPlane
+from runtime.service.recalibrator import Recalibrator
+
+PAGES = 2
+"""Known pages of a recalibration: one to fit, one to judge by."""
+
+ROLE = Role.ADMIN
+"""Who may do all of it."""
+
+
+class Actions:
+    """Does it.
+
+    Args:
+        plane: whose models.
+        recalibrator: of the service.
+    """
+
+    def __init__(self, plane: DataPlane, recalibrator: Recalibrator) -> None:
+        self._plane, self._recalibrator = plane, recalibrator
+        self._named: Mapping[str, Callable[[str, Actor], str]] = {
+            "recalibrate": self._recalibrate,
+            "roll back": self._roll_back,
+        }
+
+    def available(self) -> list[str]:
+        """Those that make sense now."""
+        found = ["recalibrate"] if self._plane.has_source else []
+        return [*found, "roll back"] if self._plane.registry.history.cursor else found
+
+    def job(self) -> dict[str, Any] | None:
+        """How the newest recalibration stands, as JSON has it; None where there has been none."""
+        jobs = self._recalibrator.jobs.all()
+        if not jobs:
+            return None
+        job = job_info(jobs[0])
+        told = job.step if job.error is None else str(job.error)
+        return {"id": job.id, "state": job.state, "fraction": job.fraction, "told": told}
+
+    def do(self, content: bytes, actor: Actor) -> str:
+        """Do what a JSON object asks for: its `action`, with the model `expected` in service; tells what came of it.
+
+        Raises:
+            InvalidInputError: no such object.
+            LightpageError: it could not be done; nothing was changed.
+        """
+        try:
+            asked: Any = json.loads(content)
+        except ValueError as error:
+            raise InvalidInputError("action", error, 'a JSON object, {"action": ..., "expected": ...}') from None
+        if not isinstance(asked, dict) or asked.keys() != {"action", "expected"}:
+            raise InvalidInputError("action", repr(asked)[:100], 'a JSON object, {"action": ..., "expected": ...}')
+        name, expected = asked["action"], asked["expected"]
+        if not isinstance(expected, str) or not expected:
+            raise InvalidInputError("expected", repr(expected)[:100], "the version of the model in service")
+        if not isinstance(name, str) or name not in self._named:
+            raise InvalidInputError("action", repr(name)[:100], " or ".join(self._named))
+        return self._named[name](expected, actor)
+
+    def _recalibrate(self, expected: str, actor: Actor) -> str:
+        pages = self._recalibrator.source_pages(PAGES)
+        return f"job {self._recalibrator.start(pages, expected, 'console', actor).id} has begun"
+
+    def _roll_back(self, expected: str, actor: Actor) -> str:
+        current, before = self._plane.rollback(expected, actor=actor)
+        return f"{current.version} is in service again, {before.version} is not"

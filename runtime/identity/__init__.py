@@ -1,0 +1,1 @@
+"""Who calls: certificates, roles, and what each of them may do."""

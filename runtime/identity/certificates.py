@@ -1,0 +1,92 @@
+"""The service's certificates, read anew when their files change: nobody restarts a service for a certificate."""
+
+from __future__ import annotations
+
+import logging
+import os
+import ssl
+import threading
+from typing import Any
+
+import grpc
+
+from lightpage.errors import InvalidInputError
+from runtime.wire.tls import Pem, TlsFiles
+
+_log = logging.getLogger(__name__)
+
+_Stamp = tuple[tuple[int, int, int], ...]
+"""Number, size and time of change of each file."""
+
+
+class Certificates:
+    """The certificates with which a service meets its callers. Its methods may be called from many threads.
+
+    New files count from the next connection on. Where they are no good, as while they are being replaced, the earlier
+    ones stay, and the log says why.
+
+    Args:
+        files: whose `ca` is that of the callers.
+
+    Raises:
+        InvalidInputError: see `TlsFiles.read`.
+    """
+
+    def __init__(self, files: TlsFiles) -> None:
+        self._files = files
+        self._lock = threading.Lock()
+        self._stamp = self._refused = self._stamp_now()
+        self._pem = files.read()
+
+    def pem(self) -> Pem:
+        """Those that count now."""
+        with self._lock:
+            stamp = self._stamp_now()
+            if stamp not in (self._stamp, self._refused):
+                try:
+                    self._pem, self._stamp = self._files.read(), stamp
+                    _log.info("certificates: read anew from %s", self._files.certificate)
+                except InvalidInputError as error:
+                    self._refused = stamp
+                    _log.warning("certificates: the earlier ones stay: %s", error)
+            return self._pem
+
+    def server_credentials(self, *, callers_too: bool = True) -> grpc.ServerCredentials:
+        """What a gRPC server listens with; `callers_too`: whether callers must have a certificate."""
+        told = self.pem()
+
+        def changed() -> grpc.ServerCertificateConfiguration | None:
+            nonlocal told
+            if (pem := self.pem()) is told:
+                return None
+            told = pem
+            return _configuration(pem, callers_too)
+
+        fetch: Any = changed  # its stubs know of no None, which stands for no change
+        return grpc.dynamic_ssl_server_credentials(_configuration(told, callers_too), fetch, callers_too)
+
+    def context(self) -> ssl.SSLContext:
+        """What an HTTP server meets the next caller with, who must have a certificate."""
+        pem = self.pem()
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.verify_mode = ssl.CERT_REQUIRED
+        context.load_verify_locations(cadata=pem.ca.decode("ascii"))
+        context.load_cert_chain(self._files.certificate, self._files.key)
+        return context
+
+    def _stamp_now(self) -> _Stamp:
+        found = []
+        for path in vars(self._files).values():
+            try:
+                status = os.stat(path)
+            except OSError:
+                found.append((0, 0, 0))
+            else:
+                found.append((status.st_ino, status.st_size, status.st_mtime_ns))
+        return tuple(found)
+
+
+def _configuration(pem: Pem, callers_too: bool) -> grpc.ServerCertificateConfiguration:
+    own = [(pem.key, pem.certificate)]
+    return grpc.ssl_server_certificate_configuration(own, pem.ca if callers_too else None)

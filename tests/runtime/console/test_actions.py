@@ -1,0 +1,137 @@
+"""The console's actions: for administrators alone, and never in their name by a page of somebody else's."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import ssl
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from runtime.wire.tls import TlsFiles
+from tests.runtime import toy
+from tests.runtime.console.stage import Stage, stage
+from tests.runtime.identity.authority import Authority
+
+ROLL_BACK = {"action": "roll back", "expected": "toy-2"}
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Authority:
+    return Authority(tmp_path / "certificates")
+
+
+@pytest.fixture
+def secured(toy_zip: Path, authority: Authority, tmp_path: Path) -> Iterator[Stage]:
+    """A console with TLS, of a service that has an earlier model."""
+    with stage(toy_zip, authority.service()) as running:
+        other = toy.write_toy_bundle(tmp_path / "c.zip", version="toy-2")
+        running.plane.adopt(running.plane.registry.opened(other))
+        yield running
+
+
+def asked(
+    running: Stage, tls: TlsFiles, path: str = "/actions", content: object = ROLL_BACK, **headers: str
+) -> tuple[int, str]:
+    """Status and text of an answer to a POST; to a GET where there is no content."""
+    context = ssl.create_default_context(cafile=str(tls.ca))
+    context.load_cert_chain(tls.certificate, tls.key)
+    connection = http.client.HTTPSConnection("localhost", running.server.port, timeout=20, context=context)
+    try:
+        told = {"Content-Type": "application/json"} | {name.replace("_", "-"): value for name, value in headers.items()}
+        body = None if content is None else json.dumps(content).encode()
+        connection.request("GET" if content is None else "POST", path, body, told)
+        reply = connection.getresponse()
+        return reply.status, reply.read().decode()
+    finally:
+        connection.close()
+
+
+def state(running: Stage, tls: TlsFiles) -> dict[str, object]:
+    status, text = asked(running, tls, "/state.json", None)
+    assert status == 200
+    return dict(json.loads(text))
+
+
+def test_an_administrator_rolls_back(secured: Stage, authority: Authority) -> None:
+    tls = authority.caller("operator 7", ["admin"])
+    before = state(secured, tls)
+    assert (before["caller"], before["actions"]) == ("operator 7", ["recalibrate", "roll back"])
+    assert asked(secured, tls) == (200, "toy-1 is in service again, toy-2 is not\n")
+    assert secured.plane.registry.current.version == "toy-1"
+    assert state(secured, tls)["actions"] == ["recalibrate"]
+    status, text = asked(secured, tls)
+    assert (status, "toy-1" in text) == (409, True), "another model is in service than was expected"
+
+
+def test_an_administrator_recalibrates(secured: Stage, authority: Authority) -> None:
+    tls = authority.caller("operator 7", ["admin"])
+    status, text = asked(secured, tls, content={"action": "recalibrate", "expected": "toy-2"})
+    assert (status, text.startswith("job ")) == (200, True)
+    until = time.monotonic() + 20
+    while (job := state(secured, tls)["job"]) and job["state"] == "RUNNING" and time.monotonic() < until:  # type: ignore[index]
+        time.sleep(0.05)
+    assert isinstance(job, dict)
+    assert job["id"] in text
+    assert job["state"] in ("DONE", "REFUSED", "FAILED")
+
+
+@pytest.mark.parametrize("roles", [("read",), ("decode", "recalibrate"), ()])
+def test_nobody_else_does(secured: Stage, authority: Authority, roles: tuple[str, ...]) -> None:
+    tls = authority.caller("other", roles)
+    status, text = asked(secured, tls)
+    assert (status, "urn:lightpage:role:admin" in text) == (403, True)
+    assert secured.plane.registry.current.version == "toy-2"
+    if roles:
+        assert state(secured, tls)["actions"] == []
+    else:
+        assert asked(secured, tls, "/state.json", None)[0] == 403
+
+
+def test_without_tls_there_are_no_actions(toy_zip: Path) -> None:
+    with stage(toy_zip) as running:
+        connection = http.client.HTTPConnection("localhost", running.server.port, timeout=20)
+        connection.request("POST", "/actions", json.dumps(ROLL_BACK).encode(), {"Content-Type": "application/json"})
+        reply = connection.getresponse()
+        assert (reply.status, b"need TLS" in reply.read()) == (403, True)
+        connection.close()
+
+
+@pytest.mark.parametrize(
+    ("content", "headers", "status"),
+    [
+        (ROLL_BACK, {"Origin": "https://elsewhere.example"}, 403),
+        (ROLL_BACK, {"Origin": "null"}, 403),
+        (ROLL_BACK, {"Content_Type": "text/plain"}, 415),
+        (ROLL_BACK, {"Content_Type": "application/x-www-form-urlencoded"}, 415),
+        ({"action": "roll back", "expected": "x" * 2000}, {}, 413),
+        ({"action": "roll back"}, {}, 400),
+        ({"action": "format", "expected": "toy-2"}, {}, 400),
+        ({"action": ["roll back"], "expected": "toy-2"}, {}, 400),
+        ({"action": "roll back", "expected": ""}, {}, 400),
+        ("roll back", {}, 400),
+    ],
+)
+def test_other_requests_change_nothing(
+    secured: Stage, authority: Authority, content: object, headers: dict[str, str], status: int
+) -> None:
+    assert asked(secured, authority.caller("operator 7", ["admin"]), content=content, **headers)[0] == status
+    assert secured.plane.registry.current.version == "toy-2"
+
+
+def test_a_caller_who_says_nothing_holds_up_nobody(secured: Stage, authority: Authority) -> None:
+    import socket
+
+    with socket.create_connection(("localhost", secured.server.port)):
+        assert asked(secured, authority.caller("watcher", ["read"]), "/metrics", None)[0] == 200
+
+
+def test_callers_without_a_certificate_get_no_answer(secured: Stage, authority: Authority, tmp_path: Path) -> None:
+    foreign = Authority(tmp_path / "foreign").caller("operator 7", ["admin"])
+    wrong = TlsFiles(authority.folder / "ca.pem", foreign.certificate, foreign.key)
+    with pytest.raises((ssl.SSLError, ConnectionError, http.client.HTTPException)):
+        asked(secured, wrong)
+    assert secured.plane.registry.current.version == "toy-2"

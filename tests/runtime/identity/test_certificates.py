@@ -1,0 +1,89 @@
+"""Certificates: files that are no good are named, and new ones count without a restart."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from lightpage.errors import InvalidInputError
+from runtime.identity.certificates import Certificates
+from runtime.wire.tls import TlsFiles
+from tests.runtime.identity.authority import Authority
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Authority:
+    return Authority(tmp_path)
+
+
+def test_files_are_read(authority: Authority) -> None:
+    files = authority.service()
+    pem = files.read()
+    assert (pem.ca, pem.key) == (files.ca.read_bytes(), files.key.read_bytes())
+
+
+@pytest.mark.parametrize("name", ["ca", "certificate", "key"])
+def test_a_missing_file_is_named(authority: Authority, name: str) -> None:
+    files = authority.service()
+    getattr(files, name).unlink()
+    with pytest.raises(InvalidInputError, match=f"^{name} .*No such file"):
+        files.read()
+
+
+def test_a_file_that_is_no_certificate_is_named(authority: Authority) -> None:
+    files = authority.service()
+    with pytest.raises(InvalidInputError, match=r"service\.key: got no certificate"):
+        TlsFiles(files.key, files.certificate, files.key).read()
+    with pytest.raises(InvalidInputError, match=r"certificate .*service\.key with key"):
+        TlsFiles(files.ca, files.key, files.key).read()
+
+
+def test_a_key_of_another_certificate_is_refused(authority: Authority) -> None:
+    files, other = authority.service(), authority.service("other")
+    with pytest.raises(InvalidInputError, match="KEY_VALUES_MISMATCH"):
+        TlsFiles(files.ca, files.certificate, other.key).read()
+
+
+def test_a_key_with_a_password_is_refused_without_asking_for_it(authority: Authority) -> None:
+    from cryptography.hazmat.primitives import serialization
+
+    files = authority.service()
+    key = serialization.load_pem_private_key(files.key.read_bytes(), None)
+    locked = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.TraditionalOpenSSL,
+        serialization.BestAvailableEncryption(b"secret"),
+    )
+    files.key.write_bytes(locked)
+    with pytest.raises(InvalidInputError, match="without a password"):
+        files.read()
+
+
+def test_new_files_count(authority: Authority) -> None:
+    files, newer = authority.service(), authority.service("newer")
+    certificates = Certificates(files)
+    before = certificates.pem()
+    assert certificates.pem() is before
+    _replace(files, newer)
+    assert certificates.pem().certificate == newer.certificate.read_bytes() != before.certificate
+
+
+def test_half_replaced_files_leave_the_earlier_ones(authority: Authority, caplog: pytest.LogCaptureFixture) -> None:
+    files, newer = authority.service(), authority.service("newer")
+    certificates = Certificates(files)
+    before = certificates.pem()
+    os.replace(newer.certificate, files.certificate)
+    assert certificates.pem() is before
+    assert certificates.pem() is before
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "the earlier ones stay" in caplog.text
+    os.replace(newer.key, files.key)
+    assert certificates.pem() is not before
+
+
+def _replace(files: TlsFiles, newer: TlsFiles) -> None:
+    shutil.copy(newer.certificate, files.certificate)
+    shutil.copy(newer.key, files.key)

@@ -1,0 +1,60 @@
+"""Roles: what a certificate says, what a call needs, and that the page for operators says the same."""
+
+from __future__ import annotations
+
+import re
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+
+from runtime.errors import NotAllowedError
+from runtime.identity.roles import LOCAL, NEEDED, Role, identity_of
+from runtime.rpc.call import SERVICE
+from tests.runtime.identity.authority import Authority
+
+OPERATIONS = Path(__file__).parents[3] / "docs" / "operations.md"
+
+
+def test_a_certificate_says_who_and_what(tmp_path: Path) -> None:
+    files = Authority(tmp_path).caller("controller 1", ["decode", "recalibrate", "king"])
+    identity = identity_of(files.certificate.read_bytes())
+    assert identity.name == "controller 1"
+    assert identity.roles == {Role.DECODE, Role.RECALIBRATE}
+
+
+def test_a_certificate_without_roles_may_nothing(tmp_path: Path) -> None:
+    identity = identity_of(Authority(tmp_path).caller("nobody").certificate.read_bytes())
+    assert not any(identity.may(role) for role in Role)
+    with pytest.raises(NotAllowedError, match=r"call X: got nobody with no role, wanted .*urn:lightpage:role:read"):
+        identity.check(Role.READ, "call X", 0.0)
+
+
+@pytest.mark.parametrize("role", list(Role))
+def test_a_role_is_itself_and_may_look(tmp_path: Path, role: Role) -> None:
+    identity = identity_of(Authority(tmp_path).caller("one", [role]).certificate.read_bytes())
+    allowed = {other for other in Role if identity.may(other)}
+    assert allowed == (set(Role) if role is Role.ADMIN else {Role.READ, role})
+
+
+def test_a_certificate_that_ends_while_connected_is_refused(tmp_path: Path) -> None:
+    files = Authority(tmp_path).caller("one", ["admin"], timedelta(hours=1))
+    identity = identity_of(files.certificate.read_bytes())
+    identity.check(Role.READ, "call X", identity.until - 1)
+    with pytest.raises(NotAllowedError, match="expired"):
+        identity.check(Role.READ, "call X", identity.until)
+
+
+def test_who_needs_no_certificate_may_do_everything() -> None:
+    assert all(LOCAL.may(role) for role in Role)
+
+
+def test_every_call_needs_a_role() -> None:
+    assert {method.name for method in SERVICE.methods} <= NEEDED.keys()
+
+
+def test_the_page_for_operators_says_the_same() -> None:
+    text = OPERATIONS.read_text("utf-8")
+    rows = re.findall(r"^\| `(read|decode|recalibrate|admin)` \| (.+) \|$", text, re.MULTILINE)
+    told = {call: role for role, calls in rows for call in re.findall(r"`([\w/]+)`", calls)}
+    assert told == NEEDED

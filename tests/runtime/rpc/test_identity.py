@@ -1,0 +1,168 @@
+"""Callers with certificates: each may do what its roles say, and nobody else gets in."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from lightpage.errors import LightpageError
+from runtime.client.client import LightpageClient
+from runtime.commands.healthcheck import is_serving
+from runtime.errors import NotAllowedError
+from runtime.identity.certificates import Certificates
+from runtime.identity.roles import NEEDED, Role
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from runtime.rpc.call import SERVICE
+from runtime.rpc.health_server import HealthServer
+from runtime.rpc.server import LightpageServer
+from runtime.service.audit import AuditLog
+from runtime.wire.channel import open_channel
+from runtime.wire.tls import TlsFiles
+from tests.runtime.identity.authority import Authority
+from tests.runtime.rpc.stage import Running, Start, a_page
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Authority:
+    return Authority(tmp_path / "certificates")
+
+
+@pytest.fixture
+def secured(start: Start, authority: Authority) -> Iterator[Running]:
+    """A service that asks for certificates."""
+    service = start()
+    server = LightpageServer(
+        service.plane, service.recalibrator, certificates=Certificates(authority.service())
+    ).start()
+    yield Running(service.plane, service.recalibrator, server, service.source, service.client)
+    server.stop(0.5)
+
+
+def code_of(channel: grpc.Channel, method: str) -> grpc.StatusCode:
+    """How a call with an empty request ends; a stream of answers by its first one."""
+    found = SERVICE.methods_by_name[method]
+    request: Any = getattr(pb, found.input_type.name)()
+    call = getattr(pb_grpc.LightpageStub(channel), method)
+    try:
+        answer = call(iter([request]) if found.client_streaming else request, timeout=5)
+        if found.server_streaming:
+            next(answer, None)
+            answer.cancel()
+    except grpc.RpcError as error:
+        ended: Any = error
+        return ended.code()  # type: ignore[no-any-return]
+    return grpc.StatusCode.OK
+
+
+def ended(target: str, tls: TlsFiles | None, method: str = "ReadPage") -> grpc.StatusCode:
+    """How a call on a connection of its own ends."""
+    with open_channel(target, tls) as channel:
+        return code_of(channel, method)
+
+
+def test_each_role_may_do_its_calls_and_no_other(secured: Running, authority: Authority) -> None:
+    for roles in ((), *((role,) for role in Role), (Role.DECODE, Role.RECALIBRATE)):
+        tls = authority.caller("caller", roles)
+        with open_channel(secured.server.target, tls) as channel:
+            refused = {name for name in NEEDED if code_of(channel, name) is grpc.StatusCode.PERMISSION_DENIED}
+        allowed = {name for name, role in NEEDED.items() if role in roles or Role.ADMIN in roles}
+        allowed |= {name for name, role in NEEDED.items() if roles and role is Role.READ}
+        assert refused == NEEDED.keys() - allowed, roles
+
+
+def test_nobody_gets_in_without_a_certificate_of_the_authority(
+    secured: Running, authority: Authority, tmp_path: Path
+) -> None:
+    target = secured.server.target
+    foreign = Authority(tmp_path / "foreign").caller("caller", ["admin"])
+    wrong = TlsFiles(authority.folder / "ca.pem", foreign.certificate, foreign.key)
+    expired = authority.caller("late", ["admin"], -timedelta(seconds=1))
+    service = authority.service("another")
+    for tls in (None, wrong, expired, service):
+        assert ended(target, tls) is grpc.StatusCode.UNAVAILABLE
+    good = authority.caller("good", ["admin"])
+    deceived = TlsFiles(tmp_path / "foreign" / "ca.pem", good.certificate, good.key)
+    assert ended(target, deceived) is grpc.StatusCode.UNAVAILABLE, "the caller believes another authority"
+    assert ended(target, good) is grpc.StatusCode.OK
+
+
+def test_a_refusal_says_what_is_lacking(secured: Running, authority: Authority) -> None:
+    tls = authority.caller("reader", ["read"])
+    with LightpageClient(secured.server.target, tls=tls) as client:
+        assert client.describe().model.version == "toy-1"
+        with pytest.raises(NotAllowedError, match=r"call Rollback: got reader with role read, wanted .*role:admin"):
+            client.rollback()
+        with pytest.raises(NotAllowedError, match="call DecodeFrames"):
+            client.decode(a_page()[1], 16)
+    assert secured.count("lightpage_calls_total", method="Rollback", code="PERMISSION_DENIED") == 1
+
+
+def test_health_and_reflection_need_a_certificate_and_no_role(secured: Running, authority: Authority) -> None:
+    for tls, code in ((authority.caller("nobody"), None), (None, grpc.StatusCode.UNAVAILABLE)):
+        with open_channel(secured.server.target, tls) as channel:
+            call = health_pb2_grpc.HealthStub(channel).Check.future(health_pb2.HealthCheckRequest(), timeout=5)
+            error: Any = call.exception()
+            assert (error and error.code()) == code
+
+
+def test_the_record_of_changes_says_who(secured: Running, authority: Authority, tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    secured.plane.models._audit = AuditLog(path)
+    tls = authority.caller("operator 7", ["admin"])
+    with LightpageClient(secured.server.target, tls=tls) as client, pytest.raises(LightpageError):
+        client.rollback()
+    assert '"who": "operator 7 at ipv4:127.0.0.1:' in path.read_text()
+
+
+def test_callers_of_other_names_share_no_session_and_no_request_id(secured: Running, authority: Authority) -> None:
+    answers = []
+    for name in ("one", "two", "one"):
+        with LightpageClient(secured.server.target, tls=authority.caller(name, ["decode"])) as client:
+            client.decode(a_page()[1], 16, session="a")
+            answers.append(client.read_page(request_id="shot"))
+    assert [answer.replayed for answer in answers] == [False, False, True]
+    assert answers[0].page == answers[2].page != answers[1].page
+    assert {name.partition("/")[0] for name in secured.plane.registry.current.sessions._trackers} == {"one", "two"}
+
+
+def test_new_certificates_count_without_a_restart(start: Start, authority: Authority, tmp_path: Path) -> None:
+    service, files = start(), authority.service()
+    server = LightpageServer(service.plane, service.recalibrator, certificates=Certificates(files)).start()
+    try:
+        old = authority.caller("old", ["decode"])
+        assert ended(server.target, old) is grpc.StatusCode.OK
+        other = Authority(tmp_path / "other")
+        new, newer = other.caller("new", ["decode"]), other.service()
+        assert ended(server.target, new) is grpc.StatusCode.UNAVAILABLE
+        before = TlsFiles(tmp_path / "earlier.pem", old.certificate, old.key)
+        shutil.copy(files.ca, before.ca)
+        for source, target in zip(vars(newer).values(), vars(files).values(), strict=True):
+            shutil.copy(source, target)
+        assert ended(server.target, new) is grpc.StatusCode.OK
+        assert ended(server.target, before) is grpc.StatusCode.UNAVAILABLE
+    finally:
+        server.stop(0.5)
+
+
+def test_health_checks_with_tls_need_no_certificate(authority: Authority) -> None:
+    files = authority.service()
+    with HealthServer("127.0.0.1:0", lambda: {"": True}, files) as health:
+        tls = authority.caller("anybody")
+        for _ in range(50):  # until the first word has come
+            serving, said = is_serving(health.target, tls=tls)
+            if serving:
+                break
+        assert serving, said
+        assert not is_serving(health.target)[0], "answered without TLS"
+        credentials = grpc.ssl_channel_credentials(files.ca.read_bytes())
+        with grpc.secure_channel(health.target, credentials) as channel:
+            reply = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=5)
+        assert reply.status == health_pb2.HealthCheckResponse.SERVING
