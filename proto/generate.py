@@ -18,10 +18,11 @@ INIT = '"""Generated from proto/ by proto/generate.py; do not edit."""\n'
 def generate(target: Path) -> list[Path]:
     """Write the stubs below `target` and return them.
 
-    protoc imports by the .proto file's own path, which would claim the top-level name `lightpage`; imports are
+    protoc imports by the .proto file's own path, which would claim top-level names such as `lightpage`; imports are
     rewritten to the package that the stubs live in.
     """
-    sources = sorted(PROTO.glob("lightpage/**/*.proto"))
+    sources = sorted(PROTO.glob("*/**/*.proto"))
+    folders = "|".join(sorted({source.relative_to(PROTO).parts[0] for source in sources}))
     target.mkdir(parents=True, exist_ok=True)
     well_known = Path(grpc_tools.__file__).parent / "_proto"
     outputs = [f"--{kind}_out={target}" for kind in ("python", "pyi", "grpc_python")]
@@ -40,7 +41,7 @@ def generate(target: Path) -> list[Path]:
             if suffix == "_pb2_grpc.py" and not serves:
                 path.unlink()
                 continue
-            text = re.sub(r"^from lightpage\.", f"from {PACKAGE}.lightpage.", path.read_text("utf-8"), flags=re.M)
+            text = re.sub(rf"^from ({folders})\b", rf"from {PACKAGE}.\1", path.read_text("utf-8"), flags=re.M)
             path.write_text("# mypy: ignore-errors\n" + text, "utf-8")
             written.append(path)
     return sorted(set(written))

@@ -78,6 +78,10 @@ class OtherModelError(BusyError):
     """Another model is in service than the caller expected; nothing was changed. `got` is its version."""
 
 
+class NoSuchModelError(BundleError):
+    """The service has no such model, or none of this version."""
+
+
 class ModelExistsError(BundleError):
     """The service has a model of this version already."""
 

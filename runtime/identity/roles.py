@@ -33,6 +33,9 @@ ROLE_URI = "urn:lightpage:role:"
 NEEDED: Mapping[str, Role] = {
     **dict.fromkeys(["Describe", "ListModels", "ListJobs", "GetJob", "WatchJob"], Role.READ),
     **dict.fromkeys(["DecodeFrames", "DecodePages", "ReadPage", "ReadPages", "ReadData"], Role.DECODE),
+    **dict.fromkeys(["inference/ServerLive", "inference/ServerReady", "inference/ModelReady"], Role.READ),
+    **dict.fromkeys(["inference/ServerMetadata", "inference/ModelMetadata"], Role.READ),
+    "inference/ModelInfer": Role.DECODE,
     **dict.fromkeys(["UploadPages", "WatchDisplay", "ReportDisplay"], Role.DECODE),
     **dict.fromkeys(["Recalibrate", "StartRecalibration", "RecalibrateFrames", "CancelJob"], Role.RECALIBRATE),
     **dict.fromkeys(["UploadModel", "ActivateModel", "PinModel", "Rollback", "RollForward"], Role.ADMIN),

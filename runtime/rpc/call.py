@@ -2,7 +2,8 @@
 
 A handler is a method named as the RPC, of one of the classes in this package. It takes the request, or an asynchronous
 iterator of requests, and the `Call`; it returns the reply, or is a generator of replies. A plain `def` runs in a thread
-and may block; an `async def` runs on the server's loop and must not.
+and may block; an `async def` runs on the server's loop and must not. A handler of a call in `LATER` takes, in place of
+the request, what reads it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from functools import partial
 from typing import Any, TypeVar
 
 import grpc
+from google.protobuf.descriptor import ServiceDescriptor
 from google.protobuf.message import DecodeError, Message
+from google.protobuf.message_factory import GetMessageClass
 
 from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError
 from runtime.identity.roles import LOCAL, NEEDED, Identity, Role, identity_of
@@ -37,6 +40,9 @@ ENDLESS = frozenset(["WatchDisplay", "WatchJob"])
 
 UPLOADS = frozenset(["UploadPages", "RecalibrateFrames", "UploadModel"])
 """Calls that change something once their callers have closed their streams."""
+
+LATER = frozenset(["inference/ModelInfer"])
+"""Calls whose one message is so large that it is not read before there is time for what it asks."""
 
 _EARLY_S = 0.05
 """A caller whose call ends so long before its deadline has run out of time too: its clock is its own."""
@@ -96,18 +102,37 @@ class Call:
         return await asyncio.wrap_future(future)
 
 
+@dataclass(frozen=True)
+class Served:
+    """A service that is served.
+
+    Attributes:
+        descriptor: of it.
+        handlers: objects whose methods answer; of two with the same method the first counts.
+        prefix: of its methods' names in metrics and logs.
+    """
+
+    descriptor: ServiceDescriptor
+    handlers: Sequence[object]
+    prefix: str = ""
+
+    def handler(self, method: str) -> Callable[..., Any] | None:
+        """What answers a method."""
+        return next((found for one in self.handlers if (found := getattr(one, method, None))), None)
+
+
 class Dispatcher:
     """Hands calls to their handlers. Lives on one event loop.
 
     Args:
-        handlers: objects whose methods answer; of two with the same method the first counts.
+        services: that are served.
         pool: threads for handlers that block, as many as there may be calls.
         limits: of the service.
         metrics: what is counted.
     """
 
-    def __init__(self, handlers: Sequence[object], pool: Executor, limits: Limits, metrics: ServiceMetrics) -> None:
-        self._handlers, self._pool, self._limits = tuple(handlers), pool, limits
+    def __init__(self, services: Sequence[Served], pool: Executor, limits: Limits, metrics: ServiceMetrics) -> None:
+        self._services, self._pool, self._limits = tuple(services), pool, limits
         self._metrics, self._log = metrics, CallLog()
         self._active: set[asyncio.Task[Any]] = set()
         self._watching: set[asyncio.Task[Any]] = set()
@@ -116,28 +141,28 @@ class Dispatcher:
         self._refuses = False
         self._longest_s = {"ReadData": limits.range_s, "ReadPages": limits.range_s}
 
-    def rpc_handler(self) -> grpc.GenericRpcHandler[Any, Any]:
-        """All RPCs of the service that have a handler, for the server.
+    def rpc_handlers(self) -> tuple[grpc.GenericRpcHandler[Any, Any], ...]:
+        """All RPCs of the services that have a handler, for the server.
 
         Messages come as bytes: the library answers those that it cannot parse with INTERNAL and a traceback, and keeps
-        20 kB of each.
+        20 kB of each. They come as streams, even where there is but one: the library would read it before anybody could
+        refuse the call.
         """
+        return tuple(map(self._rpc_handler, self._services))
+
+    def _rpc_handler(self, service: Served) -> grpc.GenericRpcHandler[Any, Any]:
         methods = {}
-        for method in SERVICE.methods:
-            handler = next((found for one in self._handlers if (found := getattr(one, method.name, None))), None)
-            if handler is None:
+        for method in service.descriptor.methods:
+            if (handler := service.handler(method.name)) is None:
                 continue
-            parse = getattr(pb, method.input_type.name).FromString
-            made = {
-                (False, False): (grpc.unary_unary_rpc_method_handler, self._unary),
-                (True, False): (grpc.stream_unary_rpc_method_handler, self._unary),
-                (False, True): (grpc.unary_stream_rpc_method_handler, self._stream),
-                (True, True): (grpc.stream_stream_rpc_method_handler, self._stream),
-            }
-            make, serve = made[method.client_streaming, method.server_streaming]
-            serving = partial(serve, method.name, handler, parse, method.client_streaming)
-            methods[method.name] = make(serving, None, getattr(pb, method.output_type.name).SerializeToString)
-        return grpc.method_handlers_generic_handler(SERVICE.full_name, methods)
+            make, serve = {
+                False: (grpc.stream_unary_rpc_method_handler, self._unary),
+                True: (grpc.stream_stream_rpc_method_handler, self._stream),
+            }[method.server_streaming]
+            name, parse = f"{service.prefix}{method.name}", GetMessageClass(method.input_type).FromString
+            serving = partial(serve, name, handler, parse, method.client_streaming)
+            methods[method.name] = make(serving, None, GetMessageClass(method.output_type).SerializeToString)
+        return grpc.method_handlers_generic_handler(service.descriptor.full_name, methods)
 
     def refuse(self) -> None:
         """Take no more calls: the service stops."""
@@ -166,7 +191,7 @@ class Dispatcher:
         self, name: str, handler: Callable[..., Any], parse: Callable[[bytes], Any], many: bool, data: Any, context: Any
     ) -> Any:
         async with self._call(name, context) as call:
-            request = self._messages(data, parse, call) if many else _parsed(parse, data, call)
+            request = self._messages(data, parse, call) if many else await self._one(data, parse, call)
             if inspect.iscoroutinefunction(handler):
                 return await handler(request, call)
             return await asyncio.wrap_future(self._pool.submit(handler, request, call))
@@ -175,7 +200,7 @@ class Dispatcher:
         self, name: str, handler: Callable[..., Any], parse: Callable[[bytes], Any], many: bool, data: Any, context: Any
     ) -> AsyncIterator[Any]:
         async with self._call(name, context) as call:
-            request = self._messages(data, parse, call) if many else _parsed(parse, data, call)
+            request = self._messages(data, parse, call) if many else await self._one(data, parse, call)
             if inspect.isasyncgenfunction(handler):
                 replies: AsyncGenerator[Any, None] = handler(request, call)
             else:
@@ -206,22 +231,25 @@ class Dispatcher:
             if step is not None:
                 step.add_done_callback(lambda _: replies.close())  # one that is at work cannot be closed
 
+    async def _one(self, data: AsyncIterator[bytes], parse: Callable[[bytes], Any], call: Call) -> Any:
+        """The one message of a call, or what reads it."""
+
+        async def receive() -> Any:
+            try:
+                return _parsed(parse, await anext(data), call)
+            except StopAsyncIteration:
+                raise MalformedError(f"message of {call.method}", "none", "one") from None
+
+        return receive if call.method in LATER else await receive()
+
     async def _messages(
         self, data: AsyncIterator[bytes], parse: Callable[[bytes], Any], call: Call
     ) -> AsyncIterator[Any]:
-        """The messages of a stream; the sender may pause between two of them for a limited time."""
-        while True:
-            try:
-                async with asyncio.timeout(self._limits.stall_s):
-                    message = await anext(data)
-            except StopAsyncIteration:
-                if call.method in UPLOADS:  # the library ends the stream of one who has gone too, and then cancels it
-                    await asyncio.sleep(_GONE_S)
-                return
-            except TimeoutError:
-                expected = f"the next message within {self._limits.stall_s:g} s"
-                raise StalledError(f"stream of {call.method}", "nothing", expected) from None
+        """The messages of a stream."""
+        async for message in data:
             yield _parsed(parse, message, call)
+        if call.method in UPLOADS:  # the library ends the stream of one who has gone too, and then cancels it
+            await asyncio.sleep(_GONE_S)
 
     @asynccontextmanager
     async def _call(self, name: str, context: Any) -> AsyncIterator[Call]:

@@ -138,9 +138,7 @@ class FrameCalls:
     ) -> _Received:
         """Take in the chunks of a pair, as soon as its header is known to be right and there will be time for it."""
         start = time.perf_counter()
-        check_options(header.options)
-        check_black(header)
-        self._pilots(header)
+        self.check(header)
         shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
         receiver = self._plane.receiver(shape, dtype, header.bit_depth, _caller(header, call))
         try:
@@ -177,6 +175,44 @@ class FrameCalls:
         except Exception as error:
             return _refusal(error, received.header)
 
+    def check(self, header: pb.DecodeHeader) -> None:
+        """Check what a header asks for.
+
+        Raises:
+            InvalidInputError: what is not to be had of any page.
+        """
+        check_options(header.options)
+        check_black(header)
+        self._pilots(header)
+
+    def decode(
+        self, pair: FramePair, header: pb.DecodeHeader, call: Call, start: float, received: float, version: str = ""
+    ) -> pb.DecodeReply:
+        """Decode a pair that has come, whose header was checked; raises as `DataPlane.decode`.
+
+        Args:
+            pair: its frames.
+            header: of it.
+            call: that it came with.
+            start, received: when its first and its last byte came, `time.perf_counter` seconds.
+            version: of the model that must be in service; empty for any.
+        """
+        options = header.options
+        answer = self._plane.decode(
+            _without_black(pair, header),
+            options.levels or None,
+            _caller(header, call),
+            self._pilots(header),
+            user_data=options.want_user_data,
+            start=start,
+            received=received,
+            version=version,
+        )
+        reply = decode_reply(answer, options)
+        reply.frame_id, reply.captured_s = header.frame_id, header.captured_s
+        reply.correlation_id = header.correlation_id
+        return reply
+
     def _pilots(self, header: pb.DecodeHeader) -> Pilots | None:
         """The caller's own pilots."""
         options, decoder = header.options, self._plane.registry.current.decoder
@@ -187,21 +223,11 @@ class FrameCalls:
 
     def _decode(self, received: _Received, call: Call) -> pb.DecodeReply:
         """Decode a pair that was received, and let go of it."""
-        header, options = received.header, received.header.options
         try:
-            caller = _caller(header, call)
-            levels, user_data = options.levels or None, options.want_user_data
-            pilots = self._pilots(header)
-            pair = _without_black(received.receiver.pair(), header)
-            answer = self._plane.decode(
-                pair, levels, caller, pilots, user_data=user_data, start=received.start, received=received.received
-            )
+            pair = received.receiver.pair()
+            return self.decode(pair, received.header, call, received.start, received.received)
         finally:
             received.receiver.close()
-        reply = decode_reply(answer, options)
-        reply.frame_id, reply.captured_s = header.frame_id, header.captured_s
-        reply.correlation_id = header.correlation_id
-        return reply
 
 
 async def _refused(error: Exception, header: pb.DecodeHeader) -> pb.DecodePagesReply:

@@ -16,9 +16,11 @@ from grpc_reflection.v1alpha import reflection
 
 from lightpage.errors import InvalidInputError
 from runtime.identity.certificates import Certificates
-from runtime.rpc.call import SERVICE, Dispatcher
+from runtime.rpc.call import SERVICE, Dispatcher, Served
 from runtime.rpc.handlers import handlers
 from runtime.rpc.health_servicer import HealthServicer
+from runtime.rpc.inference_calls import INFERENCE, PREFIX, InferenceCalls, UnknownCalls, large_messages
+from runtime.rpc.message_gate import MessageGate
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.store_health import StoreHealth
@@ -53,6 +55,7 @@ class LightpageServer:
         address: HOST:PORT; port 0 takes a free one.
         more: further handlers.
         certificates: with which it meets its callers, who must have some too; None for no TLS.
+        inference: whether the Open Inference Protocol is served too.
     """
 
     def __init__(
@@ -62,14 +65,18 @@ class LightpageServer:
         address: str = "127.0.0.1:0",
         more: Sequence[object] = (),
         certificates: Certificates | None = None,
+        inference: bool = True,
     ) -> None:
         self._plane, self._recalibrator, self._address = plane, recalibrator, address
         self._credentials = None if certificates is None else certificates.server_credentials()
-        self._handlers = (*more, *handlers(plane, recalibrator))
+        self._services = [Served(SERVICE, (*more, *handlers(plane, recalibrator)))]
+        if inference:
+            self._services.append(Served(INFERENCE, (InferenceCalls(plane),), PREFIX))
+        self._inference = inference
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, name="lightpage-rpc", daemon=True)
         self._pool = ThreadPoolExecutor(plane.limits.concurrent_calls, thread_name_prefix="lightpage-call")
-        self._names = ("", SERVICE.full_name)
+        self._names = ("", *(service.descriptor.full_name for service in self._services))
         self._store = StoreHealth(plane.store_trouble)
         self._serving = self._stopping = self._started = False
         self.port = 0
@@ -132,21 +139,25 @@ class LightpageServer:
         self.stop()
 
     async def _open(self) -> None:
-        limits = self._plane.limits
+        limits, metrics = self._plane.limits, self._plane.metrics
+        gate = MessageGate(limits, large_messages(self._plane) if self._inference else {})
         self._server = grpc.aio.server(
+            interceptors=(gate,),
             options=(
-                ("grpc.max_receive_message_length", limits.message_bytes),
+                ("grpc.max_receive_message_length", gate.largest),
                 ("grpc.max_send_message_length", limits.reply_bytes),
                 ("grpc.so_reuseport", 0),  # a second server on the port is a mistake, not a helper
                 ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
-            )
+            ),
         )
-        self._dispatcher = Dispatcher(self._handlers, self._pool, limits, self._plane.metrics)
-        self._server.add_generic_rpc_handlers((self._dispatcher.rpc_handler(),))
+        self._dispatcher = Dispatcher(self._services, self._pool, limits, metrics)
+        self._server.add_generic_rpc_handlers(self._dispatcher.rpc_handlers())
+        if self._inference:
+            self._server.add_generic_rpc_handlers((UnknownCalls(metrics),))
         self._health = HealthServicer()
         await self._say(False)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        names = (SERVICE.full_name, health.SERVICE_NAME, reflection.SERVICE_NAME)
+        names = (*self._names[1:], health.SERVICE_NAME, reflection.SERVICE_NAME)
         reflection.enable_server_reflection(names, self._server)
         self.port = add_port(self._server, self._address, self._credentials)
         await self._server.start()

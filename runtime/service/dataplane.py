@@ -198,6 +198,7 @@ class DataPlane:
         user_data: bool = False,
         start: float | None = None,
         received: float | None = None,
+        version: str = "",
     ) -> Answer:
         """Decode a pair with the model in service.
 
@@ -209,10 +210,12 @@ class DataPlane:
             start: when the call began, in `time.perf_counter` seconds.
             received: when the pair was complete, likewise.
             user_data: whether to read the page's bytes too.
+            version: of the model that must be in service; empty for any.
 
         Raises:
             BundleError: user bytes are asked for, and the model has no code.
             InvalidInputError: they are, and `levels` are not the code's.
+            OtherModelError: another model is in service.
             SlotsTakenError: no slot until the caller's time is up.
             CallerLeft: the caller has gone.
             UnconfirmedPageError, FrameError, PageError: see `Tracker.decode`.
@@ -223,7 +226,7 @@ class DataPlane:
         with self.decodes.held(caller):
             began = time.perf_counter()
             # Taken once: a swap in the meantime changes the next request, not this one.
-            model = self.registry.current
+            model = self.registry.expect(version)
             sure = pilots is None
             levels = levels_for(model.decoder, levels, self.default_levels, user_data)
             if user_data:

@@ -154,6 +154,17 @@ class ModelRegistry:
         with self._lock:
             return self._loaded[self._history.current.version]
 
+    def expect(self, version: str) -> Model:
+        """The model in service, which must be of this version; empty stands for any.
+
+        Raises:
+            OtherModelError: it is of another one.
+        """
+        current = self.current
+        if version and current.version != version:
+            raise OtherModelError("model in service", current.version, version)
+        return current
+
     @property
     def history(self) -> History:
         """Models in the order in which they came into service."""
@@ -207,7 +218,7 @@ class ModelRegistry:
             OtherModelError: another version is in service.
         """
         with self._changing:
-            before = self._expect(expected)
+            before = self.expect(expected)
             history = self.history.stepped(by)
             model = self._model(history.current)
             self._change(model, history, note)
@@ -232,7 +243,7 @@ class ModelRegistry:
             OtherModelError: another version is in service.
         """
         with self._changing:
-            before = self._expect(expected)
+            before = self.expect(expected)
             if place.version == before.version:
                 return before, before
             model = self._model(place)
@@ -281,13 +292,6 @@ class ModelRegistry:
             BundleError: it is for another device, or cannot be tracked.
         """
         self._tracked(decoder)
-
-    def _expect(self, version: str) -> Model:
-        """The model in service, if it is of this version."""
-        current = self.current
-        if version and current.version != version:
-            raise OtherModelError("model in service", current.version, version)
-        return current
 
     def _model(self, place: Place) -> Model:
         """A model, loaded if it is not."""

@@ -28,6 +28,7 @@ from runtime.errors import OverloadedError, SlotsTakenError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import SERVICE, Call
 from runtime.rpc.health_server import HealthServer
+from runtime.rpc.inference_calls import INFERENCE
 from runtime.service.caller import Caller
 from runtime.service.limits import Limits
 from runtime.service.slots import Slots
@@ -565,7 +566,7 @@ def test_the_health_of_all_services_is_told_by_both_servers(start: Start) -> Non
                     answer = ask.List(health_pb2.HealthListRequest(), timeout=5)
                     return {name: one.status for name, one in answer.statuses.items()}
 
-                names = ("", SERVICE.full_name, "lightpage.store")
+                names = ("", SERVICE.full_name, INFERENCE.full_name, "lightpage.store")
                 wanted = dict.fromkeys(names, health_pb2.HealthCheckResponse.SERVING)
                 assert wait_until(lambda states=states, wanted=wanted: states() == wanted)
                 for name in names:
@@ -581,7 +582,7 @@ def test_the_service_describes_its_contract_to_strangers(start: Start) -> None:
         ask = [reflection_pb2.ServerReflectionRequest(list_services="")]
         (answer,) = stub.ServerReflectionInfo(iter(ask), timeout=10)
         names = {one.name for one in answer.list_services_response.service}
-    assert {SERVICE.full_name, "grpc.health.v1.Health"} <= names
+    assert {SERVICE.full_name, INFERENCE.full_name, "grpc.health.v1.Health"} <= names
 
 
 def test_nothing_of_the_contract_of_0_1_was_renumbered_or_renamed() -> None:
