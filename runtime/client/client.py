@@ -35,6 +35,7 @@ from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.wire.address import check_address
 from runtime.wire.channel import open_channel
+from runtime.wire.frame_parts import FramePart, chunks_of, serialized_part
 from runtime.wire.messages import PIXEL_CODES, PIXEL_TYPES, KnownPilots, message_of, pilots_message, set_fields
 from runtime.wire.page_options import PageOptions, options_message
 from runtime.wire.pages import RemotePage, remote_page
@@ -81,6 +82,14 @@ class LightpageClient:
         self.target, self._timeout = target, timeout_s
         self._channel = open_channel(target, tls)
         self._stub = pb_grpc.LightpageStub(self._channel)  # type: ignore[no-untyped-call]
+        # Not the stub's: their chunks are no messages.
+        method = f"/{pb.DESCRIPTOR.services_by_name['Lightpage'].full_name}/"
+        self._decode_frames = self._channel.stream_unary(
+            f"{method}DecodeFrames", serialized_part, pb.DecodeReply.FromString
+        )
+        self._decode_pages = self._channel.stream_stream(
+            f"{method}DecodePages", serialized_part, pb.DecodePagesReply.FromString
+        )
         self._description: Description | None = None
 
     def __enter__(self) -> Self:
@@ -154,7 +163,7 @@ class LightpageClient:
         """
         header = self._header(pair, levels, bit_depth, black_level, pilots, correlation_id, options)
         set_fields(header, frame_id=frame_id, captured_s=captured_s)
-        reply: pb.DecodeReply = self._unary(self._stub.DecodeFrames, _parts(header, _sent_frames(pair)))
+        reply: pb.DecodeReply = self._unary(self._decode_frames, _parts(header, _sent_frames(pair)))
         return remote_page(reply)
 
     def decode_pages(
@@ -185,7 +194,7 @@ class LightpageClient:
         failed: list[Exception] = []
         bit_depth = self._bit_depth() if bit_depth is None else bit_depth
 
-        def parts() -> Iterator[pb.DecodeFramesRequest]:
+        def parts() -> Iterator[FramePart]:
             try:
                 for number, pair in enumerate(pairs):
                     header = self._header(pair, levels, bit_depth, black_level, pilots, correlation_id, options)
@@ -194,7 +203,7 @@ class LightpageClient:
             except Exception as error:  # gRPC would tell of it on stderr, and end the call with UNKNOWN
                 failed.append(error)
 
-        call = self._stub.DecodePages(parts(), timeout=timeout_s)
+        call: Any = self._decode_pages(parts(), timeout=timeout_s)
         try:
             for reply in call:
                 refused = reply.WhichOneof("outcome") == "refused"
@@ -505,11 +514,11 @@ class LightpageClient:
 
         def parts() -> Iterator[pb.RecalibrateFramesRequest]:
             yield pb.RecalibrateFramesRequest(header=header)
-            for chunk in _chunks(first):
+            for chunk in map(bytes, chunks_of(first)):
                 yield pb.RecalibrateFramesRequest(reference=chunk)
             for frames, page in pages:
                 yield pb.RecalibrateFramesRequest(symbols=page)
-                for chunk in _chunks(frames):
+                for chunk in map(bytes, chunks_of(frames)):
                     yield pb.RecalibrateFramesRequest(chunk=chunk)
 
         return job_info(self._unary(self._stub.RecalibrateFrames, parts(), timeout_s))
@@ -699,17 +708,9 @@ def _pages_of(count: int, pages: Sequence[int], recording: str | None) -> dict[s
     return {"source": message_of(pb.SourcePages, count=count, pages=pages)}
 
 
-def _parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> Iterator[pb.DecodeFramesRequest]:
+def _parts(header: pb.DecodeHeader, frames: Sequence[NDArray[np.integer]]) -> Iterator[FramePart]:
     yield pb.DecodeFramesRequest(header=header)
-    for chunk in _chunks(frames):
-        yield pb.DecodeFramesRequest(chunk=chunk)
-
-
-def _chunks(frames: Sequence[NDArray[np.integer]]) -> Iterator[bytes]:
-    for frame in frames:
-        data = np.ascontiguousarray(frame, frame.dtype.newbyteorder("<")).view(np.uint8).reshape(-1)
-        for start in range(0, data.size, CHUNK_BYTES):
-            yield data[start : start + CHUNK_BYTES].tobytes()
+    yield from chunks_of(frames)
 
 
 def _sent_frames(pair: FramePair, subject: str = "") -> list[NDArray[np.integer]]:

@@ -31,6 +31,7 @@ from runtime.rpc.call_log import CallLog
 from runtime.service.caller import Actor, Caller
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
+from runtime.wire.frame_parts import parsed_part
 from runtime.wire.status import status_of, told, trailers
 
 SERVICE = pb.DESCRIPTOR.services_by_name["Lightpage"]
@@ -159,7 +160,8 @@ class Dispatcher:
                 False: (grpc.stream_unary_rpc_method_handler, self._unary),
                 True: (grpc.stream_stream_rpc_method_handler, self._stream),
             }[method.server_streaming]
-            name, parse = f"{service.prefix}{method.name}", GetMessageClass(method.input_type).FromString
+            name, message = f"{service.prefix}{method.name}", GetMessageClass(method.input_type)
+            parse = parsed_part if message is pb.DecodeFramesRequest else message.FromString
             serving = partial(serve, name, handler, parse, method.client_streaming)
             methods[method.name] = make(serving, None, GetMessageClass(method.output_type).SerializeToString)
         return grpc.method_handlers_generic_handler(service.descriptor.full_name, methods)

@@ -23,6 +23,7 @@ from runtime.rpc.replies import decode_reply
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane, levels_for
 from runtime.service.receiver import PairReceiver
+from runtime.wire.frame_parts import FramePart
 from runtime.wire.messages import pixel_type
 from runtime.wire.requests import check_options, pilots_of
 from runtime.wire.status import refusal_of
@@ -50,16 +51,16 @@ class _Received:
 class _Counted:
     """Messages of a stream, and the bytes of frames that they brought."""
 
-    def __init__(self, requests: AsyncIterator[pb.DecodeFramesRequest]) -> None:
+    def __init__(self, requests: AsyncIterator[FramePart]) -> None:
         self._requests, self.bytes = requests, 0
 
     def __aiter__(self) -> _Counted:
         return self
 
-    async def __anext__(self) -> pb.DecodeFramesRequest:
-        message = await anext(self._requests)
-        self.bytes += len(message.chunk)
-        return message
+    async def __anext__(self) -> FramePart:
+        part = await anext(self._requests)
+        self.bytes += part.nbytes if isinstance(part, memoryview) else 0
+        return part
 
 
 class FrameCalls:
@@ -72,7 +73,7 @@ class FrameCalls:
     def __init__(self, plane: DataPlane) -> None:
         self._plane = plane
 
-    async def DecodeFrames(self, requests: AsyncIterator[pb.DecodeFramesRequest], call: Call) -> pb.DecodeReply:
+    async def DecodeFrames(self, requests: AsyncIterator[FramePart], call: Call) -> pb.DecodeReply:
         """Receive a frame pair and decode it."""
         header = _header(await anext(requests, None), call)
         received = await self._receive(header, requests, call)
@@ -85,9 +86,7 @@ class FrameCalls:
             raise
         return await call.in_thread(partial(self._decode, received, call), received.receiver.close)
 
-    async def DecodePages(
-        self, requests: AsyncIterator[pb.DecodeFramesRequest], call: Call
-    ) -> AsyncIterator[pb.DecodePagesReply]:
+    async def DecodePages(self, requests: AsyncIterator[FramePart], call: Call) -> AsyncIterator[pb.DecodePagesReply]:
         """Receive frame pairs, one after another, and decode each while the next one comes."""
         pending: asyncio.Queue[asyncio.Future[pb.DecodePagesReply] | None] = asyncio.Queue()
         room = asyncio.Semaphore(_ON_THEIR_WAY)
@@ -111,7 +110,7 @@ class FrameCalls:
             receiving.cancel()
 
     async def _begin(
-        self, header: pb.DecodeHeader, requests: AsyncIterator[pb.DecodeFramesRequest], call: Call
+        self, header: pb.DecodeHeader, requests: AsyncIterator[FramePart], call: Call
     ) -> Awaitable[pb.DecodePagesReply]:
         """Receive a pair of many, and begin to decode it. One that is refused is read to its end: others follow."""
         counted = _Counted(requests)
@@ -133,9 +132,7 @@ class FrameCalls:
             while requests.bytes < size and (part := await anext(requests, None)) is not None:
                 self._chunk(part)
 
-    async def _receive(
-        self, header: pb.DecodeHeader, requests: AsyncIterator[pb.DecodeFramesRequest], call: Call
-    ) -> _Received:
+    async def _receive(self, header: pb.DecodeHeader, requests: AsyncIterator[FramePart], call: Call) -> _Received:
         """Take in the chunks of a pair, as soon as its header is known to be right and there will be time for it."""
         start = time.perf_counter()
         self.check(header)
@@ -160,14 +157,14 @@ class FrameCalls:
         except TimeoutError:
             raise StalledError("frame pair", f"not all of it within {limit_s:g} s", "faster frames") from None
 
-    def _chunk(self, part: pb.DecodeFramesRequest) -> bytes:
-        if part.WhichOneof("part") != "chunk":
+    def _chunk(self, part: FramePart) -> memoryview:
+        if not isinstance(part, memoryview):
             got = "a second header" if part.HasField("header") else "an empty message"
             raise MalformedError("message of a frame pair", got, "chunks from there on")
-        chunk, limit = part.chunk, self._plane.limits.chunk_bytes
-        if len(chunk) > limit:
-            raise LimitError("chunk", f"{len(chunk)} bytes", f"at most {limit}")
-        return chunk
+        limit = self._plane.limits.chunk_bytes
+        if part.nbytes > limit:
+            raise LimitError("chunk", f"{part.nbytes} bytes", f"at most {limit}")
+        return part
 
     def _outcome(self, received: _Received, call: Call) -> pb.DecodePagesReply:
         try:
@@ -240,8 +237,8 @@ def _refusal(error: Exception, header: pb.DecodeHeader) -> pb.DecodePagesReply:
     return pb.DecodePagesReply(refused=refused)
 
 
-def _header(first: pb.DecodeFramesRequest | None, call: Call) -> pb.DecodeHeader:
-    if first is None or first.WhichOneof("part") != "header":
+def _header(first: FramePart | None, call: Call) -> pb.DecodeHeader:
+    if first is None or isinstance(first, memoryview) or first.WhichOneof("part") != "header":
         raise MalformedError(f"first message of {call.method}", "no header", "a header, then chunks")
     call.correlation_id = first.header.correlation_id or call.correlation_id
     return first.header

@@ -83,7 +83,7 @@ class PairReceiver:
         """Whether every pixel has come."""
         return self._filled == self.size
 
-    def add(self, chunk: bytes) -> None:
+    def add(self, chunk: bytes | memoryview) -> None:
         """Take in the next bytes.
 
         Raises:

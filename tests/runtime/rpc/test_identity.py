@@ -10,6 +10,7 @@ from typing import Any
 
 import grpc
 import pytest
+from google.protobuf.message_factory import GetMessageClass
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from lightpage.errors import LightpageError
@@ -18,10 +19,11 @@ from runtime.commands.healthcheck import is_serving
 from runtime.errors import NotAllowedError
 from runtime.identity.certificates import Certificates
 from runtime.identity.roles import NEEDED, Role
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.pb.inference import open_inference_pb2_grpc as oip_grpc
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.call import SERVICE
 from runtime.rpc.health_server import HealthServer
+from runtime.rpc.inference_calls import INFERENCE, PREFIX
 from runtime.rpc.server import LightpageServer
 from runtime.service.audit import AuditLog
 from runtime.wire.channel import open_channel
@@ -48,9 +50,11 @@ def secured(start: Start, authority: Authority) -> Iterator[Running]:
 
 def code_of(channel: grpc.Channel, method: str) -> grpc.StatusCode:
     """How a call with an empty request ends; a stream of answers by its first one."""
-    found = SERVICE.methods_by_name[method]
-    request: Any = getattr(pb, found.input_type.name)()
-    call = getattr(pb_grpc.LightpageStub(channel), method)
+    service, name = (INFERENCE, method.removeprefix(PREFIX)) if method.startswith(PREFIX) else (SERVICE, method)
+    found = service.methods_by_name[name]
+    request: Any = GetMessageClass(found.input_type)()
+    stub: Any = (pb_grpc.LightpageStub if service is SERVICE else oip_grpc.GRPCInferenceServiceStub)(channel)
+    call = getattr(stub, name)
     try:
         answer = call(iter([request]) if found.client_streaming else request, timeout=5)
         if found.server_streaming:
