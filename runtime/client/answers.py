@@ -49,6 +49,7 @@ class ServiceLimits:
         recalibration_pages: of one recalibration.
         model_bytes: of an uploaded bundle.
         range_pages: that are read in one call.
+        shared_bytes: memory that clients may share with it, 0 for none.
     """
 
     message_bytes: int
@@ -60,6 +61,7 @@ class ServiceLimits:
     recalibration_pages: int
     model_bytes: int
     range_pages: int
+    shared_bytes: int
 
 
 def limits_of(message: pb.Limits) -> ServiceLimits:

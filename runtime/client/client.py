@@ -31,6 +31,7 @@ from runtime.client.answers import (
     recalibrated,
     remote_data,
 )
+from runtime.client.shared_memory import SharedMemory
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.wire.address import check_address
@@ -142,6 +143,7 @@ class LightpageClient:
         frame_id: int = 0,
         captured_s: float = 0.0,
         correlation_id: str = "",
+        memory: SharedMemory | None = None,
         **options: Unpack[PageOptions],
     ) -> RemotePage:
         """Send a frame pair and get its symbols.
@@ -154,6 +156,7 @@ class LightpageClient:
             black_level: counts that the cameras add to every pixel.
             pilots: known symbols, where they differ from the device's pilots.
             frame_id, captured_s, correlation_id: the caller's own; the page has them too, and the log the last one.
+            memory: where the pair goes in place of being sent; it may be there already, as `SharedMemory.frames`.
             options: what to get, and whose pages the page is followed with; see `PageOptions`.
 
         Raises:
@@ -163,8 +166,28 @@ class LightpageClient:
         """
         header = self._header(pair, levels, bit_depth, black_level, pilots, correlation_id, options)
         set_fields(header, frame_id=frame_id, captured_s=captured_s)
+        if memory is not None:
+            memory.write(pair)
+            header.shared.region = memory.handle
+            request = pb.DecodeFramesRequest(header=header)
+            return remote_page(self._unary(self._decode_frames, iter([request])))
         reply: pb.DecodeReply = self._unary(self._decode_frames, _parts(header, _sent_frames(pair)))
         return remote_page(reply)
+
+    def share_memory(self, size: int = 0) -> SharedMemory:
+        """Memory that is shared with a service on this machine, for `decode`, to be closed.
+
+        Args:
+            size: bytes; 0 for a pair of the service's camera.
+
+        Raises:
+            InvalidInputError: the service is not at a Unix socket.
+            LightpageError: it shares no memory, or not as much.
+        """
+        if not size:
+            told = self._description or self.describe()
+            size = 2 * int(np.prod(told.frame_shape)) * np.dtype(told.frame_dtype).itemsize
+        return SharedMemory(self.target, size)
 
     def decode_pages(
         self,

@@ -49,8 +49,10 @@ from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry, no_tracker
 from runtime.service.self_calibration import SelfCalibration
 from runtime.service.settings import ADDRESS, OFF, STORE_VARIABLE, Effective, Option, ServiceSettings, service_settings
+from runtime.service.shared_memory import SharedMemory
 from runtime.service.store import ModelStore
 from runtime.wire.address import check_free, is_local
+from runtime.wire.shared_memory import memory_path
 
 _log = logging.getLogger(__name__)
 
@@ -66,6 +68,7 @@ _KEYS = {
     "key": ("tls", "key"),
     "metrics_port": ("metrics", "port"),
     "metrics_host": ("metrics", "host"),
+    "shared_memory": ("service", "shared_memory"),
     "store": ("service", "store"),
     "incoming": ("service", "incoming"),
     "recordings": ("service", "recordings"),
@@ -110,6 +113,9 @@ _KEYS = {
 @click.option("--key", type=click.Path(path_type=Path), help="TLS: its private key, PEM.")
 @click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show metrics and console on this port.")
 @click.option("--metrics-host", show_default="127.0.0.1", help="Where the figures are shown.")
+@click.option(
+    "--shared-memory/--no-shared-memory", default=None, help="Share memory with clients at the service's Unix socket."
+)
 @click.option(
     "--store",
     type=click.Path(file_okay=False, path_type=Path),
@@ -214,6 +220,10 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         stack.enter_context(_shown(console, settings.metrics.port, settings.metrics.host, certificates))
         server = LightpageServer(plane, recalibrator, service.address, certificates=certificates)
         check_free("address", service.address)  # before anything else takes a port
+        if service.shared_memory:
+            limits, path = settings.limits, memory_path(service.address)
+            memory = SharedMemory(path, limits.shared_bytes, limits.shared_regions, limits.stall_s)
+            plane.shared = stack.enter_context(memory)
         if service.health_address != OFF:  # entered first: it says NOT_SERVING until the last call has ended
             address = service.health_address or next_port(service.address)
             plain = settings.tls.plain_health or (is_local(address) and service.health_address is None)

@@ -128,6 +128,8 @@ class FrameCalls:
         size = 2 * header.rows_px * header.columns_px * np.dtype(pixel_type(header.pixel_type)).itemsize
         if size > self._plane.limits.pair_bytes:
             raise error
+        if header.HasField("shared"):  # nothing follows
+            return
         async with self._in_time():
             while requests.bytes < size and (part := await anext(requests, None)) is not None:
                 self._chunk(part)
@@ -139,6 +141,8 @@ class FrameCalls:
         shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
         receiver = self._plane.receiver(shape, dtype, header.bit_depth, _caller(header, call))
         try:
+            if header.HasField("shared"):
+                await call.in_thread(partial(self._take_shared, header.shared, receiver))
             async with self._in_time():
                 while not receiver.complete and (part := await anext(requests, None)) is not None:
                     receiver.add(self._chunk(part))
@@ -146,6 +150,13 @@ class FrameCalls:
         except BaseException:
             receiver.close()
             raise
+
+    def _take_shared(self, where: pb.SharedFrames, receiver: PairReceiver) -> None:
+        """Copy a pair out of shared memory: its client may change it."""
+        if (shared := self._plane.shared) is None:
+            raise InvalidInputError("header.shared", "a region", "pixels: this service shares no memory")
+        with shared.reading(where.region, where.offset, receiver.size) as pixels:
+            receiver.add(pixels)
 
     @asynccontextmanager
     async def _in_time(self) -> AsyncIterator[None]:

@@ -65,6 +65,7 @@ class Describing:
                 recalibration_pages=limits.recalibration_pages,
                 model_bytes=limits.model_bytes,
                 range_pages=limits.range_pages,
+                shared_bytes=0 if plane.shared is None else plane.shared.most_bytes,
             ),
             source=without_folders(plane.source.name) if plane.has_source else "",
             source_levels=plane.source.levels if plane.has_source else 0,

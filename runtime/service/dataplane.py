@@ -32,6 +32,7 @@ from runtime.service.observation import Observer, Seen, observed
 from runtime.service.receiver import PairReceiver, ReceiveBudget
 from runtime.service.registry import Model, ModelRegistry
 from runtime.service.replays import Replays
+from runtime.service.shared_memory import SharedMemory
 from runtime.service.slots import Slots
 from runtime.service.store import ModelStore
 
@@ -104,6 +105,8 @@ class DataPlane:
         if source is not None:
             _check_source(source, registry.current.decoder)
         self.received = ReceiveBudget(self.limits.receive_bytes)
+        self.shared: SharedMemory | None = None
+        """Memory that clients share with the service."""
         self.heart = Heart(self.limits.decode_s)
         self.replays = Replays(self.limits.replay_s, self.limits.replay_bytes)
         self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s)

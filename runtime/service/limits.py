@@ -29,6 +29,12 @@ RECEIVE_S = 30.0
 STALL_S = 5.0
 """A client that sends nothing for so long in the middle of its frames has stalled."""
 
+SHARED_BYTES = 1 << 30
+"""Memory shared with clients, all of it together: a dozen full-size pairs of 16 bits."""
+
+SHARED_REGIONS = 64
+"""Regions of it at once."""
+
 REPLAY_S = 600.0
 """An answer with a request id is kept for so long: a controller that lost its connection has time to come back."""
 
@@ -97,6 +103,8 @@ class Limits(TomlTable):
     concurrent_calls: _Count = CONCURRENT_CALLS
     receive_s: _Seconds = RECEIVE_S
     stall_s: _Seconds = STALL_S
+    shared_bytes: _MemoryBytes = SHARED_BYTES
+    shared_regions: _Count = SHARED_REGIONS
     replay_s: _Seconds = REPLAY_S
     replay_bytes: _MemoryBytes = REPLAY_BYTES
     model_bytes: _MemoryBytes = MODEL_BYTES

@@ -94,6 +94,7 @@ class ServiceTable(SettingsTable):
         insecure: whether addresses that others reach may do without TLS, as in a container whose ports are published
             on its own machine alone.
         health_address: HOST:PORT of health checks; without, the next port of this machine; `off` for none.
+        shared_memory: whether clients at its Unix socket may share memory with it.
         store: folder of recalibrated and uploaded bundles.
         incoming: folder whose bundles are taken into the store.
         recordings: folder whose recordings a caller may name to recalibrate with.
@@ -110,6 +111,7 @@ class ServiceTable(SettingsTable):
     address: str = ADDRESS
     insecure: bool = False
     health_address: str | None = None
+    shared_memory: bool = False
     store: _Path | None = None
     incoming: _Path | None = None
     recordings: _Path | None = None
@@ -313,6 +315,12 @@ class ServiceSettings(TomlTable):
             "service.address",
             OFF,
             "an address: only health_address may be off",
+        )
+        _want(
+            not self.service.shared_memory or self.service.address.startswith("unix:"),
+            "service.shared_memory",
+            True,
+            f"service.address = unix:PATH, since memory is shared on one machine; it is {self.service.address}",
         )
         _want(
             self.service.incoming is None or self.service.store is not None,

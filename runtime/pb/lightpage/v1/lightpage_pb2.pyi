@@ -283,7 +283,7 @@ class PageShape(_message.Message):
     def __init__(self, rows: _Optional[int] = ..., columns: _Optional[int] = ...) -> None: ...
 
 class Limits(_message.Message):
-    __slots__ = ("message_bytes", "chunk_bytes", "pair_bytes", "concurrent_decodes", "replay_s", "replay_bytes", "recalibration_pages", "model_bytes", "range_pages")
+    __slots__ = ("message_bytes", "chunk_bytes", "pair_bytes", "concurrent_decodes", "replay_s", "replay_bytes", "recalibration_pages", "model_bytes", "range_pages", "shared_bytes")
     MESSAGE_BYTES_FIELD_NUMBER: _ClassVar[int]
     CHUNK_BYTES_FIELD_NUMBER: _ClassVar[int]
     PAIR_BYTES_FIELD_NUMBER: _ClassVar[int]
@@ -293,6 +293,7 @@ class Limits(_message.Message):
     RECALIBRATION_PAGES_FIELD_NUMBER: _ClassVar[int]
     MODEL_BYTES_FIELD_NUMBER: _ClassVar[int]
     RANGE_PAGES_FIELD_NUMBER: _ClassVar[int]
+    SHARED_BYTES_FIELD_NUMBER: _ClassVar[int]
     message_bytes: int
     chunk_bytes: int
     pair_bytes: int
@@ -302,7 +303,8 @@ class Limits(_message.Message):
     recalibration_pages: int
     model_bytes: int
     range_pages: int
-    def __init__(self, message_bytes: _Optional[int] = ..., chunk_bytes: _Optional[int] = ..., pair_bytes: _Optional[int] = ..., concurrent_decodes: _Optional[int] = ..., replay_s: _Optional[float] = ..., replay_bytes: _Optional[int] = ..., recalibration_pages: _Optional[int] = ..., model_bytes: _Optional[int] = ..., range_pages: _Optional[int] = ...) -> None: ...
+    shared_bytes: int
+    def __init__(self, message_bytes: _Optional[int] = ..., chunk_bytes: _Optional[int] = ..., pair_bytes: _Optional[int] = ..., concurrent_decodes: _Optional[int] = ..., replay_s: _Optional[float] = ..., replay_bytes: _Optional[int] = ..., recalibration_pages: _Optional[int] = ..., model_bytes: _Optional[int] = ..., range_pages: _Optional[int] = ..., shared_bytes: _Optional[int] = ...) -> None: ...
 
 class DecodeOptions(_message.Message):
     __slots__ = ("levels", "confidence_format", "want_concentration", "want_phase", "want_user_data", "session", "tracking")
@@ -333,7 +335,7 @@ class Pilots(_message.Message):
     def __init__(self, mask: _Optional[bytes] = ..., values: _Optional[bytes] = ..., levels: _Optional[int] = ...) -> None: ...
 
 class DecodeHeader(_message.Message):
-    __slots__ = ("rows_px", "columns_px", "pixel_type", "bit_depth", "options", "pilots", "frame_id", "captured_s", "correlation_id", "black_level")
+    __slots__ = ("rows_px", "columns_px", "pixel_type", "bit_depth", "options", "pilots", "frame_id", "captured_s", "correlation_id", "black_level", "shared")
     ROWS_PX_FIELD_NUMBER: _ClassVar[int]
     COLUMNS_PX_FIELD_NUMBER: _ClassVar[int]
     PIXEL_TYPE_FIELD_NUMBER: _ClassVar[int]
@@ -344,6 +346,7 @@ class DecodeHeader(_message.Message):
     CAPTURED_S_FIELD_NUMBER: _ClassVar[int]
     CORRELATION_ID_FIELD_NUMBER: _ClassVar[int]
     BLACK_LEVEL_FIELD_NUMBER: _ClassVar[int]
+    SHARED_FIELD_NUMBER: _ClassVar[int]
     rows_px: int
     columns_px: int
     pixel_type: PixelType
@@ -354,7 +357,16 @@ class DecodeHeader(_message.Message):
     captured_s: float
     correlation_id: str
     black_level: int
-    def __init__(self, rows_px: _Optional[int] = ..., columns_px: _Optional[int] = ..., pixel_type: _Optional[_Union[PixelType, str]] = ..., bit_depth: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., pilots: _Optional[_Union[Pilots, _Mapping]] = ..., frame_id: _Optional[int] = ..., captured_s: _Optional[float] = ..., correlation_id: _Optional[str] = ..., black_level: _Optional[int] = ...) -> None: ...
+    shared: SharedFrames
+    def __init__(self, rows_px: _Optional[int] = ..., columns_px: _Optional[int] = ..., pixel_type: _Optional[_Union[PixelType, str]] = ..., bit_depth: _Optional[int] = ..., options: _Optional[_Union[DecodeOptions, _Mapping]] = ..., pilots: _Optional[_Union[Pilots, _Mapping]] = ..., frame_id: _Optional[int] = ..., captured_s: _Optional[float] = ..., correlation_id: _Optional[str] = ..., black_level: _Optional[int] = ..., shared: _Optional[_Union[SharedFrames, _Mapping]] = ...) -> None: ...
+
+class SharedFrames(_message.Message):
+    __slots__ = ("region", "offset")
+    REGION_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_FIELD_NUMBER: _ClassVar[int]
+    region: bytes
+    offset: int
+    def __init__(self, region: _Optional[bytes] = ..., offset: _Optional[int] = ...) -> None: ...
 
 class DecodeFramesRequest(_message.Message):
     __slots__ = ("header", "chunk")

@@ -1,0 +1,99 @@
+"""A region of memory that a client shares with a service on the same machine: frames in it need not be sent."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import socket
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.errors import InvalidInputError, LightpageError
+from lightpage.recording.frame_pair import FramePair
+from runtime.wire.shared_memory import GRANTED, HANDLE_BYTES, SIZE, WHY_BYTES, memory_path
+
+_ANSWER_S = 10.0
+
+
+class SharedMemory:
+    """A region of a service's memory; use it in a `with` statement, or `close` it. Then the service lets go of it.
+
+    A pair is written to it, or straight from a camera into `frames`, and decoded by `LightpageClient.decode`. While a
+    call with it is on its way, its contents must stay.
+
+    Args:
+        target: ``unix:PATH`` of the service.
+        size: bytes.
+
+    Raises:
+        InvalidInputError: no Unix socket.
+        LightpageError: the service offers no memory, or not as much.
+    """
+
+    def __init__(self, target: str, size: int) -> None:
+        if not target.startswith("unix:"):
+            raise InvalidInputError("target of shared memory", target, "unix:PATH: memory is shared on one machine")
+        subject, expected = f"shared memory of {target}", "a service that was started with --shared-memory"
+        self.size = size
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.settimeout(_ANSWER_S)
+        descriptors: list[int] = []
+        try:
+            self._socket.connect(memory_path(target))
+            self._socket.sendall(SIZE.pack(size))
+            answer, descriptors, _, _ = socket.recv_fds(self._socket, 1 + max(HANDLE_BYTES, WHY_BYTES), 1)
+            if answer[:1] != GRANTED or len(answer) != 1 + HANDLE_BYTES or len(descriptors) != 1:
+                raise LightpageError(subject, answer[1:].decode("utf-8", "replace") or "no answer", "a region")
+            self.handle = answer[1:]
+            self._memory = mmap.mmap(descriptors[0], size)
+        except (OSError, ValueError, OverflowError) as error:
+            self._socket.close()
+            raise LightpageError(subject, error, expected) from None
+        except BaseException:
+            self._socket.close()
+            raise
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+
+    def frames(self, shape: tuple[int, int], dtype: np.dtype[np.integer] | str, offset: int = 0) -> FramePair:
+        """Two frames in the region, to be filled: in-phase at `offset`, quadrature behind it.
+
+        Raises:
+            InvalidInputError: the region is too small.
+        """
+        kind = np.dtype(dtype).newbyteorder("<")
+        count = shape[0] * shape[1]
+        if offset < 0 or offset + 2 * count * kind.itemsize > self.size:
+            expected = f"two frames of {shape[0]}x{shape[1]} {kind.name} within {self.size} bytes"
+            raise InvalidInputError("offset", offset, expected)
+        both: NDArray[np.integer] = np.frombuffer(self._memory, kind, 2 * count, offset)
+        in_phase, quadrature = both.reshape(2, *shape)
+        return FramePair(in_phase, quadrature)
+
+    def write(self, pair: FramePair) -> None:
+        """Write a pair to its begin, unless that is where it lies.
+
+        Raises:
+            InvalidInputError: the region is too small.
+        """
+        in_phase = np.asarray(pair.in_phase)
+        frames = self.frames((in_phase.shape[0], in_phase.shape[1]), in_phase.dtype)
+        for inside, frame in zip((frames.in_phase, frames.quadrature), (in_phase, pair.quadrature), strict=True):
+            if frame.__array_interface__["data"][0] != inside.__array_interface__["data"][0]:
+                inside[...] = frame
+
+    def close(self) -> None:
+        """Have the service let go of it. Frames in it that are still held stay readable."""
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
