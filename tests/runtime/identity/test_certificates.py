@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
 
+from analysis.service.identity import documented
 from lightpage.errors import InvalidInputError
 from runtime.identity.certificates import Certificates
+from runtime.identity.roles import identity_of
 from runtime.wire.tls import TlsFiles
 from tests.runtime.identity.authority import Authority
 
@@ -82,6 +85,17 @@ def test_half_replaced_files_leave_the_earlier_ones(authority: Authority, caplog
     assert "the earlier ones stay" in caplog.text
     os.replace(newer.key, files.key)
     assert certificates.pem() is not before
+
+
+def test_the_commands_for_operators_make_good_certificates(tmp_path: Path) -> None:
+    commands, _ = documented()
+    subprocess.run(["bash", "-c", f"set -e\n{commands}"], cwd=tmp_path, check=True, capture_output=True, timeout=60)
+    roles = {"watcher": {"read"}, "controller": {"decode"}, "keeper": {"decode", "recalibrate"}, "operator": {"admin"}}
+    for name in ("service", *roles):
+        TlsFiles(*(tmp_path / "tls" / file for file in ("ca.pem", f"{name}.pem", f"{name}.key"))).read()
+    for name, expected in roles.items():
+        identity = identity_of((tmp_path / "tls" / f"{name}.pem").read_bytes())
+        assert (identity.name, identity.roles) == (name, expected)
 
 
 def _replace(files: TlsFiles, newer: TlsFiles) -> None:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
+from analysis.service.identity import documented
 from runtime.errors import NotAllowedError
 from runtime.identity.roles import LOCAL, NEEDED, Role, identity_of
 from runtime.rpc.call import SERVICE
 from runtime.rpc.inference_calls import INFERENCE, PREFIX
 from tests.runtime.identity.authority import Authority
-
-OPERATIONS = Path(__file__).parents[3] / "docs" / "operations.md"
 
 
 def test_a_certificate_says_who_and_what(tmp_path: Path) -> None:
@@ -56,7 +54,4 @@ def test_every_call_needs_a_role() -> None:
 
 
 def test_the_page_for_operators_says_the_same() -> None:
-    text = OPERATIONS.read_text("utf-8")
-    rows = re.findall(r"^\| `(read|decode|recalibrate|admin)` \| (.+) \|$", text, re.MULTILINE)
-    told = {call: role for role, calls in rows for call in re.findall(r"`([\w/]+)`", calls)}
-    assert told == NEEDED
+    assert documented()[1] == NEEDED
