@@ -3,9 +3,9 @@
     python -m analysis.service.identity --json FILE
 
 The certificates are made by the very commands of docs/operations.md, and the table of roles is read from there. A
-service in a process of its own is called over TLS; each call's request is empty. A caller without a good certificate must
-find no connection (UNAVAILABLE), and one whose role is lacking must hear PERMISSION_DENIED. Any other end means that a
-call was let in.
+service in a process of its own is called over TLS; each call's request is empty. A caller without a good certificate
+must find no connection (UNAVAILABLE), and one whose role is lacking must hear PERMISSION_DENIED. Any other end means
+that a call was let in.
 """
 
 from __future__ import annotations
