@@ -22,8 +22,8 @@ _log = logging.getLogger(__name__)
 LOOK_S = 5.0
 """How often the folder is looked at; a file that has not changed since the last time is whole."""
 
-_Stamp = tuple[int, int, int]
-"""Number, size and time of change of a file."""
+_Stamp = tuple[tuple[int, int, int], tuple[int, int, int] | None]
+"""Number, size and time of change of a bundle, and of its signature where it has one."""
 
 
 class Incoming:
@@ -108,7 +108,12 @@ class Incoming:
 
 
 def _stamp(path: Path) -> _Stamp | None:
-    """What changes with a file; None for what is none, or is gone."""
+    """What changes with a bundle or its signature; None for what is no bundle, or is gone."""
+    bundle = _file_stamp(path)
+    return None if bundle is None else (bundle, _file_stamp(signature_path(path)))
+
+
+def _file_stamp(path: Path) -> tuple[int, int, int] | None:
     try:
         found = path.lstat()
     except OSError:

@@ -1,0 +1,117 @@
+"""A service with a bundle key takes signed bundles only, whichever way they come; its own models need no signature."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from lightpage.errors import BundleError
+from runtime.bundle.bundle import Bundle
+from runtime.bundle.signature import BundleKey, signature_path
+from runtime.client.client import LightpageClient
+from runtime.decoding.decoder import Decoder
+from runtime.rpc.server import LightpageServer
+from runtime.service.dataplane import DataPlane
+from runtime.service.incoming import Incoming
+from runtime.service.recalibrator import Recalibrator
+from runtime.service.registry import ModelRegistry
+from runtime.service.store import ModelStore
+from tests.runtime import toy
+from tests.runtime.bundle.test_signature import Signer
+
+
+@dataclass
+class Signed:
+    """A service that wants signatures, and whoever can make them."""
+
+    plane: DataPlane
+    signer: Signer
+    folder: Path
+
+    def bundle(self, version: str, *, signed: bool) -> Path:
+        path = toy.write_toy_bundle(self.folder / f"{version}.zip", version=version)
+        if signed:
+            self.signer.sign(path)
+        return path
+
+
+def begin(folder: Path, signer: Signer) -> DataPlane:
+    base = folder / "base.zip"
+    if not base.exists():
+        toy.write_toy_bundle(base)
+        signer.sign(base)
+    key = BundleKey(signer.path)
+    registry = ModelRegistry(Decoder(Bundle.open(base, key=key), threads=1), key=key)
+    plane = DataPlane(registry, store=ModelStore(folder / "store", registry.current.decoder.bundle))
+    plane.models.resume()
+    return plane
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Signed:
+    signer = Signer(tmp_path)
+    return Signed(begin(tmp_path, signer), signer, tmp_path)
+
+
+def test_an_upload_needs_a_signature(service: Signed) -> None:
+    good, bad = service.bundle("toy-2", signed=True), service.bundle("toy-3", signed=False)
+    server = LightpageServer(service.plane, Recalibrator(service.plane))
+    with server, LightpageClient(server.target, timeout_s=20) as client:
+        with pytest.raises(BundleError, match="new bundle: signature: got none"):
+            client.upload_model(bad)
+        signature_path(bad).write_bytes(service.signer.signature(good))
+        with pytest.raises(BundleError, match="of another bundle or key"):
+            client.upload_model(bad)
+        assert client.upload_model(good).version == "toy-2"
+        assert client.activate_model("toy-2") == ("toy-2", "toy-1")
+    stored = service.folder / "store" / "toy-2.zip"
+    assert signature_path(stored).read_bytes() == signature_path(good).read_bytes()
+    assert not list((service.folder / "store").glob("toy-3*"))
+
+
+def test_incoming_bundles_need_one(service: Signed) -> None:
+    incoming = service.folder / "incoming"
+    incoming.mkdir()
+    for version, signed in (("toy-2", True), ("toy-3", False)):
+        made = service.bundle(version, signed=signed)
+        for path in (made, signature_path(made)):
+            if path.exists():
+                path.rename(incoming / path.name)
+    taking = Incoming(service.plane, incoming)
+    taking.look()
+    taking.look()
+    assert sorted(path.name for path in incoming.iterdir()) == ["toy-3.zip"]
+    assert set(service.plane.models.versions()) == {"toy-1", "toy-2"}
+    service.signer.sign(incoming / "toy-3.zip")
+    taking.look()
+    taking.look()
+    assert not list(incoming.iterdir())
+    assert set(service.plane.models.versions()) == {"toy-1", "toy-2", "toy-3"}
+
+
+def test_a_stored_bundle_that_was_changed_is_refused(service: Signed, tmp_path: Path) -> None:
+    good = service.bundle("toy-2", signed=True)
+    signature = signature_path(good).read_bytes()
+    service.plane.models.take_in(good, signature=signature)
+    stored = tmp_path / "store" / "toy-2.zip"
+    stored.write_bytes(toy.write_toy_bundle(tmp_path / "other.zip", kappa=1.0, version="toy-2").read_bytes())
+    with pytest.raises(BundleError, match="of another bundle or key"):
+        service.plane.models.activate("toy-2")
+
+
+def test_its_own_models_need_none(service: Signed, tmp_path: Path) -> None:
+    own = toy.write_toy_bundle(tmp_path / "store" / "toy-1+r1.zip", version="toy-1+r1")
+    service.plane.adopt(service.plane.registry.current.decoder.of_another(Bundle.open(own)))
+    assert begin(tmp_path, service.signer).registry.current.version == "toy-1+r1"
+
+
+def test_pruning_takes_signatures_along(service: Signed) -> None:
+    store = ModelStore(service.folder / "store", service.plane.registry.current.decoder.bundle, kept=1)
+    for version in ("toy-2", "toy-3"):
+        good = service.bundle(version, signed=True)
+        service.plane.models.take_in(good, signature=signature_path(good).read_bytes())
+    store.note = service.plane.store.note  # type: ignore[union-attr]
+    store.prune(())
+    assert sorted(path.name for path in (service.folder / "store").glob("toy-*")) == ["toy-3.zip", "toy-3.zip.sig"]
