@@ -5,13 +5,18 @@
 #   docker run --read-only --tmpfs /tmp -v bundles:/bundles -v state:/state -p 127.0.0.1:50051:50051 \
 #       -e LIGHTPAGE_SERVICE__INSECURE=true lightpage:runtime
 #
+# The build argument `BASE` names the Debian that it is made from; a release names it with its digest. Python packages are
+# those of packaging/locks, each checked by its SHA-256 (docs/supply-chain.md).
+#
 # Two optional build secrets carry the builder's own package settings in without leaving them in a layer:
 # `pip_conf` (a pip configuration file) and `ca_bundle` (trusted certificates, where the registry needs its own). A build
 # context `packages` takes the place of the empty stage of that name where packages come from a folder.
 
+ARG BASE=debian:bookworm-slim
+
 FROM scratch AS packages
 
-FROM debian:bookworm-slim AS base
+FROM ${BASE} AS base
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3 \
@@ -21,22 +26,27 @@ RUN groupadd --gid 10001 lightpage \
     && useradd --uid 10001 --gid 10001 --home-dir /state --no-create-home --shell /usr/sbin/nologin lightpage \
     && install -d -o 10001 -g 10001 /bundles /state
 
+# /opt/build has Debian's pip and the tools that make wheels; /opt/lightpage gets what is installed, and neither of them.
 FROM base AS build
+ARG SOURCE_DATE_EPOCH
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3-venv \
     && rm -rf /var/lib/apt/lists/* \
-    && python3 -m venv /opt/lightpage
+    && python3 -m venv /opt/build \
+    && python3 -m venv --without-pip /opt/lightpage
 WORKDIR /src
-COPY pyproject.toml constraints.txt LICENSE README.md ./
+COPY packaging packaging
+RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
+    --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
+    --mount=type=bind,from=packages,target=/run/packages \
+    /opt/build/bin/pip install --no-cache-dir --require-hashes --only-binary :all: --requirement packaging/locks/build.txt
+COPY pyproject.toml LICENSE README.md ./
 COPY lightpage lightpage
 COPY train train
 COPY export export
 COPY runtime runtime
 COPY analysis analysis
-RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
-    --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
-    --mount=type=bind,from=packages,target=/run/packages \
-    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu]'
+RUN /opt/build/bin/pip wheel --no-deps --no-build-isolation --no-index --wheel-dir /dist .
 
 FROM base AS service
 # The root file system is read-only in service: no byte code is written, and what must be written goes to /state or /tmp.
@@ -57,16 +67,22 @@ HEALTHCHECK --interval=10s --timeout=5s --start-period=60s --retries=3 \
 ENTRYPOINT ["lightpage", "serve"]
 CMD ["--source", "simulator:bench", "--address", "0.0.0.0:50051"]
 
+FROM build AS build-runtime
+RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
+    --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
+    --mount=type=bind,from=packages,target=/run/packages \
+    packaging/install_locked.sh packaging/locks/runtime.txt /opt/lightpage
+
 FROM service AS runtime
-COPY --from=build /opt/lightpage /opt/lightpage
+COPY --from=build-runtime /opt/lightpage /opt/lightpage
 
 FROM build AS build-camera
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu,camera,screen]'
+    packaging/install_locked.sh packaging/locks/camera.txt /opt/lightpage
 
-FROM runtime AS camera
+FROM service AS camera
 USER 0:0
 RUN apt-get update \
     && apt-get install -y --no-install-recommends libaravis-0.8-0 libxcb1 \
@@ -78,19 +94,16 @@ FROM build AS build-deep
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu,train]'
+    packaging/install_locked.sh packaging/locks/deep.txt /opt/lightpage
 
-FROM runtime AS deep
+FROM service AS deep
 COPY --from=build-deep /opt/lightpage /opt/lightpage
 
-# An environment of its own: onnxruntime-gpu and onnxruntime are one module, and whichever came last would count.
 FROM build AS build-gpu
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    rm -rf /opt/lightpage \
-    && python3 -m venv /opt/lightpage \
-    && /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[gpu]'
+    packaging/install_locked.sh packaging/locks/gpu.txt /opt/lightpage
 
 FROM service AS gpu
 COPY --from=build-gpu /opt/lightpage /opt/lightpage

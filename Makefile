@@ -137,8 +137,9 @@ results: $(STAMP)  ## write docs/results.md from analysis/results: RESULTS_ARGS=
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
 	$(BIN)/python proto/generate.py
 
-image:  ## build the container image (IMAGE_TARGET=runtime, camera, deep or gpu)
-	packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
+image:  ## build the container image (IMAGE_TARGET=runtime, camera, deep or gpu; RELEASE=1 BASE=NAME@sha256:DIGEST; IMAGE_PLATFORM)
+	LIGHTPAGE_RELEASE=$(RELEASE) LIGHTPAGE_BASE=$(BASE) LIGHTPAGE_PLATFORM=$(IMAGE_PLATFORM) \
+	    packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
 
 check-image:  ## start the image that buildah built, and see whether it keeps its promises
 	packaging/check_image.sh $(IMAGE_TAG) $(BUNDLE)

@@ -1,0 +1,259 @@
+"""What is in an image: reads its files from outside, and compares them with an SBOM.
+
+    python3 packaging/inventory.py ROOT                    # as JSON
+    python3 packaging/inventory.py ROOT --against SBOM     # exit status 1, and a line for each difference
+
+ROOT is the image's root folder. No program of the image is run. Standard library only: the check runs where nothing is
+installed.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import Distribution, distributions
+from pathlib import Path
+
+ENVIRONMENT = Path("opt/lightpage")
+"""Of Python, in the image."""
+SHARED_OBJECT = re.compile(r"(.+?)\.so(\.[\w.]+)?")
+PREFIX = "lightpage:"
+"""Of the names of this project's properties in an SBOM."""
+
+
+@dataclass(frozen=True)
+class PythonPackage:
+    """A distribution in the image's environment.
+
+    Args:
+        wheel: file name of the wheel that it was installed from.
+        sha256: of that wheel.
+        record_sha256: of the list of its files, which holds a checksum of each.
+        libraries: shared objects that it brings for others to link with, path in the environment to SHA-256.
+        licence: what its metadata say: an SPDX expression, or free text, or nothing.
+    """
+
+    name: str
+    version: str
+    wheel: str
+    sha256: str
+    record_sha256: str
+    licence: str
+    licence_files: tuple[str, ...] = ()
+    libraries: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class DebianPackage:
+    """An installed package of Debian.
+
+    Args:
+        licences: short names of the machine-readable part of its copyright file.
+    """
+
+    name: str
+    version: str
+    architecture: str
+    section: str
+    licences: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """All of an image. `faults` are files that are not as their package's list says."""
+
+    python: tuple[PythonPackage, ...]
+    debian: tuple[DebianPackage, ...]
+    release: str
+    faults: tuple[str, ...]
+
+
+def normal(name: str) -> str:
+    """A distribution's name as pip compares it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def sha256(path: Path) -> str:
+    """Of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def take(root: Path) -> Inventory:
+    """Read an image's files.
+
+    Raises:
+        FileNotFoundError: it is none of this project's images.
+    """
+    environment = root / ENVIRONMENT
+    [site] = environment.glob("lib/python3*/site-packages")
+    wheels = dict(reversed(line.split("  ")) for line in (environment / "wheels.sha256").read_text().splitlines())
+    packages, faults, owned = [], [], set[Path]()
+    for found in sorted(distributions(path=[str(site)]), key=lambda each: normal(each.name)):
+        listed, wrong = check_files(found, site)
+        owned |= listed
+        faults += [f"{found.name}: {fault}" for fault in wrong]
+        packages.append(python_package(found, site, wheels))
+    for path in sorted(site.rglob("*")):
+        if path.is_file() and path.suffix != ".pyc" and path not in owned:
+            faults.append(f"{path.relative_to(site)}: belongs to no package")
+    os_release = dict(
+        line.split("=", 1) for line in (root / "etc/os-release").read_text().splitlines() if "=" in line
+    )
+    return Inventory(
+        tuple(packages), tuple(debian_packages(root)), os_release.get("VERSION_ID", "").strip('"'), tuple(faults)
+    )
+
+
+def check_files(found: Distribution, site: Path) -> tuple[set[Path], list[str]]:
+    """The files that a distribution lists, and what is wrong with them. Byte code has no checksum and is passed over."""
+    owned, wrong = set[Path](), []
+    for entry in found.files or ():
+        path = Path(site, *entry.parts)
+        owned.add(path)
+        if entry.hash is None:
+            continue
+        if not path.is_file():
+            wrong.append(f"{entry}: is missing")
+            continue
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, entry.hash.mode).digest()
+        if base64.urlsafe_b64encode(digest).rstrip(b"=").decode() != entry.hash.value:
+            wrong.append(f"{entry}: is not the file that was installed")
+    return owned, wrong
+
+
+def python_package(found: Distribution, site: Path, wheels: dict[str, str]) -> PythonPackage:
+    """What there is to say of one distribution."""
+    information = Path(str(found._path))  # type: ignore[attr-defined]  # no public name for its folder
+    name, version = normal(found.name), found.version
+    wheel = next((file for file in wheels if is_wheel_of(file, name, version)), "")
+    libraries = {
+        str(entry): sha256(Path(site, *entry.parts))
+        for entry in sorted(found.files or ())
+        if is_library(entry.name) and Path(site, *entry.parts).is_file()
+    }
+    metadata = found.metadata
+    licence = metadata.get("License-Expression") or metadata.get("License") or ""
+    classifiers = [c.rpartition(" :: ")[2] for c in metadata.get_all("Classifier") or () if c.startswith("License ::")]
+    if len(licence) > 60 or not licence:  # some put the whole text there
+        licence = " AND ".join(classifiers)
+    files = tuple(sorted(metadata.get_all("License-File") or ()))
+    record = sha256(information / "RECORD")
+    return PythonPackage(name, version, wheel, wheels.get(wheel, ""), record, licence.strip(), files, libraries)
+
+
+def is_wheel_of(file: str, name: str, version: str) -> bool:
+    """Whether a wheel's file name says this distribution."""
+    its_name, its_version, *_ = file.split("-")
+    return (normal(its_name), its_version) == (name, version)
+
+
+def is_library(name: str) -> bool:
+    """Whether a file is a shared object for others to link with, not a module of Python."""
+    matched = SHARED_OBJECT.fullmatch(name)
+    return matched is not None and name.startswith("lib") and ".cpython-" not in name and not matched[1].endswith(".abi3")
+
+
+def debian_packages(root: Path) -> Iterator[DebianPackage]:
+    """What dpkg says is installed, by name."""
+    paragraphs = (root / "var/lib/dpkg/status").read_text().strip().split("\n\n")
+    found = [dict(re.findall(r"^([\w-]+): (.*)$", paragraph, re.MULTILINE)) for paragraph in paragraphs]
+    for fields in sorted(found, key=lambda each: each["Package"]):
+        if fields.get("Status", "").endswith(" installed"):
+            copyright_file = root / "usr/share/doc" / fields["Package"] / "copyright"
+            yield DebianPackage(
+                fields["Package"],
+                fields["Version"],
+                fields["Architecture"],
+                fields.get("Section", ""),
+                licence_names(copyright_file),
+            )
+
+
+def licence_names(path: Path) -> tuple[str, ...]:
+    """Short names of licences in a Debian copyright file, where it has the machine-readable form."""
+    if not path.is_file():
+        return ()
+    text = path.read_text("utf-8", "replace")
+    if "copyright-format" not in text:
+        return ()
+    return tuple(sorted({name.strip() for name in re.findall(r"^License: *(\S.*)$", text, re.MULTILINE | re.I)}))
+
+
+# ---- against an SBOM --------------------------------------------------------------------------------------------------
+
+
+def differences(inventory: Inventory, sbom: dict[str, object]) -> list[str]:
+    """How an image differs from what an SBOM says of it, a line each."""
+    said = {component["bom-ref"]: facts_of_component(component) for component in sbom["components"]}  # type: ignore[attr-defined]
+    found = facts(inventory)
+    lines = [f"{ref}: in the image, not in the SBOM" for ref in found if ref not in said]
+    lines += [f"{ref}: in the SBOM, not in the image" for ref in said if ref not in found]
+    for ref in found.keys() & said.keys():
+        for key in sorted(found[ref].keys() | said[ref].keys()):
+            if found[ref].get(key) != said[ref].get(key):
+                lines.append(f"{ref}: {key} is {found[ref].get(key)}; the SBOM says {said[ref].get(key)}")
+    return [*inventory.faults, *sorted(lines)]
+
+
+def python_ref(package: PythonPackage) -> str:
+    """Package URL of a distribution."""
+    return f"pkg:pypi/{package.name}@{package.version}"
+
+
+def debian_ref(package: DebianPackage, release: str) -> str:
+    """Package URL of a Debian package."""
+    version = package.version.replace("+", "%2B").replace(":", "%3A")
+    name = package.name.replace("+", "%2B")
+    return f"pkg:deb/debian/{name}@{version}?arch={package.architecture}&distro=debian-{release}"
+
+
+def facts(inventory: Inventory) -> dict[str, dict[str, str]]:
+    """What is compared, by package URL: checksums of a wheel, of the list of its files, and of its libraries."""
+    found: dict[str, dict[str, str]] = {debian_ref(each, inventory.release): {} for each in inventory.debian}
+    for package in inventory.python:
+        found[python_ref(package)] = {
+            "wheel": package.sha256,
+            "record": package.record_sha256,
+            **package.libraries,
+        }
+    return found
+
+
+def facts_of_component(component: dict[str, object]) -> dict[str, str]:
+    """The same of an SBOM's component."""
+    if not str(component["bom-ref"]).startswith("pkg:pypi/"):
+        return {}
+    properties: Sequence[dict[str, str]] = component.get("properties", ())  # type: ignore[assignment]
+    hashes: Sequence[dict[str, str]] = component.get("hashes", ())  # type: ignore[assignment]
+    inner: Sequence[dict[str, object]] = component.get("components", ())  # type: ignore[assignment]
+    return {
+        "wheel": next((each["content"] for each in hashes), ""),
+        "record": next((each["value"] for each in properties if each["name"] == f"{PREFIX}record-sha256"), ""),
+        **{str(each["name"]): each["hashes"][0]["content"] for each in inner},  # type: ignore[index]
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Do what the head of the file says."""
+    inventory = take(Path(arguments[0]))
+    if arguments[1:2] != ["--against"]:
+        print(json.dumps(asdict(inventory), indent=1))
+        return 0
+    path = Path(arguments[2])
+    if not path.is_file():
+        print(f"{path}: no SBOM; make one with `make sbom`")
+        return 1
+    lines = differences(inventory, json.loads(path.read_text()))
+    print(*lines, sep="\n", end="\n" if lines else "")
+    return 1 if lines else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
