@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Starts an image that buildah built, as it is meant to run, and sees whether it keeps its promises: not root, root file
-# system read-only, no torch (unless deep), healthy only while it serves, gone soon after SIGTERM.
+# system read-only, no torch (unless deep), what its SBOM says and nothing else, healthy only while it serves, gone soon
+# after SIGTERM.
 #
 #   packaging/check_image.sh [TAG [BUNDLE]]
 #
@@ -8,6 +9,7 @@
 # image serves by itself. Needs root, since it makes a mount namespace of its own.
 #
 # Environment:
+#   LIGHTPAGE_SBOM           the SBOM (default what write_sbom.sh wrote, build/sbom/TAG.cdx.json)
 #   LIGHTPAGE_CHECK_DEVICE   folder of a running `lightpage virtual-device`, in whose network this is: the image then does
 #                            the main job over its cameras, serial line and modulator
 set -euo pipefail
@@ -70,6 +72,8 @@ mapfile -t entrypoint < <(field '{{range .Docker.Config.Entrypoint}}{{println .}
 mapfile -t arguments < <(field '{{range .Docker.Config.Cmd}}{{println .}}{{end}}' | sed '/^$/d')
 mapfile -t health < <(field '{{range .Docker.Config.Healthcheck.Test}}{{println .}}{{end}}' | sed '/^$/d;1d')
 user="$(field '{{.Docker.Config.User}}')"
+label() { field "{{index .Docker.Config.Labels \"org.opencontainers.image.$1\"}}"; }
+sbom="${LIGHTPAGE_SBOM:-build/sbom/${tag//[:\/]/-}.cdx.json}"
 
 become_image() { # in place of the calling shell, so that a signal reaches the command itself
   exec env --ignore-environment "${environment[@]}" chroot --userspec="$user" "$root" "$@"
@@ -112,6 +116,9 @@ case "$tag" in
 esac
 claim "keeps onnxruntime's telemetry off" test "$(in_image printenv ORT_DISABLE_TELEMETRY)" = 1
 claim "has no trace of the builder's packages" test -z "$(ls -A "$root/run/packages" "$root/run/secrets" 2>/dev/null)"
+claim "names its version, revision and time" test -n "$(label version)" -a -n "$(label revision)" -a -n "$(label created)"
+claim "holds what $sbom says, and nothing else" python3 packaging/inventory.py "$tree" --against "$sbom"
+claim "has no pip" not in_image python -c 'import pip'
 claim "has the command" in_image "${entrypoint[0]}" --help
 claim "is not healthy before it serves" not probe
 
