@@ -102,16 +102,12 @@ def take(root: Path) -> Inventory:
     for path in sorted(site.rglob("*")):
         if path.is_file() and path.suffix != ".pyc" and path not in owned:
             faults.append(f"{path.relative_to(site)}: belongs to no package")
-    os_release = dict(
-        line.split("=", 1) for line in (root / "etc/os-release").read_text().splitlines() if "=" in line
-    )
-    return Inventory(
-        tuple(packages), tuple(debian_packages(root)), os_release.get("VERSION_ID", "").strip('"'), tuple(faults)
-    )
+    release = re.search(r'^VERSION_ID="(.*)"$', (root / "etc/os-release").read_text(), re.MULTILINE)
+    return Inventory(tuple(packages), tuple(debian_packages(root)), release[1] if release else "unknown", tuple(faults))
 
 
 def check_files(found: Distribution, site: Path) -> tuple[set[Path], list[str]]:
-    """The files that a distribution lists, and what is wrong with them. Byte code has no checksum and is passed over."""
+    """The files that a distribution lists, and what is wrong with them. Byte code has no checksum to look at."""
     owned, wrong = set[Path](), []
     for entry in found.files or ():
         path = Path(site, *entry.parts)
@@ -157,7 +153,7 @@ def is_wheel_of(file: str, name: str, version: str) -> bool:
 def is_library(name: str) -> bool:
     """Whether a file is a shared object for others to link with, not a module of Python."""
     matched = SHARED_OBJECT.fullmatch(name)
-    return matched is not None and name.startswith("lib") and ".cpython-" not in name and not matched[1].endswith(".abi3")
+    return matched is not None and name.startswith("lib") and not matched[1].endswith((".abi3", "-linux-gnu"))
 
 
 def debian_packages(root: Path) -> Iterator[DebianPackage]:
@@ -186,7 +182,7 @@ def licence_names(path: Path) -> tuple[str, ...]:
     return tuple(sorted({name.strip() for name in re.findall(r"^License: *(\S.*)$", text, re.MULTILINE | re.I)}))
 
 
-# ---- against an SBOM --------------------------------------------------------------------------------------------------
+# ---- against an SBOM -----------------------------------------------------------------------------------------------
 
 
 def differences(inventory: Inventory, sbom: dict[str, object]) -> list[str]:

@@ -3,7 +3,7 @@
     python packaging/lock.py [TARGET ...]
 
 Versions are those of constraints.txt; uv asks the package index for the rest. A target is resolved for every platform
-that it is built for. One lock serves them all, so that the answers must be alike. No address gets into a lock. The image
+that it is built for. One lock serves them all, so the answers must be alike. No address gets into a lock. The image
 `deep` takes PyTorch's build for processors, which the index lacks: UV_FIND_LINKS names the folder or page that has it.
 """
 

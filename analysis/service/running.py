@@ -38,10 +38,14 @@ class RunningService:
     Args:
         arguments: of the command, beside addresses.
         environment: variables that it has beside those of this process.
+        before: words before the command, of a program that becomes it, as `env` does.
     """
 
-    def __init__(self, *arguments: str, environment: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, *arguments: str, environment: Mapping[str, str] | None = None, before: Sequence[str] = ()
+    ) -> None:
         self._arguments, self._environment = arguments, {**os.environ, **(environment or {})}
+        self._before = before
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115  # closed with the service
         self.process: subprocess.Popen[str] | None = None
         self.target = self.health = self._metrics = ""
@@ -56,7 +60,7 @@ class RunningService:
         begun = time.monotonic()
         command = [sys.executable, "-m", "lightpage.cli.main", "serve", "--address", "127.0.0.1:0"]
         self.process = subprocess.Popen(
-            [*command, "--metrics-port", "0", *self._arguments],
+            [*self._before, *command, "--metrics-port", "0", *self._arguments],
             stdout=subprocess.PIPE,
             stderr=self._log,
             stdin=subprocess.DEVNULL,
@@ -87,12 +91,12 @@ class RunningService:
 
     def cpu_s(self) -> float:
         """CPU seconds of its process so far."""
-        fields = Path(f"/proc/{self._pid}/stat").read_text().rpartition(")")[2].split()
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / 100
 
     def resident_bytes(self) -> int:
         """Its memory."""
-        return int(Path(f"/proc/{self._pid}/statm").read_text().split()[1]) * resource.getpagesize()
+        return int(Path(f"/proc/{self.pid}/statm").read_text().split()[1]) * resource.getpagesize()
 
     def metric(self, name: str, **labels: str) -> float:
         """Sum of the samples of a metric with these labels."""
@@ -104,6 +108,10 @@ class RunningService:
             for line in lines
             if re.match(rf"{name}(\{{| )", line) and all(each in line for each in wanted)
         )
+
+    def page(self, name: str) -> str:
+        """Address of a page of its web server."""
+        return self._metrics.replace("/metrics", f"/{name}")
 
     def channel(self) -> grpc.Channel:
         """A connection of its own."""
@@ -139,7 +147,8 @@ class RunningService:
         self._log.close()
 
     @property
-    def _pid(self) -> int:
+    def pid(self) -> int:
+        """Number of its process."""
         assert self.process is not None  # it was started
         return self.process.pid
 
