@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image check-image check-camera-image proto lint format clean
+.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -52,6 +52,7 @@ lint: $(STAMP)  ## ruff, mypy --strict, hadolint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy packaging/*.py
 	$(BIN)/hadolint Dockerfile
 
 format: $(STAMP)  ## let ruff put the code in order
@@ -97,6 +98,7 @@ bench-service: $(STAMP)  ## the service under load, faults and attack, from outs
 	$(BIN)/python -m analysis.service.lifecycle --json $(BENCH_SERVICE)/lifecycle.json
 	$(BIN)/python -m analysis.service.changes --json $(BENCH_SERVICE)/changes.json
 	$(BIN)/python -m analysis.service.hostile --json $(BENCH_SERVICE)/hostile.json
+	$(BIN)/python -m analysis.service.outgoing --json $(BENCH_SERVICE)/outgoing.json
 	$(BIN)/python -m analysis.service.kills --out $(BENCH_SERVICE)/kills --json $(BENCH_SERVICE)/kills.json
 	$(BIN)/python -m analysis.service.identity --json $(BENCH_SERVICE)/identity.json
 	$(BIN)/python -m analysis.service.transport --json $(BENCH_SERVICE)/transport.json
@@ -141,12 +143,25 @@ image:  ## build the container image (IMAGE_TARGET=runtime, camera, deep or gpu;
 	LIGHTPAGE_RELEASE=$(RELEASE) LIGHTPAGE_BASE=$(BASE) LIGHTPAGE_PLATFORM=$(IMAGE_PLATFORM) \
 	    packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
 
+# Needs root where buildah made the image, since it mounts it; so does check-image.
+sbom: $(STAMP)  ## write build/sbom/lightpage-TARGET.cdx.json: all that is in the image, as CycloneDX
+	LIGHTPAGE_PYTHON=$(BIN)/python packaging/write_sbom.sh $(IMAGE_TAG)
+
 check-image:  ## start the image that buildah built, and see whether it keeps its promises
 	packaging/check_image.sh $(IMAGE_TAG) $(BUNDLE)
 
 check-camera-image: $(STAMP)  ## the same with image `camera`, which then does the main job over the simulated device
 	LIGHTPAGE_CHECK_DEVICE=build/device $(BIN)/lightpage virtual-device --out build/device -- \
 	    packaging/check_image.sh lightpage:camera
+
+lock: $(STAMP)  ## write packaging/locks anew from pyproject.toml and constraints.txt: versions, and a SHA-256 of every file
+	UV_FIND_LINKS="$${UV_FIND_LINKS:-$$PIP_FIND_LINKS}" $(BIN)/python packaging/lock.py
+
+licences: $(STAMP)  ## list the licences of all that is in the image, by its SBOM; fails on one that is not allowed
+	$(BIN)/python packaging/licences.py build/sbom/$(subst /,-,$(subst :,-,$(IMAGE_TAG))).cdx.json
+
+audit: $(STAMP)  ## ask for known vulnerabilities of the locked packages; ends with 3 where nobody could tell of all
+	$(BIN)/python packaging/audit.py
 
 clean:  ## remove what was built and measured, and leave the environment
 	rm -rf build out .pytest_cache .mypy_cache .ruff_cache

@@ -10,7 +10,6 @@ which is also what it makes of an index without advisories.
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 import sysconfig
@@ -19,14 +18,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-LOCKS = Path(__file__).resolve().parent / "locks"
+from lock import LOCKS, read_lock
+
 FOUND, UNKNOWN = 1, 3
 _LONGEST_S = 600.0
 
 
 def pins(lock: Path) -> list[str]:
-    """NAME==VERSION of a lock's packages. A local tag is taken off: no database knows torch 2.13.0+cpu but as 2.13.0."""
-    return re.findall(r"^(\w[\w.-]*==[^\s+]+)", lock.read_text(), re.MULTILINE)
+    """NAME==VERSION of a lock's packages, without a local tag: databases know torch 2.13.0+cpu as 2.13.0."""
+    return [f"{name}=={package.version.partition('+')[0]}" for name, package in read_lock(lock).items()]
 
 
 def ask(packages: Sequence[str]) -> tuple[str, str]:

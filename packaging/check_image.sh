@@ -117,7 +117,8 @@ esac
 claim "keeps onnxruntime's telemetry off" test "$(in_image printenv ORT_DISABLE_TELEMETRY)" = 1
 claim "has no trace of the builder's packages" test -z "$(ls -A "$root/run/packages" "$root/run/secrets" 2>/dev/null)"
 claim "names its version, revision and time" test -n "$(label version)" -a -n "$(label revision)" -a -n "$(label created)"
-claim "holds what $sbom says, and nothing else" python3 packaging/inventory.py "$tree" --against "$sbom"
+lock="packaging/locks/$(label title | sed 's/^lightpage //').txt"
+claim "holds what $sbom and $lock say, and nothing else" python3 packaging/inventory.py "$tree" --against "$sbom" "$lock"
 claim "has no pip" not in_image python -c 'import pip'
 claim "has the command" in_image "${entrypoint[0]}" --help
 claim "is not healthy before it serves" not probe

@@ -1,7 +1,7 @@
-"""What is in an image: reads its files from outside, and compares them with an SBOM.
+"""What is in an image: reads its files from outside, and compares them with an SBOM and a lock.
 
-    python3 packaging/inventory.py ROOT                    # as JSON
-    python3 packaging/inventory.py ROOT --against SBOM     # exit status 1, and a line for each difference
+    python3 packaging/inventory.py ROOT                         # as JSON
+    python3 packaging/inventory.py ROOT --against SBOM LOCK     # exit status 1, and a line for each difference
 
 ROOT is the image's root folder. No program of the image is run. Standard library only: the check runs where nothing is
 installed.
@@ -14,14 +14,28 @@ import hashlib
 import json
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import Distribution, distributions
 from pathlib import Path
+from typing import Any
+
+from lock import BUILT_FROM_SOURCE, normal, read_lock
 
 ENVIRONMENT = Path("opt/lightpage")
 """Of Python, in the image."""
+LEFT_OUT = (
+    "usr/share/doc/",
+    "usr/share/man/",
+    "usr/share/locale/",
+    "usr/share/info/",
+    "usr/share/groff/",
+    "usr/share/lintian/",
+    "usr/share/linda/",
+)
+"""Folders that images of Debian leave out."""
 SHARED_OBJECT = re.compile(r"(.+?)\.so(\.[\w.]+)?")
+OWN = "lightpage"
 PREFIX = "lightpage:"
 """Of the names of this project's properties in an SBOM."""
 
@@ -44,7 +58,6 @@ class PythonPackage:
     sha256: str
     record_sha256: str
     licence: str
-    licence_files: tuple[str, ...] = ()
     libraries: dict[str, str] = field(default_factory=dict)
 
 
@@ -53,6 +66,8 @@ class DebianPackage:
     """An installed package of Debian.
 
     Args:
+        section: with the area before it, unless that is `main`.
+        record_sha256: of the list of its files, which holds an MD5 of each; empty where it has none.
         licences: short names of the machine-readable part of its copyright file.
     """
 
@@ -60,6 +75,7 @@ class DebianPackage:
     version: str
     architecture: str
     section: str
+    record_sha256: str
     licences: tuple[str, ...]
 
 
@@ -71,11 +87,6 @@ class Inventory:
     debian: tuple[DebianPackage, ...]
     release: str
     faults: tuple[str, ...]
-
-
-def normal(name: str) -> str:
-    """A distribution's name as pip compares it."""
-    return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def sha256(path: Path) -> str:
@@ -92,7 +103,8 @@ def take(root: Path) -> Inventory:
     """
     environment = root / ENVIRONMENT
     [site] = environment.glob("lib/python3*/site-packages")
-    wheels = dict(reversed(line.split("  ")) for line in (environment / "wheels.sha256").read_text().splitlines())
+    listed_wheels = (line.split("  ") for line in (environment / "wheels.sha256").read_text().splitlines())
+    wheels = {file: digest for digest, file in listed_wheels}
     packages, faults, owned = [], [], set[Path]()
     for found in sorted(distributions(path=[str(site)]), key=lambda each: normal(each.name)):
         listed, wrong = check_files(found, site)
@@ -102,8 +114,11 @@ def take(root: Path) -> Inventory:
     for path in sorted(site.rglob("*")):
         if path.is_file() and path.suffix != ".pyc" and path not in owned:
             faults.append(f"{path.relative_to(site)}: belongs to no package")
+    debian = tuple(debian_packages(root))
+    for package in debian:
+        faults += [f"{package.name}: {fault}" for fault in check_debian_files(root, package)]
     release = re.search(r'^VERSION_ID="(.*)"$', (root / "etc/os-release").read_text(), re.MULTILINE)
-    return Inventory(tuple(packages), tuple(debian_packages(root)), release[1] if release else "unknown", tuple(faults))
+    return Inventory(tuple(packages), debian, release[1] if release else "unknown", tuple(faults))
 
 
 def check_files(found: Distribution, site: Path) -> tuple[set[Path], list[str]]:
@@ -135,13 +150,12 @@ def python_package(found: Distribution, site: Path, wheels: dict[str, str]) -> P
         if is_library(entry.name) and Path(site, *entry.parts).is_file()
     }
     metadata = found.metadata
-    licence = metadata.get("License-Expression") or metadata.get("License") or ""
+    licence: str = next(iter(metadata.get_all("License-Expression") or metadata.get_all("License") or [""]))
     classifiers = [c.rpartition(" :: ")[2] for c in metadata.get_all("Classifier") or () if c.startswith("License ::")]
     if len(licence) > 60 or not licence:  # some put the whole text there
         licence = " AND ".join(classifiers)
-    files = tuple(sorted(metadata.get_all("License-File") or ()))
     record = sha256(information / "RECORD")
-    return PythonPackage(name, version, wheel, wheels.get(wheel, ""), record, licence.strip(), files, libraries)
+    return PythonPackage(name, version, wheel, wheels.get(wheel, ""), record, licence.strip(), libraries)
 
 
 def is_wheel_of(file: str, name: str, version: str) -> bool:
@@ -162,14 +176,49 @@ def debian_packages(root: Path) -> Iterator[DebianPackage]:
     found = [dict(re.findall(r"^([\w-]+): (.*)$", paragraph, re.MULTILINE)) for paragraph in paragraphs]
     for fields in sorted(found, key=lambda each: each["Package"]):
         if fields.get("Status", "").endswith(" installed"):
-            copyright_file = root / "usr/share/doc" / fields["Package"] / "copyright"
+            name, architecture = fields["Package"], fields["Architecture"]
+            record = debian_record(root, name, architecture)
             yield DebianPackage(
-                fields["Package"],
+                name,
                 fields["Version"],
-                fields["Architecture"],
+                architecture,
                 fields.get("Section", ""),
-                licence_names(copyright_file),
+                sha256(record) if record is not None else "",
+                licence_names(root / "usr/share/doc" / name / "copyright"),
             )
+
+
+def debian_record(root: Path, name: str, architecture: str) -> Path | None:
+    """dpkg's list of a package's files with their MD5, where it has one."""
+    folder = root / "var/lib/dpkg/info"
+    paths = (folder / f"{name}.md5sums", folder / f"{name}:{architecture}.md5sums")
+    return next((path for path in paths if path.is_file()), None)
+
+
+def check_debian_files(root: Path, package: DebianPackage) -> Iterator[str]:
+    """What is wrong with a package's files. Those that a slim Debian leaves out may be missing."""
+    record = debian_record(root, package.name, package.architecture)
+    for line in record.read_text().splitlines() if record is not None else ():
+        expected, name = line.split(maxsplit=1)
+        path = within(root, name)
+        if path is None:
+            if not name.startswith(LEFT_OUT):
+                yield f"{name}: is missing"
+            continue
+        with path.open("rb") as file:
+            if hashlib.file_digest(file, "md5").hexdigest() != expected:
+                yield f"{name}: is not the file that was installed"
+
+
+def within(root: Path, name: str) -> Path | None:
+    """A file of the image by its name there, through links of folders that begin at the image's root; None: no file."""
+    path = root
+    for part in Path(name).parts:
+        path = path / part
+        if path.is_symlink():
+            target = path.readlink()
+            path = root / target.relative_to("/") if target.is_absolute() else path.parent / target
+    return path if path.is_file() else None
 
 
 def licence_names(path: Path) -> tuple[str, ...]:
@@ -185,9 +234,9 @@ def licence_names(path: Path) -> tuple[str, ...]:
 # ---- against an SBOM -----------------------------------------------------------------------------------------------
 
 
-def differences(inventory: Inventory, sbom: dict[str, object]) -> list[str]:
+def differences(inventory: Inventory, sbom: Mapping[str, Any]) -> list[str]:
     """How an image differs from what an SBOM says of it, a line each."""
-    said = {component["bom-ref"]: facts_of_component(component) for component in sbom["components"]}  # type: ignore[attr-defined]
+    said = {component["bom-ref"]: facts_of_component(component) for component in sbom["components"]}
     found = facts(inventory)
     lines = [f"{ref}: in the image, not in the SBOM" for ref in found if ref not in said]
     lines += [f"{ref}: in the SBOM, not in the image" for ref in said if ref not in found]
@@ -211,8 +260,8 @@ def debian_ref(package: DebianPackage, release: str) -> str:
 
 
 def facts(inventory: Inventory) -> dict[str, dict[str, str]]:
-    """What is compared, by package URL: checksums of a wheel, of the list of its files, and of its libraries."""
-    found: dict[str, dict[str, str]] = {debian_ref(each, inventory.release): {} for each in inventory.debian}
+    """What is compared, by package URL: checksums of the list of its files, and of a wheel and its libraries."""
+    found = {debian_ref(each, inventory.release): {"record": each.record_sha256} for each in inventory.debian}
     for package in inventory.python:
         found[python_ref(package)] = {
             "wheel": package.sha256,
@@ -222,18 +271,32 @@ def facts(inventory: Inventory) -> dict[str, dict[str, str]]:
     return found
 
 
-def facts_of_component(component: dict[str, object]) -> dict[str, str]:
+def facts_of_component(component: Mapping[str, Any]) -> dict[str, str]:
     """The same of an SBOM's component."""
-    if not str(component["bom-ref"]).startswith("pkg:pypi/"):
-        return {}
-    properties: Sequence[dict[str, str]] = component.get("properties", ())  # type: ignore[assignment]
-    hashes: Sequence[dict[str, str]] = component.get("hashes", ())  # type: ignore[assignment]
-    inner: Sequence[dict[str, object]] = component.get("components", ())  # type: ignore[assignment]
-    return {
-        "wheel": next((each["content"] for each in hashes), ""),
-        "record": next((each["value"] for each in properties if each["name"] == f"{PREFIX}record-sha256"), ""),
-        **{str(each["name"]): each["hashes"][0]["content"] for each in inner},  # type: ignore[index]
-    }
+    properties = {each["name"]: each["value"] for each in component.get("properties", ())}
+    record = {"record": properties.get(f"{PREFIX}record-sha256", "")}
+    if component["bom-ref"].startswith("pkg:deb/"):
+        return record
+    wheel = next((each["content"] for each in component.get("hashes", ())), "")
+    libraries = {each["name"]: each["hashes"][0]["content"] for each in component.get("components", ())}
+    return {"wheel": wheel, **record, **libraries}
+
+
+def strangers(inventory: Inventory, lock: Path) -> list[str]:
+    """How an image's Python packages differ from what a lock names, a line each. Our own is in no lock."""
+    locked = read_lock(lock)
+    found = {package.name: package for package in inventory.python if package.name != OWN}
+    lines = [f"{name}: is in {lock.name}, not in the image" for name in locked.keys() - found.keys()]
+    for name, package in found.items():
+        if name not in locked:
+            lines.append(f"{name}: is in the image, not in {lock.name}")
+        elif package.version != locked[name].version:
+            lines.append(f"{name}: is {package.version}; {lock.name} says {locked[name].version}")
+        elif package.sha256 not in locked[name].hashes and name not in BUILT_FROM_SOURCE:
+            lines.append(
+                f"{name}: its wheel has SHA-256 {package.sha256 or 'unknown'}, which {lock.name} does not name"
+            )
+    return sorted(lines)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -246,7 +309,7 @@ def main(arguments: Sequence[str]) -> int:
     if not path.is_file():
         print(f"{path}: no SBOM; make one with `make sbom`")
         return 1
-    lines = differences(inventory, json.loads(path.read_text()))
+    lines = differences(inventory, json.loads(path.read_text())) + strangers(inventory, Path(arguments[3]))
     print(*lines, sep="\n", end="\n" if lines else "")
     return 1 if lines else 0
 

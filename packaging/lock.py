@@ -9,6 +9,7 @@ that it is built for. One lock serves them all, so the answers must be alike. No
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import sysconfig
@@ -57,10 +58,36 @@ class LockError(Exception):
     """A lock cannot be made."""
 
 
-def pins(path: Path) -> list[str]:
-    """NAME==VERSION of each package of a lock, none where there is no lock."""
-    lines = path.read_text().splitlines() if path.exists() else []
-    return [line.removesuffix(" \\") for line in lines if line[:1].isalnum()]
+@dataclass(frozen=True)
+class Locked:
+    """What a lock says of a package: its version, and the SHA-256 of each of its files."""
+
+    version: str
+    hashes: frozenset[str]
+
+
+def normal(name: str) -> str:
+    """A distribution's name as pip compares it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def read_lock(path: Path) -> dict[str, Locked]:
+    """The packages of a lock by normal name.
+
+    Raises:
+        LockError: a line is neither a pin nor a SHA-256: an address, an option, or a package without a version.
+    """
+    found: dict[str, Locked] = {}
+    text = re.sub(r"^#.*\n", "", path.read_text(), flags=re.MULTILINE).replace("\\\n", " ")
+    for line in text.splitlines():
+        pin, *hashes = line.split()
+        if not re.fullmatch(r"[\w.-]+==[\w.+]+", pin) or not hashes:
+            raise LockError(f"{path.name}: got '{line[:80].strip()}', wanted NAME==VERSION --hash=sha256:DIGEST ...")
+        if bad := [each for each in hashes if not re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", each)]:
+            raise LockError(f"{path.name}: {pin}: got '{bad[0][:80]}', wanted --hash=sha256:DIGEST")
+        name, version = pin.split("==")
+        found[normal(name)] = Locked(version, frozenset(each.removeprefix("--hash=sha256:") for each in hashes))
+    return found
 
 
 def compiled(target: str, machine: str) -> str:
@@ -81,7 +108,8 @@ def compiled(target: str, machine: str) -> str:
         words += [word for extra in TARGETS[target].extras for word in ("--extra", extra)]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "lock.txt"
-        out.write_text("".join(f"{pin}\n" for pin in pins(LOCKS / f"{target}.txt")))  # what need not change stays
+        if (before := LOCKS / f"{target}.txt").exists():  # what need not change stays
+            out.write_text("".join(f"{name}=={package.version}\n" for name, package in read_lock(before).items()))
         done = subprocess.run(
             [uv, "pip", "compile", source, *words, "--constraint", "constraints.txt", "--output-file", out],
             cwd=ROOT,

@@ -24,11 +24,9 @@ from cyclonedx.model.license import DisjunctiveLicense, License
 from cyclonedx.output.json import JsonV1Dot6
 from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
-from packageurl import PackageURL
-
-sys.path.insert(0, str(Path(__file__).parent))
 from inventory import PREFIX, DebianPackage, Inventory, PythonPackage, debian_ref, python_ref, take
 from licences import spdx
+from packageurl import PackageURL
 
 OCI = "org.opencontainers.image."
 _NAMESPACE = uuid.UUID("6f0c5b5c-4a3e-5c5e-9a51-8d3d4a0b7d10")
@@ -111,7 +109,10 @@ def debian_component(package: DebianPackage, release: str) -> Component:
         bom_ref=reference,
         purl=PackageURL.from_string(reference),
         licenses=[DisjunctiveLicense(name=name) for name in package.licences],
-        properties=[Property(name=f"{PREFIX}debian-section", value=package.section)],
+        properties=[
+            Property(name=f"{PREFIX}debian-section", value=package.section),
+            Property(name=f"{PREFIX}record-sha256", value=package.record_sha256),
+        ],
     )
 
 

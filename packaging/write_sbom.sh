@@ -35,7 +35,7 @@ case "$builder" in
   docker)
     container="$(docker create "$tag")"
     mkdir "$scratch/root"
-    docker export "$container" | tar -x -C "$scratch/root" opt/lightpage var/lib/dpkg/status usr/share/doc usr/lib/os-release etc/os-release
+    docker export "$container" | tar -x -C "$scratch/root" --exclude='dev/*'
     root="$scratch/root"
     labels="$(docker inspect --format "$format" "$tag")"
     ;;
