@@ -36,6 +36,8 @@ LEFT_OUT = (
 """Folders that images of Debian leave out."""
 SHARED_OBJECT = re.compile(r"(.+?)\.so(\.[\w.]+)?")
 OWN = "lightpage"
+LONGEST_NAME = 200
+"""Of a licence, characters."""
 PREFIX = "lightpage:"
 """Of the names of this project's properties in an SBOM."""
 
@@ -149,13 +151,18 @@ def python_package(found: Distribution, site: Path, wheels: dict[str, str]) -> P
         for entry in sorted(found.files or ())
         if is_library(entry.name) and Path(site, *entry.parts).is_file()
     }
-    metadata = found.metadata
-    licence: str = next(iter(metadata.get_all("License-Expression") or metadata.get_all("License") or [""]))
-    classifiers = [c.rpartition(" :: ")[2] for c in metadata.get_all("Classifier") or () if c.startswith("License ::")]
-    if len(licence) > 60 or not licence:  # some put the whole text there
-        licence = " AND ".join(classifiers)
     record = sha256(information / "RECORD")
-    return PythonPackage(name, version, wheel, wheels.get(wheel, ""), record, licence.strip(), libraries)
+    return PythonPackage(name, version, wheel, wheels.get(wheel, ""), record, licence_of(found), libraries)
+
+
+def licence_of(found: Distribution) -> str:
+    """What a distribution's metadata say of its licence: an SPDX expression, a few words, or nothing."""
+    metadata = found.metadata
+    licence: str = next(iter(metadata.get_all("License-Expression") or metadata.get_all("License") or [""])).strip()
+    if licence and "\n" not in licence and len(licence) <= LONGEST_NAME:
+        return licence  # others put the whole text there
+    classifiers = [c for c in metadata.get_all("Classifier") or () if c.startswith("License ::")]
+    return ", ".join(each.rpartition(" :: ")[2] for each in classifiers)
 
 
 def is_wheel_of(file: str, name: str, version: str) -> bool:

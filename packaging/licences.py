@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 import sys
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -19,6 +20,8 @@ from license_expression import AND, OR, ExpressionError, get_spdx_licensing
 
 RULES = Path(__file__).with_name("licences.toml")
 _SPDX = get_spdx_licensing()
+_OWN_WORDS = re.compile(r"LicenseRef-[A-Za-z0-9.-]+")
+"""What SPDX calls a licence that is in none of its lists."""
 
 
 @functools.cache
@@ -36,6 +39,8 @@ def spdx(name: str, licence: str) -> str | None:
     """
     if name in rules()["named"]:
         return rules()["named"][name]
+    if _OWN_WORDS.fullmatch(licence):
+        return licence
     try:
         parsed = _SPDX.parse(licence, validate=True, strict=True)
     except ExpressionError:

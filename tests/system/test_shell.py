@@ -20,9 +20,11 @@ ROOT = Path(__file__).resolve().parents[2]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 COMMANDS: dict[str, str] = {**PROJECT["scripts"], **PROJECT["entry-points"]["lightpage.commands"]}
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
-# What a wheel is made of, and so what the image build is given.
+LOCKS = ROOT / "packaging" / "locks"
+# What a wheel is made of, and what the image build is given beside that.
 PACKAGES = ("lightpage", "train", "export", "runtime", "analysis")
-SOURCES = ("pyproject.toml", "constraints.txt", "LICENSE", "README.md", *PACKAGES)
+SOURCES = ("pyproject.toml", "LICENSE", "README.md", *PACKAGES)
+PACKAGING = ("packaging",)
 
 
 def run(command: Sequence[str | Path], *, cwd: Path = ROOT, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
@@ -49,7 +51,7 @@ def pins() -> dict[str, str]:
 # ---- make and continuous integration ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("target", ["setup", "demo", "test", "bench", "image", "proto", "lint"])
+@pytest.mark.parametrize("target", ["setup", "demo", "test", "bench", "image", "sbom", "lock", "proto", "lint"])
 def test_make_knows_what_to_do_for(target: str) -> None:
     planned = run(["make", "--dry-run", target])
     assert planned.returncode == 0, planned.stderr
@@ -59,7 +61,7 @@ def test_the_first_target_only_tells() -> None:
     assert run(["make", "--dry-run"]).stdout == run(["make", "--dry-run", "help"]).stdout
 
 
-@pytest.mark.parametrize("script", [".ci/run", "packaging/build_image.sh", "packaging/check_image.sh"])
+@pytest.mark.parametrize("script", [".ci/run", *(str(path.relative_to(ROOT)) for path in ROOT.glob("packaging/*.sh"))])
 def test_scripts_are_executable_and_parse(script: str) -> None:
     assert os.access(ROOT / script, os.X_OK)
     parsed = run(["bash", "-n", script])
@@ -136,29 +138,33 @@ def test_the_image_is_not_root_quiet_and_checked() -> None:
     assert 'CMD ["python", "-m", "runtime.commands.healthcheck"]' in runtime
     assert 'ENTRYPOINT ["lightpage", "serve"]' in runtime
     text = (ROOT / "Dockerfile").read_text()
-    for name in ("runtime", "gpu"):  # whatever is installed, it is run alike
+    for name in ("runtime", "camera", "deep", "gpu"):  # whatever is installed, it is run alike
         assert f"FROM service AS {name}" in text
 
 
-def test_only_the_deep_image_installs_the_train_extra() -> None:
-    assert [name for name, text in stages().items() if "train]" in text] == ["build-deep"]
-    assert "--from=build-deep" in stages()["deep"]
-    assert "--from=build-deep" not in stages()["runtime"]
+def test_every_image_installs_its_own_lock() -> None:
+    for name in ("runtime", "camera", "deep", "gpu"):
+        installed = re.findall(r"packaging/install_locked.sh (\S+) (\S+)$", stages()[f"build-{name}"], re.MULTILINE)
+        assert installed == [(f"packaging/locks/{name}.txt", "/opt/lightpage")]
+        assert re.findall(r"--from=(\S+)", stages()[name]) == [f"build-{name}"]
 
 
-def test_no_image_installs_both_runtimes() -> None:
-    installed = {name: re.findall(r"'\.\[(.*?)\]'", text) for name, text in stages().items()}
-    extras = {name: set(",".join(found).split(",")) for name, found in installed.items() if found}
-    assert [name for name, some in extras.items() if "gpu" in some] == ["build-gpu"]
-    assert "cpu" not in extras["build-gpu"]
-    assert all("cpu" in some for name, some in extras.items() if name != "build-gpu")
+def test_only_the_deep_image_has_torch_and_none_has_both_runtimes() -> None:
+    named = {
+        path.stem: set(re.findall(r"^([\w.-]+)==", path.read_text(), re.MULTILINE)) for path in LOCKS.glob("*.txt")
+    }
+    assert [name for name, some in named.items() if "torch" in some] == ["deep"]
+    runtimes = {name: sorted(some & {"onnxruntime", "onnxruntime-gpu"}) for name, some in named.items()}
+    assert runtimes.pop("build") == []
+    assert runtimes.pop("gpu") == ["onnxruntime-gpu"]
+    assert set(map(tuple, runtimes.values())) == {("onnxruntime",)}
 
 
 def test_the_image_is_built_of_what_the_wheel_is_built_of() -> None:
     copied = re.findall(r"^COPY (?!--)(.*) \S+$", stages()["build"], re.MULTILINE)
-    assert sorted(" ".join(copied).split()) == sorted(SOURCES)
+    assert sorted(" ".join(copied).split()) == sorted((*SOURCES, *PACKAGING))
     let_through = [line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")]
-    assert sorted(let_through) == sorted(SOURCES)
+    assert sorted(let_through) == sorted((*SOURCES, *PACKAGING))
 
 
 # ---- what the image build is lent ---------------------------------------------------------------------------------
@@ -231,10 +237,10 @@ def torchless(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = run([sys.executable, "-m", "venv", folder / "environment"])
     assert made.returncode == 0, made.stderr
     scripts = folder / "environment" / "bin"
-    installed = run(
-        [scripts / "pip", "install", "--constraint", "constraints.txt", ".[cpu]"], cwd=source, timeout_s=500
-    )
-    assert installed.returncode == 0, installed.stderr
+    locked = ["--require-hashes", "--only-binary", ":all:", "--requirement", LOCKS / "runtime.txt"]
+    for words in (locked, ["--no-deps", "."]):
+        installed = run([scripts / "pip", "install", *words], cwd=source, timeout_s=500)
+        assert installed.returncode == 0, installed.stderr
     return scripts
 
 

@@ -1,0 +1,148 @@
+"""The locks name all that an image installs, in the versions of constraints.txt, by the SHA-256 of each file."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Any
+
+import pytest
+from packaging.requirements import Requirement
+
+from tests.packaging.scripts import ROOT, script
+
+lock = script("lock")
+LOCKS: Path = lock.LOCKS
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+OF_CUDA = ("nvidia-", "cuda-", "triton")
+"""How names of packages begin that PyTorch's build for GPUs brings. A developer may have it; no lock does."""
+BEYOND_CONSTRAINTS = ("nvidia-",)
+"""What the image `gpu` alone installs. constraints.txt leaves it open: PyTorch's build for GPUs needs other versions."""
+
+
+def constrained() -> dict[str, str]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    return {lock.normal(name): version for name, _, version in (line.partition("==") for line in lines if "==" in line)}
+
+
+def asked(target: str) -> list[Requirement]:
+    """What pyproject.toml asks for, for a target."""
+    extras: Mapping[str, list[str]] = PROJECT["optional-dependencies"]
+    lists = [PROJECT["dependencies"], *(extras[extra] for extra in lock.TARGETS[target].extras)]
+    return [Requirement(line) for requirements in lists for line in requirements]
+
+
+def closure(requirements: Iterable[Requirement], machine: str) -> set[str]:
+    """Names of these requirements and all that they need on a processor, by the metadata of what is installed here."""
+    found: set[str] = set()
+    open_ones = [(requirement, frozenset(requirement.extras)) for requirement in requirements]
+    seen: set[tuple[str, frozenset[str]]] = set()
+    while open_ones:
+        requirement, extras = open_ones.pop()
+        name = lock.normal(requirement.name)
+        if (name, extras) in seen:
+            continue
+        seen.add((name, extras))
+        found.add(name)
+        for line in distribution(name).requires or ():
+            inner = Requirement(line)
+            environments = [{"platform_machine": machine, "extra": extra} for extra in (*extras, "")]
+            wanted = inner.marker is None or any(inner.marker.evaluate(each) for each in environments)
+            if wanted and not (name == "torch" and inner.name.startswith(OF_CUDA)):
+                open_ones.append((inner, frozenset(inner.extras)))
+    return found
+
+
+def disagreements(
+    locked: Mapping[str, Any], pins: Mapping[str, str], needed: set[str], beyond: tuple[str, ...] = ()
+) -> list[str]:
+    """What is wrong with a lock: packages that are missing or too many, and versions that constraints.txt has not."""
+    lines = [f"{name} is not locked" for name in needed - locked.keys()]
+    for name, package in locked.items():
+        if beyond and name.startswith(beyond):
+            continue
+        if name not in needed:
+            lines.append(f"{name} is needed by nothing")
+        if (version := package.version.partition("+")[0]) != pins.get(name):
+            lines.append(f"{name} is {version}, and {pins.get(name)} in constraints.txt")
+    return sorted(lines)
+
+
+@pytest.mark.parametrize("target", ["runtime", "camera", "deep"])
+def test_a_lock_is_what_the_image_needs_and_no_more(target: str) -> None:
+    locked = lock.read_lock(LOCKS / f"{target}.txt")
+    for machine in lock.TARGETS[target].machines:
+        assert disagreements(locked, constrained(), closure(asked(target), machine)) == []
+
+
+def test_the_lock_for_gpus_is_what_pyproject_asks_for_and_the_libraries_of_cuda() -> None:
+    locked = lock.read_lock(LOCKS / "gpu.txt")
+    # onnxruntime-gpu is installed in that image alone. Beside the libraries of CUDA it needs what onnxruntime needs.
+    needed = closure(asked("runtime"), "x86_64") - {"onnxruntime"} | {"onnxruntime-gpu"}
+    assert disagreements(locked, constrained(), needed, BEYOND_CONSTRAINTS) == []
+    assert all(locked[requirement.name].version in requirement.specifier for requirement in asked("gpu"))
+    assert {"nvidia-cublas", "nvidia-cudnn-cu13"} <= locked.keys()
+
+
+def test_the_tools_that_build_wheels_are_locked() -> None:
+    locked = lock.read_lock(LOCKS / "build.txt")
+    assert disagreements(locked, constrained(), closure([Requirement("setuptools")], "x86_64")) == []
+
+
+def test_every_stage_that_installs_does_it_by_its_lock() -> None:
+    text = (ROOT / "Dockerfile").read_text()
+    assert sorted(re.findall(r"packaging/locks/(\w+)\.txt", text)) == sorted(path.stem for path in LOCKS.glob("*.txt"))
+    installs = re.findall(
+        r"pip (?:install|wheel|download) .*", text + (ROOT / "packaging/install_locked.sh").read_text()
+    )
+    for line in installs:
+        assert "--require-hashes" in line or "--no-index" in line, line
+
+
+# ---- what is wrong is seen ------------------------------------------------------------------------------------------
+
+
+def spoiled(folder: Path, old: str, new: str) -> Path:
+    """The lock of `runtime`, changed at its first match."""
+    text = (LOCKS / "runtime.txt").read_text()
+    changed = re.sub(old, new, text, count=1, flags=re.MULTILINE)
+    assert changed != text
+    path = folder / "lock.txt"
+    path.write_text(changed)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (r"^(click==\S+) \\\n(    --hash=\S+( \\)?\n)+", r"\1\n", "click==8.5.1"),
+        (r"^(click==\S+ \\\n    --hash=sha256:)", r"\1x", "click==8.5.1: got '--hash=sha256:x"),
+        (r"^click==", r"--index-url https://example.com/simple\nclick==", "--index-url"),
+        (r"^click==\S+", r"click @ https://example.com/click.whl", "click @"),
+        (r"^click==", "click>=", "click>="),
+    ],
+)
+def test_a_line_that_is_no_pin_with_hashes_is_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
+    with pytest.raises(lock.LockError, match=re.escape(said)):
+        lock.read_lock(spoiled(tmp_path, old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (r"^click==\S+", "click==8.5.0", "click is 8.5.0, and 8.5.1 in constraints.txt"),
+        (r"^pydantic-core==\S+ \\\n(    --hash=\S+( \\)?\n)+", "", "pydantic-core is not locked"),
+        (r"^click==", "idna==3.20 --hash=sha256:" + 64 * "0" + "\nclick==", "idna is needed by nothing"),
+    ],
+)
+def test_a_version_and_a_package_that_do_not_agree_are_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+    locked = lock.read_lock(spoiled(tmp_path, old, new))
+    assert disagreements(locked, constrained(), closure(asked("runtime"), "x86_64")) == [said]
+
+
+def test_a_dependency_that_is_not_installed_here_cannot_be_judged() -> None:
+    with pytest.raises(PackageNotFoundError):
+        closure([Requirement("lightpage-has-no-such-dependency")], "x86_64")

@@ -1,0 +1,238 @@
+"""An SBOM names all that is in an image, is CycloneDX, and whatever differs from it afterwards is found."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.packaging.scripts import script
+
+inventory, licences, sbom = script("inventory"), script("licences"), script("sbom")
+LABELS = {f"{sbom.OCI}title": "lightpage runtime", f"{sbom.OCI}version": "0.1.0", f"{sbom.OCI}revision": 40 * "a"}
+LABELS[f"{sbom.OCI}created"] = "2026-11-25T12:00:00Z"
+STATUS = """Package: libgood1
+Status: install ok installed
+Architecture: amd64
+Multi-Arch: same
+Version: 1:2.0+deb12u1
+Section: libs
+Description: a library
+ of more than one line
+
+Package: gone
+Status: deinstall ok config-files
+Architecture: amd64
+Version: 1
+"""
+
+
+def digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def write(path: Path, content: bytes) -> bytes:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    return content
+
+
+def install(site: Path, name: str, version: str, licence: str, files: dict[str, bytes]) -> None:
+    """A distribution as pip leaves it."""
+    folder = f"{name}-{version}.dist-info"
+    metadata = f"Metadata-Version: 2.4\nName: {name}\nVersion: {version}\nLicense-Expression: {licence}\n".encode()
+    lines = []
+    for path, content in {**files, f"{folder}/METADATA": metadata}.items():
+        write(site / path, content)
+        hashed = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+        lines.append(f"{path},sha256={hashed},{len(content)}")
+    write(site / folder / "RECORD", "\n".join([*lines, f"{folder}/RECORD,,"]).encode())
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """The files of a small image."""
+    return image(tmp_path / "root")
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The SBOM of `root` before anything is planted there."""
+    return told(image(tmp_path_factory.mktemp("image")))
+
+
+def image(root: Path) -> Path:
+    """Write the files of a small image."""
+    site = root / "opt/lightpage/lib/python3.11/site-packages"
+    install(site, "lightpage", "0.1.0", "MIT", {"lightpage/__init__.py": b""})
+    files = {"click/__init__.py": b"import os\n", "click.libs/libfast-1a.so.2": b"elf", "click/_c.abi3.so": b"elf"}
+    install(site, "Click", "8.5.1", "BSD-3-Clause", files)
+    write(site / "click/__pycache__/x.pyc", b"compiled")
+    wheels = f"{64 * '1'}  lightpage-0.1.0-py3-none-any.whl\n{64 * '2'}  click-8.5.1-py3-none-any.whl\n"
+    write(root / "opt/lightpage/wheels.sha256", wheels.encode())
+    write(root / "etc/os-release", b'NAME="Debian"\nVERSION_ID="12"\n')
+    write(root / "var/lib/dpkg/status", STATUS.encode())
+    library = write(root / "usr/lib/libgood.so.1", b"library")
+    (root / "lib").symlink_to("usr/lib")
+    left_out = f"{32 * '0'}  usr/share/doc/libgood1/README\n"
+    md5 = hashlib.md5(library).hexdigest()
+    write(root / "var/lib/dpkg/info/libgood1:amd64.md5sums", f"{md5}  lib/libgood.so.1\n{left_out}".encode())
+    notice = b"Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/\n\nLicense: LGPL-2+\n"
+    write(root / "usr/share/doc/libgood1/copyright", notice)
+    return root
+
+
+@pytest.fixture
+def lock(tmp_path: Path) -> Path:
+    path = tmp_path / "runtime.txt"
+    path.write_text(f"# Made.\nclick==8.5.1 \\\n    --hash=sha256:{64 * '9'} \\\n    --hash=sha256:{64 * '2'}\n")
+    return path
+
+
+def told(root: Path) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(sbom.sbom(inventory.take(root), LABELS))
+    return document
+
+
+def test_it_names_every_package_with_version_checksum_licence_and_libraries(document: dict[str, Any]) -> None:
+    components = {component["bom-ref"]: component for component in document["components"]}
+    assert components.keys() == {
+        "pkg:pypi/click@8.5.1",
+        "pkg:pypi/lightpage@0.1.0",
+        "pkg:deb/debian/libgood1@1%3A2.0%2Bdeb12u1?arch=amd64&distro=debian-12",
+    }
+    click = components["pkg:pypi/click@8.5.1"]
+    assert click["hashes"] == [{"alg": "SHA-256", "content": 64 * "2"}]
+    assert click["licenses"] == [{"license": {"id": "BSD-3-Clause"}}]
+    assert [(each["name"], each["hashes"][0]["content"]) for each in click["components"]] == [
+        ("click.libs/libfast-1a.so.2", digest(b"elf"))
+    ]
+    [debian] = [component for ref, component in components.items() if ref.startswith("pkg:deb/")]
+    assert (debian["version"], debian["licenses"]) == ("1:2.0+deb12u1", [{"license": {"name": "LGPL-2+"}}])
+    said = {each["name"]: each["value"] for each in document["metadata"]["component"]["properties"]}
+    assert said == LABELS
+    assert document["metadata"]["timestamp"] == "2026-11-25T12:00:00+00:00"
+
+
+def test_it_is_the_same_for_the_same_image(root: Path, document: dict[str, Any]) -> None:
+    assert told(root) == document
+
+
+def test_what_breaks_the_schema_is_not_written(root: Path) -> None:
+    found = inventory.take(root)
+    [click, own] = found.python
+    with pytest.raises(ValueError, match=r"none of CycloneDX 1\.6"):
+        sbom.sbom(replace(found, python=(replace(click, sha256="short"), own)), LABELS)
+
+
+def test_the_image_that_it_was_made_of_agrees_with_it_and_with_the_lock(
+    root: Path, lock: Path, document: dict[str, Any]
+) -> None:
+    assert inventory.differences(inventory.take(root), document) == []
+    assert inventory.strangers(inventory.take(root), lock) == []
+
+
+SITE = Path("opt/lightpage/lib/python3.11/site-packages")
+PLANTED: dict[str, tuple[Callable[[Path], object], list[str]]] = {
+    "a changed module": (
+        lambda root: write(root / SITE / "click/__init__.py", b"import socket\n"),
+        ["Click: click/__init__.py: is not the file that was installed"],
+    ),
+    "a module that is gone": (
+        lambda root: (root / SITE / "click/__init__.py").unlink(),
+        ["Click: click/__init__.py: is missing"],
+    ),
+    "a module of nobody": (
+        lambda root: write(root / SITE / "usercustomize.py", b""),
+        ["usercustomize.py: belongs to no package"],
+    ),
+    "another package": (
+        lambda root: install(root / SITE, "extra", "1.0", "MIT", {"extra.py": b""}),
+        ["pkg:pypi/extra@1.0: in the image, not in the SBOM"],
+    ),
+    "a package that is gone": (
+        lambda root: [shutil.rmtree(path) for path in (root / SITE).glob("[cC]lick*")],
+        ["pkg:pypi/click@8.5.1: in the SBOM, not in the image"],
+    ),
+    "another version of Debian's": (
+        lambda root: write(root / "var/lib/dpkg/status", STATUS.replace("deb12u1", "deb12u2").encode()),
+        [
+            "pkg:deb/debian/libgood1@1%3A2.0%2Bdeb12u1?arch=amd64&distro=debian-12: in the SBOM, not in the image",
+            "pkg:deb/debian/libgood1@1%3A2.0%2Bdeb12u2?arch=amd64&distro=debian-12: in the image, not in the SBOM",
+        ],
+    ),
+    "a changed library of Debian's": (
+        lambda root: write(root / "usr/lib/libgood.so.1", b"other"),
+        ["libgood1: lib/libgood.so.1: is not the file that was installed"],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_difference_is_found(root: Path, document: dict[str, Any], name: str) -> None:
+    plant, expected = PLANTED[name]
+    plant(root)
+    assert inventory.differences(inventory.take(root), document) == expected
+
+
+def test_a_file_and_its_checksum_changed_together_are_found(root: Path, document: dict[str, Any]) -> None:
+    install(root / SITE, "Click", "8.5.1", "BSD-3-Clause", {"click/__init__.py": b"import socket\n"})
+    found = inventory.differences(inventory.take(root), document)
+    assert any(line.startswith("pkg:pypi/click@8.5.1: record is ") for line in found)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (64 * "2", 64 * "3", f"click: its wheel has SHA-256 {64 * '2'}, which runtime.txt does not name"),
+        ("8.5.1", "8.5.0", "click: is 8.5.1; runtime.txt says 8.5.0"),
+        ("click==", "clock==", "click: is in the image, not in runtime.txt"),
+        ("click==", f"idna==3.20 --hash=sha256:{64 * '4'}\nclick==", "idna: is in runtime.txt, not in the image"),
+    ],
+)
+def test_an_image_of_another_lock_is_found(root: Path, lock: Path, old: str, new: str, said: str) -> None:
+    lock.write_text(lock.read_text().replace(old, new))
+    assert said in inventory.strangers(inventory.take(root), lock)
+
+
+# ---- licences -------------------------------------------------------------------------------------------------------
+
+
+def test_licences_of_an_image_are_judged_by_its_sbom(document: dict[str, Any]) -> None:
+    assert licences.judged(document) == [
+        ("click 8.5.1", "BSD-3-Clause", ""),
+        ("libgood1 1:2.0+deb12u1 (Debian)", "LGPL-2+", ""),
+        ("lightpage 0.1.0", "MIT", ""),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("licence", "fault"),
+    [
+        ("AGPL-3.0-only", "is not allowed: AGPL-3.0-only"),
+        ("MIT AND GPL-3.0-only", "is not allowed: GPL-3.0-only"),
+        ("MIT OR GPL-3.0-only", ""),
+        ("GPL-3.0-or-later WITH GCC-exception-3.1", ""),
+        ("LicenseRef-Secret", "is not allowed: LicenseRef-Secret"),
+        ("BSD", "is no SPDX expression; name it in licences.toml"),
+        ("", "is no SPDX expression; name it in licences.toml"),
+    ],
+)
+def test_a_licence_that_is_not_allowed_is_named(licence: str, fault: str) -> None:
+    package = inventory.PythonPackage("other", "1", "", "", "", licence)
+    component = json.loads(sbom.JsonV1Dot6(sbom.Bom(components=[sbom.python_component(package)])).output_as_string())
+    [(_, _, found)] = licences.judged(component)
+    assert found == fault
+
+
+def test_debian_packages_that_are_not_of_main_are_named(root: Path) -> None:
+    write(root / "var/lib/dpkg/status", STATUS.replace("Section: libs", "Section: non-free/libs").encode())
+    [found] = [fault for name, _, fault in licences.judged(told(root)) if "Debian" in name]
+    assert found == "is of Debian's area non-free, not main"
