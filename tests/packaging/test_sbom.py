@@ -80,7 +80,7 @@ def image(root: Path) -> Path:
     write(root / "etc/os-release", b'NAME="Debian"\nVERSION_ID="12"\n')
     write(root / "var/lib/dpkg/status", STATUS.encode())
     library = write(root / "usr/lib/libgood.so.1", b"library")
-    (root / "lib").symlink_to("usr/lib")
+    (root / "lib").symlink_to("/usr/lib")  # that of the image, not of this machine
     left_out = f"{32 * '0'}  usr/share/doc/libgood1/README\n"
     md5 = hashlib.md5(library).hexdigest()
     write(root / "var/lib/dpkg/info/libgood1:amd64.md5sums", f"{md5}  lib/libgood.so.1\n{left_out}".encode())
