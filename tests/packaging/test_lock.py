@@ -20,7 +20,7 @@ PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["
 OF_CUDA = ("nvidia-", "cuda-", "triton")
 """How names of packages begin that PyTorch's build for GPUs brings. A developer may have it; no lock does."""
 BEYOND_CONSTRAINTS = ("nvidia-",)
-"""What the image `gpu` alone installs. constraints.txt leaves them open: torch's build for GPUs needs other versions."""
+"""What the image `gpu` alone installs. constraints.txt leaves them open: torch for GPUs needs other versions."""
 
 
 def constrained() -> dict[str, str]:
