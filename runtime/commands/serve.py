@@ -46,6 +46,7 @@ from runtime.service.registry import ModelRegistry
 from runtime.service.self_calibration import SelfCalibration
 from runtime.service.settings import ADDRESS, OFF, STORE_VARIABLE, Effective, Option, ServiceSettings, service_settings
 from runtime.service.store import ModelStore
+from runtime.service.traces import Traces
 from runtime.wire.address import check_free
 
 _log = logging.getLogger(__name__)
@@ -194,7 +195,10 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         console = Console(metrics, history, registry, monitor, source_name)
         stack.enter_context(_shown(console, settings.metrics.port, settings.metrics.host))
         recalibrator = Recalibrator(plane, recordings=service.recordings)
-        server = LightpageServer(plane, recalibrator, service.address)
+        traces = None
+        if settings.traces.endpoint is not None:
+            traces = stack.enter_context(Traces(settings.traces.endpoint, settings.traces.share))
+        server = LightpageServer(plane, recalibrator, service.address, traces=traces)
         check_free("address", service.address)  # before anything else takes a port
         if service.health_address != OFF:  # entered first: it says NOT_SERVING until the last call has ended
             address = service.health_address or next_port(service.address)

@@ -23,10 +23,12 @@ from google.protobuf.message import DecodeError, Message
 
 from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.rpc.call_log import CallLog
+from runtime.rpc.call_log import CallLog, reason_told
 from runtime.service.caller import Actor, Caller
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
+from runtime.service.stages import CallTimes
+from runtime.service.traces import MOST_PAGES, EndedCall, Traces
 from runtime.wire.status import status_of, told, trailers
 
 SERVICE = pb.DESCRIPTOR.services_by_name["Lightpage"]
@@ -57,6 +59,7 @@ class Call:
         peer: address and connection that it came from.
         correlation_id: the caller's own text for the log, empty where it gave none.
         begun: when its first byte came, by `time.perf_counter`.
+        times: of its pages.
     """
 
     method: str
@@ -65,6 +68,7 @@ class Call:
     peer: str = ""
     correlation_id: str = ""
     begun: float = field(default_factory=time.perf_counter)
+    times: CallTimes = field(default_factory=CallTimes)
 
     @property
     def actor(self) -> Actor:
@@ -97,11 +101,19 @@ class Dispatcher:
         pool: threads for handlers that block, as many as there may be calls.
         limits: of the service.
         metrics: what is counted.
+        traces: are told of every call, None for none.
     """
 
-    def __init__(self, handlers: Sequence[object], pool: Executor, limits: Limits, metrics: ServiceMetrics) -> None:
+    def __init__(
+        self,
+        handlers: Sequence[object],
+        pool: Executor,
+        limits: Limits,
+        metrics: ServiceMetrics,
+        traces: Traces | None = None,
+    ) -> None:
         self._handlers, self._pool, self._limits = tuple(handlers), pool, limits
-        self._metrics, self._log = metrics, CallLog()
+        self._metrics, self._traces, self._log = metrics, traces, CallLog()
         self._active: set[asyncio.Task[Any]] = set()
         self._watching: set[asyncio.Task[Any]] = set()
         self._told: set[asyncio.Task[Any]] = set()
@@ -113,7 +125,7 @@ class Dispatcher:
         """All RPCs of the service that have a handler, for the server.
 
         Messages come as bytes: the library answers those that it cannot parse with INTERNAL and a traceback, and keeps
-        20 kB of each.
+        20 kB of each. They go as bytes, so that serialising them is a part of the call, and timed with it.
         """
         methods = {}
         for method in SERVICE.methods:
@@ -128,8 +140,9 @@ class Dispatcher:
                 (True, True): (grpc.stream_stream_rpc_method_handler, self._stream),
             }
             make, serve = made[method.client_streaming, method.server_streaming]
-            serving = partial(serve, method.name, handler, parse, method.client_streaming)
-            methods[method.name] = make(serving, None, getattr(pb, method.output_type.name).SerializeToString)
+            serialise = getattr(pb, method.output_type.name).SerializeToString
+            serving = partial(serve, method.name, handler, parse, serialise, method.client_streaming)
+            methods[method.name] = make(serving, None, None)
         return grpc.method_handlers_generic_handler(SERVICE.full_name, methods)
 
     def refuse(self) -> None:
@@ -156,17 +169,31 @@ class Dispatcher:
             task.cancel()
 
     async def _unary(
-        self, name: str, handler: Callable[..., Any], parse: Callable[[bytes], Any], many: bool, data: Any, context: Any
-    ) -> Any:
+        self,
+        name: str,
+        handler: Callable[..., Any],
+        parse: Callable[[bytes], Any],
+        serialise: Callable[[Any], bytes],
+        many: bool,
+        data: Any,
+        context: Any,
+    ) -> bytes:
         async with self._call(name, context) as call:
             request = self._messages(data, parse, call) if many else _parsed(parse, data, call)
             if inspect.iscoroutinefunction(handler):
-                return await handler(request, call)
-            return await asyncio.wrap_future(self._pool.submit(handler, request, call))
+                return serialise(await handler(request, call))
+            return serialise(await asyncio.wrap_future(self._pool.submit(handler, request, call)))
 
     async def _stream(
-        self, name: str, handler: Callable[..., Any], parse: Callable[[bytes], Any], many: bool, data: Any, context: Any
-    ) -> AsyncIterator[Any]:
+        self,
+        name: str,
+        handler: Callable[..., Any],
+        parse: Callable[[bytes], Any],
+        serialise: Callable[[Any], bytes],
+        many: bool,
+        data: Any,
+        context: Any,
+    ) -> AsyncIterator[bytes]:
         async with self._call(name, context) as call:
             request = self._messages(data, parse, call) if many else _parsed(parse, data, call)
             if inspect.isasyncgenfunction(handler):
@@ -177,7 +204,7 @@ class Dispatcher:
             try:
                 async with asyncio.timeout(longest_s):
                     async for reply in replies:
-                        yield reply
+                        yield serialise(reply)
             except TimeoutError:
                 raise StalledError(f"answer of {name}", f"not taken within {longest_s} s", "a faster reader") from None
             finally:
@@ -220,6 +247,8 @@ class Dispatcher:
     async def _call(self, name: str, context: Any) -> AsyncIterator[Call]:
         """Admit a call, count it, and turn what it raises into its status."""
         call = Call(name, Caller(partial(_seconds_left, context)), self._pool, context.peer())
+        call.times = CallTimes(call.begun, partial(self._metrics.timed, name), MOST_PAGES if self._traces else 0)
+        headers = dict(context.invocation_metadata() or ()) if self._traces else {}
         task = asyncio.current_task()
         assert task is not None  # calls run in tasks
         mine = self._watching if call.is_watch else self._active
@@ -232,28 +261,46 @@ class Dispatcher:
                 got, expected = f"{len(self._active) - 1} at once", f"at most {self._limits.concurrent_calls}"
                 raise OverloadedError("calls", got, f"{expected}; try again later", retry_s=1.0)
             yield call
-            self._ended(call, grpc.StatusCode.OK, None)
+            self._ended(call, headers, grpc.StatusCode.OK, None)
         except (asyncio.CancelledError, GeneratorExit) as left:
             if task in self._told and isinstance(left, asyncio.CancelledError):
                 task.uncancel()
                 error = _stopping(name)
-                self._ended(call, status_of(error), error)
+                self._ended(call, headers, status_of(error), error)
                 await context.abort(status_of(error), told(error), trailers(error))
-            self._ended(call, _code_of_leaving(context), left)
+            self._ended(call, headers, _code_of_leaving(context), left)
             raise
         except Exception as error:
             code = _code_of_leaving(context) if isinstance(error, CallerLeft) else status_of(error)
-            self._ended(call, code, error)
+            self._ended(call, headers, code, error)
             await context.abort(code, told(error), trailers(error))
         finally:
             call.caller.leave()
             mine.discard(task)
             self._told.discard(task)
 
-    def _ended(self, call: Call, code: grpc.StatusCode, error: BaseException | None) -> None:
+    def _ended(self, call: Call, headers: dict[str, Any], code: grpc.StatusCode, error: BaseException | None) -> None:
         """Count a call, before its caller hears of its end."""
+        ended, reason = time.perf_counter(), reason_told(error)
+        call.times.end(ended)
         self._metrics.in_flight.dec()
-        self._metrics.calls.labels(call.method, code.name).inc()
+        self._metrics.call_ended(call.method, code.name, reason, None if call.is_watch else ended - call.begun)
+        if self._traces is not None:
+            self._traces.ended(
+                EndedCall(
+                    service=SERVICE.full_name,
+                    method=call.method,
+                    peer=call.peer,
+                    correlation_id=call.correlation_id,
+                    code=code,
+                    reason=reason,
+                    begun=call.begun,
+                    ended=ended,
+                    pages=call.times.pages,
+                    count=call.times.count,
+                ),
+                headers,
+            )
         self._log.ended(call, code, error)
 
 

@@ -21,6 +21,7 @@ from runtime.rpc.health_servicer import HealthServicer
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.store_health import StoreHealth
+from runtime.service.traces import Traces
 from runtime.wire.address import check_free
 
 _KEEPALIVE_MS = 30_000
@@ -50,6 +51,7 @@ class LightpageServer:
         recalibrator: what recalibrates it.
         address: HOST:PORT; port 0 takes a free one.
         more: further handlers.
+        traces: are told of every call, None for none.
     """
 
     def __init__(
@@ -58,7 +60,9 @@ class LightpageServer:
         recalibrator: Recalibrator,
         address: str = "127.0.0.1:0",
         more: Sequence[object] = (),
+        traces: Traces | None = None,
     ) -> None:
+        self._traces = traces
         self._plane, self._recalibrator, self._address = plane, recalibrator, address
         self._handlers = (*more, *handlers(plane, recalibrator))
         self._loop = asyncio.new_event_loop()
@@ -136,7 +140,7 @@ class LightpageServer:
                 ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
             )
         )
-        self._dispatcher = Dispatcher(self._handlers, self._pool, limits, self._plane.metrics)
+        self._dispatcher = Dispatcher(self._handlers, self._pool, limits, self._plane.metrics, self._traces)
         self._server.add_generic_rpc_handlers((self._dispatcher.rpc_handler(),))
         self._health = HealthServicer()
         await self._say(False)
