@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from prometheus_client import (
@@ -23,6 +23,8 @@ from runtime.acquisition.source import FrameSource
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import unconfirmed_page
 from runtime.errors import LostPageError, UnconfirmedPageError
+from runtime.errors import Reason as PageLoss
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.service.store import Reason, Trouble
 
 if TYPE_CHECKING:
@@ -35,6 +37,8 @@ _STAGE_SECONDS = (0.0005, 0.001, 0.002, *_SECONDS, 30.0, 60.0)
 """From handing over a small reply to the longest wait for a slot."""
 _CALL_SECONDS = (0.001, 0.002, *_SECONDS, 30.0, 60.0, 300.0)
 """Up to a recalibration that is waited for."""
+_READ = "none"
+"""Loss of a page whose bytes were read."""
 VERSIONS = 32
 """Models whose pages are told apart, the newest: each recalibration makes another one."""
 
@@ -83,6 +87,21 @@ class ServiceMetrics:
         self.monitor_raised = Gauge("lightpage_monitor_sign_raised", "1 where beyond it.", ["sign"], registry=own)
         self.flight_pages = Counter("lightpage_flight_pages", "Kept, dropped or failed.", ["result"], registry=own)
         self.model = Gauge("lightpage_model_info", "1 for the model in service.", ["version"], registry=own)
+        self._begin_at_zero()
+
+    def _begin_at_zero(self) -> None:
+        """Show what may happen before it does: Prometheus sees no rise from nothing to the first one."""
+        known: tuple[tuple[Counter, Iterable[str]], ...] = (
+            (self.rejects, (name.removeprefix("ERROR_REASON_") for name in pb.ErrorReason.keys()[1:])),
+            (self.lost_pages, (reason.value for reason in PageLoss)),
+            (self.data_pages, (_READ, *(loss.value for loss in Loss))),
+            (self.searches, ("true", "false")),
+            (self.recalibrations, ("done", "refused", "failed", "dropped")),
+            (self.flight_pages, ("kept", "dropped", "failed")),
+        )
+        for counter, values in known:
+            for value in values:
+                counter.labels(value)
 
     def call_ended(self, method: str, code: str, reason: str, seconds: float | None) -> None:
         """Count a call by its status; `reason` is empty where it ended well, `seconds` None of a watch."""
@@ -117,7 +136,7 @@ class ServiceMetrics:
 
     def user_data(self, found: PageBytes) -> None:
         """Count a page whose bytes were read, or not."""
-        self.data_pages.labels("none" if found.loss is None else found.loss.value).inc()
+        self.data_pages.labels(_READ if found.loss is None else found.loss.value).inc()
         self.margin.set(found.margin_bits)
         self.corrected.inc(found.corrected)
         self.code_iterations.set(found.iterations)
@@ -154,6 +173,7 @@ class ServiceMetrics:
         """Say which model decodes now."""
         self.model.clear()
         self.model.labels(version).set(1)
+        self.pages.labels(version)
         self._versions = [*(known for known in self._versions if known != version), version]
         for old in self._versions[:-VERSIONS]:
             self.pages.remove(old)

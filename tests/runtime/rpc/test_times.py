@@ -1,4 +1,4 @@
-"""Where the time of calls goes: the stages of their pages are all of it, and what is refused is counted by its cause."""
+"""Where the time of calls goes: the stages of their pages are all of it; what is refused is counted by its cause."""
 
 from __future__ import annotations
 

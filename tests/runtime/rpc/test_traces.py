@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +111,7 @@ def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(toy_zip: Pa
     assert call.end_time_unix_nano <= after
     assert stages[0].start_time_unix_nano == call.start_time_unix_nano
     assert stages[-1].end_time_unix_nano == call.end_time_unix_nano
-    for one, following in zip(stages, stages[1:], strict=False):
+    for one, following in pairwise(stages):
         assert one.end_time_unix_nano == following.start_time_unix_nano
     failed = next(span for span in receiver.spans if span.name.endswith("/GetJob"))
     assert failed.parent_span_id == b""
@@ -121,9 +122,8 @@ def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(toy_zip: Pa
 
 def test_a_call_of_many_pages_has_a_span_of_each_up_to_a_number(toy_zip: Path) -> None:
     count = MOST_PAGES + 2
-    with receiving() as (receiver, endpoint):
-        with traced(toy_zip, endpoint) as stub:
-            assert len(list(stub.ReadPages(pb.ReadPagesRequest(count=count), timeout=60))) == count
+    with receiving() as (receiver, endpoint), traced(toy_zip, endpoint) as stub:
+        assert len(list(stub.ReadPages(pb.ReadPagesRequest(count=count), timeout=60))) == count
     call = next(span for span in receiver.spans if span.name.endswith("/ReadPages"))
     assert attributes(call)["lightpage.pages"] == count
     pages = inside(receiver.spans, call)
@@ -159,14 +159,14 @@ def test_where_nobody_takes_spans_no_page_is_lost_and_nothing_waits(toy_zip: Pat
         traces._exporter.export = export
         plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), toy.ToySource(toy.ToyDevice()))
         recalibrator = Recalibrator(plane, toy.fit_references)
-        with LightpageServer(plane, recalibrator, traces=traces) as server:
-            with grpc.insecure_channel(server.target) as channel:
-                stub = pb_grpc.LightpageStub(channel)
-                count = 120  # makes more spans than a batch has
-                replies = list(stub.ReadPages(pb.ReadPagesRequest(count=count), timeout=60))
-                replies += [stub.ReadPage(pb.ReadPageRequest(), timeout=20) for _ in range(count)]
-                assert held.wait(20)
-                replies += [stub.ReadPage(pb.ReadPageRequest(), timeout=20) for _ in range(count)]
+        server = LightpageServer(plane, recalibrator, traces=traces)
+        with server, grpc.insecure_channel(server.target) as channel:
+            stub = pb_grpc.LightpageStub(channel)
+            count = 120  # makes more spans than a batch has
+            replies = list(stub.ReadPages(pb.ReadPagesRequest(count=count), timeout=60))
+            replies += [stub.ReadPage(pb.ReadPageRequest(), timeout=20) for _ in range(count)]
+            assert held.wait(20)
+            replies += [stub.ReadPage(pb.ReadPageRequest(), timeout=20) for _ in range(count)]
         assert len(replies) == 3 * count
         release.set()
         begun = time.monotonic()

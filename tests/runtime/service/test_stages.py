@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from runtime.service.stages import CallTimes, Lap, Stage, Stages
 
 
@@ -43,7 +45,7 @@ def test_the_stages_are_the_whole_way() -> None:
         Stage.RESPOND: 32.0,
     }
     assert sum(stages.seconds().values()) == stages.elapsed_s == 63.25
-    for one, following in zip(stages.laps, stages.laps[1:], strict=False):
+    for one, following in pairwise(stages.laps):
         assert one.end == following.start
 
 
