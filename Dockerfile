@@ -35,7 +35,7 @@ COPY analysis analysis
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu]'
+    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu,traces]'
 
 FROM base AS service
 # The root file system is read-only in service: no byte code is written, and what must be written goes to /state or /tmp.
@@ -63,7 +63,7 @@ FROM build AS build-camera
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu,camera,screen]'
+    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu,camera,screen,traces]'
 
 FROM runtime AS camera
 USER 0:0
@@ -77,7 +77,7 @@ FROM build AS build-deep
 RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
     --mount=type=bind,from=packages,target=/run/packages \
-    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu,train]'
+    /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[cpu,train,traces]'
 
 FROM runtime AS deep
 COPY --from=build-deep /opt/lightpage /opt/lightpage
@@ -89,7 +89,7 @@ RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
     --mount=type=bind,from=packages,target=/run/packages \
     rm -rf /opt/lightpage \
     && python3 -m venv /opt/lightpage \
-    && /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[gpu]'
+    && /opt/lightpage/bin/pip install --no-cache-dir --constraint constraints.txt '.[gpu,traces]'
 
 FROM service AS gpu
 COPY --from=build-gpu /opt/lightpage /opt/lightpage

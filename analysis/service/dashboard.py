@@ -31,7 +31,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.gridspec import GridSpec
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, Locator, MaxNLocator, MultipleLocator
 
 from analysis.service.overload import capacity
 from analysis.service.prometheus import DEPLOY, RunningPrometheus
@@ -48,7 +48,7 @@ from runtime.acquisition.source import SHOT_S, Shot
 from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
-from runtime.demo.demo import drifted, write_pages
+from runtime.demo.demo import SPOILT_PAGE, drifted, write_pages
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 DASHBOARD = DEPLOY / "grafana" / "lightpage.json"
@@ -65,7 +65,7 @@ _COLOURS = {
 }
 _PALETTE = [*_COLOURS.values(), "#8ab8ff", "#fade2a", "#96d98d", "#ffb357", "#ca95e5", "#ff7383"]
 _BACK, _PANEL, _TEXT, _FAINT = "#111217", "#181b1f", "#ccccdc", "#3a3d44"
-_PAGES = 6
+_PAGES = tuple(page for page in range(6) if page != SPOILT_PAGE)
 _DRIFT = 0.1
 """Of the change of temperature of `drifted`: margin is lost, and no page yet."""
 _DEADLINE_S = 4.0
@@ -89,13 +89,13 @@ def shots(decoder: Decoder, folder: Path) -> tuple[Shots, Shots]:
     with source:
         for device in (Device(), drifted(Device(), _DRIFT)):
             source.set_device(device)
-            pages = [source.shot(SHOT_S, n) for n in track(range(_PAGES), "simulate", total=_PAGES)]
+            pages = [source.shot(SHOT_S, n) for n in track(_PAGES, "simulate", total=len(_PAGES))]
             taken.append(Shots(tuple(pages), source.references()))
     return taken[0], taken[1]
 
 
 class Load:
-    """Callers that send pairs of the device, and read a page of the source now and then.
+    """Callers that send pairs of the device, now and then two in one call.
 
     Args:
         service: that they call.
@@ -124,10 +124,10 @@ class Load:
             while not self._stop.wait(chance.exponential(_CALLERS / (self.factor * self._rate))):
                 pair = self.pairs[int(chance.integers(len(self.pairs)))]
                 with suppress(grpc.RpcError):
+                    requests = sent.requests(pair, options=_USER_BYTES)
                     if chance.random() < 0.1:
-                        stub(channel).ReadPage(pb.ReadPageRequest(), timeout=_DEADLINE_S)
+                        list(stub(channel).DecodePages(iter(2 * requests), timeout=2 * _DEADLINE_S))
                     else:
-                        requests = sent.requests(pair, options=_USER_BYTES)
                         stub(channel).DecodeFrames(iter(requests), timeout=_DEADLINE_S)
 
 
@@ -136,7 +136,7 @@ def scenario(service: RunningService, decoder: Decoder, seconds: float, folder: 
     click.echo("simulate pages")
     fresh, moved = shots(decoder, folder)
     pairs = [[shot.pair for shot in taken.pages] for taken in (fresh, moved)]
-    known = [(shot.pair, shot.symbols) for shot in moved.pages[2:5] if shot.symbols is not None]
+    known = [(shot.pair, shot.symbols) for shot in moved.pages[1:4] if shot.symbols is not None]
     rate = capacity(service, PagesToSend(), 8.0)
     click.echo(f"the service decodes {rate:.2f} pages a second")
     load = Load(service, rate)
@@ -295,7 +295,7 @@ def _series(
     low, high = axes.get_ylim()
     axes.set_ylim(defaults.get("min", low), max(defaults.get("max", high), defaults.get("min", low) + 1e-9))
     axes.yaxis.set_major_formatter(FuncFormatter(formatted(defaults["unit"])))
-    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.yaxis.set_major_locator(_locator(defaults["unit"], axes.get_ylim()))
     axes.xaxis.set_major_formatter(matplotlib.dates.DateFormatter("%H:%M"))  # type: ignore[no-untyped-call]
     axes.xaxis.set_major_locator(matplotlib.dates.MinuteLocator())  # type: ignore[no-untyped-call]
     axes.tick_params(colors=_TEXT, labelsize=8, length=0)
@@ -314,6 +314,13 @@ def _series(
         columnspacing=1.0,
         borderaxespad=0.3,
     )
+
+
+def _locator(unit: str, limits: tuple[float, float]) -> Locator:
+    """Some five marks; of bytes at powers of two."""
+    if unit not in ("bytes", "Bps"):
+        return MaxNLocator(5)
+    return MultipleLocator(2.0 ** math.ceil(math.log2(max(1.0, (limits[1] - limits[0]) / 5))))
 
 
 def _stat(frame: Axes, panel: dict[str, Any], found: list[tuple[str, list[datetime], list[float]]]) -> None:
@@ -339,10 +346,7 @@ def main(seconds: float, threads: int, out: Path) -> None:
     decoder = Decoder.load(bundle_path(DEFAULT), threads)
     with tempfile.TemporaryDirectory(prefix="lightpage-") as name:
         folder = Path(name)
-        source = PagesToSend().record(folder / "golden.h5")
-        service = RunningService(
-            "--source", f"recording:{source}", "--store", f"{folder}/models", "--threads", str(threads)
-        )
+        service = RunningService("--store", f"{folder}/models", "--threads", str(threads))
         with service, RunningPrometheus(service.metrics.removeprefix("http://").partition("/")[0]) as prometheus:
             begun = time.time()
             scenario(service, decoder, seconds, folder)

@@ -33,10 +33,8 @@ if TYPE_CHECKING:
     from runtime.service.stages import Stages
 
 _SECONDS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-_STAGE_SECONDS = (0.0005, 0.001, 0.002, *_SECONDS, 30.0, 60.0)
-"""From handing over a small reply to the longest wait for a slot."""
-_CALL_SECONDS = (0.001, 0.002, *_SECONDS, 30.0, 60.0, 300.0)
-"""Up to a recalibration that is waited for."""
+_FINE_SECONDS = tuple(sorted({*_SECONDS, 0.001, 0.002, 0.03, 0.07, 0.15, 0.3, 0.7, 1.5, 3.0, 7.0, 20.0, 60.0}))
+"""From handing over a small reply to the longest wait for a slot; no bucket is much wider than the time in it."""
 _READ = "none"
 """Loss of a page whose bytes were read."""
 VERSIONS = 32
@@ -55,13 +53,17 @@ class ServiceMetrics:
         self.calls = Counter("lightpage_calls", "Finished calls.", ["method", "code"], registry=own)
         self.in_flight = Gauge("lightpage_calls_in_flight", "Calls being served.", registry=own)
         self.call_seconds = Histogram(
-            "lightpage_call_seconds", "Whole calls, watches left out.", ["method"], buckets=_CALL_SECONDS, registry=own
+            "lightpage_call_seconds",
+            "Whole calls, watches left out.",
+            ["method"],
+            buckets=(*_FINE_SECONDS, 300.0),
+            registry=own,
         )
         self.stage_seconds = Histogram(
             "lightpage_stage_seconds",
             "Stages of pages on their way through calls.",
             ["method", "stage"],
-            buckets=_STAGE_SECONDS,
+            buckets=_FINE_SECONDS,
             registry=own,
         )
         self.rejects = Counter("lightpage_rejects", "Calls and pages refused, by reason.", ["reason"], registry=own)

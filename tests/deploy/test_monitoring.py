@@ -86,7 +86,7 @@ def test_every_own_metric_is_documented_with_its_labels(shown: str) -> None:
         base = name if name in own else re.sub(r"_(bucket|sum|count)$", "", name)
         if base in own:
             labels[base] |= set(re.findall(r'(\w+)="', inside)) - {"le"}
-    rows = re.findall(r"^\| `(lightpage_\w+)` \| (\w+) \| ([^|]*) \|", DOCUMENT.read_text(), re.MULTILINE)
+    rows = re.findall(r"^\| `(lightpage_\w+)` \| (\w+) \|([^|]*)\|", DOCUMENT.read_text(), re.MULTILINE)
     told = {name: (kind, set(re.findall(r"`(\w+)`", given))) for name, kind, given in rows}
     assert {name: kind for name, (kind, _) in told.items()} == own
     for name, seen in labels.items():

@@ -9,7 +9,7 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import Thread
 from wsgiref.simple_server import make_server
@@ -72,11 +72,12 @@ def test_a_wrong_address_is_named_with_what_to_do(toy_zip: Path, capsys: pytest.
     assert gone in told
     assert "--metrics-port" in told
 
-    def other(environ: object, start_response: object) -> Iterator[bytes]:
-        start_response("200 OK", [])  # type: ignore[operator]
-        return iter([b"up 1\n" if strange == "metrics" else b"<html>a page</html>\n"])
+    for text in (b"up 1\n", b"<html>a page</html>\n"):
 
-    for strange in ("metrics", "page"):
+        def other(_: object, start_response: Callable[..., object], text: bytes = text) -> list[bytes]:
+            start_response("200 OK", [])
+            return [text]
+
         with make_server("127.0.0.1", 0, other) as server:
             Thread(target=server.handle_request, daemon=True).start()
             assert cli_main.run(top, ["--address", f"127.0.0.1:{server.server_port}", "--once"]) == EXIT_ERROR
