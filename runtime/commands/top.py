@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from datetime import timedelta
 
 import click
-from rich.columns import Columns
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.panel import Panel
@@ -63,9 +62,13 @@ def view(looks: Looks, address: str, silent: str = "") -> RenderableType:
     parts: list[RenderableType] = [_header(change, looks.restarts, address)]
     if silent:
         parts.append(Text(silent, style="bold white on red"))
-    boxes = [_load(change), _device(change), _process(change)]
-    parts += [Columns([Panel(table, title=title) for title, table in boxes]), Panel(_stages(change), title="stages")]
-    return Group(*parts)
+    load, device, process = (
+        Panel(table(change), title=title, expand=False)
+        for title, table in (("load", _load), ("device", _device), ("process", _process))
+    )
+    upper = Table.grid(padding=(0, 1))
+    upper.add_row(load, Group(device, process))
+    return Group(*parts, upper, Panel(_stages(change), title="stages", expand=False))
 
 
 def _header(change: Change, restarts: int, address: str) -> Text:
@@ -88,7 +91,7 @@ def _table() -> Table:
     return table
 
 
-def _load(change: Change) -> tuple[str, Table]:
+def _load(change: Change) -> Table:
     now, table = change.now, _table()
     table.add_row("pages", f"{_number(change.rate('lightpage_pages_total'))}/s")
     lost = change.rises("lightpage_pages_lost_total", "reason")
@@ -105,10 +108,10 @@ def _load(change: Change) -> tuple[str, Table]:
     used, limit = now.value("lightpage_receive_buffer_bytes"), now.value("lightpage_receive_buffer_limit_bytes")
     table.add_row("frames in memory", f"{_bytes(used)} of {_bytes(limit)}")
     table.add_row("frames received", f"{_bytes(change.rate('lightpage_received_bytes_total'))}/s")
-    return "load", table
+    return table
 
 
-def _device(change: Change) -> tuple[str, Table]:
+def _device(change: Change) -> Table:
     now, table = change.now, _table()
     read = change.now.value("lightpage_data_pages_total", loss="none") > 0
     margin = now.value("lightpage_margin_bits")
@@ -129,17 +132,17 @@ def _device(change: Change) -> tuple[str, Table]:
     if now.value("lightpage_store_ok") == 0:
         trouble = [dict(own)["reason"] for own, value in now.values("lightpage_store_trouble").items() if value == 1]
         table.add_row("store", Text(", ".join(trouble) or "in trouble", "red"))
-    return "device", table
+    return table
 
 
-def _process(change: Change) -> tuple[str, Table]:
+def _process(change: Change) -> Table:
     now, table = change.now, _table()
     table.add_row("CPU", f"{_number(change.rate('process_cpu_seconds_total'))} cores")
     table.add_row("memory", _bytes(now.value("process_resident_memory_bytes")))
     descriptors = _number(now.value("process_open_fds")), _number(now.value("process_max_fds"))
     table.add_row("descriptors", f"{descriptors[0]} of {descriptors[1]}")
     table.add_row("calls in flight", _number(now.value("lightpage_calls_in_flight")))
-    return "process", table
+    return table
 
 
 def _stages(change: Change) -> Table:

@@ -159,8 +159,9 @@ class Traces:
         ending = threading.Thread(target=self._provider.shutdown, name="lightpage-traces", daemon=True)
         ending.start()
         ending.join(_END_S)
-        self._exporter.shutdown()  # whoever still tries gives up
-        ending.join(_END_S)
+        if ending.is_alive():
+            self._exporter.shutdown()  # whoever still tries gives up
+            ending.join(_END_S)
 
     def __enter__(self) -> Self:
         return self

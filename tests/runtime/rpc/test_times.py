@@ -86,6 +86,7 @@ def test_waiting_for_a_slot_is_told_apart_from_the_work(start: Start) -> None:
     assert ended(service, "DecodeFrames", 1)
     assert seconds(service, "DecodeFrames", Stage.QUEUE) >= waited > 0
     assert service.count("lightpage_receive_buffer_bytes") == 0
+    assert service.count("lightpage_received_bytes_total") == size
 
 
 def test_pairs_of_one_call_are_timed_each_and_their_refusals_counted(start: Start) -> None:
