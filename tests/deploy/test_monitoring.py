@@ -22,6 +22,7 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.registry import ModelRegistry
+from runtime.service.stages import Stages
 from runtime.service.store import ModelStore
 from tests.deploy import promql
 from tests.runtime import toy
@@ -48,7 +49,10 @@ def shown(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     store = ModelStore(tmp_path_factory.mktemp("store"), bundle)
     plane = DataPlane(registry, source, store, metrics=metrics, observers=[history], monitor=monitor)
     for _ in range(3):
-        plane.read_page(None, None, Caller())
+        stages = Stages()
+        plane.read_page(None, None, Caller(), stages=stages)
+        metrics.timed("ReadPage", stages)
+        metrics.call_ended("ReadPage", "OK", "", stages.elapsed_s)
     console = Console(metrics, history, registry, monitor, "toy:device")
     with ConsoleServer(console, 0) as server, urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=20) as reply:
         return str(reply.read(), "utf-8")
