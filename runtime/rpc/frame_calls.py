@@ -99,8 +99,9 @@ class FrameCalls:
             try:
                 async for message in requests:
                     stages = call.times.page(time.perf_counter())
-                    stages.begin(Stage.RECEIVE)
+                    stages.begin(Stage.QUEUE)
                     await room.acquire()
+                    stages.begin(Stage.RECEIVE)
                     outcome = await self._begin(_header(message, call), requests, call, stages)
                     pending.put_nowait((asyncio.ensure_future(outcome), stages))
             finally:

@@ -15,7 +15,7 @@ class Stage(StrEnum):
     RECEIVE = "receive"
     """Its frames come: from the caller, black level taken off, or from the source's cameras."""
     QUEUE = "queue"
-    """It waits: for a slot, for that of a range before it, or for the same request of somebody else."""
+    """It waits: for a slot, for that of a range, for pairs before it in its call, for the same request in another."""
     INFERENCE = "inference"
     """Its frames are checked, and the graph runs, every attempt counted."""
     POST_PROCESSING = "post_processing"

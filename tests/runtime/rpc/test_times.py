@@ -102,7 +102,7 @@ def test_pairs_of_one_call_are_timed_each_and_their_refusals_counted(start: Star
         replies = list(service.stub(channel).DecodePages(stream(), timeout=20))
     assert [reply.WhichOneof("outcome") for reply in replies] == ["decoded", "refused", "refused", "decoded"]
     assert ended(service, "DecodePages", 1)
-    for stage, count in (("receive", 4), ("queue", 3), ("inference", 3), ("post_processing", 2), ("respond", 4)):
+    for stage, count in (("receive", 4), ("queue", 4), ("inference", 3), ("post_processing", 2), ("respond", 4)):
         assert service.count("lightpage_stage_seconds_count", method="DecodePages", stage=stage) == count, stage
     assert service.count("lightpage_rejects_total", reason="FRAMES_DISAGREE") == 1
     assert service.count("lightpage_rejects_total", reason="FRAME_FORMAT") == 1
