@@ -18,6 +18,7 @@ import pytest
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR
+from lightpage.errors import LightpageError
 from runtime.commands.top import top
 from runtime.console.looks import Change, Look, Looks, look_at
 from runtime.console.server import ConsoleServer
@@ -72,7 +73,7 @@ def test_a_wrong_address_is_named_with_what_to_do(toy_zip: Path, capsys: pytest.
     assert gone in told
     assert "--metrics-port" in told
 
-    for text in (b"up 1\n", b"<html>a page</html>\n"):
+    for text, told in ((b"up 1\n", "metrics of something else"), (b"<html>a page</html>\n", "got no metrics")):
 
         def other(_: object, start_response: Callable[..., object], text: bytes = text) -> list[bytes]:
             start_response("200 OK", [])
@@ -80,8 +81,8 @@ def test_a_wrong_address_is_named_with_what_to_do(toy_zip: Path, capsys: pytest.
 
         with make_server("127.0.0.1", 0, other) as server:
             Thread(target=server.handle_request, daemon=True).start()
-            assert cli_main.run(top, ["--address", f"127.0.0.1:{server.server_port}", "--once"]) == EXIT_ERROR
-            assert "metrics" in capsys.readouterr().err
+            with pytest.raises(LightpageError, match=told):
+                look_at(f"127.0.0.1:{server.server_port}")
 
 
 def test_quantiles_are_those_of_what_came_between() -> None:
