@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -104,6 +104,9 @@ bench-service: $(STAMP)  ## the service under load, faults and attack, from outs
 	$(BIN)/python -m analysis.service.transport --json $(BENCH_SERVICE)/transport.json
 	$(BIN)/python -m analysis.service.memory_attacks --json $(BENCH_SERVICE)/memory.json
 	$(BIN)/python -m analysis.hardware.recalibration --load 0.6 --json $(BENCH_SERVICE)/recalibration.json
+
+dashboard: $(STAMP)  ## draw docs/images/dashboard.png from a service under load: needs prometheus
+	$(BIN)/python -m analysis.service.dashboard --out docs/images/dashboard.png
 
 soak: $(STAMP)  ## 40 minutes at 80% of the service's load: does its memory grow?
 	@mkdir -p $(BENCH_SERVICE)

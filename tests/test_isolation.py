@@ -85,7 +85,7 @@ FORBIDDEN = {
     "analysis": {"tests"},
 }
 """By package, what none of its files may use: lightpage <- {train, runtime} <- export <- analysis."""
-COMMANDS_ONLY = {"click", "tqdm"}
+COMMANDS_ONLY = {"click", "rich", "tqdm"}
 """Terminals are the business of commands and of what they share."""
 
 
@@ -181,7 +181,7 @@ with server, LightpageClient(server.target) as client:
     page = client.read_page(want_written=True)
     assert (page.symbols == page.written).all()
 loaded = {name.partition(".")[0] for name in sys.modules}
-bad = loaded & {"torch", "lightning", "onnx", "onnxscript", "train", "export", "tests"}
+bad = loaded & {"torch", "lightning", "onnx", "onnxscript", "opentelemetry", "train", "export", "tests"}
 assert not bad, bad
 import os
 import signal
@@ -190,7 +190,7 @@ print("served")
 """
 
 
-def test_importing_everything_and_serving_a_page_loads_no_torch(toy_zip: Path, tmp_path: Path) -> None:
+def test_importing_everything_and_serving_a_page_loads_no_torch_and_no_tracing(toy_zip: Path, tmp_path: Path) -> None:
     from tests.runtime import toy
 
     toy.write_toy_recording(tmp_path / "r.h5", toy.ToyDevice(), 16, 1)

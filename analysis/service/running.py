@@ -98,6 +98,11 @@ class RunningService:
         """Its memory."""
         return int(Path(f"/proc/{self.pid}/statm").read_text().split()[1]) * resource.getpagesize()
 
+    @property
+    def metrics(self) -> str:
+        """Address of its metrics."""
+        return self._metrics
+
     def metric(self, name: str, **labels: str) -> float:
         """Sum of the samples of a metric with these labels."""
         wanted = [f'{key}="{value}"' for key, value in labels.items()]

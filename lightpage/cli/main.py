@@ -42,6 +42,7 @@ EXTRAS = {
 SUMMARIES = {
     "bench": "Measure speed: inference alone, whole decode, through gRPC.",
     "console": "Open the web page of a running service.",
+    "top": "Show live how a running service fares.",
     "code": "Choose how user bytes are protected on a device's pages.",
     "calibrate": "Find a device's geometry from nominal with a few known pages.",
     "decode": "Decode a recording, or pages of the service's source, with a running service.",

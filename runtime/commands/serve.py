@@ -51,6 +51,7 @@ from runtime.service.self_calibration import SelfCalibration
 from runtime.service.settings import ADDRESS, OFF, STORE_VARIABLE, Effective, Option, ServiceSettings, service_settings
 from runtime.service.shared_memory import SharedMemory
 from runtime.service.store import ModelStore
+from runtime.service.traces import Traces
 from runtime.wire.address import check_free, is_local
 from runtime.wire.shared_memory import memory_path
 
@@ -218,7 +219,10 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         actions = Actions(plane, recalibrator)
         console = Console(metrics, history, registry, monitor, source_name, actions)
         stack.enter_context(_shown(console, settings.metrics.port, settings.metrics.host, certificates))
-        server = LightpageServer(plane, recalibrator, service.address, certificates=certificates)
+        traces = None
+        if settings.traces.endpoint is not None:
+            traces = stack.enter_context(Traces(settings.traces.endpoint, settings.traces.share))
+        server = LightpageServer(plane, recalibrator, service.address, certificates=certificates, traces=traces)
         check_free("address", service.address)  # before anything else takes a port
         if service.shared_memory:
             limits, path = settings.limits, memory_path(service.address)

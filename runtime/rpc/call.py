@@ -27,10 +27,12 @@ from google.protobuf.message_factory import GetMessageClass
 from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError
 from runtime.identity.roles import LOCAL, NEEDED, Identity, Role, identity_of
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.rpc.call_log import CallLog
+from runtime.rpc.call_log import CallLog, reason_told
 from runtime.service.caller import Actor, Caller
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
+from runtime.service.stages import CallTimes
+from runtime.service.traces import MOST_PAGES, EndedCall, Traces
 from runtime.wire.frame_parts import parsed_part
 from runtime.wire.status import status_of, told, trailers
 
@@ -66,6 +68,7 @@ class Call:
         identity: who calls.
         correlation_id: the caller's own text for the log, empty where it gave none.
         begun: when its first byte came, by `time.perf_counter`.
+        times: of its pages.
     """
 
     method: str
@@ -75,6 +78,7 @@ class Call:
     identity: Identity = LOCAL
     correlation_id: str = ""
     begun: float = field(default_factory=time.perf_counter)
+    times: CallTimes = field(default_factory=CallTimes)
 
     @property
     def actor(self) -> Actor:
@@ -130,11 +134,19 @@ class Dispatcher:
         pool: threads for handlers that block, as many as there may be calls.
         limits: of the service.
         metrics: what is counted.
+        traces: are told of every call, None for none.
     """
 
-    def __init__(self, services: Sequence[Served], pool: Executor, limits: Limits, metrics: ServiceMetrics) -> None:
+    def __init__(
+        self,
+        services: Sequence[Served],
+        pool: Executor,
+        limits: Limits,
+        metrics: ServiceMetrics,
+        traces: Traces | None = None,
+    ) -> None:
         self._services, self._pool, self._limits = tuple(services), pool, limits
-        self._metrics, self._log = metrics, CallLog()
+        self._metrics, self._traces, self._log = metrics, traces, CallLog()
         self._active: set[asyncio.Task[Any]] = set()
         self._watching: set[asyncio.Task[Any]] = set()
         self._told: set[asyncio.Task[Any]] = set()
@@ -147,7 +159,7 @@ class Dispatcher:
 
         Messages come as bytes: the library answers those that it cannot parse with INTERNAL and a traceback, and keeps
         20 kB of each. They come as streams, even where there is but one: the library would read it before anybody could
-        refuse the call.
+        refuse the call. They go as bytes, so that serialising them is a part of the call, and timed with it.
         """
         return tuple(map(self._rpc_handler, self._services))
 
@@ -162,8 +174,9 @@ class Dispatcher:
             }[method.server_streaming]
             name, message = f"{service.prefix}{method.name}", GetMessageClass(method.input_type)
             parse = parsed_part if message is pb.DecodeFramesRequest else message.FromString
-            serving = partial(serve, name, handler, parse, method.client_streaming)
-            methods[method.name] = make(serving, None, GetMessageClass(method.output_type).SerializeToString)
+            serialise = GetMessageClass(method.output_type).SerializeToString
+            serving = partial(serve, name, handler, parse, serialise, method.client_streaming)
+            methods[method.name] = make(serving, None, None)
         return grpc.method_handlers_generic_handler(service.descriptor.full_name, methods)
 
     def refuse(self) -> None:
@@ -190,17 +203,31 @@ class Dispatcher:
             task.cancel()
 
     async def _unary(
-        self, name: str, handler: Callable[..., Any], parse: Callable[[bytes], Any], many: bool, data: Any, context: Any
-    ) -> Any:
+        self,
+        name: str,
+        handler: Callable[..., Any],
+        parse: Callable[[bytes], Any],
+        serialise: Callable[[Any], bytes],
+        many: bool,
+        data: Any,
+        context: Any,
+    ) -> bytes:
         async with self._call(name, context) as call:
             request = self._messages(data, parse, call) if many else await self._one(data, parse, call)
             if inspect.iscoroutinefunction(handler):
-                return await handler(request, call)
-            return await asyncio.wrap_future(self._pool.submit(handler, request, call))
+                return serialise(await handler(request, call))
+            return serialise(await asyncio.wrap_future(self._pool.submit(handler, request, call)))
 
     async def _stream(
-        self, name: str, handler: Callable[..., Any], parse: Callable[[bytes], Any], many: bool, data: Any, context: Any
-    ) -> AsyncIterator[Any]:
+        self,
+        name: str,
+        handler: Callable[..., Any],
+        parse: Callable[[bytes], Any],
+        serialise: Callable[[Any], bytes],
+        many: bool,
+        data: Any,
+        context: Any,
+    ) -> AsyncIterator[bytes]:
         async with self._call(name, context) as call:
             request = self._messages(data, parse, call) if many else await self._one(data, parse, call)
             if inspect.isasyncgenfunction(handler):
@@ -211,7 +238,7 @@ class Dispatcher:
             try:
                 async with asyncio.timeout(longest_s):
                     async for reply in replies:
-                        yield reply
+                        yield serialise(reply)
             except TimeoutError:
                 raise StalledError(f"answer of {name}", f"not taken within {longest_s} s", "a faster reader") from None
             finally:
@@ -258,6 +285,8 @@ class Dispatcher:
         """Admit a call, count it, and turn what it raises into its status."""
         caller = Caller(partial(_seconds_left, context))
         call = Call(name, caller, self._pool, context.peer(), _identity(context))
+        call.times = CallTimes(call.begun, partial(self._metrics.timed, name), MOST_PAGES if self._traces else 0)
+        headers = dict(context.invocation_metadata() or ()) if self._traces else {}
         task = asyncio.current_task()
         assert task is not None  # calls run in tasks
         mine = self._watching if call.is_watch else self._active
@@ -271,28 +300,46 @@ class Dispatcher:
                 got, expected = f"{len(self._active) - 1} at once", f"at most {self._limits.concurrent_calls}"
                 raise OverloadedError("calls", got, f"{expected}; try again later", retry_s=1.0)
             yield call
-            self._ended(call, grpc.StatusCode.OK, None)
+            self._ended(call, headers, grpc.StatusCode.OK, None)
         except (asyncio.CancelledError, GeneratorExit) as left:
             if task in self._told and isinstance(left, asyncio.CancelledError):
                 task.uncancel()
                 error = _stopping(name)
-                self._ended(call, status_of(error), error)
+                self._ended(call, headers, status_of(error), error)
                 await context.abort(status_of(error), told(error), trailers(error))
-            self._ended(call, _code_of_leaving(context), left)
+            self._ended(call, headers, _code_of_leaving(context), left)
             raise
         except Exception as error:
             code = _code_of_leaving(context) if isinstance(error, CallerLeft) else status_of(error)
-            self._ended(call, code, error)
+            self._ended(call, headers, code, error)
             await context.abort(code, told(error), trailers(error))
         finally:
             call.caller.leave()
             mine.discard(task)
             self._told.discard(task)
 
-    def _ended(self, call: Call, code: grpc.StatusCode, error: BaseException | None) -> None:
+    def _ended(self, call: Call, headers: dict[str, Any], code: grpc.StatusCode, error: BaseException | None) -> None:
         """Count a call, before its caller hears of its end."""
+        ended, reason = time.perf_counter(), reason_told(error)
+        call.times.end(ended)
         self._metrics.in_flight.dec()
-        self._metrics.calls.labels(call.method, code.name).inc()
+        self._metrics.call_ended(call.method, code.name, reason, None if call.is_watch else ended - call.begun)
+        if self._traces is not None:
+            self._traces.ended(
+                EndedCall(
+                    service=SERVICE.full_name,
+                    method=call.method,
+                    peer=call.peer,
+                    correlation_id=call.correlation_id,
+                    code=code,
+                    reason=reason,
+                    begun=call.begun,
+                    ended=ended,
+                    pages=call.times.pages,
+                    count=call.times.count,
+                ),
+                headers,
+            )
         self._log.ended(call, code, error)
 
 

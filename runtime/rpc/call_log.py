@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import grpc
 
 from runtime.errors import CallerLeft
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.wire.status import reason_of, told
+from runtime.wire.status import reason_name, told
 
 if TYPE_CHECKING:
     from runtime.rpc.call import Call
@@ -49,7 +48,7 @@ class CallLog:
             "peer": call.peer,
             "correlation_id": call.correlation_id,
             "code": code.name,
-            "reason": _reason(error),
+            "reason": reason_told(error),
             "seconds": round(self._clock() - call.begun, 4),
         }
         text = "done" if error is None else told(error) if isinstance(error, Exception) else "the caller has gone"
@@ -64,8 +63,8 @@ def _level(call: Call, code: grpc.StatusCode, error: BaseException | None) -> in
     return logging.WARNING if code in _FAULTS_OF_THE_SERVICE else logging.INFO
 
 
-def _reason(error: BaseException | None) -> str:
+def reason_told(error: BaseException | None) -> str:
     """The name of the reason that the caller hears; empty where there is none to tell."""
     if error is None or isinstance(error, CallerLeft) or not isinstance(error, Exception):
         return ""
-    return pb.ErrorReason.Name(reason_of(error)).removeprefix("ERROR_REASON_")
+    return reason_name(error)

@@ -19,10 +19,12 @@ from lightpage.recording.layout import frame_type
 from runtime.errors import MalformedError, StalledError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import Call
+from runtime.rpc.call_log import reason_told
 from runtime.rpc.replies import decode_reply
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane, levels_for
 from runtime.service.receiver import PairReceiver
+from runtime.service.stages import Stage, Stages
 from runtime.wire.frame_parts import FramePart
 from runtime.wire.messages import pixel_type
 from runtime.wire.requests import check_options, pilots_of
@@ -39,13 +41,12 @@ class _Received:
     Attributes:
         header: of it.
         receiver: that holds it, to be closed once it is decoded.
-        start, received: when its header and its last byte came, `time.perf_counter` seconds.
+        stages: times it.
     """
 
     header: pb.DecodeHeader
     receiver: PairReceiver
-    start: float
-    received: float
+    stages: Stages
 
 
 class _Counted:
@@ -75,8 +76,10 @@ class FrameCalls:
 
     async def DecodeFrames(self, requests: AsyncIterator[FramePart], call: Call) -> pb.DecodeReply:
         """Receive a frame pair and decode it."""
+        stages = call.times.page()
+        stages.begin(Stage.RECEIVE)
         header = _header(await anext(requests, None), call)
-        received = await self._receive(header, requests, call)
+        received = await self._receive(header, requests, call, stages)
         try:
             async with self._in_time():
                 async for part in requests:
@@ -88,39 +91,44 @@ class FrameCalls:
 
     async def DecodePages(self, requests: AsyncIterator[FramePart], call: Call) -> AsyncIterator[pb.DecodePagesReply]:
         """Receive frame pairs, one after another, and decode each while the next one comes."""
-        pending: asyncio.Queue[asyncio.Future[pb.DecodePagesReply] | None] = asyncio.Queue()
+        pending: asyncio.Queue[tuple[asyncio.Future[pb.DecodePagesReply], Stages] | None] = asyncio.Queue()
         room = asyncio.Semaphore(_ON_THEIR_WAY)
 
         async def receive() -> None:
             try:
                 async for message in requests:
+                    stages = call.times.page(time.perf_counter())
+                    stages.begin(Stage.QUEUE)
                     await room.acquire()
-                    outcome = await self._begin(_header(message, call), requests, call)
-                    pending.put_nowait(asyncio.ensure_future(outcome))
+                    stages.begin(Stage.RECEIVE)
+                    outcome = await self._begin(_header(message, call), requests, call, stages)
+                    pending.put_nowait((asyncio.ensure_future(outcome), stages))
             finally:
                 pending.put_nowait(None)
 
         receiving = asyncio.ensure_future(receive())
         try:
             while (work := await pending.get()) is not None:
-                yield await work
+                outcome, stages = work
+                yield await outcome
+                call.times.done(stages)
                 room.release()
             await receiving
         finally:
             receiving.cancel()
 
     async def _begin(
-        self, header: pb.DecodeHeader, requests: AsyncIterator[FramePart], call: Call
+        self, header: pb.DecodeHeader, requests: AsyncIterator[FramePart], call: Call, stages: Stages
     ) -> Awaitable[pb.DecodePagesReply]:
         """Receive a pair of many, and begin to decode it. One that is refused is read to its end: others follow."""
         counted = _Counted(requests)
         try:
-            received = await self._receive(header, counted, call)
+            received = await self._receive(header, counted, call, stages)
         except (MalformedError, StalledError):
             raise  # where the next pair would begin is not known
         except LightpageError as error:
             await self._skip(header, counted, error)
-            return _refused(error, header)
+            return self._refused(error, header, stages)
         return call.in_thread(partial(self._outcome, received, call), received.receiver.close)
 
     async def _skip(self, header: pb.DecodeHeader, requests: _Counted, error: LightpageError) -> None:
@@ -134,9 +142,10 @@ class FrameCalls:
             while requests.bytes < size and (part := await anext(requests, None)) is not None:
                 self._chunk(part)
 
-    async def _receive(self, header: pb.DecodeHeader, requests: AsyncIterator[FramePart], call: Call) -> _Received:
+    async def _receive(
+        self, header: pb.DecodeHeader, requests: AsyncIterator[FramePart], call: Call, stages: Stages
+    ) -> _Received:
         """Take in the chunks of a pair, as soon as its header is known to be right and there will be time for it."""
-        start = time.perf_counter()
         self.check(header)
         shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
         receiver = self._plane.receiver(shape, dtype, header.bit_depth, _caller(header, call))
@@ -146,7 +155,7 @@ class FrameCalls:
             async with self._in_time():
                 while not receiver.complete and (part := await anext(requests, None)) is not None:
                     receiver.add(self._chunk(part))
-            return _Received(header, receiver.checked(), start, time.perf_counter())
+            return _Received(header, receiver.checked(), stages)
         except BaseException:
             receiver.close()
             raise
@@ -181,7 +190,7 @@ class FrameCalls:
         try:
             return pb.DecodePagesReply(decoded=self._decode(received, call))
         except Exception as error:
-            return _refusal(error, received.header)
+            return self._refusal(error, received.header, received.stages)
 
     def check(self, header: pb.DecodeHeader) -> None:
         """Check what a header asks for.
@@ -194,7 +203,7 @@ class FrameCalls:
         self._pilots(header)
 
     def decode(
-        self, pair: FramePair, header: pb.DecodeHeader, call: Call, start: float, received: float, version: str = ""
+        self, pair: FramePair, header: pb.DecodeHeader, call: Call, stages: Stages, version: str = ""
     ) -> pb.DecodeReply:
         """Decode a pair that has come, whose header was checked; raises as `DataPlane.decode`.
 
@@ -202,7 +211,7 @@ class FrameCalls:
             pair: its frames.
             header: of it.
             call: that it came with.
-            start, received: when its first and its last byte came, `time.perf_counter` seconds.
+            stages: times it.
             version: of the model that must be in service; empty for any.
         """
         options = header.options
@@ -212,8 +221,7 @@ class FrameCalls:
             _caller(header, call),
             self._pilots(header),
             user_data=options.want_user_data,
-            start=start,
-            received=received,
+            stages=stages,
             version=version,
         )
         reply = decode_reply(answer, options)
@@ -232,20 +240,19 @@ class FrameCalls:
     def _decode(self, received: _Received, call: Call) -> pb.DecodeReply:
         """Decode a pair that was received, and let go of it."""
         try:
-            pair = received.receiver.pair()
-            return self.decode(pair, received.header, call, received.start, received.received)
+            return self.decode(received.receiver.pair(), received.header, call, received.stages)
         finally:
             received.receiver.close()
 
+    async def _refused(self, error: Exception, header: pb.DecodeHeader, stages: Stages) -> pb.DecodePagesReply:
+        return self._refusal(error, header, stages)
 
-async def _refused(error: Exception, header: pb.DecodeHeader) -> pb.DecodePagesReply:
-    return _refusal(error, header)
-
-
-def _refusal(error: Exception, header: pb.DecodeHeader) -> pb.DecodePagesReply:
-    refused = refusal_of(error)
-    refused.frame_id, refused.correlation_id = header.frame_id, header.correlation_id
-    return pb.DecodePagesReply(refused=refused)
+    def _refusal(self, error: Exception, header: pb.DecodeHeader, stages: Stages) -> pb.DecodePagesReply:
+        stages.begin(Stage.RESPOND)
+        self._plane.metrics.rejected(reason_told(error))
+        refused = refusal_of(error)
+        refused.frame_id, refused.correlation_id = header.frame_id, header.correlation_id
+        return pb.DecodePagesReply(refused=refused)
 
 
 def _header(first: FramePart | None, call: Call) -> pb.DecodeHeader:

@@ -9,9 +9,11 @@ from lightpage.errors import InvalidInputError, LimitError
 from runtime.errors import CallerLeft, SlotsTakenError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import Call
+from runtime.rpc.call_log import reason_told
 from runtime.rpc.replies import data_reply, read_reply
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
+from runtime.service.stages import Stage, Stages
 from runtime.service.user_data import read_data
 from runtime.wire.requests import check_options
 from runtime.wire.status import refusal_of
@@ -32,23 +34,26 @@ class PageCalls:
 
     def ReadPage(self, request: pb.ReadPageRequest, call: Call) -> pb.ReadPageReply:
         """Read a page from the source and decode it; with a request id at most once."""
+        stages = call.times.page()
+        stages.begin(Stage.QUEUE)
         check_options(request.options)
         caller = _caller(request.options, call)
         if not request.request_id:
-            return self._read(request, caller)
+            return self._read(request, caller, stages)
         limit_s = self._plane.limits.deadline_s
 
         def work() -> bytes:
             # The answer is wanted even where its caller leaves meanwhile, and asks again.
             until = time.monotonic() + limit_s
             detached = Caller(lambda: until - time.monotonic(), caller.session, caller.stateless, caller.actor)
-            return self._read(request, detached).SerializeToString()
+            return self._read(request, detached, stages).SerializeToString()
 
         same = pb.ReadPageRequest()
         same.CopyFrom(request)
         same.correlation_id = ""
         asked = same.SerializeToString(deterministic=True)
         answer, replayed = self._plane.replays.once(call.own(request.request_id), asked, caller, work)
+        stages.begin(Stage.RESPOND)
         reply = pb.ReadPageReply.FromString(answer)
         reply.replayed, reply.decoded.correlation_id = replayed, request.correlation_id
         return reply
@@ -65,14 +70,19 @@ class PageCalls:
                 one.correlation_id = request.correlation_id
                 if number is not None:
                     one.page = number
+                stages = call.times.page()
                 try:
-                    yield pb.ReadPagesReply(read=self._read(one, caller))
+                    reply = pb.ReadPagesReply(read=self._read(one, caller, stages))
                 except (CallerLeft, SlotsTakenError):
                     raise
                 except Exception as error:
+                    stages.begin(Stage.RESPOND)
+                    self._plane.metrics.rejected(reason_told(error))
                     refused = refusal_of(error)
                     refused.page, refused.correlation_id = number or 0, request.correlation_id
-                    yield pb.ReadPagesReply(refused=refused)
+                    reply = pb.ReadPagesReply(refused=refused)
+                yield reply
+                call.times.done(stages)
 
     def ReadData(self, request: pb.ReadDataRequest, call: Call) -> Iterator[pb.ReadDataReply]:
         """Read the bytes of a range of pages."""
@@ -80,12 +90,17 @@ class PageCalls:
         if request.first_page + request.pages > _MOST_PAGES:
             raise InvalidInputError("first_page", request.first_page, f"less than {_MOST_PAGES} with all")
         with self._plane.ranges.held(call.caller):
-            for page in read_data(self._plane, request.first_page, request.pages, call.caller):
+            for page in read_data(self._plane, request.first_page, request.pages, call.caller, call.times.page):
+                if page.error is not None:
+                    self._plane.metrics.rejected(reason_told(page.error))
                 yield data_reply(page)
+                if page.stages is not None:
+                    call.times.done(page.stages)
 
-    def _read(self, request: pb.ReadPageRequest, caller: Caller) -> pb.ReadPageReply:
+    def _read(self, request: pb.ReadPageRequest, caller: Caller, stages: Stages) -> pb.ReadPageReply:
         page, options = request.page if request.HasField("page") else None, request.options
-        read = self._plane.read_page(page, options.levels or None, caller, user_data=options.want_user_data)
+        levels, user_data = options.levels or None, options.want_user_data
+        read = self._plane.read_page(page, levels, caller, user_data=user_data, stages=stages)
         return read_reply(read, request)
 
     def _check_count(self, subject: str, count: int) -> None:

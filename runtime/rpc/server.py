@@ -24,6 +24,7 @@ from runtime.rpc.message_gate import MessageGate
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.store_health import StoreHealth
+from runtime.service.traces import Traces
 from runtime.wire.address import check_free
 from runtime.wire.channel import add_port
 
@@ -56,6 +57,7 @@ class LightpageServer:
         more: further handlers.
         certificates: with which it meets its callers, who must have some too; None for no TLS.
         inference: whether the Open Inference Protocol is served too.
+        traces: are told of every call, None for none.
     """
 
     def __init__(
@@ -66,7 +68,9 @@ class LightpageServer:
         more: Sequence[object] = (),
         certificates: Certificates | None = None,
         inference: bool = True,
+        traces: Traces | None = None,
     ) -> None:
+        self._traces = traces
         self._plane, self._recalibrator, self._address = plane, recalibrator, address
         self._credentials = None if certificates is None else certificates.server_credentials()
         self._services = [Served(SERVICE, (*more, *handlers(plane, recalibrator)))]
@@ -150,7 +154,7 @@ class LightpageServer:
                 ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
             ),
         )
-        self._dispatcher = Dispatcher(self._services, self._pool, limits, metrics)
+        self._dispatcher = Dispatcher(self._services, self._pool, limits, metrics, self._traces)
         self._server.add_generic_rpc_handlers(self._dispatcher.rpc_handlers())
         if self._inference:
             self._server.add_generic_rpc_handlers((UnknownCalls(metrics),))

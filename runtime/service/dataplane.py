@@ -19,7 +19,8 @@ from lightpage.recording.frame_pair import FramePair
 from runtime.acquisition.source import FrameSource, Shot, own_fault
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
-from runtime.errors import LostPageError, NoSourceError, SourceError
+from runtime.decoding.tracking import unconfirmed_page
+from runtime.errors import LostPageError, NoSourceError, SourceError, UnconfirmedPageError
 from runtime.service.audit import AuditLog
 from runtime.service.caller import NOBODY, Actor, Caller
 from runtime.service.display import Display
@@ -34,6 +35,7 @@ from runtime.service.registry import Model, ModelRegistry
 from runtime.service.replays import Replays
 from runtime.service.shared_memory import SharedMemory
 from runtime.service.slots import Slots
+from runtime.service.stages import Stage, Stages
 from runtime.service.store import ModelStore
 
 
@@ -115,6 +117,7 @@ class DataPlane:
         self.uploads = Slots(1, "uploads of models", self.limits.deadline_s)
         self.models = Models(registry, store, self.limits.model_bytes, self._in_service, self.audit)
         self._in_service(registry.current)
+        self.metrics.watch_load(self.decodes, self.received)
         if store is not None:
             self.metrics.watch_store(self.models.trouble)
         if source is not None:
@@ -199,9 +202,8 @@ class DataPlane:
         pilots: Pilots | None = None,
         *,
         user_data: bool = False,
-        start: float | None = None,
-        received: float | None = None,
         version: str = "",
+        stages: Stages | None = None,
     ) -> Answer:
         """Decode a pair with the model in service.
 
@@ -210,10 +212,9 @@ class DataPlane:
             levels: M; None stands for `default_levels`, or for that of the code where user bytes are asked for.
             caller: who waits; nothing is computed for one who has gone.
             pilots: known symbols where they differ from the device's pattern.
-            start: when the call began, in `time.perf_counter` seconds.
-            received: when the pair was complete, likewise.
             user_data: whether to read the page's bytes too.
             version: of the model that must be in service; empty for any.
+            stages: times the page.
 
         Raises:
             BundleError: user bytes are asked for, and the model has no code.
@@ -223,9 +224,8 @@ class DataPlane:
             CallerLeft: the caller has gone.
             UnconfirmedPageError, FrameError, PageError: see `Tracker.decode`.
         """
-        now = time.perf_counter()
-        start = now if start is None else start
-        received = now if received is None else received
+        stages = stages or Stages()
+        stages.begin(Stage.QUEUE)
         with self.decodes.held(caller):
             began = time.perf_counter()
             # Taken once: a swap in the meantime changes the next request, not this one.
@@ -239,11 +239,11 @@ class DataPlane:
             seen.note(tells=sure, pair=pair)
             with observed(self.observers, seen):
                 with self._optics(user_data):
-                    page = self._decode(model, caller, pair, levels, pilots, subject, sure=sure)
-                found = self._user_data(model, page) if user_data else None
+                    page = self._decode(model, caller, pair, levels, pilots, subject, stages, sure=sure)
+                found = self._user_data(model, page, stages) if user_data else None
                 seen.note(page=page, user_data=found)
             self.decodes.took(time.perf_counter() - began)
-        return Answer(page, model.version, received - start, time.perf_counter() - start, found, self._signs)
+        return self._answer(page, model, stages, found)
 
     def read_page(
         self,
@@ -253,6 +253,7 @@ class DataPlane:
         *,
         user_data: bool = False,
         expected: Header | None = None,
+        stages: Stages | None = None,
     ) -> ReadAnswer:
         """Read a page from the source and decode it; `levels` None stands for the source's own, or the code's.
 
@@ -262,21 +263,22 @@ class DataPlane:
             caller: who waits.
             user_data: whether to read the page's bytes too.
             expected: the page of its volume that should be there, where that is known.
+            stages: times the page.
 
         Raises:
             BundleError, InvalidInputError: see `decode`.
             SourceError: no source, or one that is damaged or dark.
             PageError: no such page, or an impossible level count; else as `decode`.
         """
-        start = time.perf_counter()
-        source = self.source
+        source, stages = self.source, stages or Stages()
+        stages.begin(Stage.QUEUE)
         # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
         with self.decodes.held(caller):
             model, begun = self.registry.current, time.perf_counter()
             seen = Seen(f"{'next page' if page is None else f'page {page}'} of {source.name}", page, model.version)
             with observed(self.observers, seen):
+                stages.begin(Stage.RECEIVE)
                 found = self._shot(source, page, caller, user_data)
-                received = time.perf_counter()
                 subject = f"page {found.page_index} of {source.name}"
                 seen.note(subject=subject, page_index=found.page_index, levels=source.levels)
                 seen.note(pair=found.pair, infos=found.infos, symbols=found.symbols, pilot_mask=found.pilot_mask)
@@ -291,12 +293,16 @@ class DataPlane:
                     own = model.decoder
                     pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
                 with own_fault(f"{subject}: "), self._optics(user_data):
-                    decoded = self._decode(model, caller, found.pair, levels, pilots, subject)
-                data = self._user_data(model, decoded, expected) if user_data else None
+                    decoded = self._decode(model, caller, found.pair, levels, pilots, subject, stages)
+                data = self._user_data(model, decoded, stages, expected) if user_data else None
                 seen.note(page=decoded, user_data=data)
             self.decodes.took(time.perf_counter() - begun)
-        answer = Answer(decoded, model.version, received - begun, time.perf_counter() - start, data, self._signs)
-        return ReadAnswer(answer, found, mask)
+        return ReadAnswer(self._answer(decoded, model, stages, data), found, mask)
+
+    def _answer(self, page: DecodedPage, model: Model, stages: Stages, found: PageBytes | None) -> Answer:
+        stages.begin(Stage.RESPOND)
+        receive_s = stages.seconds().get(Stage.RECEIVE, 0.0)
+        return Answer(page, model.version, receive_s, stages.elapsed_s, found, self._signs)
 
     def _shot(self, source: FrameSource, page: int | None, caller: Caller, user_data: bool) -> Shot:
         """A page of the source; a lost shot is counted."""
@@ -317,9 +323,11 @@ class DataPlane:
                 self.metrics.no_user_data(Loss.OPTICS)
             raise
 
-    def _user_data(self, model: Model, page: DecodedPage, expected: Header | None = None) -> PageBytes:
+    def _user_data(self, model: Model, page: DecodedPage, stages: Stages, expected: Header | None = None) -> PageBytes:
         """The bytes of a page that was decoded, counted."""
+        stages.begin(Stage.CODE)
         found = model.decoder.page_codec.decode(page.phase, page.concentration, expected)
+        stages.begin(Stage.POST_PROCESSING)
         self.metrics.user_data(found)
         return found
 
@@ -364,6 +372,7 @@ class DataPlane:
         levels: int,
         pilots: Pilots | None,
         subject: str,
+        stages: Stages,
         *,
         sure: bool = True,
     ) -> DecodedPage:
@@ -372,16 +381,28 @@ class DataPlane:
         Of a page that its pilots do not confirm, only pilots that are `sure` say anything of the device: a caller's may
         be wrong.
         """
+        stages.begin(Stage.INFERENCE)
         try:
             with self.heart.at_work():
                 page = model.tracker_for(caller).decode(pair, levels, pilots)
         except LostPageError as error:
+            if isinstance(error, UnconfirmedPageError):
+                _inferred(unconfirmed_page(error), stages)
             self.metrics.lost(error, tells=sure)
             lost = error.about(subject)
             lost.recalibration_due = (lost.recalibration_due and sure) or self._due
             raise lost from None
+        _inferred(page, stages)
         self.metrics.page(page, model.version)
         return page
+
+
+def _inferred(page: DecodedPage, stages: Stages) -> None:
+    """Tell what of a decode, which has run as inference until now, was inference.
+
+    The graph may run more than once, with post-processing between: all its runs count as if they were the first part.
+    """
+    stages.begin(Stage.POST_PROCESSING, page.timings.check_s + page.timings.inference_s)
 
 
 def levels_for(decoder: Decoder, asked: int | None, usual: int, user_data: bool) -> int:

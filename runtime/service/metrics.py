@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    GCCollector,
+    Histogram,
+    PlatformCollector,
+    ProcessCollector,
+)
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
@@ -15,12 +23,22 @@ from runtime.acquisition.source import FrameSource
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import unconfirmed_page
 from runtime.errors import LostPageError, UnconfirmedPageError
+from runtime.errors import Reason as PageLoss
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.service.store import Reason, Trouble
 
 if TYPE_CHECKING:
-    pass
+    from runtime.service.receiver import ReceiveBudget
+    from runtime.service.slots import Slots
+    from runtime.service.stages import Stages
 
 _SECONDS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+_FINE_SECONDS = tuple(sorted({*_SECONDS, 0.001, 0.002, 0.03, 0.07, 0.15, 0.3, 0.7, 1.5, 3.0, 7.0, 20.0, 60.0}))
+"""From handing over a small reply to the longest wait for a slot; no bucket is much wider than the time in it."""
+_READ = "none"
+"""Loss of a page whose bytes were read."""
+VERSIONS = 32
+"""Models whose pages are told apart, the newest: each recalibration makes another one."""
 
 
 class ServiceMetrics:
@@ -28,8 +46,27 @@ class ServiceMetrics:
 
     def __init__(self) -> None:
         self.registry = own = CollectorRegistry()
+        ProcessCollector(registry=own)
+        PlatformCollector(registry=own)
+        GCCollector(registry=own)
+        self._versions: list[str] = []
         self.calls = Counter("lightpage_calls", "Finished calls.", ["method", "code"], registry=own)
         self.in_flight = Gauge("lightpage_calls_in_flight", "Calls being served.", registry=own)
+        self.call_seconds = Histogram(
+            "lightpage_call_seconds",
+            "Whole calls, watches left out.",
+            ["method"],
+            buckets=(*_FINE_SECONDS, 300.0),
+            registry=own,
+        )
+        self.stage_seconds = Histogram(
+            "lightpage_stage_seconds",
+            "Stages of pages on their way through calls.",
+            ["method", "stage"],
+            buckets=_FINE_SECONDS,
+            registry=own,
+        )
+        self.rejects = Counter("lightpage_rejects", "Calls and pages refused, by reason.", ["reason"], registry=own)
         self.pages = Counter("lightpage_pages", "Decoded pages.", ["model_version"], registry=own)
         self.decode = Histogram("lightpage_decode_seconds", "Decode of one page.", buckets=_SECONDS, registry=own)
         self.confidence = Gauge("lightpage_confidence_mean", "Mean confidence of the last page.", registry=own)
@@ -52,6 +89,38 @@ class ServiceMetrics:
         self.monitor_raised = Gauge("lightpage_monitor_sign_raised", "1 where beyond it.", ["sign"], registry=own)
         self.flight_pages = Counter("lightpage_flight_pages", "Kept, dropped or failed.", ["result"], registry=own)
         self.model = Gauge("lightpage_model_info", "1 for the model in service.", ["version"], registry=own)
+        self._begin_at_zero()
+
+    def _begin_at_zero(self) -> None:
+        """Show what may happen before it does: Prometheus sees no rise from nothing to the first one."""
+        known: tuple[tuple[Counter, Iterable[str]], ...] = (
+            (self.rejects, (name.removeprefix("ERROR_REASON_") for name in pb.ErrorReason.keys()[1:])),
+            (self.lost_pages, (reason.value for reason in PageLoss)),
+            (self.data_pages, (_READ, *(loss.value for loss in Loss))),
+            (self.searches, ("true", "false")),
+            (self.recalibrations, ("done", "refused", "failed", "dropped")),
+            (self.flight_pages, ("kept", "dropped", "failed")),
+        )
+        for counter, values in known:
+            for value in values:
+                counter.labels(value)
+
+    def call_ended(self, method: str, code: str, reason: str, seconds: float | None) -> None:
+        """Count a call by its status; `reason` is empty where it ended well, `seconds` None of a watch."""
+        self.calls.labels(method, code).inc()
+        self.rejected(reason)
+        if seconds is not None:
+            self.call_seconds.labels(method).observe(seconds)
+
+    def rejected(self, reason: str) -> None:
+        """Count what was refused, if it was."""
+        if reason:
+            self.rejects.labels(reason).inc()
+
+    def timed(self, method: str, stages: Stages) -> None:
+        """Count where the time of a page went."""
+        for stage, seconds in stages.seconds().items():
+            self.stage_seconds.labels(method, stage.value).observe(seconds)
 
     def page(self, page: DecodedPage, version: str) -> None:
         """Count one decoded page."""
@@ -69,7 +138,7 @@ class ServiceMetrics:
 
     def user_data(self, found: PageBytes) -> None:
         """Count a page whose bytes were read, or not."""
-        self.data_pages.labels("none" if found.loss is None else found.loss.value).inc()
+        self.data_pages.labels(_READ if found.loss is None else found.loss.value).inc()
         self.margin.set(found.margin_bits)
         self.corrected.inc(found.corrected)
         self.code_iterations.set(found.iterations)
@@ -90,6 +159,10 @@ class ServiceMetrics:
         if page.image is not None and page.image.searched:
             self.searches.labels(str(page.image.found).lower()).inc()
 
+    def watch_load(self, decodes: Slots, received: ReceiveBudget) -> None:
+        """Show how busy the service is, whenever somebody looks."""
+        self.registry.register(_LoadFigures(decodes, received))
+
     def watch(self, source: FrameSource) -> None:
         """Show what the source counts, whenever somebody looks."""
         self.registry.register(_SourceFigures(source))
@@ -102,6 +175,28 @@ class ServiceMetrics:
         """Say which model decodes now."""
         self.model.clear()
         self.model.labels(version).set(1)
+        self.pages.labels(version)
+        self._versions = [*(known for known in self._versions if known != version), version]
+        for old in self._versions[:-VERSIONS]:
+            self.pages.remove(old)
+        self._versions = self._versions[-VERSIONS:]
+
+
+class _LoadFigures(Collector):
+    """How busy the service is."""
+
+    def __init__(self, decodes: Slots, received: ReceiveBudget) -> None:
+        self._decodes, self._received = decodes, received
+
+    def collect(self) -> Iterator[Metric]:
+        """The figures as they are now."""
+        decodes, received = self._decodes, self._received
+        yield GaugeMetricFamily("lightpage_decodes_waiting", "Pages that wait for a slot.", value=decodes.queued)
+        yield GaugeMetricFamily("lightpage_decodes_busy", "Slots in which a page is decoded.", value=decodes.busy)
+        yield GaugeMetricFamily("lightpage_decodes_slots", "Pages decoded at once, at most.", value=decodes.count)
+        yield CounterMetricFamily("lightpage_received_bytes", "Frames that callers sent.", value=received.taken)
+        yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Of them not yet decoded.", value=received.used)
+        yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", "At most so many.", value=received.size)
 
 
 class _SourceFigures(Collector):

@@ -24,7 +24,7 @@ class ReceiveBudget:
     """
 
     def __init__(self, size: int) -> None:
-        self._size, self._used = size, 0
+        self._size, self._used, self._taken = size, 0, 0
         self._lock = threading.Lock()
 
     @property
@@ -32,6 +32,17 @@ class ReceiveBudget:
         """Bytes that are taken."""
         with self._lock:
             return self._used
+
+    @property
+    def size(self) -> int:
+        """Bytes that there are."""
+        return self._size
+
+    @property
+    def taken(self) -> int:
+        """Bytes that were ever taken."""
+        with self._lock:
+            return self._taken
 
     def take(self, count: int) -> None:
         """Take bytes.
@@ -44,6 +55,7 @@ class ReceiveBudget:
                 got, expected = f"{self._used} bytes", f"at most {self._size} with {count} more; try again later"
                 raise OverloadedError("frames that are being received", got, expected, retry_s=_RETRY_S)
             self._used += count
+            self._taken += count
 
     def give_back(self, count: int) -> None:
         """Give bytes back."""

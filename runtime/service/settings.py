@@ -34,6 +34,7 @@ from runtime.service.audit import AUDIT_BYTES, AUDIT_KEPT
 from runtime.service.flight_recorder import PAGES, RING_BYTES, FlightSettings
 from runtime.service.limits import Limits
 from runtime.service.self_calibration import SelfCalibrationSettings
+from runtime.service.traces import check_endpoint
 from runtime.wire.address import check_address, is_local
 from runtime.wire.tls import TlsFiles
 
@@ -170,6 +171,26 @@ class MetricsTable(SettingsTable):
     port: _Port | None = None
 
 
+class TracesTable(SettingsTable):
+    """Where spans of calls are sent; without an endpoint, nowhere.
+
+    Attributes:
+        endpoint: of a collector that takes OTLP over gRPC, http://HOST:PORT or https://HOST:PORT.
+        share: of the calls that are traced, where their callers have not decided.
+    """
+
+    endpoint: str | None = None
+    share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 1.0
+
+    @field_validator("endpoint")
+    @classmethod
+    def _is_endpoint(cls, endpoint: str | None) -> str | None:
+        try:
+            return endpoint if endpoint is None else check_endpoint(endpoint)
+        except InvalidInputError as error:
+            raise ValueError(error.expected) from None
+
+
 class SelfCalibrationTable(SettingsTable):
     """See `SelfCalibrationSettings`; `enabled` left out means: where pages are named."""
 
@@ -232,6 +253,7 @@ class ServiceSettings(TomlTable):
     service: ServiceTable = ServiceTable()
     tls: TlsTable = TlsTable()
     metrics: MetricsTable = MetricsTable()
+    traces: TracesTable = TracesTable()
     self_calibration: SelfCalibrationTable = SelfCalibrationTable()
     flight_recorder: FlightRecorderTable = FlightRecorderTable()
     limits: Limits = Limits()

@@ -57,6 +57,11 @@ class Slots:
         """When calls ended, and how long they took, seconds."""
 
     @property
+    def count(self) -> int:
+        """How many there are."""
+        return self._count
+
+    @property
     def queued(self) -> int:
         """Callers that wait."""
         with self._lock:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 from lightpage.codec.page_bytes import PageBytes
@@ -11,6 +11,7 @@ from lightpage.errors import LightpageError, PageError
 from runtime.errors import LostPageError, SourceError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
+from runtime.service.stages import Stage, Stages
 
 GROUPS = 4
 """Groups whose pages are held: pages of a few files may take turns. A group of full-size pages is 40 MB."""
@@ -25,12 +26,14 @@ class DataPage:
         found: what it gave; None where it could not be decoded.
         error: why not.
         model_version: what decoded it, or the last page of its group; empty where nothing did.
+        stages: times it; None where its bytes were restored.
     """
 
     source_page: int | None
     found: PageBytes | None
     error: LightpageError | None = None
     model_version: str = ""
+    stages: Stages | None = None
 
 
 @dataclass
@@ -56,13 +59,16 @@ class _Group:
             yield DataPage(None, page, model_version=self.model_version)
 
 
-def read_data(plane: DataPlane, first: int, count: int, caller: Caller) -> Iterator[DataPage]:
+def read_data(
+    plane: DataPlane, first: int, count: int, caller: Caller, timed: Callable[[], Stages] = Stages
+) -> Iterator[DataPage]:
     """Read pages `first` to `first + count - 1` of the source, or to its last one.
 
     Args:
         plane: reads and decodes.
         first, count: of the source's pages.
         caller: who waits.
+        timed: begins to time a page.
 
     Raises:
         BundleError: the model has no code.
@@ -73,11 +79,15 @@ def read_data(plane: DataPlane, first: int, count: int, caller: Caller) -> Itera
     groups: dict[tuple[Volume, int], _Group] = {}
     successor = Successor()
     for index in range(first, first + count):
+        stages = timed()
         try:
-            answer = plane.read_page(index, None, caller, user_data=True, expected=successor.header).answer
+            answer = plane.read_page(
+                index, None, caller, user_data=True, expected=successor.header, stages=stages
+            ).answer
         except (LostPageError, SourceError) as error:
             successor = successor.after()
-            yield DataPage(index, None, error)
+            stages.begin(Stage.RESPOND)
+            yield DataPage(index, None, error, stages=stages)
             continue
         except PageError:
             if index == first:
@@ -98,6 +108,6 @@ def read_data(plane: DataPlane, first: int, count: int, caller: Caller) -> Itera
                 del groups[key]  # nothing is missing
             successor = Successor(volume, found.header)
         successor = successor.after()
-        yield DataPage(index, found, model_version=answer.model_version)
+        yield DataPage(index, found, model_version=answer.model_version, stages=stages)
     for group in groups.values():
         yield from group.restored()

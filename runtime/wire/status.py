@@ -143,6 +143,11 @@ def reason_of(error: BaseException) -> pb.ErrorReason:
     return reason
 
 
+def reason_name(error: BaseException) -> str:
+    """The reason's name without its prefix, as callers read it."""
+    return pb.ErrorReason.Name(reason_of(error)).removeprefix("ERROR_REASON_")
+
+
 def _meaning(error: BaseException) -> tuple[grpc.StatusCode, pb.ErrorReason]:
     for kind, code, reason in _MEANINGS:
         if isinstance(error, kind):
@@ -181,8 +186,8 @@ def told(error: BaseException) -> str:
 
 def trailers(error: BaseException) -> tuple[tuple[str, bytes], ...]:
     """The metadata that end a call beside its status: `ErrorDetail`, and google.rpc's details."""
-    code, reason = status_of(error), reason_of(error)
-    info = rpc_details.ErrorInfo(reason=pb.ErrorReason.Name(reason).removeprefix("ERROR_REASON_"), domain=DOMAIN)
+    code = status_of(error)
+    info = rpc_details.ErrorInfo(reason=reason_name(error), domain=DOMAIN)
     details: list[Any] = [info]
     own: list[tuple[str, bytes]] = []
     if isinstance(error, LightpageError):

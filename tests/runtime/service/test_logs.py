@@ -110,6 +110,18 @@ def test_only_what_nobody_foresaw_has_a_traceback() -> None:
     assert "gone" not in lines[0]["message"]
 
 
+@pytest.mark.parametrize("format", ["text", "json"])
+def test_a_library_that_denies_a_traceback_is_logged_without_one(format: str) -> None:
+    stream = io.StringIO()
+    with logging_to_stderr(format, "info", 100, stream):
+        try:
+            raise ValueError
+        except ValueError:
+            logging.getLogger("library").error("failed", exc_info=False)
+    assert "failed" in stream.getvalue()
+    assert "Traceback" not in stream.getvalue()
+
+
 def test_a_thread_that_breaks_is_logged() -> None:
     with json_lines() as lines:
         thread = threading.Thread(target=lambda: [][0], name="odd")

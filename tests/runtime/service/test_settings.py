@@ -121,6 +121,9 @@ def test_the_short_name_of_the_store_counts_less_than_the_long_one() -> None:
         ("[self_calibration]\npages = [1]", r"pages = \[1\], wanted at least 2 that differ"),
         ("[self_calibration]\nenabled = true", r"enabled = True, wanted service\.source"),
         ("[self_calibration]\nlongest_s = 5", r"longest_s = 5\.0, wanted at least self_calibration\.least_s"),
+        ("[traces]\nendpoint = 'collector:4317'", r"traces\.endpoint = 'collector:4317', wanted http://HOST:PORT or"),
+        ("[traces]\nendpoint = 'http://collector'", r"traces\.endpoint = 'http://collector', wanted http://HOST:PORT"),
+        ("[traces]\nshare = 1.5", r"traces\.share = 1\.5, wanted at most 1"),
         ("[service", "wanted a TOML file that can be read"),
     ],
 )

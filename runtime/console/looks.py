@@ -1,0 +1,175 @@
+"""What a running service's metrics say: looks at them from outside, and what has happened between two of them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from urllib.error import URLError
+from urllib.request import ProxyHandler, build_opener
+
+from prometheus_client.parser import text_string_to_metric_families
+
+from lightpage.errors import LightpageError
+
+WINDOW_S = 60.0
+"""Rates and times are those of so many seconds, once somebody has looked for so long."""
+_ANSWER_S = 5.0
+_MOST_BYTES = 16 << 20
+_SERVES = "lightpage_calls_in_flight"
+"""A metric that every service has from its start."""
+
+Labels = frozenset[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Look:
+    """The metrics of a service at one moment.
+
+    Attributes:
+        at: `time.monotonic` seconds.
+        samples: values by name and labels.
+    """
+
+    at: float
+    samples: Mapping[tuple[str, Labels], float]
+
+    def value(self, name: str, **labels: str) -> float:
+        """A value; NaN where there is none."""
+        return self.samples.get((name, frozenset(labels.items())), math.nan)
+
+    def values(self, name: str, **labels: str) -> dict[Labels, float]:
+        """Those of a name that have at least these labels."""
+        wanted = frozenset(labels.items())
+        return {own: value for (known, own), value in self.samples.items() if known == name and wanted <= own}
+
+    def by(self, name: str, label: str) -> dict[str, float]:
+        """Sums of a name by one of its labels."""
+        sums: dict[str, float] = {}
+        for own, value in self.values(name).items():
+            key = dict(own).get(label, "")
+            sums[key] = sums.get(key, 0.0) + value
+        return sums
+
+
+def look_at(address: str) -> Look:
+    """The metrics of the service whose `--metrics-port` is at HOST:PORT.
+
+    Raises:
+        LightpageError: nobody answers there, or something else than a Lightpage service.
+    """
+    expected = "a service that runs with --metrics-port: `lightpage serve --metrics-port 9100`"
+    subject, url = f"metrics at {address}", f"http://{address}/metrics"
+    try:
+        with build_opener(ProxyHandler({})).open(url, timeout=_ANSWER_S) as reply:
+            text = reply.read(_MOST_BYTES).decode("utf-8")
+        samples = {
+            (sample.name, frozenset(sample.labels.items())): float(sample.value)
+            for family in text_string_to_metric_families(text)
+            for sample in family.samples
+        }
+    except (URLError, OSError) as error:
+        raise LightpageError(subject, getattr(error, "reason", error), expected) from None
+    except ValueError:
+        raise LightpageError(subject, "no metrics", expected) from None
+    if (_SERVES, frozenset()) not in samples:
+        raise LightpageError(subject, "metrics of something else", expected)
+    return Look(time.monotonic(), samples)
+
+
+class Looks:
+    """The looks of the last while.
+
+    Args:
+        window_s: how long they are kept, seconds.
+    """
+
+    def __init__(self, window_s: float = WINDOW_S) -> None:
+        self._window_s = window_s
+        self._kept: deque[Look] = deque()
+        self.restarts = 0
+
+    def add(self, look: Look) -> None:
+        """Take a look in; those before a restart of the service say nothing of what comes after it."""
+        if self._kept and _restarted(self._kept[-1], look):
+            self._kept.clear()
+            self.restarts += 1
+        self._kept.append(look)
+        while len(self._kept) > 2 and self._kept[1].at <= look.at - self._window_s:
+            self._kept.popleft()
+
+    @property
+    def change(self) -> Change | None:
+        """From the first one kept to the last; None where there is no look yet."""
+        return Change(self._kept[0], self._kept[-1]) if self._kept else None
+
+
+class Change:
+    """What has happened between two looks.
+
+    Args:
+        before, now: looks at the same process.
+    """
+
+    def __init__(self, before: Look, now: Look) -> None:
+        self.before, self.now = before, now
+
+    @property
+    def seconds(self) -> float:
+        """Between them."""
+        return self.now.at - self.before.at
+
+    def rise(self, name: str, **labels: str) -> float:
+        """By how much counters with at least these labels rose, all together."""
+        before = self.before.values(name, **labels)
+        return sum(value - before.get(own, 0.0) for own, value in self.now.values(name, **labels).items())
+
+    def rate(self, name: str, **labels: str) -> float:
+        """The same a second; NaN where no time has passed."""
+        return self.rise(name, **labels) / self.seconds if self.seconds > 0 else math.nan
+
+    def rises(self, name: str, label: str) -> dict[str, float]:
+        """By how much counters rose, by one of their labels, those left out that did not; the largest first."""
+        before = self.before.by(name, label)
+        risen = {key: value - before.get(key, 0.0) for key, value in self.now.by(name, label).items()}
+        return dict(sorted(((key, value) for key, value in risen.items() if value > 0), key=lambda one: -one[1]))
+
+    def mean(self, name: str, **labels: str) -> float:
+        """Mean of what a histogram counted; NaN where that is nothing."""
+        count = self.rise(f"{name}_count", **labels)
+        return self.rise(f"{name}_sum", **labels) / count if count > 0 else math.nan
+
+    def quantile(self, share: float, name: str, **labels: str) -> float:
+        """A quantile of what a histogram counted, as Prometheus estimates it: linear within a bucket.
+
+        NaN where nothing was counted; the last finite bound for what lies beyond it.
+        """
+        counts: dict[float, float] = {}
+        for own in self.now.values(f"{name}_bucket", **labels):
+            bound = float(dict(own)["le"])
+            rise = self.now.samples[f"{name}_bucket", own] - self.before.samples.get((f"{name}_bucket", own), 0.0)
+            counts[bound] = counts.get(bound, 0.0) + rise
+        total = counts.get(math.inf, 0.0)
+        if total <= 0:
+            return math.nan
+        low = below = 0.0
+        for bound, count in sorted(counts.items()):
+            if count >= share * total:
+                return low if math.isinf(bound) else low + (bound - low) * _part(share * total - below, count - below)
+            low, below = bound, count
+        return low
+
+
+def _part(wanted: float, held: float) -> float:
+    return wanted / held if held > 0 else 1.0
+
+
+def _restarted(before: Look, now: Look) -> bool:
+    """Whether another process answers: its start is another one, or a counter fell."""
+    started = "process_start_time_seconds"
+    if not math.isnan(now.value(started)) and not math.isnan(before.value(started)):
+        return now.value(started) != before.value(started)
+    calls = [sum(look.values("lightpage_calls_total").values()) for look in (before, now)]
+    return calls[1] < calls[0]

@@ -1,0 +1,61 @@
+"""What expressions and configurations of Prometheus and Grafana name."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+DASHBOARD = DEPLOY / "grafana" / "lightpage.json"
+RULES = DEPLOY / "prometheus" / "rules.yml"
+PROMETHEUS_OWN = {"up", "ALERTS"}
+"""Metrics that Prometheus makes itself."""
+
+_GROUPING = re.compile(r"\b(by|without|on|ignoring|group_left|group_right)\s*\([^)]*\)")
+_ASIDE = re.compile(r'"[^"]*"|\{[^}]*\}|\[[^\]]*\]')
+_WORDS = {"and", "or", "unless", "bool", "offset", "inf", "nan", "by", "without", "on", "ignoring"}
+
+
+def metrics_in(expression: str) -> set[str]:
+    """Names of metrics, with the suffixes that they are asked for with."""
+    left = _GROUPING.sub(" ", _ASIDE.sub(" ", re.sub(r'"[^"]*"', '""', expression)))
+    names = re.findall(r"(?<![\w.])[a-zA-Z_:][a-zA-Z0-9_:]*\b(?!\s*\()", left)
+    return {name for name in names if name.lower() not in _WORDS} - PROMETHEUS_OWN
+
+
+def dashboard() -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(DASHBOARD.read_text())
+    return found
+
+
+def panels() -> list[dict[str, Any]]:
+    """All panels, those of folded rows too."""
+    shown = dashboard()["panels"]
+    return [*shown, *(panel for row in shown for panel in row.get("panels", ()))]
+
+
+def dashboard_expressions() -> Iterator[str]:
+    """What the dashboard asks for, its variables filled in as Grafana would."""
+    whole = dashboard()
+    asked = [target["expr"] for panel in panels() for target in panel.get("targets", ())]
+    asked += [annotation["expr"] for annotation in whole["annotations"]["list"]]
+    for variable in whole["templating"]["list"]:
+        if variable["type"] == "query":
+            asked.append(re.fullmatch(r"label_values\((.*), \w+\)", variable["query"]["query"])[1])  # type: ignore[index]
+    for expression in asked:
+        yield filled_in(expression)
+
+
+def filled_in(expression: str) -> str:
+    for name, value in (("$__rate_interval", "1m"), ("$instance", ".*"), ("$method", ".*")):
+        expression = expression.replace(name, value)
+    return expression
+
+
+def rules() -> list[dict[str, Any]]:
+    return [rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]]

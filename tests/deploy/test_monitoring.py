@@ -1,0 +1,199 @@
+"""Dashboard, alerts and configurations ask for what the service shows, and their own programs take them."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from urllib.request import urlopen
+
+import compose_spec
+import pytest
+import yaml
+
+from runtime.bundle.bundle import Bundle
+from runtime.console.history import History
+from runtime.console.server import Console, ConsoleServer
+from runtime.decoding.decoder import Decoder
+from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane
+from runtime.service.metrics import ServiceMetrics
+from runtime.service.monitor import Monitor
+from runtime.service.registry import ModelRegistry
+from runtime.service.stages import Stages
+from runtime.service.store import ModelStore
+from tests.deploy import promql
+from tests.runtime import toy
+
+DOCUMENT = promql.DEPLOY.parent / "docs" / "monitoring.md"
+OTHER_UNIT = 'lightpage_margin_bits use base unit "bytes" instead of "bits"'
+"""What promtool has against a metric: it means bits of memory, and these are of information."""
+
+
+@pytest.fixture(scope="module")
+def promtool() -> str:
+    found = shutil.which("promtool")
+    if found is None:
+        pytest.skip("promtool is not installed")
+    return found
+
+
+@pytest.fixture(scope="module")
+def shown(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The metrics of a service with all its parts that has read pages, as Prometheus gets them."""
+    bundle = Bundle.open(toy_zip)
+    history, metrics, source = History(), ServiceMetrics(), toy.ToySource(toy.ToyDevice())
+    monitor, registry = Monitor(metrics=metrics), ModelRegistry(Decoder(bundle, threads=1))
+    store = ModelStore(tmp_path_factory.mktemp("store"), bundle)
+    plane = DataPlane(registry, source, store, metrics=metrics, observers=[history], monitor=monitor)
+    for _ in range(3):
+        stages = Stages()
+        plane.read_page(None, None, Caller(), stages=stages)
+        metrics.timed("ReadPage", stages)
+        metrics.call_ended("ReadPage", "OK", "", stages.elapsed_s)
+    console = Console(metrics, history, registry, monitor, "toy:device")
+    with ConsoleServer(console, 0) as server, urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=20) as reply:
+        return str(reply.read(), "utf-8")
+
+
+def names_of(shown: str) -> set[str]:
+    """All names that a query can ask for."""
+    names = set()
+    for name, kind in re.findall(r"^# TYPE (\S+) (\S+)$", shown, re.MULTILINE):
+        names |= {f"{name}_{part}" for part in ("bucket", "sum", "count")} if kind == "histogram" else {name}
+    return names
+
+
+def checked(*command: str, text: str | None = None, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, input=text, cwd=folder, capture_output=True, text=True, timeout=60)
+
+
+def test_every_metric_that_somebody_asks_for_is_shown(shown: str) -> None:
+    known = names_of(shown)
+    asked = [*promql.dashboard_expressions(), *(rule["expr"] for rule in promql.rules())]
+    assert len(asked) > 50
+    missing = {name for expression in asked for name in promql.metrics_in(expression)} - known
+    assert missing == set()
+    planted = (
+        'sum by (job) (rate(lightpage_page_total{a="lightpage_pages_total"}[5m])) / on (job) lightpage_store_ok > 1e3'
+    )
+    assert promql.metrics_in(planted) - known == {"lightpage_page_total"}
+
+
+def test_every_own_metric_is_documented_with_its_labels(shown: str) -> None:
+    families = dict(re.findall(r"^# TYPE (lightpage_\S+) (\S+)$", shown, re.MULTILINE))
+    own = {name: kind for name, kind in families.items() if not name.endswith("_created")}
+    labels: dict[str, set[str]] = {name: set() for name in own}
+    for name, inside in re.findall(r"^(lightpage_\w+)\{(.*)\} ", shown, re.MULTILINE):
+        base = name if name in own else re.sub(r"_(bucket|sum|count)$", "", name)
+        if base in own:
+            labels[base] |= set(re.findall(r'(\w+)="', inside)) - {"le"}
+    rows = re.findall(r"^\| `(lightpage_\w+)` \| (\w+) \|([^|]*)\|", DOCUMENT.read_text(), re.MULTILINE)
+    told = {name: (kind, set(re.findall(r"`(\w+)`", given))) for name, kind, given in rows}
+    assert {name: kind for name, (kind, _) in told.items()} == own
+    for name, seen in labels.items():
+        assert seen <= told[name][1], name
+
+
+def test_every_alert_is_documented_and_tested() -> None:
+    alerts = {rule["alert"] for rule in promql.rules()}
+    assert alerts == set(re.findall(r"^\| `(Lightpage\w+)` \|", DOCUMENT.read_text(), re.MULTILINE))
+    tests = yaml.safe_load(promql.RULES.with_name("rules_test.yml").read_text())["tests"]
+    raised = {each["alertname"] for test in tests for each in test.get("alert_rule_test", ()) if each.get("exp_alerts")}
+    assert alerts == raised
+
+
+def test_promtool_takes_rules_and_configuration_and_the_alerts_do_what_they_say(promtool: str, tmp_path: Path) -> None:
+    folder = promql.RULES.parent
+    for arguments in (("check", "config", "prometheus.yml"), ("test", "rules", "rules_test.yml")):
+        done = checked(promtool, *arguments, folder=folder)
+        assert done.returncode == 0, done.stdout + done.stderr
+    shutil.copy(folder / "rules_test.yml", tmp_path)
+    deaf = promql.RULES.read_text().replace("lightpage_store_ok == 0", "lightpage_store_ok == 2")
+    (tmp_path / "rules.yml").write_text(deaf)
+    done = checked(promtool, "test", "rules", "rules_test.yml", folder=tmp_path)
+    assert done.returncode != 0
+    assert "LightpageStoreTrouble" in done.stdout + done.stderr
+
+
+def test_every_expression_of_the_dashboard_can_be_parsed(promtool: str, tmp_path: Path) -> None:
+    def parsed(expressions: list[str]) -> subprocess.CompletedProcess[str]:
+        numbered = [{"record": f"dashboard:{number}", "expr": one} for number, one in enumerate(expressions)]
+        (tmp_path / "rules.yml").write_text(yaml.safe_dump({"groups": [{"name": "dashboard", "rules": numbered}]}))
+        return checked(promtool, "check", "rules", str(tmp_path / "rules.yml"))
+
+    expressions = list(promql.dashboard_expressions())
+    done = parsed(expressions)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert parsed([*expressions, "sum by (code (lightpage_calls_total)"]).returncode != 0
+
+
+def test_the_metrics_are_named_as_prometheus_would_have_them(promtool: str, shown: str) -> None:
+    done = checked(promtool, "check", "metrics", text=shown)
+    assert (done.stdout + done.stderr).strip().splitlines() == [OTHER_UNIT]
+
+
+def test_every_panel_says_what_it_shows_and_none_lies_on_another() -> None:
+    panels = promql.panels()
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    taken: set[tuple[int, int]] = set()
+    for panel in panels:
+        at = panel["gridPos"]
+        cells = {(at["x"] + x, at["y"] + y) for x in range(at["w"]) for y in range(at["h"])}
+        if not any(panel in row.get("panels", ()) for row in panels):  # a folded row's lie where others are
+            assert not cells & taken, panel["title"]
+            taken |= cells
+        assert max(x for x, _ in cells) < 24
+        assert panel["type"] == "row" or panel["description"]
+        for target in panel.get("targets", ()):
+            assert target["datasource"]["uid"] == "${datasource}"
+
+
+def composed(text: str) -> compose_spec.PyCompose:
+    found = compose_spec.PyOptions(apply_merge=True).from_yaml(text)
+    found.validate()
+    return found
+
+
+def test_the_composition_is_valid_and_nothing_of_it_can_be_reached_or_written_from_outside() -> None:
+    file = promql.DEPLOY / "compose.yml"
+    text = file.read_text()
+    services = composed(text).services
+    assert services is not None
+    assert set(services) == {"lightpage", "prometheus", "grafana"}
+    volumes = set(composed(text).volumes or {})
+    for name, plain in yaml.safe_load(text)["services"].items():
+        assert plain["read_only"] is True, name
+        assert plain["cap_drop"] == ["ALL"], name
+        assert "no-new-privileges:true" in plain["security_opt"], name
+        assert plain.get("privileged", False) is False, name
+        assert all(port.startswith("127.0.0.1:") for port in plain["ports"]), name
+        for volume in plain["volumes"]:
+            source = volume.split(":")[0]
+            assert source in volumes or (file.parent / source).exists(), volume
+            assert source in volumes or volume.endswith(":ro"), volume
+    for wrong in (
+        text.replace("read_only", "red_only"),
+        text.replace("networks: [monitoring]", "networks: [other]"),
+        text.replace("127.0.0.1:9090:9090", "127.0.0.1:9090:99999"),
+    ):
+        with pytest.raises(ValueError, match=r"red_only|other|99999"):
+            composed(wrong)
+
+
+def test_the_parts_of_the_composition_find_each_other() -> None:
+    services = yaml.safe_load((promql.DEPLOY / "compose.yml").read_text())["services"]
+    (scrape,) = yaml.safe_load((promql.DEPLOY / "prometheus" / "prometheus.yml").read_text())["scrape_configs"]
+    (target,) = scrape["static_configs"][0]["targets"]
+    host, _, port = target.partition(":")
+    assert f"--metrics-port={port}" in services[host]["command"]
+    assert scrape["job_name"] == "lightpage"  # as the alerts name it
+    provisioned = promql.DEPLOY / "grafana" / "provisioning"
+    (source,) = yaml.safe_load((provisioned / "datasources" / "prometheus.yml").read_text())["datasources"]
+    assert source["url"].removeprefix("http://").partition(":")[0] in services
+    (provider,) = yaml.safe_load((provisioned / "dashboards" / "lightpage.yml").read_text())["providers"]
+    mounted = [volume.split(":")[1] for volume in services["grafana"]["volumes"]]
+    assert f"{provider['options']['path']}/{promql.DASHBOARD.name}" in mounted
+    assert json.loads(promql.DASHBOARD.read_text())["uid"] == "lightpage"

@@ -1,0 +1,163 @@
+"""`lightpage top`: what it says of a real service, of one that was restarted, and of one that is gone."""
+
+from __future__ import annotations
+
+import math
+import os
+import pty
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from threading import Thread
+from wsgiref.simple_server import make_server
+
+import pytest
+
+from lightpage.cli import main as cli_main
+from lightpage.cli.main import EXIT_ERROR
+from lightpage.errors import LightpageError
+from runtime.commands.top import top
+from runtime.console.looks import Change, Look, Looks, look_at
+from runtime.console.server import ConsoleServer
+from tests.runtime.commands.test_commands import ROOT
+from tests.runtime.console.stage import Stage, stage
+
+WAIT_S = 20.0
+
+
+def address(running: Stage) -> str:
+    return running.url.removeprefix("http://")
+
+
+def a_look(at: float, values: Mapping[str, float], started: float = 1.0) -> Look:
+    samples = {("process_start_time_seconds", frozenset[tuple[str, str]]()): started}
+    return Look(at, samples | {(name, frozenset()): value for name, value in values.items()})
+
+
+def test_one_text_says_what_the_service_does(toy_zip: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with stage(toy_zip) as running:
+        running.plane.metrics.call_ended("ReadPage", "OK", "", 0.5)
+        thread = Thread(target=running.read, args=(10,))  # two of them are lost
+        before = look_at(address(running))
+        thread.start()
+        thread.join()
+        assert cli_main.run(top, ["--address", address(running), "--interval", "0.1", "--once"]) == 0
+        told = capsys.readouterr().out
+        for text in (
+            "model toy-1",
+            "recalibration",
+            "not due",
+            "cores",
+            "MiB",
+            "inference",
+            "post processing",
+            "0 of 2",
+        ):
+            assert text in told, text
+        assert "\x1b" not in told
+        change = Change(before, look_at(address(running)))
+        assert change.rise("lightpage_pages_total") == 8
+        assert change.rises("lightpage_pages_lost_total", "reason") == {"MISSING_FRAME": 2}
+        assert 0 < change.quantile(0.5, "lightpage_decode_seconds") <= change.quantile(1.0, "lightpage_decode_seconds")
+        assert change.mean("lightpage_decode_seconds") * 8 == pytest.approx(change.rise("lightpage_decode_seconds_sum"))
+
+
+def test_a_wrong_address_is_named_with_what_to_do(toy_zip: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with stage(toy_zip) as running:
+        gone = address(running)
+    assert cli_main.run(top, ["--address", gone, "--once"]) == EXIT_ERROR
+    told = capsys.readouterr().err
+    assert gone in told
+    assert "--metrics-port" in told
+
+    for text, told in ((b"up 1\n", "metrics of something else"), (b"<html>a page</html>\n", "got no metrics")):
+
+        def other(_: object, start_response: Callable[..., object], text: bytes = text) -> list[bytes]:
+            start_response("200 OK", [])
+            return [text]
+
+        with make_server("127.0.0.1", 0, other) as server:
+            Thread(target=server.handle_request, daemon=True).start()
+            with pytest.raises(LightpageError, match=told):
+                look_at(f"127.0.0.1:{server.server_port}")
+
+
+def test_quantiles_are_those_of_what_came_between() -> None:
+    def counts(*values: float) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
+        bounds = ("0.1", "1.0", "+Inf")
+        return {("t_bucket", frozenset({("le", le)})): n for le, n in zip(bounds, values, strict=True)}
+
+    change = Change(Look(0.0, counts(100, 100, 100)), Look(2.0, counts(102, 106, 108)))
+    assert change.quantile(0.25, "t") == pytest.approx(0.1)
+    assert change.quantile(0.5, "t") == pytest.approx(0.1 + 0.9 * 2 / 4)
+    assert change.quantile(0.99, "t") == 1.0  # what lies beyond the last bound is not known
+    assert math.isnan(Change(change.now, change.now).quantile(0.5, "t"))
+
+
+def test_a_restart_ends_what_was_counted_before() -> None:
+    looks = Looks(window_s=10.0)
+    for at in range(20):
+        looks.add(a_look(float(at), {"lightpage_calls_total": 100.0 + 2 * at}))
+    change = looks.change
+    assert change is not None
+    assert (change.seconds, change.rate("lightpage_calls_total")) == (10.0, 2.0)
+    looks.add(a_look(20.0, {"lightpage_calls_total": 500.0}, started=2.0))
+    looks.add(a_look(21.0, {"lightpage_calls_total": 503.0}, started=2.0))
+    change = looks.change
+    assert change is not None
+    assert (looks.restarts, change.seconds, change.rate("lightpage_calls_total")) == (1, 1.0, 3.0)
+    looks.add(Look(22.0, {("lightpage_calls_total", frozenset()): 4.0}))  # of a system that tells no start
+    assert looks.restarts == 2
+
+
+class Terminal:
+    """`lightpage top` in a terminal of its own."""
+
+    def __init__(self, address: str) -> None:
+        self._own, other = pty.openpty()
+        command = [sys.executable, "-c", "from runtime.commands.top import top; top()", "--address", address]
+        environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120", "LINES": "50", "PYTHONPATH": str(ROOT)}
+        self.process = subprocess.Popen(
+            [*command, "--interval", "0.1"], stdin=other, stdout=other, stderr=other, env=environment, close_fds=True
+        )
+        os.close(other)
+
+    def shows(self, text: str) -> bool:
+        """Whether it comes to show a text."""
+        seen, until = "", time.monotonic() + WAIT_S
+        while time.monotonic() < until and text not in seen:
+            ready, _, _ = select.select([self._own], [], [], 0.2)
+            if ready:
+                seen += os.read(self._own, 65536).decode("utf-8", "replace")
+        return text in seen
+
+    def press(self, key: str) -> None:
+        os.write(self._own, key.encode())
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self._own)
+
+
+def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(toy_zip: Path) -> None:
+    with stage(toy_zip) as running:
+        running.read(3)
+        port = running.server.port
+        terminal = Terminal(address(running))
+        try:
+            assert terminal.shows("toy-1")
+            running.server.close()
+            assert terminal.shows("no answer since")
+            running.plane.metrics.in_service("toy-2")
+            with ConsoleServer(running.console, port):
+                assert terminal.shows("toy-2")
+                terminal.press("x")
+                terminal.press("q")
+                assert terminal.shows("\x1b[?1049l")  # the screen is as it was
+                assert terminal.process.wait(WAIT_S) == 0
+        finally:
+            terminal.close()
