@@ -224,14 +224,14 @@ class Dispatcher:
             if step is not None:
                 step.add_done_callback(lambda _: replies.close())  # one that is at work cannot be closed
 
-    async def _one(self, data: AsyncIterator[bytes], parse: Callable[[bytes], Any], call: Call) -> Any:
+    async def _one(self, data: AsyncGenerator[bytes, None], parse: Callable[[bytes], Any], call: Call) -> Any:
         """The one message of a call, or what reads it."""
 
         async def receive() -> Any:
-            try:
-                return _parsed(parse, await anext(data), call)
-            except StopAsyncIteration:
-                raise MalformedError(f"message of {call.method}", "none", "one") from None
+            if (message := await anext(data, None)) is None:
+                raise MalformedError(f"message of {call.method}", "none", "one")
+            await data.aclose()
+            return _parsed(parse, message, call)
 
         return receive if call.method in LATER else await receive()
 

@@ -23,6 +23,8 @@ RAW_TYPES = {
 _TYPED_FIELDS = {"BOOL": "bool_contents", "UINT8": "uint_contents", "UINT16": "uint_contents"}
 _SLICE = 1 << 16
 """Typed elements that are taken at a time: the interpreter does nothing else meanwhile."""
+_LARGEST_COUNT = (1 << 32) - 1
+"""Of a parameter: the fields that parameters stand for have 32 bits."""
 TYPED_BYTES = 4
 """Memory of a typed element, once parsed."""
 
@@ -83,7 +85,7 @@ def inputs_of(request: Request, expected: Mapping[str, Tensor]) -> dict[str, NDA
             found[tensor.name] = _raw(raw[index], known, subject)
     missing = [name for name, tensor in expected.items() if not tensor.optional and name not in found]
     if missing:
-        raise InvalidInputError("inputs", f"no {missing[0]}", f"{missing[0]}, {expected[missing[0]]}")
+        raise InvalidInputError(f"inputs.{missing[0]}", "nothing", expected[missing[0]])
     return found
 
 
@@ -130,7 +132,7 @@ def parameters_of(request: Request, kinds: Mapping[str, type]) -> dict[str, Any]
         kinds: int, str or bool, by name.
 
     Raises:
-        InvalidInputError: one that is not known, or of another type.
+        InvalidInputError: one that is not known, of another type, or a number that is no count.
     """
     found: dict[str, Any] = {}
     for name, parameter in request.parameters.items():
@@ -141,6 +143,8 @@ def parameters_of(request: Request, kinds: Mapping[str, type]) -> dict[str, Any]
         if type(value) is not kind:
             fields = {int: "int64_param", str: "string_param", bool: "bool_param"}
             raise InvalidInputError(f"parameters.{name}", choice or "no value", fields[kind])
+        if kind is int and not 0 <= value <= _LARGEST_COUNT:
+            raise InvalidInputError(f"parameters.{name}", value, f"0..{_LARGEST_COUNT}")
         found[name] = value
     return found
 
