@@ -194,7 +194,7 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         console = Console(metrics, history, registry, monitor, source_name)
         stack.enter_context(_shown(console, settings.metrics.port, settings.metrics.host))
         recalibrator = Recalibrator(plane, recordings=service.recordings)
-        server = LightpageServer(plane, recalibrator, service.address)
+        server = LightpageServer(plane, recalibrator, service.address, inference=settings.inference.enabled)
         check_free("address", service.address)  # before anything else takes a port
         if service.health_address != OFF:  # entered first: it says NOT_SERVING until the last call has ended
             address = service.health_address or next_port(service.address)

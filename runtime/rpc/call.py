@@ -17,6 +17,7 @@ from concurrent.futures import Executor, Future
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from traceback import clear_frames
 from typing import Any, TypeVar
 
 import grpc
@@ -272,6 +273,7 @@ class Dispatcher:
         except Exception as error:
             code = _code_of_leaving(context) if isinstance(error, CallerLeft) else status_of(error)
             self._ended(call, code, error)
+            clear_frames(error.__traceback__)  # the library keeps the error for a while, and so would it all that came
             await context.abort(code, told(error), trailers(error))
         finally:
             call.caller.leave()

@@ -62,6 +62,8 @@ _WIDEST = {"uint8": 2, "uint16": 3}
 """Bytes of a typed pixel in a message, at most."""
 _BESIDE = 1 << 16
 """Bytes of names, shapes and parameters."""
+_MOST_BYTES = (1 << 31) - 1
+"""Of a message: gRPC counts them in 32 bits."""
 
 
 def model_inputs(bundle: Bundle) -> dict[str, Tensor]:
@@ -81,7 +83,7 @@ def large_messages(plane: DataPlane) -> dict[str, int]:
     bundle = plane.registry.current.decoder.bundle
     pixels, symbols = (int(np.prod(shape)) for shape in (bundle.profile.frame_shape, bundle.profile.page_shape))
     size = 2 * pixels * _WIDEST[bundle.manifest.frame_dtype] + 4 * symbols + _BESIDE
-    return {f"/{INFERENCE.full_name}/ModelInfer": min(size, (1 << 31) - 1)}
+    return {f"/{INFERENCE.full_name}/ModelInfer": min(max(size, plane.limits.message_bytes), _MOST_BYTES)}
 
 
 class InferenceCalls:

@@ -139,13 +139,13 @@ def parameters_of(request: Request, kinds: Mapping[str, type]) -> dict[str, Any]
         if (kind := kinds.get(name)) is None:
             raise InvalidInputError("parameters", repr(name), f"one of {', '.join(kinds)}")
         choice = parameter.WhichOneof("parameter_choice")
-        value = None if choice is None else getattr(parameter, choice)
+        value: Any = None if choice is None else getattr(parameter, choice)
         if type(value) is not kind:
             fields = {int: "int64_param", str: "string_param", bool: "bool_param"}
             raise InvalidInputError(f"parameters.{name}", choice or "no value", fields[kind])
-        if kind is int and not 0 <= value <= _LARGEST_COUNT:
-            raise InvalidInputError(f"parameters.{name}", value, f"0..{_LARGEST_COUNT}")
         found[name] = value
+        if kind is int and not 0 <= found[name] <= _LARGEST_COUNT:
+            raise InvalidInputError(f"parameters.{name}", value, f"0..{_LARGEST_COUNT}")
     return found
 
 

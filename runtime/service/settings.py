@@ -140,6 +140,16 @@ class MetricsTable(SettingsTable):
     port: _Port | None = None
 
 
+class InferenceTable(SettingsTable):
+    """The Open Inference Protocol.
+
+    Attributes:
+        enabled: whether it is served beside the service's own contract; it takes a whole frame pair in one message.
+    """
+
+    enabled: bool = True
+
+
 class SelfCalibrationTable(SettingsTable):
     """See `SelfCalibrationSettings`; `enabled` left out means: where pages are named."""
 
@@ -200,6 +210,7 @@ class ServiceSettings(TomlTable):
     """The whole file."""
 
     service: ServiceTable = ServiceTable()
+    inference: InferenceTable = InferenceTable()
     metrics: MetricsTable = MetricsTable()
     self_calibration: SelfCalibrationTable = SelfCalibrationTable()
     flight_recorder: FlightRecorderTable = FlightRecorderTable()
