@@ -67,7 +67,7 @@ def expect(service: RunningService, bundle: Bundle, folder: Path) -> None:
         "model_version": page.model_version,
         "bit_depth": bundle.manifest.camera_bit_depth,
         "figures": figures,
-        "user_data_loss": None if found is None else found.loss.value if found.loss is not None else "",
+        "user_data_loss": None if found is None else found.loss.name if found.loss is not None else "",
         "user_data": "" if found is None else (found.data or b"").hex(),
     }
     assert page.phase is not None  # asked for, as the next one

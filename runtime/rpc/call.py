@@ -3,7 +3,7 @@
 A handler is a method named as the RPC, of one of the classes in this package. It takes the request, or an asynchronous
 iterator of requests, and the `Call`; it returns the reply, or is a generator of replies. A plain `def` runs in a thread
 and may block; an `async def` runs on the server's loop and must not. A handler of a call in `LATER` takes, in place of
-the request, what reads it.
+the request, what reads its bytes.
 """
 
 from __future__ import annotations
@@ -226,15 +226,15 @@ class Dispatcher:
                 step.add_done_callback(lambda _: replies.close())  # one that is at work cannot be closed
 
     async def _one(self, data: AsyncGenerator[bytes, None], parse: Callable[[bytes], Any], call: Call) -> Any:
-        """The one message of a call, or what reads it."""
+        """The one message of a call, or what reads its bytes."""
 
-        async def receive() -> Any:
+        async def receive() -> bytes:
             if (message := await anext(data, None)) is None:
                 raise MalformedError(f"message of {call.method}", "none", "one")
             await data.aclose()
-            return _parsed(parse, message, call)
+            return message
 
-        return receive if call.method in LATER else await receive()
+        return receive if call.method in LATER else _parsed(parse, await receive(), call)
 
     async def _messages(
         self, data: AsyncIterator[bytes], parse: Callable[[bytes], Any], call: Call
