@@ -99,6 +99,7 @@ bench-service: $(STAMP)  ## the service under load, faults and attack, from outs
 	$(BIN)/python -m analysis.service.changes --json $(BENCH_SERVICE)/changes.json
 	$(BIN)/python -m analysis.service.hostile --json $(BENCH_SERVICE)/hostile.json
 	$(BIN)/python -m analysis.service.outgoing --json $(BENCH_SERVICE)/outgoing.json
+	$(BIN)/python -m analysis.service.inference_protocol --out $(BENCH_SERVICE)/inference-protocol --json $(BENCH_SERVICE)/inference-protocol.json
 	$(BIN)/python -m analysis.service.kills --out $(BENCH_SERVICE)/kills --json $(BENCH_SERVICE)/kills.json
 	$(BIN)/python -m analysis.service.identity --json $(BENCH_SERVICE)/identity.json
 	$(BIN)/python -m analysis.service.transport --json $(BENCH_SERVICE)/transport.json

@@ -161,6 +161,13 @@ def test_one_module_alone_imports_onnxruntime() -> None:
     assert list(found) == ["runtime/execution/session.py"]
 
 
+def test_a_client_leaves_the_names_of_the_open_inference_protocol_alone() -> None:
+    """A process has room for one package of messages named `inference`: that of another client, where there is one."""
+    below = [path for room in ("wire", "client") for path in sorted((ROOT / "runtime" / room).rglob("*.py"))]
+    assert offenders(lambda _, name: name.startswith("runtime.pb.inference"), files("runtime"))
+    assert offenders(lambda _, name: name.startswith("runtime.pb.inference"), below) == {}
+
+
 SERVE = """
 import sys
 from pathlib import Path

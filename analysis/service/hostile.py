@@ -22,17 +22,26 @@ import click
 import grpc
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
+from google.protobuf.message_factory import GetMessageClass
 
 from analysis.service.running import PagesToSend, RunningService, stub
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import ENDLESS, SERVICE
+from runtime.rpc.inference_calls import INFERENCE
 
 _CALL_S = 30.0
 _ROUND = 500
+_HEAD = 150
+"""Bytes of a ModelInfer that are not pixels."""
+_BEYOND = {
+    FieldDescriptor.CPPTYPE_INT32: 2**31,
+    FieldDescriptor.CPPTYPE_INT64: 2**63,
+    FieldDescriptor.CPPTYPE_UINT32: 2**32,
+    FieldDescriptor.CPPTYPE_UINT64: 2**64,
+}
 _INTEGERS = (0, 1, 2, 7, 255, 256, 65_535, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
 _DOUBLES = (0.0, -1.0, 1.0, 1e300, float("inf"), float("nan"))
 _TEXTS = ("", "bench", "../../etc/passwd", "a" * 5000, "\u202e", "known.h5", "\x00")
@@ -44,6 +53,9 @@ def filled(message: Message, chance: random.Random, depth: int = 0) -> Message:
         if chance.random() < 0.35 or (depth > 3 and field.message_type):
             continue
         if field.message_type is not None and field.message_type.GetOptions().map_entry:
+            value = field.message_type.fields_by_name["value"]
+            if value.message_type is not None:
+                filled(getattr(message, field.name)[chance.choice(_TEXTS)], chance, depth + 1)
             continue
         count = chance.choice((0, 1, 2, 5)) if field.is_repeated else 1
         for _ in range(count):
@@ -72,7 +84,7 @@ def scalar(field: Any, chance: random.Random) -> Any:
         return chance.choice(_TEXTS)
     if kind == FieldDescriptor.CPPTYPE_ENUM:
         return chance.choice((0, 1, 2, 7, 1000))
-    largest = 2**64 if kind == FieldDescriptor.CPPTYPE_UINT64 else 2**32
+    largest = _BEYOND[kind]
     return chance.choice([value for value in _INTEGERS if value < largest])
 
 
@@ -97,13 +109,16 @@ def mutated(data: bytes, chance: random.Random) -> bytes:
 
 def requests_of(method: Any, chance: random.Random, pages: PagesToSend) -> list[bytes]:
     """What one call sends."""
-    kind = getattr(pb, method.input_type.name)
+    kind = GetMessageClass(method.input_type)
     if not method.client_streaming:
+        if method.name == "ModelInfer" and chance.random() < 0.5:
+            good = pages.inference()
+            return [mutated(good[:_HEAD], chance) + good[_HEAD:]]
         data: bytes = filled(kind(), chance).SerializePartialToString()
         return [mutated(data, chance) if chance.random() < 0.4 else data]
     if method.name.startswith("Decode") and chance.random() < 0.5:
-        good = [each.SerializeToString() for each in pages.requests()[:2]]
-        return [mutated(good[0], chance), *([good[1]] if chance.random() < 0.3 else [])]
+        begun = [each.SerializeToString() for each in pages.requests()[:2]]
+        return [mutated(begun[0], chance), *([begun[1]] if chance.random() < 0.3 else [])]
     count = chance.choice((0, 1, 2, 3))
     found = [filled(kind(), chance).SerializePartialToString() for _ in range(count)]
     return [mutated(data, chance) if chance.random() < 0.4 else data for data in found]
@@ -130,7 +145,8 @@ def hostile(service: RunningService, count: int, seed: int) -> dict[str, Any]:
     chance, pages = random.Random(seed), PagesToSend()
     ended: Counter[str] = Counter()
     bad: list[str] = []
-    methods = [method for method in SERVICE.methods if method.name not in ENDLESS]
+    methods = [method for service_of in (SERVICE, INFERENCE) for method in service_of.methods]
+    methods = [method for method in methods if method.name not in ENDLESS]
     good = pages.requests()
     for start in track(range(0, count, _ROUND), "hostile requests", total=count // _ROUND):
         with service.channel() as channel:
@@ -148,7 +164,8 @@ def hostile(service: RunningService, count: int, seed: int) -> dict[str, Any]:
 
 
 def _ended(channel: grpc.Channel, method: Any, sent: list[bytes]) -> str:
-    path, ways = f"/{SERVICE.full_name}/{method.name}", (method.client_streaming, method.server_streaming)
+    path = f"/{method.containing_service.full_name}/{method.name}"
+    ways = (method.client_streaming, method.server_streaming)
     try:
         if ways == (False, False):
             channel.unary_unary(path, None, None)(sent[0], timeout=_CALL_S)

@@ -24,8 +24,10 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.writer import RecordingWriter
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.shipped import DEFAULT, bundle_path
+from runtime.pb.inference import open_inference_pb2 as oip
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from runtime.rpc.inference_calls import MODEL
 from runtime.wire.messages import PIXEL_CODES
 
 START_S = 120.0
@@ -184,6 +186,14 @@ class PagesToSend:
         data = b"".join(frame.tobytes() for frame in (pair.in_phase, pair.quadrature))
         chunks = [pb.DecodeFramesRequest(chunk=data[at : at + _CHUNK]) for at in range(0, len(data), _CHUNK)]
         return [pb.DecodeFramesRequest(header=self.header(**changes)), *chunks]
+
+    def inference(self) -> bytes:
+        """The pair as a message of ModelInfer."""
+        request = oip.ModelInferRequest(model_name=MODEL)
+        for name, frame in (("in_phase", self.pair.in_phase), ("quadrature", self.pair.quadrature)):
+            request.inputs.add(name=name, datatype=str(frame.dtype).upper(), shape=frame.shape)
+            request.raw_input_contents.append(frame.tobytes())
+        return request.SerializeToString()
 
     def record(self, path: Path, pages: int = 2) -> Path:
         """Write a recording in which every page is the golden one, and return its path."""

@@ -222,7 +222,14 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         traces = None
         if settings.traces.endpoint is not None:
             traces = stack.enter_context(Traces(settings.traces.endpoint, settings.traces.share))
-        server = LightpageServer(plane, recalibrator, service.address, certificates=certificates, traces=traces)
+        server = LightpageServer(
+            plane,
+            recalibrator,
+            service.address,
+            certificates=certificates,
+            inference=settings.inference.enabled,
+            traces=traces,
+        )
         check_free("address", service.address)  # before anything else takes a port
         if service.shared_memory:
             limits, path = settings.limits, memory_path(service.address)

@@ -3,7 +3,7 @@
 A handler is a method named as the RPC, of one of the classes in this package. It takes the request, or an asynchronous
 iterator of requests, and the `Call`; it returns the reply, or is a generator of replies. A plain `def` runs in a thread
 and may block; an `async def` runs on the server's loop and must not. A handler of a call in `LATER` takes, in place of
-the request, what reads it.
+the request, what reads its bytes.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from concurrent.futures import Executor, Future
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from traceback import clear_frames
 from typing import Any, TypeVar
 
 import grpc
@@ -260,16 +261,16 @@ class Dispatcher:
             if step is not None:
                 step.add_done_callback(lambda _: replies.close())  # one that is at work cannot be closed
 
-    async def _one(self, data: AsyncIterator[bytes], parse: Callable[[bytes], Any], call: Call) -> Any:
-        """The one message of a call, or what reads it."""
+    async def _one(self, data: AsyncGenerator[bytes, None], parse: Callable[[bytes], Any], call: Call) -> Any:
+        """The one message of a call, or what reads its bytes."""
 
-        async def receive() -> Any:
-            try:
-                return _parsed(parse, await anext(data), call)
-            except StopAsyncIteration:
-                raise MalformedError(f"message of {call.method}", "none", "one") from None
+        async def receive() -> bytes:
+            if (message := await anext(data, None)) is None:
+                raise MalformedError(f"message of {call.method}", "none", "one")
+            await data.aclose()
+            return message
 
-        return receive if call.method in LATER else await receive()
+        return receive if call.method in LATER else _parsed(parse, await receive(), call)
 
     async def _messages(
         self, data: AsyncIterator[bytes], parse: Callable[[bytes], Any], call: Call
@@ -312,6 +313,7 @@ class Dispatcher:
         except Exception as error:
             code = _code_of_leaving(context) if isinstance(error, CallerLeft) else status_of(error)
             self._ended(call, headers, code, error)
+            clear_frames(error.__traceback__)  # the library keeps the error for a while, and so would it all that came
             await context.abort(code, told(error), trailers(error))
         finally:
             call.caller.leave()

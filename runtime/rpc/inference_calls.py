@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Awaitable, Callable
 from functools import partial
 from importlib.metadata import version as installed_version
@@ -20,18 +19,12 @@ from runtime.pb.inference import open_inference_pb2 as oip
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import Call
 from runtime.rpc.frame_calls import FrameCalls
-from runtime.rpc.tensors import (
-    TYPED_BYTES,
-    Tensor,
-    inputs_of,
-    outputs_of,
-    parameters_message,
-    parameters_of,
-    typed_elements,
-)
+from runtime.rpc.infer_message import take_apart
+from runtime.rpc.tensors import Tensor, inputs_of, outputs_of, parameters_message, parameters_of, typed_bytes
 from runtime.service.dataplane import DataPlane
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.receiver import ReceiveBudget
+from runtime.service.stages import Stage, Stages
 from runtime.wire.messages import PIXEL_CODES, message_of
 
 INFERENCE = oip.DESCRIPTOR.services_by_name["GRPCInferenceService"]
@@ -62,6 +55,10 @@ _WIDEST = {"uint8": 2, "uint16": 3}
 """Bytes of a typed pixel in a message, at most."""
 _BESIDE = 1 << 16
 """Bytes of names, shapes and parameters."""
+_TYPED_BYTES = 8 << 20
+"""Typed contents of a message, at most: a pair of four million pixels. Parsed, they take many times their size."""
+_MOST_BYTES = (1 << 31) - 1
+"""Of a message: gRPC counts them in 32 bits."""
 
 
 def model_inputs(bundle: Bundle) -> dict[str, Tensor]:
@@ -77,11 +74,19 @@ def model_inputs(bundle: Bundle) -> dict[str, Tensor]:
 
 
 def large_messages(plane: DataPlane) -> dict[str, int]:
-    """Bytes of the largest ModelInfer that makes sense, by its full name: a pair and pilots in typed contents."""
+    """Bytes of the largest ModelInfer that makes sense, by its full name: a pair of the device, and pilots."""
+    bundle = plane.registry.current.decoder.bundle
+    pixels, symbols = (int(np.prod(shape)) for shape in (bundle.profile.frame_shape, bundle.profile.page_shape))
+    size = 2 * pixels * np.dtype(bundle.manifest.frame_dtype).itemsize + 2 * symbols + _BESIDE
+    return {f"/{INFERENCE.full_name}/ModelInfer": min(max(size, _most_beside(plane)), _MOST_BYTES)}
+
+
+def _most_beside(plane: DataPlane) -> int:
+    """Bytes that a ModelInfer may have beside raw contents: typed ones, as far as they make sense."""
     bundle = plane.registry.current.decoder.bundle
     pixels, symbols = (int(np.prod(shape)) for shape in (bundle.profile.frame_shape, bundle.profile.page_shape))
     size = 2 * pixels * _WIDEST[bundle.manifest.frame_dtype] + 4 * symbols + _BESIDE
-    return {f"/{INFERENCE.full_name}/ModelInfer": min(size, (1 << 31) - 1)}
+    return max(min(size, _TYPED_BYTES), plane.limits.message_bytes)
 
 
 class InferenceCalls:
@@ -93,6 +98,7 @@ class InferenceCalls:
 
     def __init__(self, plane: DataPlane) -> None:
         self._plane, self._frames = plane, FrameCalls(plane)
+        self._most_beside = _most_beside(plane)
 
     async def ServerLive(self, request: oip.ServerLiveRequest, call: Call) -> oip.ServerLiveResponse:
         """Whoever hears this is answered."""
@@ -141,16 +147,15 @@ class InferenceCalls:
             reply.properties["user_bytes_per_page"] = str(decoder.page_codec.user_bytes)
         return reply
 
-    async def ModelInfer(
-        self, receive: Callable[[], Awaitable[oip.ModelInferRequest]], call: Call
-    ) -> oip.ModelInferResponse:
+    async def ModelInfer(self, receive: Callable[[], Awaitable[bytes]], call: Call) -> oip.ModelInferResponse:
         """Decode a pair."""
-        start = time.perf_counter()
+        stages = call.times.page()
+        stages.begin(Stage.RECEIVE)
         self._plane.decodes.check(call.caller)
-        sent = _Sent(await receive(), self._plane.received)
-        call.correlation_id = sent.id
+        sent = _Sent(await receive(), self._plane.received, self._most_beside)
+        call.correlation_id = sent.request.id
         call.caller.actor = call.actor
-        return await call.in_thread(partial(self._infer, sent, call, start, time.perf_counter()), sent.close)
+        return await call.in_thread(partial(self._infer, sent, call, stages), sent.close)
 
     @property
     def _ready(self) -> bool:
@@ -166,16 +171,18 @@ class InferenceCalls:
         if version not in ("", self._plane.registry.current.version) and version not in (known := self._versions()):
             raise NoSuchModelError("model version", repr(version), f"one of {', '.join(known)}, or none")
 
-    def _infer(self, sent: _Sent, call: Call, start: float, received: float) -> oip.ModelInferResponse:
+    def _infer(self, sent: _Sent, call: Call, stages: Stages) -> oip.ModelInferResponse:
         try:
-            version, names, header, pair = self._translated(sent.taken())
-            reply = self._frames.decode(pair, header, call, start, received, version)
+            names, header, pair = self._translated(sent.request, sent.raw)
+            reply = self._frames.decode(pair, header, call, stages, sent.request.model_version)
         finally:
             sent.close()
         return _response(reply, names)
 
-    def _translated(self, request: oip.ModelInferRequest) -> tuple[str, list[str], pb.DecodeHeader, FramePair]:
-        """The version that is wanted, names of the outputs, and the pair with a header as DecodeFrames has them."""
+    def _translated(
+        self, request: oip.ModelInferRequest, raw: list[memoryview]
+    ) -> tuple[list[str], pb.DecodeHeader, FramePair]:
+        """Names of the outputs, and the pair with a header as DecodeFrames has it."""
         self._check_known(request.model_name, request.model_version)
         self._plane.registry.expect(request.model_version)
         bundle = self._plane.registry.current.decoder.bundle
@@ -203,12 +210,12 @@ class InferenceCalls:
             correlation_id=request.id,
             black_level=asked.get("black_level", 0),
         )
-        arrays = inputs_of(request, model_inputs(bundle))
+        arrays = inputs_of(request, raw, model_inputs(bundle))
         pilots = _pilots(arrays.get("pilot_mask"), arrays.get("pilot_symbols"), asked.get("pilot_levels", 0))
         if pilots is not None:
             header.pilots.CopyFrom(pilots)
         self._frames.check(header)
-        return request.model_version, names, header, FramePair(arrays["in_phase"], arrays["quadrature"])
+        return names, header, FramePair(arrays["in_phase"], arrays["quadrature"])
 
 
 class UnknownCalls(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its types alone
@@ -240,30 +247,32 @@ class _Sent:
     """A request that has come, within a budget of memory until it is closed.
 
     Args:
-        request: that came.
+        data: its message.
         budget: that takes its bytes.
+        most_beside: as for `take_apart`, which says what is raised too.
 
     Raises:
         OverloadedError: there is no room for it.
     """
 
-    def __init__(self, request: oip.ModelInferRequest, budget: ReceiveBudget) -> None:
-        size = request.ByteSize() + TYPED_BYTES * typed_elements(request)
-        budget.take(size)
-        self.id = request.id
-        self._request: oip.ModelInferRequest | None = request
-        self._size, self._budget = size, budget
-
-    def taken(self) -> oip.ModelInferRequest:
-        """The request, once: it is not kept."""
-        request, self._request = self._request, None
-        assert request is not None  # taken once
-        return request
+    def __init__(self, data: bytes, budget: ReceiveBudget, most_beside: int) -> None:
+        self._size, self._budget = 0, budget
+        self._take(len(data))
+        try:
+            self.request, self.raw = take_apart(data, most_beside)
+            self._take(typed_bytes(self.request))
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Give back what it took from the budget."""
         size, self._size = self._size, 0
         self._budget.give_back(size)
+
+    def _take(self, size: int) -> None:
+        self._budget.take(size)
+        self._size += size
 
 
 def _pilots(mask: NDArray[np.bool_] | None, symbols: NDArray[np.uint8] | None, levels: int) -> pb.Pilots | None:

@@ -104,14 +104,21 @@ class _Messages:
             except TimeoutError:
                 expected = f"the next message within {self._longest_s:g} s"
                 raise StalledError(f"stream of {self._name}", "nothing", expected) from None
-        if len(message) > self._largest:
-            raise LimitError(f"message of {self._name}", f"{len(message)} bytes", f"at most {self._largest}")
+        if (size := len(message)) > self._largest:
+            del message
+            await self.aclose()
+            raise LimitError(f"message of {self._name}", f"{size} bytes", f"at most {self._largest}")
         if self._parse is None:
             return message
         try:
             return self._parse(message)
         except DecodeError as error:
             raise MalformedError(f"message of {self._name}", str(error), "one that can be parsed") from None
+
+    async def aclose(self) -> None:
+        """Read no more. Until then, the library keeps the message that it gave out last."""
+        generator: Any = aiter(self._data)
+        await generator.aclose()
 
     @asynccontextmanager
     async def _place(self) -> AsyncIterator[None]:
@@ -147,6 +154,7 @@ async def _generated(
 
 async def _one(messages: _Messages) -> Any:
     async for message in messages:
+        await messages.aclose()
         return message
     raise MalformedError("message", "none", "one")
 

@@ -23,8 +23,11 @@ RAW_TYPES = {
 _TYPED_FIELDS = {"BOOL": "bool_contents", "UINT8": "uint_contents", "UINT16": "uint_contents"}
 _SLICE = 1 << 16
 """Typed elements that are taken at a time: the interpreter does nothing else meanwhile."""
-TYPED_BYTES = 4
-"""Memory of a typed element, once parsed."""
+_LARGEST_COUNT = (1 << 32) - 1
+"""Of a parameter: the fields that parameters stand for have 32 bits."""
+_TYPED_BYTES = {"bool_contents": 1, "uint_contents": 4}
+_ANY_BYTES = 16
+"""Memory of a typed element, once parsed; of kinds that no input has, at most."""
 
 Request = oip.ModelInferRequest
 Input = oip.ModelInferRequest.InferInputTensor
@@ -50,44 +53,52 @@ class Tensor:
         return _told(self.datatype, self.shape)
 
 
-def inputs_of(request: Request, expected: Mapping[str, Tensor]) -> dict[str, NDArray[Any]]:
-    """The input tensors by name; those with raw contents are views of the request's bytes, which cannot be written to.
+def inputs_of(request: Request, raw: Sequence[memoryview], expected: Mapping[str, Tensor]) -> dict[str, NDArray[Any]]:
+    """The input tensors by name; those with raw contents are views of these, which cannot be written to.
 
     Args:
         request: that came.
+        raw: its raw contents.
         expected: what the model takes, by name.
 
     Raises:
         InvalidInputError: a tensor that is missing, unknown, or there twice, of another type, shape or size, or with
             contents in two forms; of the class `Tensor.wrong` where that is known.
     """
-    raw = request.raw_input_contents
-    if raw and len(raw) != len(request.inputs):
+    names = set[str]()
+    for tensor in request.inputs:
+        _check(tensor, expected)
+        if tensor.name in names:
+            raise InvalidInputError(f"inputs.{tensor.name}", "this tensor twice", "once")
+        names.add(tensor.name)
+    for name, known in expected.items():
+        if name not in names and not known.optional:
+            raise InvalidInputError(f"inputs.{name}", "nothing", known)
+    if not raw:
+        return {tensor.name: _typed(tensor, expected[tensor.name]) for tensor in request.inputs}
+    for tensor in request.inputs:
+        if tensor.HasField("contents"):
+            subject = f"inputs.{tensor.name}.contents"
+            raise InvalidInputError(subject, "typed contents beside raw_input_contents", "one of the two")
+    if len(raw) != len(request.inputs):
         raise InvalidInputError("raw_input_contents", f"{len(raw)} of them", f"{len(request.inputs)}, one an input")
-    found: dict[str, NDArray[Any]] = {}
-    for index, tensor in enumerate(request.inputs):
-        subject, known = f"inputs.{tensor.name}", expected.get(tensor.name)
-        if known is None:
-            raise InvalidInputError("inputs", repr(tensor.name), f"one of {', '.join(expected)}")
-        if tensor.name in found:
-            raise InvalidInputError(subject, "this tensor twice", "once")
-        if tensor.parameters:
-            raise InvalidInputError(f"{subject}.parameters", ", ".join(sorted(tensor.parameters)), "none")
-        if (tensor.datatype, tuple(tensor.shape)) != (known.datatype, known.shape):
-            raise known.wrong(subject, _told(tensor.datatype, tensor.shape), known)
-        if not raw:
-            found[tensor.name] = _typed(tensor, known, subject)
-        elif tensor.HasField("contents"):
-            raise InvalidInputError(f"{subject}.contents", "typed contents beside raw_input_contents", "one of the two")
-        else:
-            found[tensor.name] = _raw(raw[index], known, subject)
-    missing = [name for name, tensor in expected.items() if not tensor.optional and name not in found]
-    if missing:
-        raise InvalidInputError("inputs", f"no {missing[0]}", f"{missing[0]}, {expected[missing[0]]}")
-    return found
+    pairs = zip(request.inputs, raw, strict=True)
+    return {tensor.name: _raw(tensor, content, expected[tensor.name]) for tensor, content in pairs}
 
 
-def _raw(content: bytes, known: Tensor, subject: str) -> NDArray[Any]:
+def _check(tensor: Input, expected: Mapping[str, Tensor]) -> None:
+    """Check all of a tensor but its contents."""
+    known, subject = expected.get(tensor.name), f"inputs.{tensor.name}"
+    if known is None:
+        raise InvalidInputError("inputs", repr(tensor.name), f"one of {', '.join(expected)}")
+    if tensor.parameters:
+        raise InvalidInputError(f"{subject}.parameters", ", ".join(sorted(tensor.parameters)), "none")
+    if (tensor.datatype, tuple(tensor.shape)) != (known.datatype, known.shape):
+        raise known.wrong(subject, _told(tensor.datatype, tensor.shape), known)
+
+
+def _raw(tensor: Input, content: memoryview, known: Tensor) -> NDArray[Any]:
+    subject = f"inputs.{tensor.name}"
     dtype, count = RAW_TYPES[known.datatype], int(np.prod(known.shape))
     if len(content) != count * dtype.itemsize:
         raise known.wrong(subject, f"{len(content)} bytes", f"{count * dtype.itemsize} bytes of {known}")
@@ -95,31 +106,32 @@ def _raw(content: bytes, known: Tensor, subject: str) -> NDArray[Any]:
         flags = np.frombuffer(content, np.uint8)
         if int(flags.max(initial=0)) > 1:
             raise known.wrong(subject, f"a flag of {flags.max()}", "flags of 0 or 1")
-    native = dtype.newbyteorder("=")
-    return np.frombuffer(content, dtype).astype(native, copy=False).reshape(known.shape)
+    array = np.frombuffer(content, dtype).astype(dtype.newbyteorder("="), copy=False)
+    return np.require(array, requirements="A").reshape(known.shape)
 
 
-def _typed(tensor: Input, known: Tensor, subject: str) -> NDArray[Any]:
-    field, count = _TYPED_FIELDS[known.datatype], int(np.prod(known.shape))
+def _typed(tensor: Input, known: Tensor) -> NDArray[Any]:
+    subject, field = f"inputs.{tensor.name}.contents", _TYPED_FIELDS[known.datatype]
+    count = int(np.prod(known.shape))
     others = sorted(each.name for each, _ in tensor.contents.ListFields() if each.name != field)
     if others:
-        raise known.wrong(f"{subject}.contents", ", ".join(others), f"{field} alone")
+        raise known.wrong(subject, ", ".join(others), f"{field} alone")
     values = getattr(tensor.contents, field)
     if len(values) != count:
-        raise known.wrong(f"{subject}.contents.{field}", f"{len(values)} elements", f"{count} of {known}")
+        raise known.wrong(f"{subject}.{field}", f"{len(values)} elements", f"{count} of {known}")
     array = np.empty(count, RAW_TYPES[known.datatype].newbyteorder("="))
     for start in range(0, count, _SLICE):
         part = np.array(values[start : start + _SLICE])
         if array.dtype != np.bool_ and int(part.max()) > (largest := np.iinfo(array.dtype).max):
-            raise known.wrong(f"{subject}.contents.{field}", f"an element of {part.max()}", f"0..{largest}")
+            raise known.wrong(f"{subject}.{field}", f"an element of {part.max()}", f"0..{largest}")
         array[start : start + _SLICE] = part
     return array.reshape(known.shape)
 
 
-def typed_elements(request: Request) -> int:
-    """Elements of all typed contents of a request."""
-    lists = (values for tensor in request.inputs for _, values in tensor.contents.ListFields())
-    return sum(len(values) for values in lists)
+def typed_bytes(request: Request) -> int:
+    """Memory of all typed contents of a request, once they are parsed."""
+    lists = (each for tensor in request.inputs for each in tensor.contents.ListFields())
+    return sum(len(values) * _TYPED_BYTES.get(field.name, _ANY_BYTES) for field, values in lists)
 
 
 def parameters_of(request: Request, kinds: Mapping[str, type]) -> dict[str, Any]:
@@ -130,18 +142,20 @@ def parameters_of(request: Request, kinds: Mapping[str, type]) -> dict[str, Any]
         kinds: int, str or bool, by name.
 
     Raises:
-        InvalidInputError: one that is not known, or of another type.
+        InvalidInputError: one that is not known, of another type, or a number that is no count.
     """
     found: dict[str, Any] = {}
     for name, parameter in request.parameters.items():
         if (kind := kinds.get(name)) is None:
             raise InvalidInputError("parameters", repr(name), f"one of {', '.join(kinds)}")
         choice = parameter.WhichOneof("parameter_choice")
-        value = None if choice is None else getattr(parameter, choice)
+        value: Any = None if choice is None else getattr(parameter, choice)
         if type(value) is not kind:
             fields = {int: "int64_param", str: "string_param", bool: "bool_param"}
             raise InvalidInputError(f"parameters.{name}", choice or "no value", fields[kind])
         found[name] = value
+        if kind is int and not 0 <= found[name] <= _LARGEST_COUNT:
+            raise InvalidInputError(f"parameters.{name}", value, f"0..{_LARGEST_COUNT}")
     return found
 
 

@@ -70,8 +70,8 @@ def _time(record: logging.LogRecord) -> str:
 
 
 def _has_traceback(record: logging.LogRecord) -> bool:
-    # False where a library has logged with `exc_info=False`.
-    return bool(record.exc_info) and record.exc_info[0] is not None
+    told = record.exc_info  # False where a library has logged with `exc_info=False`
+    return told is not None and bool(told) and told[0] is not None
 
 
 def _fields(record: logging.LogRecord) -> dict[str, Any]:

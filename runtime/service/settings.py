@@ -191,6 +191,16 @@ class TracesTable(SettingsTable):
             raise ValueError(error.expected) from None
 
 
+class InferenceTable(SettingsTable):
+    """The Open Inference Protocol.
+
+    Attributes:
+        enabled: whether it is served beside the service's own contract; it takes a whole frame pair in one message.
+    """
+
+    enabled: bool = True
+
+
 class SelfCalibrationTable(SettingsTable):
     """See `SelfCalibrationSettings`; `enabled` left out means: where pages are named."""
 
@@ -252,6 +262,7 @@ class ServiceSettings(TomlTable):
 
     service: ServiceTable = ServiceTable()
     tls: TlsTable = TlsTable()
+    inference: InferenceTable = InferenceTable()
     metrics: MetricsTable = MetricsTable()
     traces: TracesTable = TracesTable()
     self_calibration: SelfCalibrationTable = SelfCalibrationTable()

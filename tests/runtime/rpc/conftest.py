@@ -32,13 +32,14 @@ def start(toy_zip: Path, tmp_path: Path) -> Iterator[Start]:
         bundle: Path = toy_zip,
         store: Path | None = None,
         tracker: TrackerFactory = no_tracker,
+        inference: bool = True,
     ) -> Running:
         source = toy.ToySource(toy.ToyDevice())
         registry = ModelRegistry(Decoder(Bundle.open(bundle), threads=1), tracker)
         models = ModelStore(store, registry.current.decoder.bundle) if store is not None else None
         plane = DataPlane(registry, source, models, limits)
         recalibrator = Recalibrator(plane, fit, tmp_path)
-        server = LightpageServer(plane, recalibrator).start()
+        server = LightpageServer(plane, recalibrator, inference=inference).start()
         client = LightpageClient(server.target, timeout_s=20)
         running.append(Running(plane, recalibrator, server, source, client))
         return running[-1]
