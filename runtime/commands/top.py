@@ -21,8 +21,10 @@ from rich.table import Table
 from rich.text import Text
 
 from lightpage.errors import LightpageError
+from runtime.commands.connection import with_tls
 from runtime.console.looks import WINDOW_S, Change, Looks, look_at
 from runtime.service.stages import Stage
+from runtime.wire.tls import TlsFiles
 
 _WIDTH = 100
 """Columns where nobody looks at a terminal."""
@@ -34,13 +36,14 @@ _WIDTH = 100
     "--interval", default=2.0, show_default=True, type=click.FloatRange(0.1, 60), help="Seconds between two looks."
 )
 @click.option("--once", is_flag=True, help="Print what two looks say, and end; also where nobody has a terminal.")
-def top(address: str, interval: float, once: bool) -> None:
+@with_tls
+def top(address: str, interval: float, once: bool, tls: TlsFiles | None) -> None:
     """Show how a service fares that runs with --metrics-port. The key q ends it."""
     looks = Looks()
-    looks.add(look_at(address))
+    looks.add(look_at(address, tls))
     if once or not sys.stdout.isatty():
         time.sleep(interval)
-        looks.add(look_at(address))
+        looks.add(look_at(address, tls))
         width = None if sys.stdout.isatty() else _WIDTH
         Console(width=width, highlight=False).print(view(looks, address))
         return
@@ -48,7 +51,7 @@ def top(address: str, interval: float, once: bool) -> None:
     with _keys() as pressed, Live(view(looks, address), screen=True, auto_refresh=False) as live:
         while "q" not in pressed(interval):
             try:
-                looks.add(look_at(address))
+                looks.add(look_at(address, tls))
                 silent = ""
             except LightpageError as error:
                 silent = silent or f"no answer since {time.strftime('%H:%M:%S')}: {error.got}"

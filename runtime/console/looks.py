@@ -8,11 +8,12 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from urllib.error import URLError
-from urllib.request import ProxyHandler, build_opener
+from urllib.request import HTTPSHandler, ProxyHandler, build_opener
 
 from prometheus_client.parser import text_string_to_metric_families
 
 from lightpage.errors import LightpageError
+from runtime.wire.tls import TlsFiles
 
 WINDOW_S = 60.0
 """Rates and times are those of so many seconds, once somebody has looked for so long."""
@@ -54,16 +55,22 @@ class Look:
         return sums
 
 
-def look_at(address: str) -> Look:
+def look_at(address: str, tls: TlsFiles | None = None) -> Look:
     """The metrics of the service whose `--metrics-port` is at HOST:PORT.
 
+    Args:
+        address: HOST:PORT.
+        tls: certificates to connect with; None for a service without TLS.
+
     Raises:
+        InvalidInputError: certificates that are no good.
         LightpageError: nobody answers there, or something else than a Lightpage service.
     """
     expected = "a service that runs with --metrics-port: `lightpage serve --metrics-port 9100`"
-    subject, url = f"metrics at {address}", f"http://{address}/metrics"
+    subject, url = f"metrics at {address}", f"http{'s' if tls else ''}://{address}/metrics"
+    secure = [HTTPSHandler(context=tls.client_context())] if tls else []
     try:
-        with build_opener(ProxyHandler({})).open(url, timeout=_ANSWER_S) as reply:
+        with build_opener(ProxyHandler({}), *secure).open(url, timeout=_ANSWER_S) as reply:
             text = reply.read(_MOST_BYTES).decode("utf-8")
         samples = {
             (sample.name, frozenset(sample.labels.items())): float(sample.value)

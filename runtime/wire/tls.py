@@ -54,6 +54,13 @@ class TlsFiles:
             raise InvalidInputError(f"certificate {self.certificate} with key {self.key}", got, expected) from None
         return pem
 
+    def client_context(self) -> ssl.SSLContext:
+        """What an HTTP client connects with; raises as `read`."""
+        self.read()
+        context = ssl.create_default_context(cafile=str(self.ca))
+        context.load_cert_chain(self.certificate, self.key)
+        return context
+
     def channel_credentials(self) -> grpc.ChannelCredentials:
         """What a client connects with; raises as `read`."""
         pem = self.read()

@@ -7,13 +7,16 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 from urllib.request import urlopen
 
 import compose_spec
 import pytest
 import yaml
+from click.testing import CliRunner
 
 from runtime.bundle.bundle import Bundle
+from runtime.commands.serve import serve
 from runtime.console.history import History
 from runtime.console.server import Console, ConsoleServer
 from runtime.decoding.decoder import Decoder
@@ -22,6 +25,7 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.registry import ModelRegistry
+from runtime.service.settings import Option, service_settings
 from runtime.service.stages import Stages
 from runtime.service.store import ModelStore
 from tests.deploy import promql
@@ -107,7 +111,8 @@ def test_every_alert_is_documented_and_tested() -> None:
 
 def test_promtool_takes_rules_and_configuration_and_the_alerts_do_what_they_say(promtool: str, tmp_path: Path) -> None:
     folder = promql.RULES.parent
-    for arguments in (("check", "config", "prometheus.yml"), ("test", "rules", "rules_test.yml")):
+    secured = ("check", "config", "--syntax-only", "prometheus.tls.yml")  # its certificates are in a container
+    for arguments in (("check", "config", "prometheus.yml"), secured, ("test", "rules", "rules_test.yml")):
         done = checked(promtool, *arguments, folder=folder)
         assert done.returncode == 0, done.stdout + done.stderr
     shutil.copy(folder / "rules_test.yml", tmp_path)
@@ -155,6 +160,67 @@ def composed(text: str) -> compose_spec.PyCompose:
     found = compose_spec.PyOptions(apply_merge=True).from_yaml(text)
     found.validate()
     return found
+
+
+class _Overriding(yaml.SafeLoader):
+    """Reads compose's tag for lists that take the place of earlier ones."""
+
+
+class _Override(list[str]):
+    """Such a list."""
+
+
+_Overriding.add_constructor("!override", lambda loader, node: _Override(loader.construct_sequence(node)))
+
+
+def merged(base: Any, other: Any) -> Any:
+    """Two compositions as compose merges them: tables by key, volumes by where they are mounted, other lists joined."""
+    if isinstance(base, dict) and isinstance(other, dict):
+        return base | {key: merged(base[key], value) if key in base else value for key, value in other.items()}
+    if isinstance(other, _Override):
+        return list(other)
+    if isinstance(base, list) and isinstance(other, list):
+        mounted = {str(one).split(":")[1] for one in other if ":" in str(one)}
+        return [one for one in base if str(one).split(":")[1:2] != [] and str(one).split(":")[1] not in mounted] + other
+    return other
+
+
+def test_the_composition_for_other_machines_has_tls_everywhere() -> None:
+    plain, secured = (
+        yaml.load((promql.DEPLOY / name).read_text(), _Overriding) for name in ("compose.yml", "compose.tls.yml")
+    )
+    whole = merged(plain, secured)
+    services = whole["services"]
+    composed(yaml.safe_dump(whole))
+    for name, service in services.items():
+        targets = [volume.split(":")[1] for volume in service["volumes"]]
+        assert len(targets) == len(set(targets)), name
+        assert all(volume.endswith(":ro") for volume in service["volumes"] if "/tls/" in volume)
+    own = services["lightpage"]
+    arguments = [argument.removeprefix("--").split("=", 1) for argument in own["command"]]
+    keys = {"source": "source", "address": "address"}
+    options = [Option(name, ("service", keys[name]), value) for name, value in arguments if name in keys]
+    options += [Option("", ("metrics", "host"), "0.0.0.0"), Option("", ("metrics", "port"), 9100)]
+    settings = service_settings(None, own["environment"], options).settings
+    assert not settings.service.insecure
+    files = settings.tls.files()
+    assert files is not None
+    mounted = {volume.split(":")[1] for volume in own["volumes"]}
+    assert {str(path) for path in vars(files).values()} <= mounted
+    scraped = yaml.safe_load((promql.DEPLOY / "prometheus" / "prometheus.tls.yml").read_text())["scrape_configs"][0]
+    mounted = {volume.split(":")[1] for volume in services["prometheus"]["volumes"]}
+    assert {path for key, path in scraped["tls_config"].items() if key.endswith("_file")} <= mounted
+    assert (scraped["scheme"], "prometheus.tls.yml" in str(services["prometheus"]["volumes"])) == ("https", True)
+    unchanged = yaml.safe_load((promql.DEPLOY / "prometheus" / "prometheus.yml").read_text())
+    assert [target["targets"] for target in scraped["static_configs"]] == [
+        target["targets"] for target in unchanged["scrape_configs"][0]["static_configs"]
+    ]
+
+
+def test_the_composition_on_one_machine_is_what_the_service_takes() -> None:
+    own = yaml.safe_load((promql.DEPLOY / "compose.yml").read_text())["services"]["lightpage"]
+    result = CliRunner().invoke(serve, [*own["command"], "--print-config"], env=own["environment"])
+    assert result.exit_code == 0, result.output
 
 
 def test_the_composition_is_valid_and_nothing_of_it_can_be_reached_or_written_from_outside() -> None:

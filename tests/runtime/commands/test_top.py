@@ -24,12 +24,13 @@ from runtime.console.looks import Change, Look, Looks, look_at
 from runtime.console.server import ConsoleServer
 from tests.runtime.commands.test_commands import ROOT
 from tests.runtime.console.stage import Stage, stage
+from tests.runtime.identity.authority import Authority
 
 WAIT_S = 20.0
 
 
 def address(running: Stage) -> str:
-    return running.url.removeprefix("http://")
+    return running.url.removeprefix("http://").replace("localhost", "127.0.0.1")
 
 
 def a_look(at: float, values: Mapping[str, float], started: float = 1.0) -> Look:
@@ -161,3 +162,17 @@ def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(toy_zip: Path) ->
                 assert terminal.process.wait(WAIT_S) == 0
         finally:
             terminal.close()
+
+
+def test_a_service_with_tls_is_looked_at_with_a_certificate(
+    toy_zip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    authority = Authority(tmp_path)
+    with stage(toy_zip, authority.service()) as running:
+        own = authority.caller("watcher", ["read"])
+        files = [word for name, path in vars(own).items() for word in (f"--{name}", str(path))]
+        place = ["--address", f"localhost:{running.server.port}", "--interval", "0.1", "--once"]
+        assert cli_main.run(top, [*place, *files]) == 0
+        assert "model toy-1" in capsys.readouterr().out
+        assert cli_main.run(top, place) == EXIT_ERROR
+        assert "metrics at localhost" in capsys.readouterr().err
