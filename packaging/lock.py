@@ -44,10 +44,10 @@ class Target:
 
 
 TARGETS: Mapping[str, Target] = {
-    "runtime": Target(("cpu",)),
-    "camera": Target(("cpu", "camera", "screen"), ("x86_64",), "genicam has no wheel for it"),
-    "deep": Target(("cpu", "train"), ("x86_64",), "the lock holds PyTorch's CPU build for x86_64 alone"),
-    "gpu": Target(("gpu",)),
+    "runtime": Target(("cpu", "traces")),
+    "camera": Target(("cpu", "camera", "screen", "traces"), ("x86_64",), "genicam has no wheel for it"),
+    "deep": Target(("cpu", "train", "traces"), ("x86_64",), "the lock holds PyTorch's CPU build for x86_64 alone"),
+    "gpu": Target(("gpu", "traces")),
 }
 """The stages of the Dockerfile."""
 BUILD = "build"

@@ -66,20 +66,20 @@ class Call:
         caller: who waits for the answer.
         pool: threads for what blocks.
         peer: address and connection that it came from.
-        identity: who calls.
         correlation_id: the caller's own text for the log, empty where it gave none.
         begun: when its first byte came, by `time.perf_counter`.
         times: of its pages.
+        identity: who calls.
     """
 
     method: str
     caller: Caller
     pool: Executor
     peer: str = ""
-    identity: Identity = LOCAL
     correlation_id: str = ""
     begun: float = field(default_factory=time.perf_counter)
     times: CallTimes = field(default_factory=CallTimes)
+    identity: Identity = LOCAL
 
     @property
     def actor(self) -> Actor:
@@ -285,7 +285,7 @@ class Dispatcher:
     async def _call(self, name: str, context: Any) -> AsyncIterator[Call]:
         """Admit a call, count it, and turn what it raises into its status."""
         caller = Caller(partial(_seconds_left, context))
-        call = Call(name, caller, self._pool, context.peer(), _identity(context))
+        call = Call(name, caller, self._pool, context.peer(), identity=_identity(context))
         call.times = CallTimes(call.begun, partial(self._metrics.timed, name), MOST_PAGES if self._traces else 0)
         headers = dict(context.invocation_metadata() or ()) if self._traces else {}
         task = asyncio.current_task()
