@@ -148,6 +148,8 @@ class Dispatcher:
     ) -> None:
         self._services, self._pool, self._limits = tuple(services), pool, limits
         self._metrics, self._traces, self._log = metrics, traces, CallLog()
+        self._full_names: dict[str, tuple[str, str]] = {}
+        """Of each name in metrics and logs that of the service and of the method."""
         self._active: set[asyncio.Task[Any]] = set()
         self._watching: set[asyncio.Task[Any]] = set()
         self._told: set[asyncio.Task[Any]] = set()
@@ -174,6 +176,7 @@ class Dispatcher:
                 True: (grpc.stream_stream_rpc_method_handler, self._stream),
             }[method.server_streaming]
             name, message = f"{service.prefix}{method.name}", GetMessageClass(method.input_type)
+            self._full_names[name] = service.descriptor.full_name, method.name
             parse = parsed_part if message is pb.DecodeFramesRequest else message.FromString
             serialise = GetMessageClass(method.output_type).SerializeToString
             serving = partial(serve, name, handler, parse, serialise, method.client_streaming)
@@ -327,10 +330,11 @@ class Dispatcher:
         self._metrics.in_flight.dec()
         self._metrics.call_ended(call.method, code.name, reason, None if call.is_watch else ended - call.begun)
         if self._traces is not None:
+            service, method = self._full_names[call.method]
             self._traces.ended(
                 EndedCall(
-                    service=SERVICE.full_name,
-                    method=call.method,
+                    service=service,
+                    method=method,
                     peer=call.peer,
                     correlation_id=call.correlation_id,
                     code=code,

@@ -15,6 +15,7 @@ from lightpage.recording.frame_pair import FramePair
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.rpc.inference_calls import PREFIX
 from runtime.rpc.server import LightpageServer
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
@@ -25,6 +26,7 @@ from runtime.service.stages import Stage
 from tests.runtime import coded, toy
 from tests.runtime.rpc.stage import Running, Start, a_page, wait_until
 from tests.runtime.rpc.test_edge import parts
+from tests.runtime.rpc.test_inference import request_of, stub_of
 
 EXACT_S = 1e-6
 """Sums of doubles of some seconds, in whatever order."""
@@ -49,11 +51,19 @@ def test_the_stages_of_a_pages_calls_are_all_of_their_time(start: Start) -> None
         service.client.decode(pair, 16)
     with pytest.raises(FrameError):
         service.client.decode(FramePair(pair.quadrature, pair.in_phase), 16)
+    with stub_of(service) as other:
+        other.ModelInfer(request_of(pair), timeout=20)
     service.client.read_page()
     for _ in range(2):
         service.client.read_page(3, request_id="once")
     assert len(list(service.client.read_pages(count=3))) == 3
-    for method, calls, pages in (("DecodeFrames", 3, 3), ("ReadPage", 3, 3), ("ReadPages", 1, 3)):
+    other_protocol = f"{PREFIX}ModelInfer"
+    for method, calls, pages in (
+        ("DecodeFrames", 3, 3),
+        (other_protocol, 1, 1),
+        ("ReadPage", 3, 3),
+        ("ReadPages", 1, 3),
+    ):
         assert ended(service, method, calls)
         whole = service.count("lightpage_call_seconds_sum", method=method)
         given = [seconds(service, method, stage) for stage in (Stage.RECEIVE, Stage.INFERENCE)]

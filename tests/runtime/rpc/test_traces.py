@@ -21,8 +21,11 @@ from opentelemetry.proto.trace.v1.trace_pb2 import Span, Status
 from lightpage.errors import InvalidInputError
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
+from runtime.pb.inference import open_inference_pb2 as oip
+from runtime.pb.inference import open_inference_pb2_grpc as oip_grpc
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from runtime.rpc.inference_calls import INFERENCE
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
@@ -34,6 +37,9 @@ from tests.runtime.rpc.test_edge import parts
 
 TRACE, CALLER = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
 SAMPLED, UNSAMPLED = (f"00-{TRACE}-{CALLER}-0{flag}" for flag in (1, 0))
+
+
+Stubs = tuple[pb_grpc.LightpageStub, oip_grpc.GRPCInferenceServiceStub]
 
 
 class Receiver(trace_service_pb2_grpc.TraceServiceServicer):
@@ -63,7 +69,7 @@ def receiving() -> Iterator[tuple[Receiver, str]]:
 
 
 @contextmanager
-def traced(bundle: Path, endpoint: str, share: float = 1.0) -> Iterator[pb_grpc.LightpageStub]:
+def traced(bundle: Path, endpoint: str, share: float = 1.0) -> Iterator[Stubs]:
     """A service whose spans have been sent once the block has ended."""
     plane = DataPlane(ModelRegistry(Decoder(Bundle.open(bundle), threads=1)), toy.ToySource(toy.ToyDevice()))
     with (
@@ -71,7 +77,7 @@ def traced(bundle: Path, endpoint: str, share: float = 1.0) -> Iterator[pb_grpc.
         LightpageServer(plane, Recalibrator(plane, toy.fit_references), traces=traces) as server,
         grpc.insecure_channel(server.target) as channel,
     ):
-        yield pb_grpc.LightpageStub(channel)
+        yield pb_grpc.LightpageStub(channel), oip_grpc.GRPCInferenceServiceStub(channel)
 
 
 def attributes(span: Span) -> dict[str, Any]:
@@ -87,11 +93,12 @@ def inside(spans: list[Span], parent: Span) -> list[Span]:
 def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(toy_zip: Path) -> None:
     with receiving() as (receiver, endpoint):
         before = time.time_ns()
-        with traced(toy_zip, endpoint) as stub:
+        with traced(toy_zip, endpoint) as (stub, other):
             header = (("traceparent", SAMPLED),)
             stub.DecodeFrames(parts(a_page()[1], correlation_id="order-7"), timeout=20, metadata=header)
             with pytest.raises(grpc.RpcError):
                 stub.GetJob(pb.GetJobRequest(id="none"), timeout=20)
+            other.ServerLive(oip.ServerLiveRequest(), timeout=20)
         after = time.time_ns()
     call = next(span for span in receiver.spans if span.name == "lightpage.v1.Lightpage/DecodeFrames")
     assert receiver.services == {"lightpage"}
@@ -118,11 +125,13 @@ def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(toy_zip: Pa
     assert attributes(failed)["lightpage.reason"] == "NO_SUCH_JOB"
     assert attributes(failed)["rpc.grpc.status_code"] == grpc.StatusCode.NOT_FOUND.value[0]
     assert inside(receiver.spans, failed) == []
+    live = next(span for span in receiver.spans if span.name == f"{INFERENCE.full_name}/ServerLive")
+    assert (attributes(live)["rpc.service"], attributes(live)["rpc.method"]) == (INFERENCE.full_name, "ServerLive")
 
 
 def test_a_call_of_many_pages_has_a_span_of_each_up_to_a_number(toy_zip: Path) -> None:
     count = MOST_PAGES + 2
-    with receiving() as (receiver, endpoint), traced(toy_zip, endpoint) as stub:
+    with receiving() as (receiver, endpoint), traced(toy_zip, endpoint) as (stub, _):
         assert len(list(stub.ReadPages(pb.ReadPagesRequest(count=count), timeout=60))) == count
     call = next(span for span in receiver.spans if span.name.endswith("/ReadPages"))
     assert attributes(call)["lightpage.pages"] == count
@@ -137,7 +146,7 @@ def test_a_caller_that_has_decided_for_its_trace_has_decided_for_its_calls(toy_z
     with receiving() as (receiver, endpoint):
         for share, wanted in ((0.0, ["ReadPage"]), (1.0, ["Describe", "ReadPage"])):
             receiver.spans.clear()
-            with traced(toy_zip, endpoint, share) as stub:
+            with traced(toy_zip, endpoint, share) as (stub, _):
                 stub.ReadPage(pb.ReadPageRequest(), timeout=20, metadata=(("traceparent", SAMPLED),))
                 stub.ListModels(pb.ListModelsRequest(), timeout=20, metadata=(("traceparent", UNSAMPLED),))
                 stub.Describe(pb.DescribeRequest(), timeout=20, metadata=(("traceparent", "nonsense"),))
