@@ -117,7 +117,8 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_its_changes_down(toy
     file = tmp_path / "service.toml"
     file.write_text(
         f"[service]\nbundle = '{toy_zip}'\nstore = '{tmp_path}/store'\n"
-        "[inference]\nenabled = false\n[limits]\nrange_pages = 7\nchunk_bytes = 65536\n[logs]\nformat = 'json'\nlines_per_second = 1\n"
+        "[inference]\nenabled = false\n[limits]\nrange_pages = 7\nchunk_bytes = 65536\n"
+        "[logs]\nformat = 'json'\nlines_per_second = 1\n"
     )
     served = Served("--config", file)
     try:
