@@ -10,6 +10,7 @@ compares each answer bit by bit with that of the service's own client. The exit 
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -25,12 +26,14 @@ from lightpage.files import write_json
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.client.client import LightpageClient
+from runtime.service.settings import ADDRESS
 
 PACKAGES = ("tritonclient[grpc]==2.73.0", "grpcio-health-checking==1.81.1", "grpcio-reflection==1.81.1")
 """The last two of the last version that goes with tritonclient's protobuf."""
 
 _INSTALL_S = 600.0
 _CHECKS_S = 1800.0
+_PAGE = Path(__file__).resolve().parents[2] / "docs" / "contract-inference.md"
 _PROGRAM = Path(__file__).with_name("triton_checks.py")
 
 
@@ -52,7 +55,7 @@ def environment(folder: Path) -> Path:
 
 
 def expect(service: RunningService, bundle: Bundle, folder: Path) -> None:
-    """Write the golden pair of a bundle, and what the service's own client gets for it."""
+    """Write the golden pair of a bundle, what the service's own client gets for it, and the documentation's example."""
     pair, has_code = bundle.golden.pair, bundle.code is not None
     with LightpageClient(service.target, timeout_s=300) as client:
         page = client.decode(pair, stateless=True, want_phase=True, want_concentration=True)
@@ -84,6 +87,9 @@ def expect(service: RunningService, bundle: Bundle, folder: Path) -> None:
         pilot_mask=bundle.pilot_mask.astype(np.uint8),
     )
     (folder / "expected.json").write_text(json.dumps(told), "utf-8")
+    found_example = re.search(r"```python\n(.*?)```", _PAGE.read_text("utf-8"), re.DOTALL)
+    assert found_example is not None  # the page has one
+    (folder / "example.py").write_text(found_example[1].replace(ADDRESS, service.target), "utf-8")
 
 
 def checks(python: Path, service: RunningService, folder: Path) -> list[dict[str, Any]]:

@@ -3,8 +3,8 @@
     PYTHON analysis/service/triton_checks.py TARGET HEALTH FOLDER
 
 `inference_protocol.py` makes the environment and the folder: `expected.npz` with a pair and what the service's own
-client gets for it, `expected.json` with the figures. Each line of the output is a check as JSON. Nothing of Lightpage
-is imported.
+client gets for it, `expected.json` with the figures, `example.py` with the example of the documentation. Each line of
+the output is a check as JSON. Nothing of Lightpage is imported.
 
 The checks do by the service's model what that project's own examples do by theirs: health and metadata, inference,
 asynchronous inference, keep-alive, channel arguments, the asyncio client, explicit contents, objects used again. Its
@@ -15,6 +15,8 @@ clearly.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import io
 import json
 import queue
 import sys
@@ -54,7 +56,7 @@ class Service:
     """
 
     def __init__(self, target: str, health: str, folder: Path) -> None:
-        self.target, self.health = target, health
+        self.target, self.health, self.folder = target, health, folder
         self.arrays = dict(np.load(folder / "expected.npz"))
         self.told: dict[str, Any] = json.loads((folder / "expected.json").read_text("utf-8"))
         self.client = triton.InferenceServerClient(target)
@@ -329,6 +331,15 @@ def reflection(service: Service) -> None:
         assert dict(model.properties)["bit_depth"] == str(service.told["bit_depth"])
 
 
+def example_of_the_docs(service: Service) -> None:
+    """What a reader would paste."""
+    text = (service.folder / "example.py").read_text("utf-8")
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(compile(text, "example.py", "exec", dont_inherit=True), {})
+    assert printed.getvalue().startswith(("StatusCode.DATA_LOSS", "StatusCode.INVALID_ARGUMENT")), printed.getvalue()
+
+
 CHECKS = (
     live_and_ready,
     metadata,
@@ -346,6 +357,7 @@ CHECKS = (
     extensions,
     health_protocol,
     reflection,
+    example_of_the_docs,
 )
 
 

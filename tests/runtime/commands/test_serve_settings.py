@@ -117,7 +117,8 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_its_changes_down(toy
     file = tmp_path / "service.toml"
     file.write_text(
         f"[service]\nbundle = '{toy_zip}'\nstore = '{tmp_path}/store'\n"
-        "[limits]\nrange_pages = 7\nchunk_bytes = 65536\n[logs]\nformat = 'json'\nlines_per_second = 1\n"
+        "[inference]\nenabled = false\n[limits]\nrange_pages = 7\nchunk_bytes = 65536\n"
+        "[logs]\nformat = 'json'\nlines_per_second = 1\n"
     )
     served = Served("--config", file)
     try:
@@ -127,6 +128,8 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_its_changes_down(toy
         with grpc.insecure_channel(target) as channel:
             stub = pb_grpc.LightpageStub(channel)
             assert stub.Describe(pb.DescribeRequest(), timeout=10).limits.chunk_bytes == 65536
+            with pytest.raises(grpc.RpcError, match="Method not found"):
+                channel.unary_unary("/inference.GRPCInferenceService/ServerLive")(b"", timeout=10)
             stub.Rollback(pb.RollbackRequest(correlation_id="shift 2"), timeout=10)
             for number in range(8):
                 with pytest.raises(grpc.RpcError, match="at most 7"):

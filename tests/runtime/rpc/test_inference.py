@@ -196,7 +196,7 @@ def test_a_hung_decode_makes_the_service_unready(start: Start) -> None:
 
 
 def test_only_the_version_in_service_decodes(start: Start, tmp_path: Path) -> None:
-    service = start()
+    service = start(Limits(concurrent_decodes=1))
     second = toy.write_toy_bundle(tmp_path / "toy-2.zip", version="toy-2")
     service.plane.adopt(Decoder(Bundle.open(second), 1))
     request = request_of(a_page()[1], levels=16)
@@ -207,7 +207,8 @@ def test_only_the_version_in_service_decodes(start: Start, tmp_path: Path) -> No
             request.model_version = version
             assert stub.ModelInfer(request, timeout=20).model_version == "toy-2"
         request.model_version = "toy-1"
-        code, reason, text = refused(lambda: stub.ModelInfer(request, timeout=20))
+        with service.plane.decodes.held(Caller()):  # it does not wait for its turn
+            code, reason, text = refused(lambda: stub.ModelInfer(request, timeout=20))
         assert (code, reason) == (grpc.StatusCode.ABORTED, "OTHER_MODEL")
         assert text == "model in service: got toy-2, wanted toy-1"
         request.model_version = "toy-3"
