@@ -1,4 +1,4 @@
-"""The locks name all that an image installs, in the versions of constraints.txt, by the SHA-256 of each file."""
+"""The locks name all that an image installs: versions of constraints.txt, a SHA-256 of each file, a known licence."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 
 from tests.packaging.scripts import ROOT, script
 
-lock = script("lock")
+inventory, licences, lock = script("inventory"), script("licences"), script("lock")
 LOCKS: Path = lock.LOCKS
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 OF_CUDA = ("nvidia-", "cuda-", "triton")
@@ -100,6 +100,13 @@ def test_every_stage_that_installs_does_it_by_its_lock() -> None:
     )
     for line in installs:
         assert "--require-hashes" in line or "--no-index" in line, line
+
+
+@pytest.mark.parametrize("target", ["runtime", "camera", "deep"])
+def test_every_locked_package_has_a_licence_that_is_allowed(target: str) -> None:
+    locked = lock.read_lock(LOCKS / f"{target}.txt")
+    found = {name: licences.spdx(name, inventory.licence_of(distribution(name))) for name in locked}
+    assert {name: licence for name, licence in found.items() if licence is None or licences.refused(licence)} == {}
 
 
 # ---- what is wrong is seen ------------------------------------------------------------------------------------------
