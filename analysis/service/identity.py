@@ -5,7 +5,7 @@
 The certificates are made by the very commands of docs/operations.md, and the table of roles is read from there. A
 service in a process of its own is called over TLS; each call's request is empty. A caller without a good certificate
 must find no connection (UNAVAILABLE), and one whose role is lacking must hear PERMISSION_DENIED. Any other end means
-that a call was let in.
+that a call was let in. UNAVAILABLE for a caller with a good certificate is wrong, whatever its role.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,8 +37,9 @@ from runtime.wire.tls import TlsFiles
 
 OPERATIONS = Path(__file__).resolve().parents[2] / "docs" / "operations.md"
 CALL_S = 10.0
-_STRANGERS = ("none", "wrong", "expired", "service")
-"""Those who may not even connect."""
+_UNKNOWN = ("none", "wrong", "expired", "service")
+"""Callers without a good certificate, who may not even connect."""
+LET_IN, REFUSED, NO_CONNECTION = "let in", "refused", "no connection"
 _MORE = r"""
 role=urn:lightpage:role
 issue recalibrator extendedKeyUsage=clientAuth "subjectAltName=URI:$role:recalibrate"
@@ -79,15 +81,17 @@ def documented() -> tuple[str, dict[str, str]]:
     return commands[1], {call: role for role, calls in rows for call in re.findall(r"`([\w/]+)`", calls)}
 
 
-def allowed(call: str, roles: Sequence[str], needed: Mapping[str, str]) -> bool:
-    """Whether the documentation lets a caller with these roles make a call."""
-    role = needed[call]
-    return bool(roles) and (role == "read" or role in roles or "admin" in roles)
+def expected(caller: str, role: str) -> str:
+    """What the documentation says becomes of a call that needs a role."""
+    if caller in _UNKNOWN:
+        return NO_CONNECTION
+    roles = CALLERS[caller]
+    return LET_IN if roles and (role == "read" or role in roles or "admin" in roles) else REFUSED
 
 
-def let_in(caller: str, code: str) -> bool:
-    """Whether a call that ended so was let in."""
-    return code != ("UNAVAILABLE" if caller in _STRANGERS else "PERMISSION_DENIED")
+def outcome(code: str) -> str:
+    """What became of a call that ended so."""
+    return {"UNAVAILABLE": NO_CONNECTION, "PERMISSION_DENIED": REFUSED}.get(code, LET_IN)
 
 
 def methods() -> Iterator[tuple[str, MethodDescriptor]]:
@@ -152,7 +156,7 @@ def measured() -> dict[str, Any]:
         f"{caller}: {call} ended with {code}"
         for caller, calls in found.items()
         for call, code in calls.items()
-        if call in needed and let_in(caller, code) != allowed(call, CALLERS[caller], needed)
+        if call in needed and outcome(code) != expected(caller, needed[call])
     ]
     return {"ended": found, "undocumented": undocumented, "wrong": wrong}
 
@@ -163,8 +167,10 @@ def main(json_path: Path | None) -> None:
     """Print how many calls each caller may make, and what is not as documented."""
     found = measured()
     for caller, calls in found["ended"].items():
-        count = sum(let_in(caller, code) for code in calls.values())
-        click.echo(f"{caller:<14}{count:>4} of {len(calls)} calls let in")
+        counts = Counter(map(outcome, calls.values()))
+        click.echo(
+            f"{caller:<14}" + ", ".join(f"{counts[each]:>3} {each}" for each in (LET_IN, REFUSED, NO_CONNECTION))
+        )
     for each in [*found["wrong"], *(f"{call} is not in the table of roles" for call in found["undocumented"])]:
         click.echo(f"  {each}")
     calls = sum(map(len, found["ended"].values()))

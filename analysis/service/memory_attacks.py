@@ -3,9 +3,11 @@
     python -m analysis.service.memory_attacks --json FILE
 
 Each try is one of: a handle that was never given out, cut off, or of a region that is gone; an offset beyond the end; a
-region that is dropped while a call reads it; one whose size its client tries to change; garbage, too much, nothing, or
-a file descriptor at the socket where regions are given out. Between them, good pairs must be answered. A try that is
-answered with a page though part of it lay outside its region counts as a read outside.
+region that is dropped while a call reads it; a call that is cancelled; a region whose size its client tries to change;
+garbage, too much, nothing, or a file descriptor at the socket where regions are given out. Between them, good pairs
+must be answered. A try that is answered with a page though part of it lay outside its region counts as a read outside.
+Once all callers have left, the service must hold no more regions and files than before, and no byte of its receive
+budget. The exit status is 1 where any of this fails.
 """
 
 from __future__ import annotations
@@ -17,8 +19,9 @@ import socket
 import sys
 import tempfile
 import threading
+import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -27,7 +30,7 @@ import click
 import grpc
 
 from analysis.service.constant_bundle import constant_bundle
-from analysis.service.running import RunningService
+from analysis.service.running import RunningService, until
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import load_profile
@@ -42,6 +45,10 @@ from runtime.wire.channel import open_channel
 from runtime.wire.shared_memory import HANDLE_BYTES, SIZE, memory_path
 
 CALL_S = 30.0
+_CANCEL_S = 15e-3
+"""Within so long after its begin a call is cancelled: some before its frames are copied, some meanwhile, some after."""
+_SETTLE_S = 10.0
+"""Until the service has let go of what callers left."""
 _GOOD_EVERY = 500
 
 
@@ -76,6 +83,7 @@ class Attacker:
             "offset beyond the end": lambda: self._bad(self._memory.handle, self._beyond()),
             "larger frames than the region": lambda: self._bad(self._memory.handle, 0, self._size + 1),
             "dropped while it is read": self._dropped,
+            "cancelled": self._cancelled,
             "size changed": self._resized,
             "garbage at the socket": self._garbage,
         }
@@ -93,20 +101,25 @@ class Attacker:
         far = (1, 4095, 4096, self._size - 1, self._size, 1 << 31, 1 << 32, 1 << 62, (1 << 64) - 1)
         return self._chance.choice([*far, self._chance.randrange(1, 1 << 64)])
 
-    def _ended(self, region: bytes, offset: int, rows_px: int | None = None) -> str:
-        """How a call ends."""
+    def _begun(self, region: bytes, offset: int, rows_px: int | None = None) -> Any:
+        """A call that is on its way."""
         header = pb.DecodeHeader()
         header.CopyFrom(self._header)
         header.shared.region, header.shared.offset = region, offset
         if rows_px is not None:
             header.rows_px = rows_px
-        try:
-            self._stub.DecodeFrames(iter([pb.DecodeFramesRequest(header=header)]), timeout=CALL_S)
-        except grpc.RpcError as error:
-            call: Any = error
-            name: str = call.code().name
-            return name
-        return "OK"
+        return self._stub.DecodeFrames.future(iter([pb.DecodeFramesRequest(header=header)]), timeout=CALL_S)
+
+    def _ended(self, region: bytes, offset: int, rows_px: int | None = None) -> str:
+        """How a call ends."""
+        return str(self._begun(region, offset, rows_px).code().name)
+
+    def _cancelled(self) -> str:
+        """The whole pair is there, so a page may come of it; its bytes of the receive budget must be given back."""
+        call = self._begun(self._memory.handle, 0)
+        time.sleep(self._chance.uniform(0, _CANCEL_S))
+        call.cancel()
+        return str(call.code().name)
 
     def _bad(self, region: bytes, offset: int, larger: int = 0) -> str:
         """A try of which no page may come."""
@@ -190,7 +203,8 @@ def attacked(tries: int, seed: int) -> dict[str, Any]:
                     failed.append(f"no answer to a good pair after {number} tries")
             good = attacker.good()
             attacker.close()
-            after, alive = _held(service.process.pid), service.process.poll() is None
+            alive = service.process.poll() is None
+            after, receiving = _left(service, before) if alive else ((0, 0), 0)
             status = service.stop()
             log = service.log()
     return {
@@ -202,8 +216,37 @@ def attacked(tries: int, seed: int) -> dict[str, Any]:
         "crashes": int(not alive) + int(status != 0),
         "regions_and_files_before": before,
         "regions_and_files_after": after,
+        "receive_buffer_bytes_after": receiving,
         "tracebacks": log.count("Traceback"),
     }
+
+
+def faults(found: Mapping[str, Any]) -> list[str]:
+    """What is wrong with figures of `attacked`, a few words each."""
+    before, after = found["regions_and_files_before"], found["regions_and_files_after"]
+    wrong = {
+        f"{found['crashes']} crashes": found["crashes"],
+        f"{found['reads_outside']} reads outside a region": found["reads_outside"],
+        f"{found['tracebacks']} tracebacks": found["tracebacks"],
+        f"{len(found['failed'])} tries failed otherwise": found["failed"],
+        "no answer to a good pair at the end": not found["good_at_the_end"],
+        f"{after[0]} regions mapped at the end, {before[0]} before": after[0] > before[0],
+        f"{after[1]} files open at the end, {before[1]} before": after[1] > before[1],
+        f"{found['receive_buffer_bytes_after']} bytes of the receive budget never given back": found[
+            "receive_buffer_bytes_after"
+        ],
+    }
+    return [words for words, is_so in wrong.items() if is_so]
+
+
+def _left(service: RunningService, before: tuple[int, int]) -> tuple[tuple[int, int], int]:
+    """Regions and files, and bytes of the receive budget, that a service holds once its callers have left."""
+    held, receiving = (0, 0), 0
+    for _ in until(time.monotonic() + _SETTLE_S, 0.2):
+        held, receiving = _held(service.pid), int(service.metric("lightpage_receive_buffer_bytes"))
+        if not receiving and all(now <= then for now, then in zip(held, before, strict=True)):
+            break
+    return held, receiving
 
 
 def _held(process: int) -> tuple[int, int]:
@@ -229,9 +272,13 @@ def main(tries: int, seed: int, json_path: Path | None) -> None:
     )
     (regions, files), (held, open_files) = found["regions_and_files_before"], found["regions_and_files_after"]
     click.echo(f"regions mapped: {regions} before, {held} after; open files: {files} before, {open_files} after")
+    click.echo(f"receive budget: {found['receive_buffer_bytes_after']} bytes are held once all callers have left")
+    wrong = faults(found)
+    for words in wrong:
+        click.echo(f"wrong: {words}")
     if json_path is not None:
         write_json(json_path, found)
-    if found["crashes"] or found["reads_outside"] or found["failed"] or found["tracebacks"]:
+    if wrong:
         sys.exit(1)
 
 

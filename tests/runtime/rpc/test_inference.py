@@ -421,6 +421,22 @@ def test_pairs_that_wait_count_against_the_budget(start: Start) -> None:
     assert service.plane.received.used == 0
 
 
+def test_typed_contents_count_against_the_budget_with_what_they_take_once_parsed(start: Start) -> None:
+    pair = a_page()[1]
+    raw, typed = request_of(pair, levels=16), request_of(pair, typed=True, levels=16)
+    parsed = 2 * pair.in_phase.size * np.dtype(np.uint32).itemsize
+    for size, fits in ((typed.ByteSize() + parsed, True), (typed.ByteSize() + parsed - 1, False)):
+        service = start(Limits(receive_bytes=size, pair_bytes=size))
+        with stub_of(service) as stub:
+            stub.ModelInfer(raw, timeout=20)
+            if fits:
+                stub.ModelInfer(typed, timeout=20)
+            else:
+                code, reason, _ = refused(lambda stub=stub: stub.ModelInfer(typed, timeout=20))
+                assert (code, reason) == (grpc.StatusCode.RESOURCE_EXHAUSTED, "OVERLOADED")
+        assert service.plane.received.used == 0
+
+
 def test_a_call_that_comes_too_late_is_refused_before_its_message_is_read(start: Start) -> None:
     service = start()
     service.plane.decodes.took(5.0)
