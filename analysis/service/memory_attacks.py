@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import grpc
 
 from analysis.service.constant_bundle import constant_bundle
 from analysis.service.running import RunningService, until
