@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+import socket
 import ssl
 import threading
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Self
 from wsgiref.simple_server import WSGIRequestHandler, make_server
@@ -37,6 +40,11 @@ IDENTITY = "lightpage.identity"
 """Key of a request's caller, an `Identity`, in its environment; it is not there without TLS."""
 _ACTION_BYTES = 1000
 _DRAINED_BYTES = 1 << 16
+MOST_CONNECTIONS = 64
+"""Connections that are answered at once: browsers, Prometheus, and those who say nothing."""
+LONGEST_S = 60.0
+"""For one connection: more than any answer takes, and too little to hold one for hours by a byte now and then."""
+_HANDSHAKE_S = 5.0
 POINTS = 600
 """Most points of a series."""
 RECENT = 50
@@ -99,7 +107,7 @@ class Console:
         if method == "POST" and path == "/actions":
             return self._act(environ, start_response, identity)
         if identity is not None and not identity.may(Role.READ):
-            return _refused(start_response, "403 Forbidden", f"{identity.name} has no role")
+            return _answer(start_response, "403 Forbidden", "text/plain", b"a certificate without a role\n", method)
         if method not in ("GET", "HEAD"):
             return _answer(start_response, "405 Method Not Allowed", "text/plain", b"GET and HEAD only\n", method)
         if path == "/metrics":
@@ -123,8 +131,11 @@ class Console:
         without asking first, which is refused, and says where a request comes from.
         """
         told = environ.get("CONTENT_LENGTH") or "0"
-        size = int(told) if told.isdecimal() else 0
-        content = environ["wsgi.input"].read(min(size, _DRAINED_BYTES))  # whoever is still sending hears no refusal
+        size = int(told) if told.isdecimal() and len(told) < 10 else 0
+        try:
+            content = environ["wsgi.input"].read(min(size, _DRAINED_BYTES))  # whoever is still sending hears no refusal
+        except OSError:
+            return _refused(start_response, "408 Request Timeout", "the rest did not come")
         if identity is None or self._actions is None:
             return _refused(start_response, "403 Forbidden", "actions need TLS, and a certificate with role admin")
         if environ.get("HTTP_ORIGIN", own := f"https://{environ.get('HTTP_HOST', '')}") != own:
@@ -232,17 +243,47 @@ class ConsoleServer:
 
 
 class _Server(ThreadingWSGIServer):
-    """Takes each connection in a thread of its own, TLS included: a caller that says nothing holds up nobody."""
+    """Takes each connection in a thread of its own, TLS included: a caller that says nothing holds up nobody.
+
+    Beyond `MOST_CONNECTIONS` a connection is closed at once, and each is closed after `LONGEST_S`.
+    """
 
     certificates: Certificates | None = None
     """With which callers are met; None for no TLS."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Begin to answer a connection, if there is room for one more."""
+        if not self._room.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except BaseException:
+            self._room.release()
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer a connection, for a limited time."""
+        ending = threading.Timer(LONGEST_S, _cut_off, [socket.socket(fileno=os.dup(request.fileno()))])
+        ending.daemon = True
+        ending.start()
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            ending.cancel()
+            ending.args[0].close()  # type: ignore[index]  # it was given
+            self._room.release()
 
     def finish_request(self, request: Any, client_address: Any) -> None:
         """Answer the requests of a connection."""
         if self.certificates is None:
             super().finish_request(request, client_address)
             return
-        request.settimeout(_Handler.timeout)
+        request.settimeout(_HANDSHAKE_S)
         try:
             secured = self.certificates.context().wrap_socket(request, server_side=True)
         except (OSError, ValueError) as error:  # an SSLError is an OSError
@@ -296,6 +337,12 @@ def _model(model: Model, current: bool) -> dict[str, Any]:
         "air_before": metrics.get("recalibration_air_bits_per_symbol_before"),
         "air_after": metrics.get("recalibration_air_bits_per_symbol"),
     }
+
+
+def _cut_off(connection: socket.socket) -> None:
+    """End a connection that another thread reads from."""
+    with suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 def _refused(start: StartResponse, status: str, why: str) -> Iterable[bytes]:

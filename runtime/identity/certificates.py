@@ -36,7 +36,7 @@ class Certificates:
         self._files = files
         self._lock = threading.Lock()
         self._stamp = self._refused = self._stamp_now()
-        self._pem = files.read()
+        self._pem, self._context = files.read(), self._loaded()
 
     def pem(self) -> Pem:
         """Those that count now."""
@@ -44,7 +44,7 @@ class Certificates:
             stamp = self._stamp_now()
             if stamp not in (self._stamp, self._refused):
                 try:
-                    self._pem, self._stamp = self._files.read(), stamp
+                    self._pem, self._context, self._stamp = self._files.read(), self._loaded(), stamp
                     _log.info("certificates: read anew from %s", self._files.certificate)
                 except InvalidInputError as error:
                     self._refused = stamp
@@ -67,12 +67,24 @@ class Certificates:
 
     def context(self) -> ssl.SSLContext:
         """What an HTTP server meets the next caller with, who must have a certificate."""
-        pem = self.pem()
+        self.pem()
+        return self._context
+
+    def _loaded(self) -> ssl.SSLContext:
+        """The context of the files as they are.
+
+        Raises:
+            InvalidInputError: they have changed since they were read.
+        """
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.verify_mode = ssl.CERT_REQUIRED
-        context.load_verify_locations(cadata=pem.ca.decode("ascii"))
-        context.load_cert_chain(self._files.certificate, self._files.key)
+        try:
+            context.load_verify_locations(self._files.ca)
+            context.load_cert_chain(self._files.certificate, self._files.key)
+        except (OSError, ValueError) as error:
+            expected = "files that do not change while they are read"
+            raise InvalidInputError(f"certificate {self._files.certificate}", error, expected) from None
         return context
 
     def _stamp_now(self) -> _Stamp:

@@ -43,8 +43,8 @@ class TlsFiles:
         pem = Pem(*(_read(name, path) for name, path in vars(self).items()))
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
-            context.load_verify_locations(cadata=pem.ca.decode("ascii", "replace"))
-        except (ssl.SSLError, ValueError):
+            context.load_verify_locations(self.ca)
+        except (OSError, ValueError):  # an SSLError is an OSError
             raise InvalidInputError(f"ca {self.ca}", "no certificate", "certificates of authorities, PEM") from None
         try:
             context.load_cert_chain(self.certificate, self.key, password=_no_password)
