@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import os
@@ -140,7 +141,7 @@ class Console:
             return _refused(start_response, "403 Forbidden", "actions need TLS, and a certificate with role admin")
         if environ.get("HTTP_ORIGIN", own := f"https://{environ.get('HTTP_HOST', '')}") != own:
             return _refused(start_response, "403 Forbidden", "actions are asked for from the console's own page")
-        if environ.get("CONTENT_TYPE", "") != "application/json":
+        if environ.get("CONTENT_TYPE", "").partition(";")[0].strip().lower() != "application/json":
             return _refused(start_response, "415 Unsupported Media Type", "application/json only")
         if not 0 < size <= _ACTION_BYTES:
             return _refused(start_response, "413 Content Too Large", f"1 to {_ACTION_BYTES} bytes only")
@@ -157,7 +158,7 @@ class Console:
         except Exception:
             _log.exception("console: action of %s", name)
             return _refused(start_response, "500 Internal Server Error", "see the log")
-        return _answer(start_response, "200 OK", "text/plain; charset=utf-8", f"{outcome}\n".encode(), "POST")
+        return _answer(start_response, "200 OK", "text/plain; charset=utf-8", _encoded(outcome), "POST")
 
     def _content(self, path: str, identity: Identity | None) -> tuple[bytes, str] | None:
         if path in _STATIC:
@@ -303,6 +304,10 @@ class _Handler(WSGIRequestHandler):
     timeout = 20
     """A caller that says nothing is hung up on, seconds."""
 
+    def get_stderr(self) -> Any:
+        """Nowhere: a caller that hangs up is no fault, and what the console does not foresee it logs itself."""
+        return io.StringIO()
+
     def get_environ(self) -> WSGIEnvironment:
         """See `WSGIRequestHandler`."""
         environ = super().get_environ()
@@ -346,7 +351,12 @@ def _cut_off(connection: socket.socket) -> None:
 
 
 def _refused(start: StartResponse, status: str, why: str) -> Iterable[bytes]:
-    return _answer(start, status, "text/plain; charset=utf-8", f"{why}\n".encode(), "POST")
+    return _answer(start, status, "text/plain; charset=utf-8", _encoded(why), "POST")
+
+
+def _encoded(text: str) -> bytes:
+    """A line, whatever a caller has put into it."""
+    return f"{text}\n".encode("utf-8", "backslashreplace")
 
 
 def _answer(start: StartResponse, status: str, kind: str, content: bytes, method: str) -> Iterable[bytes]:

@@ -6,14 +6,20 @@ import logging
 import os
 import ssl
 import threading
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import grpc
+from cryptography import x509
+from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from lightpage.errors import InvalidInputError
 from runtime.wire.tls import Pem, TlsFiles
 
 _log = logging.getLogger(__name__)
+
+SOON = timedelta(days=14)
+"""A certificate that ends within this time is warned of."""
 
 _Stamp = tuple[tuple[int, int, int], ...]
 """Number, size and time of change of each file."""
@@ -37,6 +43,7 @@ class Certificates:
         self._lock = threading.Lock()
         self._stamp = self._refused = self._stamp_now()
         self._pem, self._context = files.read(), self._loaded()
+        _warn_of(self._pem)
 
     def pem(self) -> Pem:
         """Those that count now."""
@@ -46,6 +53,7 @@ class Certificates:
                 try:
                     self._pem, self._context, self._stamp = self._files.read(), self._loaded(), stamp
                     _log.info("certificates: read anew from %s", self._files.certificate)
+                    _warn_of(self._pem)
                 except InvalidInputError as error:
                     self._refused = stamp
                     _log.warning("certificates: the earlier ones stay: %s", error)
@@ -97,6 +105,21 @@ class Certificates:
             else:
                 found.append((status.st_ino, status.st_size, status.st_mtime_ns))
         return tuple(found)
+
+
+def _warn_of(pem: Pem) -> None:
+    """Say what callers will have against the service's own certificate."""
+    own = x509.load_pem_x509_certificate(pem.certificate)
+    left = own.not_valid_after_utc - datetime.now(UTC)
+    if left <= SOON:
+        state = "has expired" if left <= timedelta() else "expires soon"
+        _log.warning("certificates: that of the service %s, at %s", state, own.not_valid_after_utc.isoformat())
+    try:
+        usage = own.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    except x509.ExtensionNotFound:
+        return
+    if ExtendedKeyUsageOID.SERVER_AUTH not in usage:
+        _log.warning("certificates: that of the service is for callers; callers want extendedKeyUsage=serverAuth")
 
 
 def _configuration(pem: Pem, callers_too: bool) -> grpc.ServerCertificateConfiguration:

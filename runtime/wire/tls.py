@@ -30,9 +30,9 @@ class TlsFiles:
         key: its private key, PEM, without a password.
     """
 
-    ca: Path
-    certificate: Path
-    key: Path
+    ca: Path | str
+    certificate: Path | str
+    key: Path | str
 
     def read(self) -> Pem:
         """Read the files.
@@ -40,7 +40,7 @@ class TlsFiles:
         Raises:
             InvalidInputError: one cannot be read, or holds no certificate, or the key belongs to another certificate.
         """
-        pem = Pem(*(_read(name, path) for name, path in vars(self).items()))
+        pem = Pem(*(_read(name, Path(path)) for name, path in vars(self).items()))
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
             context.load_verify_locations(self.ca)

@@ -114,6 +114,7 @@ def test_without_tls_there_are_no_actions(toy_zip: Path) -> None:
         ({"action": "format", "expected": "toy-2"}, {}, 400),
         ({"action": ["roll back"], "expected": "toy-2"}, {}, 400),
         ({"action": "roll back", "expected": ""}, {}, 400),
+        ({"action": "roll back", "expected": "\ud800"}, {}, 409),
         ("roll back", {}, 400),
     ],
 )
@@ -180,3 +181,17 @@ def test_connections_are_bounded_in_number_and_in_time(toy_zip: Path, monkeypatc
                 time.sleep(0.01)
         else:
             pytest.fail("nobody is answered any more")
+
+
+def test_a_caller_that_hangs_up_is_no_fault(
+    secured: Stage, authority: Authority, capfd: pytest.CaptureFixture[str]
+) -> None:
+    tls = authority.caller("watcher", ["read"])
+    context = ssl.create_default_context(cafile=str(tls.ca))
+    context.load_cert_chain(tls.certificate, tls.key)
+    for _ in range(5):
+        raw = socket.create_connection(("localhost", secured.server.port))
+        with context.wrap_socket(raw, server_hostname="localhost") as connection:
+            connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+    assert asked(secured, tls, "/metrics", None)[0] == 200
+    assert capfd.readouterr().err == ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -120,3 +121,16 @@ def test_the_commands_for_operators_make_good_certificates(tmp_path: Path) -> No
 def _replace(files: TlsFiles, newer: TlsFiles) -> None:
     shutil.copy(newer.certificate, files.certificate)
     shutil.copy(newer.key, files.key)
+
+
+@pytest.mark.parametrize(("days", "told"), [(-1, "has expired"), (13, "expires soon"), (15, "")])
+def test_a_certificate_that_ends_is_warned_of(
+    authority: Authority, caplog: pytest.LogCaptureFixture, days: int, told: str
+) -> None:
+    Certificates(authority.service(valid_for=timedelta(days=days)))
+    assert (told in caplog.text) if told else not caplog.records
+
+
+def test_a_certificate_for_callers_is_warned_of(authority: Authority, caplog: pytest.LogCaptureFixture) -> None:
+    Certificates(authority.caller("caller", ["read"], timedelta(days=90)))
+    assert "serverAuth" in caplog.text
