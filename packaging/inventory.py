@@ -12,18 +12,29 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import Distribution, distributions
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from lock import BUILT_FROM_SOURCE, normal, read_lock
 
 ENVIRONMENT = Path("opt/lightpage")
 """Of Python, in the image."""
+PYTHON_FOLDER = Path("/usr/bin")
+"""Of the image's Python, which the environment names and links to."""
+WHEELS = "wheels.sha256"
+"""The list of installed wheels, in the environment."""
+OWN_FILES = frozenset(
+    ["pyvenv.cfg", *(f"bin/{name}" for name in ("activate", "activate.csh", "activate.fish", "Activate.ps1")), WHEELS]
+)
+"""Files of the environment that come with no package: of venv, and the list of wheels."""
+INTERPRETER = re.compile(r"python3?|python3\.\d+")
+"""Names of venv's links to Python."""
 LEFT_OUT = (
     "usr/share/doc/",
     "usr/share/man/",
@@ -83,7 +94,7 @@ class DebianPackage:
 
 @dataclass(frozen=True)
 class Inventory:
-    """All of an image. `faults` are files that are not as their package's list says."""
+    """All of an image. `faults` are files that are not as their package's list says, and files of no package."""
 
     python: tuple[PythonPackage, ...]
     debian: tuple[DebianPackage, ...]
@@ -103,19 +114,23 @@ def take(root: Path) -> Inventory:
     Raises:
         FileNotFoundError: it is none of this project's images.
     """
-    environment = root / ENVIRONMENT
+    environment = root.resolve() / ENVIRONMENT
+    files, faults = walk(environment)
+    faults += [f"{part}: is a link" for part in (ENVIRONMENT, ENVIRONMENT.parent) if (root / part).is_symlink()]
     [site] = environment.glob("lib/python3*/site-packages")
-    listed_wheels = (line.split("  ") for line in (environment / "wheels.sha256").read_text().splitlines())
+    listed_wheels = (line.split("  ") for line in (environment / WHEELS).read_text().splitlines())
     wheels = {file: digest for digest, file in listed_wheels}
-    packages, faults, owned = [], [], set[Path]()
+    packages, owned = [], {environment / name for name in OWN_FILES}
     for found in sorted(distributions(path=[str(site)]), key=lambda each: normal(each.name)):
-        listed, wrong = check_files(found, site)
+        if folder_of(found) / "RECORD" not in files:
+            faults.append(f"{found.name}: has no list of its files")
+            continue
+        listed, wrong = check_files(found, site, files)
         owned |= listed
         faults += [f"{found.name}: {fault}" for fault in wrong]
-        packages.append(python_package(found, site, wheels))
-    for path in sorted(site.rglob("*")):
-        if path.is_file() and path.suffix != ".pyc" and path not in owned:
-            faults.append(f"{path.relative_to(site)}: belongs to no package")
+        packages.append(python_package(found, site, wheels, files))
+    faults += [f"{path.relative_to(environment)}: belongs to no package" for path in sorted(files - owned)]
+    faults += check_settings(environment / "pyvenv.cfg")
     debian = tuple(debian_packages(root))
     for package in debian:
         faults += [f"{package.name}: {fault}" for fault in check_debian_files(root, package)]
@@ -123,15 +138,63 @@ def take(root: Path) -> Inventory:
     return Inventory(tuple(packages), debian, release[1] if release else "unknown", tuple(faults))
 
 
-def check_files(found: Distribution, site: Path) -> tuple[set[Path], list[str]]:
-    """The files that a distribution lists, and what is wrong with them. Byte code has no checksum to look at."""
+def walk(environment: Path) -> tuple[set[Path], list[str]]:
+    """The regular files of an environment, and what is neither a file nor a folder there. Links are not followed.
+
+    venv's own links to Python, and `lib64` to `lib`, are in order.
+    """
+    files, faults = set[Path](), []
+    for folder, names, others in os.walk(environment):
+        for name in sorted([*names, *others]):
+            path = Path(folder, name)
+            inside = path.relative_to(environment)
+            if path.is_symlink():
+                if not is_of_venv(inside, path.readlink()):
+                    faults.append(f"{inside}: is a link to {path.readlink()}")
+            elif path.is_file():
+                files.add(path)
+            elif not path.is_dir():
+                faults.append(f"{inside}: is neither a file nor a folder")
+    return files, faults
+
+
+def is_of_venv(link: Path, target: Path) -> bool:
+    """Whether venv makes such a link, named within the environment."""
+    if link == Path("lib64"):
+        return target == Path("lib")
+    known = link.parent == Path("bin") and target.parent in (Path(), PYTHON_FOLDER)
+    return known and all(INTERPRETER.fullmatch(path.name) for path in (link, target))
+
+
+def check_settings(path: Path) -> Iterator[str]:
+    """What is wrong with the file that says which Python an environment has."""
+    pairs = (line.partition("=") for line in path.read_text().splitlines())
+    settings = {key.strip().lower(): value.strip() for key, _, value in pairs}
+    for key, expected in (("home", str(PYTHON_FOLDER)), ("include-system-site-packages", "false")):
+        if settings.get(key) != expected:
+            yield f"{path.name}: {key} is {settings.get(key)}, not {expected}"
+
+
+def check_files(found: Distribution, site: Path, files: set[Path]) -> tuple[set[Path], list[str]]:
+    """The files that a distribution lists, and what is wrong with them.
+
+    Only its list itself and byte code in `__pycache__` have no checksum.
+
+    Args:
+        found: the distribution.
+        site: folder that its list begins at.
+        files: regular files of the environment.
+    """
     owned, wrong = set[Path](), []
     for entry in found.files or ():
-        path = Path(site, *entry.parts)
+        path = installed(site, entry)
         owned.add(path)
         if entry.hash is None:
+            compiled = path.suffix == ".pyc" and path.parent.name == "__pycache__"
+            if path != folder_of(found) / "RECORD" and not compiled:
+                wrong.append(f"{entry}: has no checksum")
             continue
-        if not path.is_file():
+        if path not in files:
             wrong.append(f"{entry}: is missing")
             continue
         with path.open("rb") as file:
@@ -141,17 +204,26 @@ def check_files(found: Distribution, site: Path) -> tuple[set[Path], list[str]]:
     return owned, wrong
 
 
-def python_package(found: Distribution, site: Path, wheels: dict[str, str]) -> PythonPackage:
-    """What there is to say of one distribution."""
-    information = Path(str(found._path))  # type: ignore[attr-defined]  # no public name for its folder
+def installed(site: Path, entry: PurePath) -> Path:
+    """Where a file of a distribution's list is; scripts are outside `site`."""
+    return Path(os.path.normpath(site / entry))
+
+
+def folder_of(found: Distribution) -> Path:
+    """Where a distribution has its metadata."""
+    return Path(str(found._path))  # type: ignore[attr-defined]  # it has no public name
+
+
+def python_package(found: Distribution, site: Path, wheels: dict[str, str], files: set[Path]) -> PythonPackage:
+    """What there is to say of one distribution; arguments as for `check_files`, and SHA-256 of wheels by file name."""
     name, version = normal(found.name), found.version
     wheel = next((file for file in wheels if is_wheel_of(file, name, version)), "")
     libraries = {
-        str(entry): sha256(Path(site, *entry.parts))
+        str(entry): sha256(installed(site, entry))
         for entry in sorted(found.files or ())
-        if is_library(entry.name) and Path(site, *entry.parts).is_file()
+        if is_library(entry.name) and installed(site, entry) in files
     }
-    record = sha256(information / "RECORD")
+    record = sha256(folder_of(found) / "RECORD")
     return PythonPackage(name, version, wheel, wheels.get(wheel, ""), record, licence_of(found), libraries)
 
 
@@ -289,7 +361,7 @@ def facts_of_component(component: Mapping[str, Any]) -> dict[str, str]:
     return {"wheel": wheel, **record, **libraries}
 
 
-def strangers(inventory: Inventory, lock: Path) -> list[str]:
+def differences_from_lock(inventory: Inventory, lock: Path) -> list[str]:
     """How an image's Python packages differ from what a lock names, a line each. Our own is in no lock."""
     locked = read_lock(lock)
     found = {package.name: package for package in inventory.python if package.name != OWN}
@@ -316,7 +388,7 @@ def main(arguments: Sequence[str]) -> int:
     if not path.is_file():
         print(f"{path}: no SBOM; make one with `make sbom`")
         return 1
-    lines = differences(inventory, json.loads(path.read_text())) + strangers(inventory, Path(arguments[3]))
+    lines = differences(inventory, json.loads(path.read_text())) + differences_from_lock(inventory, Path(arguments[3]))
     print(*lines, sep="\n", end="\n" if lines else "")
     return 1 if lines else 0
 

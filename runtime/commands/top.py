@@ -22,47 +22,47 @@ from rich.text import Text
 
 from lightpage.errors import LightpageError
 from runtime.commands.connection import with_tls
-from runtime.console.looks import WINDOW_S, Change, Looks, look_at
+from runtime.console.scrapes import WINDOW_S, Change, Scrapes, scrape
 from runtime.service.stages import Stage
 from runtime.wire.tls import TlsFiles
 
 _WIDTH = 100
-"""Columns where nobody looks at a terminal."""
+"""Columns where the output is no terminal."""
 
 
 @click.command()
 @click.option("--address", default="127.0.0.1:9100", show_default=True, help="HOST:PORT of its --metrics-port.")
 @click.option(
-    "--interval", default=2.0, show_default=True, type=click.FloatRange(0.1, 60), help="Seconds between two looks."
+    "--interval", default=2.0, show_default=True, type=click.FloatRange(0.1, 60), help="Seconds between two scrapes."
 )
-@click.option("--once", is_flag=True, help="Print what two looks say, and end; also where nobody has a terminal.")
+@click.option("--once", is_flag=True, help="Print what two scrapes say, and end; also where nobody has a terminal.")
 @with_tls
 def top(address: str, interval: float, once: bool, tls: TlsFiles | None) -> None:
     """Show how a service fares that runs with --metrics-port. The key q ends it."""
-    looks = Looks()
-    looks.add(look_at(address, tls))
+    scrapes = Scrapes()
+    scrapes.add(scrape(address, tls))
     if once or not sys.stdout.isatty():
         time.sleep(interval)
-        looks.add(look_at(address, tls))
+        scrapes.add(scrape(address, tls))
         width = None if sys.stdout.isatty() else _WIDTH
-        Console(width=width, highlight=False).print(view(looks, address))
+        Console(width=width, highlight=False).print(view(scrapes, address))
         return
     silent = ""
-    with _keys() as pressed, Live(view(looks, address), screen=True, auto_refresh=False) as live:
+    with _keys() as pressed, Live(view(scrapes, address), screen=True, auto_refresh=False) as live:
         while "q" not in pressed(interval):
             try:
-                looks.add(look_at(address, tls))
+                scrapes.add(scrape(address, tls))
                 silent = ""
             except LightpageError as error:
                 silent = silent or f"no answer since {time.strftime('%H:%M:%S')}: {error.got}"
-            live.update(view(looks, address, silent), refresh=True)
+            live.update(view(scrapes, address, silent), refresh=True)
 
 
-def view(looks: Looks, address: str, silent: str = "") -> RenderableType:
-    """What the looks say, for a terminal; `silent` says since when nobody answers, empty where somebody does."""
-    change = looks.change
-    assert change is not None  # somebody has looked
-    parts: list[RenderableType] = [_header(change, looks.restarts, address)]
+def view(scrapes: Scrapes, address: str, silent: str = "") -> RenderableType:
+    """What the scrapes say, for a terminal; `silent` says since when nobody answers, empty where somebody does."""
+    change = scrapes.change
+    assert change is not None  # there is a scrape
+    parts: list[RenderableType] = [_header(change, scrapes.restarts, address)]
     if silent:
         parts.append(Text(silent, style="bold white on red"))
     load, device, process = (

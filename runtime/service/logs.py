@@ -18,8 +18,8 @@ from runtime.service.observation import Observation
 FIELDS = ("method", "peer", "correlation_id", "code", "reason", "seconds")
 """What may be said of a call beside the message, in this order."""
 
-_MOST_TEXT = 300
-"""Characters of a field: a caller chooses its correlation id."""
+MOST_TEXT = 300
+"""Characters of a text of a call in logs and traces: a caller chooses its correlation id."""
 _WINDOW_S = 1.0
 _MOST_KINDS = 1000
 """Kinds of lines that are counted apart; beyond them those of earlier seconds are forgotten."""
@@ -78,7 +78,7 @@ def _fields(record: logging.LogRecord) -> dict[str, Any]:
     """What is said beside the message, without what is empty."""
     said = getattr(record, "told", {})
     known = [*(key for key in FIELDS if key in said), *(key for key in said if key not in FIELDS)]
-    cut = {key: said[key][:_MOST_TEXT] if isinstance(said[key], str) else said[key] for key in known}
+    cut = {key: said[key][:MOST_TEXT] if isinstance(said[key], str) else said[key] for key in known}
     return {key: value for key, value in cut.items() if value != ""}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
@@ -50,6 +51,8 @@ class ServiceMetrics:
         PlatformCollector(registry=own)
         GCCollector(registry=own)
         self._versions: list[str] = []
+        self._naming = threading.Lock()
+        """Held while `_versions` and the labels of `pages` are read or changed."""
         self.calls = Counter("lightpage_calls", "Finished calls.", ["method", "code"], registry=own)
         self.in_flight = Gauge("lightpage_calls_in_flight", "Calls being served.", registry=own)
         self.call_seconds = Histogram(
@@ -123,8 +126,10 @@ class ServiceMetrics:
             self.stage_seconds.labels(method, stage.value).observe(seconds)
 
     def page(self, page: DecodedPage, version: str) -> None:
-        """Count one decoded page."""
-        self.pages.labels(version).inc()
+        """Count one decoded page. One of a model whose label was removed does not bring it back."""
+        with self._naming:
+            if version in self._versions:
+                self.pages.labels(version).inc()
         self.decode.observe(page.timings.total_s)
         self.confidence.set(float(page.confidence.mean()))
         self.concentration.set(float(page.concentration.mean()))
@@ -175,11 +180,12 @@ class ServiceMetrics:
         """Say which model decodes now."""
         self.model.clear()
         self.model.labels(version).set(1)
-        self.pages.labels(version)
-        self._versions = [*(known for known in self._versions if known != version), version]
-        for old in self._versions[:-VERSIONS]:
-            self.pages.remove(old)
-        self._versions = self._versions[-VERSIONS:]
+        with self._naming:
+            self.pages.labels(version)
+            self._versions = [*(known for known in self._versions if known != version), version]
+            for old in self._versions[:-VERSIONS]:
+                self.pages.remove(old)
+            self._versions = self._versions[-VERSIONS:]
 
 
 class _LoadFigures(Collector):

@@ -18,12 +18,13 @@ from urllib.parse import urlsplit
 import grpc
 
 from lightpage.errors import InvalidInputError
+from runtime.service.logs import MOST_TEXT
 from runtime.service.stages import Lap, Stages
 
 MOST_PAGES = 64
 """Pages of a call that have spans, the first ones: a range may have thousands."""
 _QUEUED_SPANS = 2048
-"""Spans that wait to be sent, some 2 kB each; further ones are dropped."""
+"""Spans that wait to be sent, a few kB each, since texts of a caller are cut; further ones are dropped."""
 _SEND_S = 5.0
 """For a batch of spans, tries again included."""
 _END_S = 1.0
@@ -85,7 +86,7 @@ class Traces:
         try:
             from opentelemetry.exporter.otlp.proto.grpc.trace_exporter import OTLPSpanExporter
             from opentelemetry.sdk.resources import Resource
-            from opentelemetry.sdk.trace import TracerProvider
+            from opentelemetry.sdk.trace import SpanLimits, TracerProvider
             from opentelemetry.sdk.trace.export import BatchSpanProcessor
             from opentelemetry.sdk.trace.sampling import ParentBased, TraceIdRatioBased
             from opentelemetry.trace import SpanKind, Status, StatusCode, set_span_in_context
@@ -97,7 +98,8 @@ class Traces:
         version = installed_version("lightpage")
         about = Resource.create({"service.name": "lightpage", "service.version": version})
         self._exporter = OTLPSpanExporter(endpoint, endpoint.startswith("http://"), timeout=_SEND_S)
-        self._provider = TracerProvider(ParentBased(TraceIdRatioBased(share)), about, shutdown_on_exit=False)
+        sampler, limits = ParentBased(TraceIdRatioBased(share)), SpanLimits(max_span_attribute_length=MOST_TEXT)
+        self._provider = TracerProvider(sampler, about, shutdown_on_exit=False, span_limits=limits)
         self._provider.add_span_processor(BatchSpanProcessor(self._exporter, max_queue_size=_QUEUED_SPANS))
         self._tracer = self._provider.get_tracer("lightpage", version)
         self._propagator = TraceContextTextMapPropagator()

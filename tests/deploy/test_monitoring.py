@@ -156,8 +156,10 @@ def test_every_panel_says_what_it_shows_and_none_lies_on_another() -> None:
             assert target["datasource"]["uid"] == "${datasource}"
 
 
-def composed(text: str) -> compose_spec.PyCompose:
-    found = compose_spec.PyOptions(apply_merge=True).from_yaml(text)
+def composed(text: str, **variables: str) -> compose_spec.PyCompose:
+    """A composition that is valid, with its variables filled in as compose does."""
+    filled = re.sub(r"\$\{(\w+):-([^}]*)\}", lambda found: variables.get(found[1], found[2]), text)
+    found = compose_spec.PyOptions(apply_merge=True).from_yaml(filled)
     found.validate()
     return found
 
@@ -247,6 +249,19 @@ def test_the_composition_is_valid_and_nothing_of_it_can_be_reached_or_written_fr
     ):
         with pytest.raises(ValueError, match=r"red_only|other|99999"):
             composed(wrong)
+
+
+def test_images_of_others_can_be_named_by_digest() -> None:
+    text, digest = (promql.DEPLOY / "compose.yml").read_text(), f"sha256:{64 * 'a'}"
+    told = dict(re.findall(r"(\w+_IMAGE)=([\w/]+)@sha256:DIGEST", DOCUMENT.read_text()))
+    named = {variable: f"{image}@{digest}" for variable, image in told.items()}
+    plain, pinned = composed(text).services, composed(text, **named).services
+    assert plain is not None
+    assert pinned is not None
+    for name in plain.keys() - {"lightpage"}:
+        variable = f"{name.upper()}_IMAGE"
+        assert str(plain[name].image).startswith(f"{told[variable]}:")
+        assert str(pinned[name].image) == named[variable]
 
 
 def test_the_parts_of_the_composition_find_each_other() -> None:

@@ -5,7 +5,11 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import shutil
+import subprocess
+import sys
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -44,6 +48,12 @@ def write(path: Path, content: bytes) -> bytes:
     return content
 
 
+def listed(path: str, content: bytes) -> str:
+    """A file's line in RECORD."""
+    hashed = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+    return f"{path},sha256={hashed},{len(content)}"
+
+
 def install(site: Path, name: str, version: str, licence: str, files: dict[str, bytes]) -> None:
     """A distribution as pip leaves it."""
     folder = f"{name}-{version}.dist-info"
@@ -51,8 +61,11 @@ def install(site: Path, name: str, version: str, licence: str, files: dict[str, 
     lines = []
     for path, content in {**files, f"{folder}/METADATA": metadata}.items():
         write(site / path, content)
-        hashed = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
-        lines.append(f"{path},sha256={hashed},{len(content)}")
+        lines.append(listed(path, content))
+    for path in filter(lambda path: path.endswith(".py"), files):
+        compiled = Path(path).parent / "__pycache__" / f"{Path(path).stem}.cpython-311.pyc"
+        write(site / compiled, b"compiled")
+        lines.append(f"{compiled},,")
     write(site / folder / "RECORD", "\n".join([*lines, f"{folder}/RECORD,,"]).encode())
 
 
@@ -74,7 +87,11 @@ def image(root: Path) -> Path:
     install(site, "lightpage", "0.1.0", "MIT", {"lightpage/__init__.py": b""})
     files = {"click/__init__.py": b"import os\n", "click.libs/libfast-1a.so.2": b"elf", "click/_c.abi3.so": b"elf"}
     install(site, "Click", "8.5.1", "BSD-3-Clause", files)
-    write(site / "click/__pycache__/x.pyc", b"compiled")
+    for name, target in (("bin/python3", "/usr/bin/python3"), ("bin/python", "python3"), ("lib64", "lib")):
+        (root / "opt/lightpage" / name).parent.mkdir(exist_ok=True)
+        (root / "opt/lightpage" / name).symlink_to(target)
+    write(root / "opt/lightpage/bin/activate", b"")
+    write(root / "opt/lightpage/pyvenv.cfg", b"home = /usr/bin\ninclude-system-site-packages = false\n")
     wheels = f"{64 * '1'}  lightpage-0.1.0-py3-none-any.whl\n{64 * '2'}  click-8.5.1-py3-none-any.whl\n"
     write(root / "opt/lightpage/wheels.sha256", wheels.encode())
     write(root / "etc/os-release", b'NAME="Debian"\nVERSION_ID="12"\n')
@@ -136,7 +153,22 @@ def test_the_image_that_it_was_made_of_agrees_with_it_and_with_the_lock(
     root: Path, lock: Path, document: dict[str, Any]
 ) -> None:
     assert inventory.differences(inventory.take(root), document) == []
-    assert inventory.strangers(inventory.take(root), lock) == []
+    assert inventory.differences_from_lock(inventory.take(root), lock) == []
+
+
+def moved_and_linked(path: Path, to: Path) -> None:
+    """Move it, and leave a link as the image would follow it."""
+    path.rename(to)
+    path.symlink_to(Path("/usr/lib", to.name))
+
+
+def relinked(path: Path, target: str) -> None:
+    path.unlink()
+    path.symlink_to(target)
+
+
+def piped(path: Path) -> None:
+    os.mkfifo(path)
 
 
 SITE = Path("opt/lightpage/lib/python3.11/site-packages")
@@ -151,7 +183,60 @@ PLANTED: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     ),
     "a module of nobody": (
         lambda root: write(root / SITE / "usercustomize.py", b""),
-        ["usercustomize.py: belongs to no package"],
+        ["lib/python3.11/site-packages/usercustomize.py: belongs to no package"],
+    ),
+    "a program of nobody, first in PATH": (
+        lambda root: write(root / "opt/lightpage/bin/sh", b""),
+        ["bin/sh: belongs to no package"],
+    ),
+    "byte code of nobody that needs no source": (
+        lambda root: write(root / SITE / "socket.pyc", b""),
+        ["lib/python3.11/site-packages/socket.pyc: belongs to no package"],
+    ),
+    "byte code of nobody beside a source": (
+        lambda root: write(root / SITE / "click/__pycache__/__init__.cpython-312.pyc", b""),
+        ["lib/python3.11/site-packages/click/__pycache__/__init__.cpython-312.pyc: belongs to no package"],
+    ),
+    "a module outside of the packages": (
+        lambda root: write(root / SITE.parent / "sitecustomize.py", b""),
+        ["lib/python3.11/sitecustomize.py: belongs to no package"],
+    ),
+    "a linked package": (
+        lambda root: (root / SITE / "extra").symlink_to("../../../../../usr/lib"),
+        ["lib/python3.11/site-packages/extra: is a link to ../../../../../usr/lib"],
+    ),
+    "a link to nothing on this machine": (
+        lambda root: (root / SITE / "extra.py").symlink_to("/nowhere/extra.py"),
+        ["lib/python3.11/site-packages/extra.py: is a link to /nowhere/extra.py"],
+    ),
+    "a module that has become a link to itself elsewhere": (
+        lambda root: moved_and_linked(root / SITE / "click/__init__.py", root / "usr/lib/click.py"),
+        [
+            "lib/python3.11/site-packages/click/__init__.py: is a link to /usr/lib/click.py",
+            "Click: click/__init__.py: is missing",
+        ],
+    ),
+    "a package that has become a link": (
+        lambda root: moved_and_linked(root / SITE / "lightpage", root / "usr/lib/own"),
+        [
+            "lib/python3.11/site-packages/lightpage: is a link to /usr/lib/own",
+            "lightpage: lightpage/__init__.py: is missing",
+        ],
+    ),
+    "another Python": (
+        lambda root: relinked(root / "opt/lightpage/bin/python3", "/state/python3"),
+        ["bin/python3: is a link to /state/python3"],
+    ),
+    "a Python with packages of others": (
+        lambda root: write(root / "opt/lightpage/pyvenv.cfg", b"home = /state\ninclude-system-site-packages = true\n"),
+        [
+            "pyvenv.cfg: home is /state, not /usr/bin",
+            "pyvenv.cfg: include-system-site-packages is true, not false",
+        ],
+    ),
+    "a pipe": (
+        lambda root: piped(root / "opt/lightpage/bin/pipe"),
+        ["bin/pipe: is neither a file nor a folder"],
     ),
     "another package": (
         lambda root: install(root / SITE, "extra", "1.0", "MIT", {"extra.py": b""}),
@@ -182,6 +267,40 @@ def test_a_difference_is_found(root: Path, document: dict[str, Any], name: str) 
     assert inventory.differences(inventory.take(root), document) == expected
 
 
+def test_what_is_listed_without_a_checksum_is_told(root: Path) -> None:
+    with (root / SITE / "Click-8.5.1.dist-info/RECORD").open("a") as record:
+        record.write("\nhidden.pyc,,")
+    write(root / SITE / "hidden.pyc", b"")
+    assert inventory.take(root).faults == ("Click: hidden.pyc: has no checksum",)
+
+
+def test_an_environment_as_venv_and_pip_make_it_is_in_order(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    base, environment = Path(sys._base_executable), root / "opt/lightpage"  # type: ignore[attr-defined]  # of the venv
+    shutil.rmtree(environment)
+    subprocess.run([base, "-m", "venv", "--without-pip", environment], check=True, timeout=60)
+    wheel = root / "tool-1.0-py3-none-any.whl"
+    files = {
+        "tool.py": b"def main():\n    print('hello')\n",
+        "tool-1.0.data/scripts/tool.sh": b"#!/bin/sh\n",
+        "tool-1.0.dist-info/METADATA": b"Metadata-Version: 2.4\nName: tool\nVersion: 1.0\n",
+        "tool-1.0.dist-info/WHEEL": b"Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        "tool-1.0.dist-info/entry_points.txt": b"[console_scripts]\ntool = tool:main\n",
+    }
+    files["tool-1.0.dist-info/RECORD"] = "\n".join(listed(*each) for each in files.items()).encode()
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    pip = (sys.executable, "-m", "pip", "--python", environment / "bin/python")
+    subprocess.run([*pip, "install", "--quiet", "--no-index", "--no-deps", wheel], check=True, timeout=60)
+    write(environment / "wheels.sha256", f"{64 * '1'}  {wheel.name}\n".encode())
+    monkeypatch.setattr(inventory, "PYTHON_FOLDER", base.parent)
+    found = inventory.take(root)
+    assert [package.name for package in found.python] == ["tool"]
+    assert found.faults == ()
+    (environment / "bin/tool").write_text("")
+    assert inventory.take(root).faults == ("tool: ../../../bin/tool: is not the file that was installed",)
+
+
 def test_a_file_and_its_checksum_changed_together_are_found(root: Path, document: dict[str, Any]) -> None:
     install(root / SITE, "Click", "8.5.1", "BSD-3-Clause", {"click/__init__.py": b"import socket\n"})
     found = inventory.differences(inventory.take(root), document)
@@ -199,7 +318,7 @@ def test_a_file_and_its_checksum_changed_together_are_found(root: Path, document
 )
 def test_an_image_of_another_lock_is_found(root: Path, lock: Path, old: str, new: str, said: str) -> None:
     lock.write_text(lock.read_text().replace(old, new))
-    assert said in inventory.strangers(inventory.take(root), lock)
+    assert said in inventory.differences_from_lock(inventory.take(root), lock)
 
 
 # ---- licences -------------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR
 from lightpage.errors import LightpageError
 from runtime.commands.top import top
-from runtime.console.looks import Change, Look, Looks, look_at
+from runtime.console.scrapes import Change, Scrape, Scrapes, scrape
 from runtime.console.server import ConsoleServer
 from tests.runtime.commands.test_commands import ROOT
 from tests.runtime.console.stage import Stage, stage
@@ -33,16 +33,16 @@ def address(running: Stage) -> str:
     return running.url.removeprefix("http://").replace("localhost", "127.0.0.1")
 
 
-def a_look(at: float, values: Mapping[str, float], started: float = 1.0) -> Look:
+def a_scrape(at: float, values: Mapping[str, float], started: float = 1.0) -> Scrape:
     samples = {("process_start_time_seconds", frozenset[tuple[str, str]]()): started}
-    return Look(at, samples | {(name, frozenset()): value for name, value in values.items()})
+    return Scrape(at, samples | {(name, frozenset()): value for name, value in values.items()})
 
 
 def test_one_text_says_what_the_service_does(toy_zip: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with stage(toy_zip) as running:
         running.plane.metrics.call_ended("ReadPage", "OK", "", 0.5)
         thread = Thread(target=running.read, args=(10,))  # two of them are lost
-        before = look_at(address(running))
+        before = scrape(address(running))
         thread.start()
         thread.join()
         assert cli_main.run(top, ["--address", address(running), "--interval", "0.1", "--once"]) == 0
@@ -59,7 +59,7 @@ def test_one_text_says_what_the_service_does(toy_zip: Path, capsys: pytest.Captu
         ):
             assert text in told, text
         assert "\x1b" not in told
-        change = Change(before, look_at(address(running)))
+        change = Change(before, scrape(address(running)))
         assert change.rise("lightpage_pages_total") == 8
         assert change.rises("lightpage_pages_lost_total", "reason") == {"MISSING_FRAME": 2}
         assert 0 < change.quantile(0.5, "lightpage_decode_seconds") <= change.quantile(1.0, "lightpage_decode_seconds")
@@ -83,7 +83,7 @@ def test_a_wrong_address_is_named_with_what_to_do(toy_zip: Path, capsys: pytest.
         with make_server("127.0.0.1", 0, other) as server:
             Thread(target=server.handle_request, daemon=True).start()
             with pytest.raises(LightpageError, match=told):
-                look_at(f"127.0.0.1:{server.server_port}")
+                scrape(f"127.0.0.1:{server.server_port}")
 
 
 def test_quantiles_are_those_of_what_came_between() -> None:
@@ -91,7 +91,7 @@ def test_quantiles_are_those_of_what_came_between() -> None:
         bounds = ("0.1", "1.0", "+Inf")
         return {("t_bucket", frozenset({("le", le)})): n for le, n in zip(bounds, values, strict=True)}
 
-    change = Change(Look(0.0, counts(100, 100, 100)), Look(2.0, counts(102, 106, 108)))
+    change = Change(Scrape(0.0, counts(100, 100, 100)), Scrape(2.0, counts(102, 106, 108)))
     assert change.quantile(0.25, "t") == pytest.approx(0.1)
     assert change.quantile(0.5, "t") == pytest.approx(0.1 + 0.9 * 2 / 4)
     assert change.quantile(0.99, "t") == 1.0  # what lies beyond the last bound is not known
@@ -99,19 +99,19 @@ def test_quantiles_are_those_of_what_came_between() -> None:
 
 
 def test_a_restart_ends_what_was_counted_before() -> None:
-    looks = Looks(window_s=10.0)
+    scrapes = Scrapes(window_s=10.0)
     for at in range(20):
-        looks.add(a_look(float(at), {"lightpage_calls_total": 100.0 + 2 * at}))
-    change = looks.change
+        scrapes.add(a_scrape(float(at), {"lightpage_calls_total": 100.0 + 2 * at}))
+    change = scrapes.change
     assert change is not None
     assert (change.seconds, change.rate("lightpage_calls_total")) == (10.0, 2.0)
-    looks.add(a_look(20.0, {"lightpage_calls_total": 500.0}, started=2.0))
-    looks.add(a_look(21.0, {"lightpage_calls_total": 503.0}, started=2.0))
-    change = looks.change
+    scrapes.add(a_scrape(20.0, {"lightpage_calls_total": 500.0}, started=2.0))
+    scrapes.add(a_scrape(21.0, {"lightpage_calls_total": 503.0}, started=2.0))
+    change = scrapes.change
     assert change is not None
-    assert (looks.restarts, change.seconds, change.rate("lightpage_calls_total")) == (1, 1.0, 3.0)
-    looks.add(Look(22.0, {("lightpage_calls_total", frozenset()): 4.0}))  # of a system that tells no start
-    assert looks.restarts == 2
+    assert (scrapes.restarts, change.seconds, change.rate("lightpage_calls_total")) == (1, 1.0, 3.0)
+    scrapes.add(Scrape(22.0, {("lightpage_calls_total", frozenset()): 4.0}))  # of a system that tells no start
+    assert scrapes.restarts == 2
 
 
 class Terminal:
@@ -164,7 +164,7 @@ def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(toy_zip: Path) ->
             terminal.close()
 
 
-def test_a_service_with_tls_is_looked_at_with_a_certificate(
+def test_a_service_with_tls_is_scraped_with_a_certificate(
     toy_zip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     authority = Authority(tmp_path)

@@ -28,12 +28,13 @@ from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.inference_calls import INFERENCE
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
+from runtime.service.logs import MOST_TEXT
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
 from runtime.service.traces import MOST_PAGES, Traces
 from tests.runtime import toy
 from tests.runtime.rpc.stage import a_page
-from tests.runtime.rpc.test_edge import parts
+from tests.runtime.rpc.test_edge import parts, resident
 
 TRACE, CALLER = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
 SAMPLED, UNSAMPLED = (f"00-{TRACE}-{CALLER}-0{flag}" for flag in (1, 0))
@@ -127,6 +128,21 @@ def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(toy_zip: Pa
     assert inside(receiver.spans, failed) == []
     live = next(span for span in receiver.spans if span.name == f"{INFERENCE.full_name}/ServerLive")
     assert (attributes(live)["rpc.service"], attributes(live)["rpc.method"]) == (INFERENCE.full_name, "ServerLive")
+
+
+def test_a_callers_text_is_cut_before_it_waits_to_be_sent(toy_zip: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # nobody listens there
+        with traced(toy_zip, f"http://127.0.0.1:{taken.getsockname()[1]}") as (stub, _):
+            stub.ReadPage(pb.ReadPageRequest(correlation_id="a"), timeout=20)
+            before, size, count = resident(), 2 << 20, 40
+            for _ in range(count):
+                stub.ReadPage(pb.ReadPageRequest(correlation_id=size * "a"), timeout=20)
+            assert resident() - before < count * size / 2
+    with receiving() as (receiver, endpoint), traced(toy_zip, endpoint) as (stub, _):
+        stub.ReadPage(pb.ReadPageRequest(correlation_id=2 * MOST_TEXT * "a"), timeout=20)
+    [call] = (span for span in receiver.spans if span.kind == Span.SPAN_KIND_SERVER)
+    assert attributes(call)["lightpage.correlation_id"] == MOST_TEXT * "a"
 
 
 def test_a_call_of_many_pages_has_a_span_of_each_up_to_a_number(toy_zip: Path) -> None:

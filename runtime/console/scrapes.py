@@ -1,4 +1,4 @@
-"""What a running service's metrics say: looks at them from outside, and what has happened between two of them."""
+"""What a running service's metrics say: scrapes of them, and what has happened between two of these."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lightpage.errors import LightpageError
 from runtime.wire.tls import TlsFiles
 
 WINDOW_S = 60.0
-"""Rates and times are those of so many seconds, once somebody has looked for so long."""
+"""Rates and times are those of so many seconds, once it has been scraped for so long."""
 _ANSWER_S = 5.0
 _MOST_BYTES = 16 << 20
 _SERVES = "lightpage_calls_in_flight"
@@ -26,7 +26,7 @@ Labels = frozenset[tuple[str, str]]
 
 
 @dataclass(frozen=True)
-class Look:
+class Scrape:
     """The metrics of a service at one moment.
 
     Attributes:
@@ -55,7 +55,7 @@ class Look:
         return sums
 
 
-def look_at(address: str, tls: TlsFiles | None = None) -> Look:
+def scrape(address: str, tls: TlsFiles | None = None) -> Scrape:
     """The metrics of the service whose `--metrics-port` is at HOST:PORT.
 
     Args:
@@ -83,11 +83,11 @@ def look_at(address: str, tls: TlsFiles | None = None) -> Look:
         raise LightpageError(subject, "no metrics", expected) from None
     if (_SERVES, frozenset()) not in samples:
         raise LightpageError(subject, "metrics of something else", expected)
-    return Look(time.monotonic(), samples)
+    return Scrape(time.monotonic(), samples)
 
 
-class Looks:
-    """The looks of the last while.
+class Scrapes:
+    """The scrapes of the last while.
 
     Args:
         window_s: how long they are kept, seconds.
@@ -95,32 +95,32 @@ class Looks:
 
     def __init__(self, window_s: float = WINDOW_S) -> None:
         self._window_s = window_s
-        self._kept: deque[Look] = deque()
+        self._kept: deque[Scrape] = deque()
         self.restarts = 0
 
-    def add(self, look: Look) -> None:
-        """Take a look in; those before a restart of the service say nothing of what comes after it."""
-        if self._kept and _restarted(self._kept[-1], look):
+    def add(self, newest: Scrape) -> None:
+        """Take a scrape in; those before a restart of the service say nothing of what comes after it."""
+        if self._kept and _restarted(self._kept[-1], newest):
             self._kept.clear()
             self.restarts += 1
-        self._kept.append(look)
-        while len(self._kept) > 2 and self._kept[1].at <= look.at - self._window_s:
+        self._kept.append(newest)
+        while len(self._kept) > 2 and self._kept[1].at <= newest.at - self._window_s:
             self._kept.popleft()
 
     @property
     def change(self) -> Change | None:
-        """From the first one kept to the last; None where there is no look yet."""
+        """From the first one kept to the last; None where there is no scrape yet."""
         return Change(self._kept[0], self._kept[-1]) if self._kept else None
 
 
 class Change:
-    """What has happened between two looks.
+    """What has happened between two scrapes.
 
     Args:
-        before, now: looks at the same process.
+        before, now: scrapes of the same process.
     """
 
-    def __init__(self, before: Look, now: Look) -> None:
+    def __init__(self, before: Scrape, now: Scrape) -> None:
         self.before, self.now = before, now
 
     @property
@@ -173,10 +173,10 @@ def _part(wanted: float, held: float) -> float:
     return wanted / held if held > 0 else 1.0
 
 
-def _restarted(before: Look, now: Look) -> bool:
+def _restarted(before: Scrape, now: Scrape) -> bool:
     """Whether another process answers: its start is another one, or a counter fell."""
     started = "process_start_time_seconds"
     if not math.isnan(now.value(started)) and not math.isnan(before.value(started)):
         return now.value(started) != before.value(started)
-    calls = [sum(look.values("lightpage_calls_total").values()) for look in (before, now)]
+    calls = [sum(each.values("lightpage_calls_total").values()) for each in (before, now)]
     return calls[1] < calls[0]
