@@ -1,0 +1,137 @@
+"""One graph in all servers: their ways to be called, what calls take, and how they compare."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from analysis.service.other_servers import rivals
+from analysis.service.other_servers.bare_run import CUT, WHOLE, BareRuns
+from analysis.service.other_servers.calls import Call, chunk_caller, inference_caller, memory_caller
+from analysis.service.other_servers.figures import Comparison, Figure, turned
+from analysis.service.other_servers.graphs import DECODER_NAME, Graph
+from analysis.service.other_servers.onnx_run import GRAPH, OUTPUT, OnnxRun
+from analysis.service.other_servers.servers import MARK, Marked, OtherServer
+from analysis.service.other_servers.timing import CALLERS, in_turns, rate, seconds
+from analysis.service.running import RunningService
+from lightpage.errors import LightpageError
+from lightpage.progress import track
+from runtime.rpc.inference_calls import MODEL
+
+OWN = "Lightpage"
+CALLS_EACH = {"constant-small": 12, "constant-large": 3, DECODER_NAME: 4}
+"""Calls of each caller at once, in one round."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to call one server.
+
+    Attributes:
+        server: its name.
+        marked: its processes.
+        connect: a caller.
+    """
+
+    server: str
+    marked: Marked
+    connect: Callable[[], AbstractContextManager[Call]]
+
+
+@contextmanager
+def own_ways(graph: Graph, threads: int, folder: Path) -> Iterator[dict[str, Way]]:
+    """The service with a graph, at a port and at a socket."""
+    own = ("--bundle", str(graph.bundle), "--no-tracking", "--threads", str(threads))
+    near, far = Marked(), Marked()
+    at_socket = ("--address", f"unix:{folder}/{graph.name}.socket", "--shared-memory")
+    with (
+        RunningService(*own, environment={MARK: far.mark}) as service,
+        RunningService(*own, *at_socket, environment={MARK: near.mark}) as local,
+    ):
+        wanted = ("symbols", "confidence")
+        yield {
+            f"{OWN}, chunks": Way(OWN, far, partial(chunk_caller, service.target, graph)),
+            f"{OWN}, Open Inference Protocol": Way(
+                OWN, far, partial(inference_caller, service.target, MODEL, graph.pair, wanted)
+            ),
+            f"{OWN}, shared memory": Way(OWN, near, partial(memory_caller, local.target, graph)),
+        }
+
+
+def other_ways(servers: Mapping[str, OtherServer], graph: Graph) -> dict[str, Way]:
+    """The others with a graph."""
+    return {
+        f"{name}, {kind}": Way(name, server.marked, partial(callers[name], graph))
+        for name, server in servers.items()
+        for kind, callers in (("gRPC", rivals.GRPC), ("HTTP", rivals.HTTP))
+    }
+
+
+def check_answers(graph: Graph, ways: Mapping[str, Way], folder: Path, threads: int) -> None:
+    """Check that the others carry this graph, and that the service answers the same in every way.
+
+    Raises:
+        LightpageError: they do not.
+    """
+    expected, symbols = OnnxRun(folder / graph.name / GRAPH, threads)(*graph.frames), None
+    for name, way in ways.items():
+        with way.connect() as call:
+            answer = call()
+        if OUTPUT in answer:
+            same = np.array_equal(answer[OUTPUT].reshape(expected.shape), expected)
+        else:
+            symbols = answer["symbols"] if symbols is None else symbols
+            same = np.array_equal(answer["symbols"], symbols)
+        if not same:
+            raise LightpageError(f"{name} with graph {graph.name}", "another answer", "that of the same ONNX file")
+
+
+def measured(graph: Graph, ways: Mapping[str, Way], bare: BareRuns, calls: int, rounds: int) -> dict[str, Any]:
+    """Overheads, rates and CPU time of each way with a graph."""
+    with ExitStack() as stack:
+        timed = {name: seconds(stack.enter_context(way.connect())) for name, way in ways.items()}
+        told = in_turns(
+            {kind: partial(bare.seconds, kind, graph.name) for kind in (WHOLE, CUT)} | timed, calls, graph.name
+        )
+    whole, cut = (told.pop(kind) for kind in (WHOLE, CUT))
+    alone = median(whole)
+    overheads = {name: Figure.of([1e3 * (each - alone) for each in taken]) for name, taken in told.items()}
+    rates: dict[str, list[float]] = {name: [] for name in ways}
+    cpu: dict[str, list[float]] = {name: [] for name in ways}
+    each = CALLS_EACH[graph.name]
+    for number in track(range(rounds), f"{graph.name}, {CALLERS} callers", total=rounds):
+        for name in turned(list(ways), number):
+            before = ways[name].marked.cpu_s()
+            rates[name].append(rate(ways[name].connect, each))
+            cpu[name].append(1e3 * (ways[name].marked.cpu_s() - before) / (CALLERS * (each + 1)))
+    throughput = {name: Figure.of(found) for name, found in rates.items()}
+    own = [name for name, way in ways.items() if way.server == OWN]
+    return {
+        "pair_bytes": graph.pair_bytes,
+        "bare_run_ms": asdict(Figure.of([1e3 * each for each in whole])),
+        "bare_cut_run_ms": asdict(Figure.of([1e3 * each for each in cut])),
+        "overhead_ms": {name: asdict(figure) for name, figure in overheads.items()},
+        "pages_per_s": {name: asdict(figure) for name, figure in throughput.items()},
+        "server_cpu_ms": {name: median(found) for name, found in cpu.items()},
+        "calls_ms": {name: [1e3 * each for each in taken] for name, taken in told.items()},
+        "overhead_compared": {name: compared(name, overheads, ways, False) for name in own},
+        "pages_per_s_compared": {name: compared(name, throughput, ways, True) for name in own},
+    }
+
+
+def compared(own: str, figures: Mapping[str, Figure], ways: Mapping[str, Way], more: bool) -> dict[str, dict[str, Any]]:
+    """One way of the service beside the best way of each other server, by that server's name."""
+    found: dict[str, dict[str, Any]] = {}
+    for server in {way.server: None for way in ways.values() if way.server != ways[own].server}:
+        names = [name for name, way in ways.items() if way.server == server]
+        best = (max if more else min)(names, key=lambda name: figures[name].p50)
+        comparison = Comparison.of(figures[own], figures[best], more)
+        found[server] = {"way": best, **asdict(comparison), "missed_by": comparison.missed_by}
+    return found

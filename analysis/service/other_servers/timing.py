@@ -1,0 +1,72 @@
+"""Times calls: one after the other in turns, and of some callers at once."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+
+from analysis.service.other_servers.calls import CALL_S, Call
+from analysis.service.other_servers.figures import turned
+from lightpage.progress import track
+
+WARM = 5
+"""Calls of each that are not counted: buffers and connections are made in them."""
+CALLERS = 4
+
+
+def in_turns(calls: Mapping[str, Callable[[], float]], rounds: int, what: str) -> dict[str, list[float]]:
+    """What calls tell of themselves, round by round; each round begins with another one.
+
+    Args:
+        calls: by name.
+        rounds: that count.
+        what: is timed, for the progress.
+    """
+    told: dict[str, list[float]] = {name: [] for name in calls}
+    for number in track(range(WARM + rounds), what, total=WARM + rounds):
+        for name in turned(list(calls), number):
+            value = calls[name]()
+            if number >= WARM:
+                told[name].append(value)
+    return told
+
+
+def seconds(call: Call) -> Callable[[], float]:
+    """A call that tells how long it took."""
+
+    def timed() -> float:
+        begun = time.perf_counter()
+        call()
+        return time.perf_counter() - begun
+
+    return timed
+
+
+def rate(connect: Callable[[], AbstractContextManager[Call]], calls_each: int) -> float:
+    """Answers a second to `CALLERS` callers at once; each has its own connection, and calls once before the clock runs.
+
+    Args:
+        connect: a caller.
+        calls_each: calls of each caller.
+    """
+    begun: list[float] = []
+    ready = threading.Barrier(CALLERS, lambda: begun.append(time.perf_counter()), CALL_S)
+
+    def caller() -> float:
+        try:
+            with connect() as call:
+                call()
+                ready.wait()
+                for _ in range(calls_each):
+                    call()
+                return time.perf_counter()
+        except BaseException:
+            ready.abort()
+            raise
+
+    with ThreadPoolExecutor(CALLERS) as pool:
+        ended = [future.result() for future in [pool.submit(caller) for _ in range(CALLERS)]]
+    return CALLERS * calls_each / (max(ended) - begun[0])
