@@ -51,6 +51,9 @@ def rate(connect: Callable[[], AbstractContextManager[Call]], calls_each: int) -
     Args:
         connect: a caller.
         calls_each: calls of each caller.
+
+    Raises:
+        Exception: what a call has raised; the others have ended then.
     """
     begun: list[float] = []
     ready = threading.Barrier(CALLERS, lambda: begun.append(time.perf_counter()), CALL_S)
@@ -68,5 +71,9 @@ def rate(connect: Callable[[], AbstractContextManager[Call]], calls_each: int) -
             raise
 
     with ThreadPoolExecutor(CALLERS) as pool:
-        ended = [future.result() for future in [pool.submit(caller) for _ in range(CALLERS)]]
+        futures = [pool.submit(caller) for _ in range(CALLERS)]
+    errors = [error for future in futures if (error := future.exception()) is not None]
+    for error in sorted(errors, key=lambda error: isinstance(error, threading.BrokenBarrierError)):
+        raise error  # what broke the barrier, not that it is broken
+    ended = [future.result() for future in futures]
     return CALLERS * calls_each / (max(ended) - begun[0])
