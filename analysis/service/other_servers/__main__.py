@@ -9,18 +9,19 @@ turns, one at a time. How busy the idle ones keep the cores is told.
 **Graphs.** Two answer a constant whatever the frames are, for pairs of 2.5 and 40 MB. The third is the decoder of the
 shipped bundle. The others run the bundle's ONNX file as it is, by the same ONNX Runtime with the same threads, and
 answer its output p. They do nothing else. The service checks frames and pilots, decides symbols, and answers them with
-their posterior probabilities. It has the graph cut in two: what follows from the table alone is computed on loading
-(`runtime/execution/constant_table.py`), and not for every page. Image tracking is off.
+their posterior probabilities: that counts as overhead. It has the graph cut in two: what follows from the table alone
+is computed on loading, and not for every page (`runtime/execution/constant_table.py`). Image tracking is off.
 
 **Overhead** is a call's time, from frames as arrays to an answer as arrays, less the median run of the same ONNX file
 in a process that serves nobody, in the same rounds. With the decoder, the cut takes time off the service's alone. What
-the cut graph takes is told too. **Throughput** is of four callers at once.
+the cut graph takes is told too. So is the overhead without the service's checks and decision, whose time it tells
+itself. **Throughput** is of four callers at once.
 
 **Ways.** The service is called by its own contract (chunks), by the Open Inference Protocol, and over a Unix socket
-with shared memory. The others are called by the Open Inference Protocol over gRPC, and with bare bytes over HTTP. The
-service is compared with the faster one of both. A server is better than another if their medians differ by more than
-the larger spread of both, from the 10th to the 90th percentile. Others that were tried are timed with a few calls:
-MLServer with tensors of numbers, Ray Serve behind its proxy.
+with shared memory that frames are copied into. The others are called by the Open Inference Protocol over gRPC, and with
+bare bytes over HTTP. The service is compared with the faster one of both. A server is better than another if their
+medians differ by more than the larger spread of both, from the 10th to the 90th percentile. What was tried too is timed
+with a few calls: MLServer with tensors of numbers, Ray Serve behind its proxy.
 """
 
 from __future__ import annotations
@@ -31,8 +32,10 @@ import sys
 import tempfile
 import time
 from contextlib import ExitStack
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import click
@@ -40,12 +43,11 @@ import click
 from analysis.service.other_servers import rivals
 from analysis.service.other_servers.bare_run import BareRuns
 from analysis.service.other_servers.environments import NAMES, environment, requirements
-from analysis.service.other_servers.figures import Figure
 from analysis.service.other_servers.graphs import Graph, write_graphs
 from analysis.service.other_servers.measuring import check_answers, measured, other_ways, own_ways
 from analysis.service.other_servers.onnx_run import AT_ONCE
 from analysis.service.other_servers.servers import Marked, OtherServer
-from analysis.service.other_servers.timing import CALLERS, in_turns, seconds
+from analysis.service.other_servers.timing import CALLERS, in_turns, timed
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
@@ -58,6 +60,11 @@ _TRIED = 5
 """Calls of a configuration that does not count."""
 _TOLD = ("grpcio", "numpy", "onnxruntime", "protobuf")
 """Packages whose versions are told, beside the server's own."""
+_COMPARED = (
+    ("overhead", "overhead_compared", "ms less"),
+    ("overhead without the service's checks and decision", "overhead_without_work_compared", "ms less"),
+    ("throughput", "pages_per_s_compared", "pages/s more"),
+)
 
 
 def idle_cores(servers: dict[str, Marked]) -> dict[str, float]:
@@ -82,8 +89,8 @@ def tried(name: str, connect: rivals.Caller, graphs: list[Graph]) -> dict[str, f
     found = {}
     for graph in graphs:
         with connect(graph) as call:
-            taken = in_turns({name: seconds(call)}, _TRIED, f"{name}, {graph.name}")[name]
-        found[graph.name] = 1e3 * Figure.of(taken).p50
+            taken = in_turns({name: partial(timed, call)}, _TRIED, f"{name}, {graph.name}")[name]
+        found[graph.name] = 1e3 * median(each.seconds for each in taken)
     return found
 
 
@@ -102,12 +109,15 @@ def show(name: str, found: dict[str, Any]) -> None:
             f"{way:<36}{overhead['p10']:>8.2f}{overhead['p50']:>8.2f}{overhead['p90']:>8.2f}"
             f"{rates['p10']:>12.2f}{rates['p50']:>8.2f}{rates['p90']:>8.2f}{cpu:>16.1f}"
         )
-    for what, key, unit in (("overhead", "overhead_compared", "ms less"), ("pages", "pages_per_s_compared", "/s more")):
+    for what, key, unit in _COMPARED:
+        click.echo(f"{what}, {unit}, over the faster way of each: difference (spread)")
         for own, others in found[key].items():
-            for one in others.values():
-                verdict = "better" if one["missed_by"] < 0 else f"missed by {one['missed_by']:.2f}"
-                between = f"{one['difference']:.2f} {unit}, spread {one['spread']:.2f}"
-                click.echo(f"{what}: {own} over {one['way']}: {between}: {verdict}")
+            verdicts = [
+                f"{one['way']} {one['difference']:+.2f} ({one['spread']:.2f}) "
+                + ("better" if one["missed_by"] < 0 else f"missed by {one['missed_by']:.2f}")
+                for one in others.values()
+            ]
+            click.echo(f"  {own:<34}{'; '.join(verdicts)}")
 
 
 @click.command()

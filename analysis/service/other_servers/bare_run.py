@@ -18,6 +18,7 @@ import numpy as np
 
 from analysis.service.other_servers.graphs import Graph
 from analysis.service.other_servers.onnx_run import FRAMES, open_all
+from analysis.service.other_servers.timing import Timed
 from lightpage.recording.frame_pair import FramePair
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder, open_graph
@@ -51,11 +52,11 @@ class BareRuns:
             self._process.end()
             raise
 
-    def seconds(self, kind: str, name: str) -> float:
-        """Of one run of a graph, `WHOLE` or `CUT`."""
+    def run(self, kind: str, name: str) -> Timed:
+        """Run a graph once, `WHOLE` or `CUT`."""
         end = time.monotonic() + _RUN_S
         self._process.send(f"{kind} {name}\n".encode(), end)
-        return float(self._process.line(end))
+        return Timed(float(self._process.line(end)))
 
     def __enter__(self) -> Self:
         return self

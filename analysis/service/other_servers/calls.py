@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection
+from select import select
 from typing import Any
 
 import grpc
@@ -20,10 +21,14 @@ from runtime.client.client import LightpageClient
 from runtime.pb.inference import open_inference_pb2 as oip
 from runtime.rpc.inference_calls import INFERENCE
 from runtime.rpc.tensors import RAW_TYPES
+from runtime.wire.pages import RemotePage
 from runtime.wire.sizes import REPLY_BYTES
 
 Answer = dict[str, NDArray[Any]]
 """Arrays by name."""
+WORK_S = "work_s"
+"""Name of what the service tells of itself: seconds of its checks and decision, the run of the graph left out."""
+_TIMING = "timings.{}_s"
 Call = Callable[[], Answer]
 
 CALL_S = 120.0
@@ -59,7 +64,9 @@ def infer_request(
 
 
 def arrays_of(response: oip.ModelInferResponse) -> Answer:
-    """Tensors of an answer in raw contents by name; one of type BYTES as float32, without a shape.
+    """Tensors of an answer in raw contents by name, and `WORK_S` where it is told.
+
+    One of type BYTES is taken as float32, without a shape.
 
     Raises:
         LightpageError: tensors without contents, or whose contents contradict their shape.
@@ -80,6 +87,9 @@ def arrays_of(response: oip.ModelInferResponse) -> Answer:
         if len(content) != dtype.itemsize * int(np.prod(tensor.shape)):
             raise LightpageError(subject, f"{len(content)} bytes", f"{tensor.datatype} {list(tensor.shape)}")
         found[tensor.name] = np.frombuffer(content, dtype).reshape(tuple(tensor.shape))
+    if _TIMING.format("decode") in response.parameters:
+        decode, run = (response.parameters[_TIMING.format(each)].double_param for each in ("decode", "inference"))
+        found[WORK_S] = np.array(decode - run)
     return found
 
 
@@ -105,6 +115,8 @@ def bytes_caller(port: int, path: str, graph: Graph) -> Iterator[Call]:
     shape = (2, *graph.page_shape)
 
     def call() -> Answer:
+        if connection.sock is not None and select([connection.sock], [], [], 0)[0]:
+            connection.close()  # the server has ended it, since it was idle; the next request opens it anew
         body = b"".join(frame.tobytes() for frame in (graph.pair.in_phase, graph.pair.quadrature))
         connection.request("POST", path, body, {"Content-Type": _FRAMES})
         answer = connection.getresponse()
@@ -126,8 +138,7 @@ def chunk_caller(target: str, graph: Graph) -> Iterator[Call]:
         client.describe()
 
         def call() -> Answer:
-            page = client.decode(graph.pair)
-            return {"symbols": page.symbols, "confidence": page.confidence}
+            return _of_page(client.decode(graph.pair))
 
         yield call
 
@@ -138,7 +149,11 @@ def memory_caller(target: str, graph: Graph) -> Iterator[Call]:
     with LightpageClient(target, CALL_S) as client, client.share_memory() as memory:
 
         def call() -> Answer:
-            page = client.decode(graph.pair, memory=memory)
-            return {"symbols": page.symbols, "confidence": page.confidence}
+            return _of_page(client.decode(graph.pair, memory=memory))
 
         yield call
+
+
+def _of_page(page: RemotePage) -> Answer:
+    work = np.array(page.timings.decode_s - page.timings.inference_s)
+    return {"symbols": page.symbols, "confidence": page.confidence, WORK_S: work}

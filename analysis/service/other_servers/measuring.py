@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -19,7 +19,7 @@ from analysis.service.other_servers.figures import Comparison, Figure, turned
 from analysis.service.other_servers.graphs import DECODER_NAME, Graph
 from analysis.service.other_servers.onnx_run import GRAPH, OUTPUT, OnnxRun
 from analysis.service.other_servers.servers import MARK, Marked, OtherServer
-from analysis.service.other_servers.timing import CALLERS, in_turns, rate, seconds
+from analysis.service.other_servers.timing import CALLERS, in_turns, rate, timed
 from analysis.service.running import RunningService
 from lightpage.errors import LightpageError
 from lightpage.progress import track
@@ -96,13 +96,13 @@ def check_answers(graph: Graph, ways: Mapping[str, Way], folder: Path, threads: 
 def measured(graph: Graph, ways: Mapping[str, Way], bare: BareRuns, calls: int, rounds: int) -> dict[str, Any]:
     """Overheads, rates and CPU time of each way with a graph."""
     with ExitStack() as stack:
-        timed = {name: seconds(stack.enter_context(way.connect())) for name, way in ways.items()}
-        told = in_turns(
-            {kind: partial(bare.seconds, kind, graph.name) for kind in (WHOLE, CUT)} | timed, calls, graph.name
-        )
-    whole, cut = (told.pop(kind) for kind in (WHOLE, CUT))
+        called = {name: partial(timed, stack.enter_context(way.connect())) for name, way in ways.items()}
+        runs = {kind: partial(bare.run, kind, graph.name) for kind in (WHOLE, CUT)}
+        told = in_turns({**runs, **called}, calls, graph.name)
+    whole, cut = ([each.seconds for each in told.pop(kind)] for kind in (WHOLE, CUT))
     alone = median(whole)
-    overheads = {name: Figure.of([1e3 * (each - alone) for each in taken]) for name, taken in told.items()}
+    overheads = {name: figure_ms([each.seconds - alone for each in taken]) for name, taken in told.items()}
+    without = {name: figure_ms([each.seconds - alone - each.work_s for each in taken]) for name, taken in told.items()}
     rates: dict[str, list[float]] = {name: [] for name in ways}
     cpu: dict[str, list[float]] = {name: [] for name in ways}
     each = CALLS_EACH[graph.name]
@@ -112,26 +112,35 @@ def measured(graph: Graph, ways: Mapping[str, Way], bare: BareRuns, calls: int, 
             rates[name].append(rate(ways[name].connect, each))
             cpu[name].append(1e3 * (ways[name].marked.cpu_s() - before) / (CALLERS * (each + 1)))
     throughput = {name: Figure.of(found) for name, found in rates.items()}
-    own = [name for name, way in ways.items() if way.server == OWN]
     return {
         "pair_bytes": graph.pair_bytes,
-        "bare_run_ms": asdict(Figure.of([1e3 * each for each in whole])),
-        "bare_cut_run_ms": asdict(Figure.of([1e3 * each for each in cut])),
+        "bare_run_ms": asdict(figure_ms(whole)),
+        "bare_cut_run_ms": asdict(figure_ms(cut)),
         "overhead_ms": {name: asdict(figure) for name, figure in overheads.items()},
+        "overhead_without_work_ms": {name: asdict(figure) for name, figure in without.items()},
         "pages_per_s": {name: asdict(figure) for name, figure in throughput.items()},
         "server_cpu_ms": {name: median(found) for name, found in cpu.items()},
-        "calls_ms": {name: [1e3 * each for each in taken] for name, taken in told.items()},
-        "overhead_compared": {name: compared(name, overheads, ways, False) for name in own},
-        "pages_per_s_compared": {name: compared(name, throughput, ways, True) for name in own},
+        "calls_ms": {name: [1e3 * each.seconds for each in taken] for name, taken in told.items()},
+        "overhead_compared": compared(overheads, ways),
+        "overhead_without_work_compared": compared(without, ways),
+        "pages_per_s_compared": compared(throughput, ways, more_is_better=True),
     }
 
 
-def compared(own: str, figures: Mapping[str, Figure], ways: Mapping[str, Way], more: bool) -> dict[str, dict[str, Any]]:
-    """One way of the service beside the best way of each other server, by that server's name."""
-    found: dict[str, dict[str, Any]] = {}
-    for server in {way.server: None for way in ways.values() if way.server != ways[own].server}:
+def figure_ms(seconds: Sequence[float]) -> Figure:
+    """Milliseconds of seconds."""
+    return Figure.of([1e3 * each for each in seconds])
+
+
+def compared(
+    figures: Mapping[str, Figure], ways: Mapping[str, Way], more_is_better: bool = False
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Each way of the service beside the best way of each other server, by that server's name."""
+    found: dict[str, dict[str, dict[str, Any]]] = {name: {} for name, way in ways.items() if way.server == OWN}
+    for server in dict.fromkeys(way.server for way in ways.values() if way.server != OWN):
         names = [name for name, way in ways.items() if way.server == server]
-        best = (max if more else min)(names, key=lambda name: figures[name].p50)
-        comparison = Comparison.of(figures[own], figures[best], more)
-        found[server] = {"way": best, **asdict(comparison), "missed_by": comparison.missed_by}
+        best = (max if more_is_better else min)(names, key=lambda name: figures[name].p50)
+        for own, others in found.items():
+            comparison = Comparison.of(figures[own], figures[best], more_is_better)
+            others[server] = {"way": best, **asdict(comparison), "missed_by": comparison.missed_by}
     return found

@@ -7,17 +7,21 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import TypeVar
 
-from analysis.service.other_servers.calls import CALL_S, Call
+from analysis.service.other_servers.calls import CALL_S, WORK_S, Call
 from analysis.service.other_servers.figures import turned
 from lightpage.progress import track
+
+T = TypeVar("T")
 
 WARM = 5
 """Calls of each that are not counted: buffers and connections are made in them."""
 CALLERS = 4
 
 
-def in_turns(calls: Mapping[str, Callable[[], float]], rounds: int, what: str) -> dict[str, list[float]]:
+def in_turns(calls: Mapping[str, Callable[[], T]], rounds: int, what: str) -> dict[str, list[T]]:
     """What calls tell of themselves, round by round; each round begins with another one.
 
     Args:
@@ -25,7 +29,7 @@ def in_turns(calls: Mapping[str, Callable[[], float]], rounds: int, what: str) -
         rounds: that count.
         what: is timed, for the progress.
     """
-    told: dict[str, list[float]] = {name: [] for name in calls}
+    told: dict[str, list[T]] = {name: [] for name in calls}
     for number in track(range(WARM + rounds), what, total=WARM + rounds):
         for name in turned(list(calls), number):
             value = calls[name]()
@@ -34,15 +38,24 @@ def in_turns(calls: Mapping[str, Callable[[], float]], rounds: int, what: str) -
     return told
 
 
-def seconds(call: Call) -> Callable[[], float]:
-    """A call that tells how long it took."""
+@dataclass(frozen=True)
+class Timed:
+    """A call that was timed.
 
-    def timed() -> float:
-        begun = time.perf_counter()
-        call()
-        return time.perf_counter() - begun
+    Attributes:
+        seconds: that it took.
+        work_s: of these, the service's checks and decision; zero of other servers.
+    """
 
-    return timed
+    seconds: float
+    work_s: float = 0.0
+
+
+def timed(call: Call) -> Timed:
+    """Call once."""
+    begun = time.perf_counter()
+    answer = call()
+    return Timed(time.perf_counter() - begun, float(answer.get(WORK_S, 0.0)))
 
 
 def rate(connect: Callable[[], AbstractContextManager[Call]], calls_each: int) -> float:
