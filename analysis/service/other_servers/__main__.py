@@ -19,7 +19,7 @@ itself. **Throughput** is of four callers at once.
 
 **Ways.** The service is called by its own contract (chunks), by the Open Inference Protocol, and over a Unix socket
 with shared memory that frames are copied into. The others are called by the Open Inference Protocol over gRPC, and with
-bare bytes over HTTP. The service is compared with the faster one of both. A server is better than another if their
+bare bytes over HTTP. Each way of the one is compared with each of the others. A way is better than another if their
 medians differ by more than the larger spread of both, from the 10th to the 90th percentile. What was tried too is timed
 with a few calls: MLServer with tensors of numbers, Ray Serve behind its proxy.
 """
@@ -110,14 +110,18 @@ def show(name: str, found: dict[str, Any]) -> None:
             f"{rates['p10']:>12.2f}{rates['p50']:>8.2f}{rates['p90']:>8.2f}{cpu:>16.1f}"
         )
     for what, key, unit in _COMPARED:
-        click.echo(f"{what}, {unit}, over the faster way of each: difference (spread)")
-        for own, others in found[key].items():
-            verdicts = [
-                f"{one['way']} {one['difference']:+.2f} ({one['spread']:.2f}) "
-                + ("better" if one["missed_by"] < 0 else f"missed by {one['missed_by']:.2f}")
-                for one in others.values()
-            ]
-            click.echo(f"  {own:<34}{'; '.join(verdicts)}")
+        click.echo(f"{what}: {unit} in the service than in others, * in their better way, (spread)")
+        owns = next(iter(found[key].values()))
+        click.echo(f"{'':<36}" + "".join(f"{name:<38}" for name in owns))
+        for other, beside in found[key].items():
+            mark = "*" if next(iter(beside.values()))["best"] else ""
+            click.echo(f"{other + mark:<36}" + "".join(f"{verdict(one):<38}" for one in beside.values()).rstrip())
+
+
+def verdict(one: dict[str, Any]) -> str:
+    """A comparison in words."""
+    beyond = "better" if one["missed_by"] < 0 else f"missed by {one['missed_by']:.2f}"
+    return f"{one['difference']:+.2f} ({one['spread']:.2f}) {beyond}"
 
 
 @click.command()

@@ -135,12 +135,16 @@ def figure_ms(seconds: Sequence[float]) -> Figure:
 def compared(
     figures: Mapping[str, Figure], ways: Mapping[str, Way], more_is_better: bool = False
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """Each way of the service beside the best way of each other server, by that server's name."""
-    found: dict[str, dict[str, dict[str, Any]]] = {name: {} for name, way in ways.items() if way.server == OWN}
-    for server in dict.fromkeys(way.server for way in ways.values() if way.server != OWN):
-        names = [name for name, way in ways.items() if way.server == server]
+    """Each way of the others beside each one of the service, by both names; `best` says it is its server's best."""
+    own = [name for name, way in ways.items() if way.server == OWN]
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for other, way in ways.items():
+        if way.server == OWN:
+            continue
+        names = [name for name in ways if ways[name].server == way.server]
         best = (max if more_is_better else min)(names, key=lambda name: figures[name].p50)
-        for own, others in found.items():
-            comparison = Comparison.of(figures[own], figures[best], more_is_better)
-            others[server] = {"way": best, **asdict(comparison), "missed_by": comparison.missed_by}
+        found[other] = {}
+        for name in own:
+            comparison = Comparison.of(figures[name], figures[other], more_is_better)
+            found[other][name] = {**asdict(comparison), "missed_by": comparison.missed_by, "best": other == best}
     return found

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from analysis.service.other_servers.calls import Answer, Call, arrays_of, infer_request
+from analysis.service.other_servers.calls import Answer, Call, arrays_of, bytes_caller, infer_request
 from analysis.service.other_servers.environments import NAMES, requirements
 from analysis.service.other_servers.figures import Comparison, Figure, turned
-from analysis.service.other_servers.graphs import committed
+from analysis.service.other_servers.graphs import Graph, committed
+from analysis.service.other_servers.measuring import Way, compared
 from analysis.service.other_servers.rivals import MLSERVER_HTTP_PORT, MLSERVER_PORT
-from analysis.service.other_servers.timing import CALLERS, WARM, in_turns, rate
+from analysis.service.other_servers.servers import Marked
+from analysis.service.other_servers.timing import CALLERS, WARM, in_turns, rate, timed
 from lightpage.errors import LightpageError
 from lightpage.recording.frame_pair import FramePair
 from runtime.pb.inference import open_inference_pb2 as oip
@@ -111,6 +115,52 @@ def test_an_answer_is_read_as_tensors_and_as_bytes() -> None:
     found = arrays_of(response)
     np.testing.assert_array_equal(found["p"], P)
     np.testing.assert_array_equal(found["same"], P.ravel())
+
+
+def test_what_the_service_tells_of_its_own_work_leaves_the_run_out() -> None:
+    response = oip.ModelInferResponse()
+    for name, value in (("timings.decode_s", 0.5), ("timings.inference_s", 0.375)):
+        response.parameters[name].double_param = value
+    assert timed(lambda: arrays_of(response)).work_s == 0.125
+    assert timed(dict).work_s == 0
+
+
+def test_every_way_is_compared_and_the_best_one_of_a_server_is_marked() -> None:
+    def connect() -> AbstractContextManager[Call]:
+        raise AssertionError
+
+    ways = {name: Way(name.partition(",")[0], Marked(), connect) for name in ("Lightpage, a", "Other, a", "Other, b")}
+    figures = {name: Figure(value, value, value) for name, value in zip(ways, (4.0, 5.0, 7.0), strict=True)}
+    found = compared(figures, ways)
+    assert [(name, one["Lightpage, a"]["best"]) for name, one in found.items()] == [
+        ("Other, a", True),
+        ("Other, b", False),
+    ]
+    found = compared(figures, ways, more_is_better=True)
+    assert found["Other, b"]["Lightpage, a"] == {"difference": -3, "spread": 0, "missed_by": 3, "best": True}
+
+
+def test_a_connection_that_the_server_has_ended_is_opened_anew() -> None:
+    graph = Graph("g", FramePair(*np.zeros((2, 2, 3), np.uint8)), Path("none"), (2, 3))
+    answer = b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % P.nbytes + P.tobytes()
+    with socket.create_server(("127.0.0.1", 0)) as listening, ThreadPoolExecutor(1) as pool:
+        listening.settimeout(10)
+
+        def serve_once() -> bytes:
+            with listening.accept()[0] as connection, connection.makefile("rb") as asked:
+                connection.settimeout(10)
+                size = next(int(line.split()[1]) for line in asked if line.lower().startswith(b"content-length"))
+                while asked.readline().strip():
+                    pass
+                body = asked.read(size)
+                connection.sendall(answer)
+            return body
+
+        with bytes_caller(listening.getsockname()[1], "/g", graph) as call:
+            for _ in range(2):
+                served = pool.submit(serve_once)
+                np.testing.assert_array_equal(call()["p"], P)
+                assert served.result(10) == bytes(12)
 
 
 @pytest.mark.parametrize(
