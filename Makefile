@@ -102,7 +102,7 @@ bench-service: $(STAMP)  ## the service under load, faults and attack, from outs
 	$(BIN)/python -m analysis.service.memory_attacks --json $(BENCH_SERVICE)/memory.json
 	$(BIN)/python -m analysis.hardware.recalibration --load 0.6 --json $(BENCH_SERVICE)/recalibration.json
 
-bench-other-servers: $(STAMP)  ## the service beside MLServer, KServe and Ray Serve with the same graph: installs them first, 1.6 GB
+bench-other-servers: $(STAMP)  ## the service beside MLServer, KServe and Ray Serve with the same graph: installs them first, 1.5 GB
 	@mkdir -p $(BENCH_SERVICE)
 	$(BIN)/python -m analysis.service.other_servers --out $(BENCH_SERVICE)/other-servers --json $(BENCH_SERVICE)/other-servers.json
 

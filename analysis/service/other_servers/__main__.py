@@ -2,7 +2,7 @@
 
     python -m analysis.service.other_servers --out runs/bench-service/other-servers --json FILE
 
-Each of the others is installed into an environment of its own below --out, at the first run: 1.6 GB in all. All servers
+Each of the others is installed into an environment of its own below --out, at the first run: 1.5 GB in all. All servers
 then run in a private network, since some of them listen on every address. They stay up together, and are called in
 turns, one at a time. How busy the idle ones keep the cores is told.
 
@@ -31,6 +31,7 @@ import re
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
 from contextlib import ExitStack
 from functools import partial
 from importlib.metadata import version
@@ -44,9 +45,9 @@ from analysis.service.other_servers import rivals
 from analysis.service.other_servers.bare_run import BareRuns
 from analysis.service.other_servers.environments import NAMES, environment, requirements
 from analysis.service.other_servers.graphs import Graph, write_graphs
-from analysis.service.other_servers.measuring import check_answers, measured, other_ways, own_ways
+from analysis.service.other_servers.measuring import Way, check_answers, measured, other_ways, own_ways
 from analysis.service.other_servers.onnx_run import AT_ONCE
-from analysis.service.other_servers.servers import Marked, OtherServer
+from analysis.service.other_servers.servers import OtherServer
 from analysis.service.other_servers.timing import CALLERS, in_turns, timed
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
@@ -67,11 +68,15 @@ _COMPARED = (
 )
 
 
-def idle_cores(servers: dict[str, Marked]) -> dict[str, float]:
-    """How many cores each server keeps busy while nobody calls it."""
-    before = {name: marked.cpu_s() for name, marked in servers.items()}
+def idle_cores(ways: Iterable[Way]) -> dict[str, float]:
+    """How many cores each server keeps busy while nobody calls it; the service at its port and at its socket as one."""
+    servers = {way.marked: way.server for way in ways}
+    before = {marked: marked.cpu_s() for marked in servers}
     time.sleep(_IDLE_S)
-    return {name: (marked.cpu_s() - before[name]) / _IDLE_S for name, marked in servers.items()}
+    busy = dict.fromkeys(servers.values(), 0.0)
+    for marked, name in servers.items():
+        busy[name] += (marked.cpu_s() - before[marked]) / _IDLE_S
+    return busy
 
 
 def versions() -> dict[str, Any]:
@@ -173,7 +178,7 @@ def main(out: Path, calls: int, rounds: int, threads: int | None, json_path: Pat
                     ways = own | other_ways(servers, graph)
                     check_answers(graph, ways, models, threads)
                     if "idle_cores" not in figures:
-                        figures["idle_cores"] = idle_cores({way.server: way.marked for way in ways.values()})
+                        figures["idle_cores"] = idle_cores(ways.values())
                         busy = ", ".join(f"{name} {share:.3f}" for name, share in figures["idle_cores"].items())
                         click.echo(f"cores that idle servers keep busy: {busy}")
                     found = measured(graph, ways, bare, calls, rounds)
