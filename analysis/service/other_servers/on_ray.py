@@ -78,11 +78,10 @@ def main(folder: str, threads: str, grpc_port: str, http_port: str, temporary: s
         http_options=HTTPOptions(host="127.0.0.1", port=int(http_port)),
         grpc_options=gRPCOptions(port=int(grpc_port), grpc_servicer_functions=[_STUBS]),
     )
-    deployment = serve.deployment(Graphs).options(num_replicas=1, max_ongoing_requests=_ONGOING)
+    deployment = serve.deployment(num_replicas=1, max_ongoing_requests=_ONGOING)(Graphs)
     serve.run(deployment.bind(Path(folder), int(threads)))
     sys.stdin.read()
-    serve.shutdown()
-    ray.shutdown()
+    ray.shutdown()  # Serve with it
 
 
 if __name__ == "__main__":
