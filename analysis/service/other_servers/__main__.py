@@ -4,7 +4,7 @@
 
 Each of the others is installed into an environment of its own below --out, at the first run: 1.5 GB in all. All servers
 then run in a private network, since some of them listen on every address. They stay up together, and are called in
-turns, one at a time. How busy the idle ones keep the cores is told.
+turns, one at a time, in an order that changes. How busy the idle ones keep the cores is told.
 
 **Graphs.** Two answer a constant whatever the frames are, for pairs of 2.5 and 40 MB. The third is the decoder of the
 shipped bundle. The others run the bundle's ONNX file as it is, by the same ONNX Runtime with the same threads, and
@@ -40,6 +40,7 @@ from statistics import median
 from typing import Any
 
 import click
+import numpy as np
 
 from analysis.service.other_servers import rivals
 from analysis.service.other_servers.bare_run import BareRuns
@@ -91,10 +92,10 @@ def versions() -> dict[str, Any]:
 
 def tried(name: str, connect: rivals.Caller, graphs: list[Graph]) -> dict[str, float]:
     """Milliseconds of a few calls with each graph."""
-    found = {}
+    found, rng = {}, np.random.default_rng(0)
     for graph in graphs:
         with connect(graph) as call:
-            taken = in_turns({name: partial(timed, call)}, _TRIED, f"{name}, {graph.name}")[name]
+            taken = in_turns({name: partial(timed, call)}, _TRIED, f"{name}, {graph.name}", rng)[name]
         found[graph.name] = 1e3 * median(each.seconds for each in taken)
     return found
 
@@ -140,13 +141,14 @@ def verdict(one: dict[str, Any]) -> str:
 @click.option("--calls", default=40, show_default=True, type=click.IntRange(3), help="Calls of each way, one by one.")
 @click.option("--rounds", default=3, show_default=True, type=click.IntRange(1), help="Of callers at once.")
 @click.option("--threads", type=click.IntRange(1), help="Threads of one run; by default all cores.")
+@click.option("--seed", default=0, show_default=True, help="Of the order in which they are called.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
-def main(out: Path, calls: int, rounds: int, threads: int | None, json_path: Path | None) -> None:
+def main(out: Path, calls: int, rounds: int, threads: int | None, seed: int, json_path: Path | None) -> None:
     """Print what calls cost beside the graph, and pages a second, of all servers."""
     require()
     pythons = {name: environment(out.absolute(), name) for name in NAMES}
     go_on_inside(_NAME)
-    threads = threads or available_cpus()
+    threads, rng = threads or available_cpus(), np.random.default_rng(seed)
     figures: dict[str, Any] = {
         "versions": versions(),
         "cores": available_cpus(),
@@ -155,6 +157,7 @@ def main(out: Path, calls: int, rounds: int, threads: int | None, json_path: Pat
         "callers": CALLERS,
         "calls": calls,
         "rounds": rounds,
+        "seed": seed,
     }
     with tempfile.TemporaryDirectory(prefix="lightpage-") as name:
         folder, models = Path(name), Path(name) / "models"
@@ -181,7 +184,7 @@ def main(out: Path, calls: int, rounds: int, threads: int | None, json_path: Pat
                         figures["idle_cores"] = idle_cores(ways.values())
                         busy = ", ".join(f"{name} {share:.3f}" for name, share in figures["idle_cores"].items())
                         click.echo(f"cores that idle servers keep busy: {busy}")
-                    found = measured(graph, ways, bare, calls, rounds)
+                    found = measured(graph, ways, bare, calls, rounds, rng)
                 figures["graphs"][graph.name] = found
                 show(graph.name, found)
             others = {"MLServer, gRPC, numbers": tried("MLServer, numbers", rivals.MLSERVER_NUMBERS, graphs)}

@@ -54,9 +54,3 @@ class Comparison:
     def missed_by(self) -> float:
         """What is missing of a difference beyond the spread; zero or less where there is one."""
         return self.spread - self.difference
-
-
-def turned(items: Sequence[str], round_number: int) -> list[str]:
-    """The order of a round: each begins with the next one, so that nobody always follows the same one."""
-    start = round_number % len(items)
-    return [*items[start:], *items[:start]]

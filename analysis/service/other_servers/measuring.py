@@ -15,14 +15,13 @@ import numpy as np
 from analysis.service.other_servers import rivals
 from analysis.service.other_servers.bare_run import CUT, WHOLE, BareRuns
 from analysis.service.other_servers.calls import Call, chunk_caller, inference_caller, memory_caller
-from analysis.service.other_servers.figures import Comparison, Figure, turned
+from analysis.service.other_servers.figures import Comparison, Figure
 from analysis.service.other_servers.graphs import DECODER_NAME, Graph
 from analysis.service.other_servers.onnx_run import GRAPH, OUTPUT, OnnxRun
 from analysis.service.other_servers.servers import MARK, Marked, OtherServer
 from analysis.service.other_servers.timing import CALLERS, in_turns, rate, timed
 from analysis.service.running import RunningService
 from lightpage.errors import LightpageError
-from lightpage.progress import track
 from runtime.rpc.inference_calls import MODEL
 
 OWN = "Lightpage"
@@ -93,25 +92,28 @@ def check_answers(graph: Graph, ways: Mapping[str, Way], folder: Path, threads: 
             raise LightpageError(f"{name} with graph {graph.name}", "another answer", "that of the same ONNX file")
 
 
-def measured(graph: Graph, ways: Mapping[str, Way], bare: BareRuns, calls: int, rounds: int) -> dict[str, Any]:
+def measured(
+    graph: Graph, ways: Mapping[str, Way], bare: BareRuns, calls: int, rounds: int, rng: np.random.Generator
+) -> dict[str, Any]:
     """Overheads, rates and CPU time of each way with a graph."""
     with ExitStack() as stack:
         called = {name: partial(timed, stack.enter_context(way.connect())) for name, way in ways.items()}
         runs = {kind: partial(bare.run, kind, graph.name) for kind in (WHOLE, CUT)}
-        told = in_turns({**runs, **called}, calls, graph.name)
+        told = in_turns({**runs, **called}, calls, graph.name, rng)
     whole, cut = ([each.seconds for each in told.pop(kind)] for kind in (WHOLE, CUT))
     alone = median(whole)
     overheads = {name: figure_ms([each.seconds - alone for each in taken]) for name, taken in told.items()}
     without = {name: figure_ms([each.seconds - alone - each.work_s for each in taken]) for name, taken in told.items()}
-    rates: dict[str, list[float]] = {name: [] for name in ways}
-    cpu: dict[str, list[float]] = {name: [] for name in ways}
     each = CALLS_EACH[graph.name]
-    for number in track(range(rounds), f"{graph.name}, {CALLERS} callers", total=rounds):
-        for name in turned(list(ways), number):
-            before = ways[name].marked.cpu_s()
-            rates[name].append(rate(ways[name].connect, each))
-            cpu[name].append(1e3 * (ways[name].marked.cpu_s() - before) / (CALLERS * (each + 1)))
-    throughput = {name: Figure.of(found) for name, found in rates.items()}
+
+    def at_once(way: Way) -> tuple[float, float]:
+        before = way.marked.cpu_s()
+        answers_per_s = rate(way.connect, each)
+        return answers_per_s, 1e3 * (way.marked.cpu_s() - before) / (CALLERS * (each + 1))
+
+    blocks = {name: partial(at_once, way) for name, way in ways.items()}
+    loaded = in_turns(blocks, rounds, f"{graph.name}, {CALLERS} callers", rng, warm=0)
+    throughput = {name: Figure.of([answers_per_s for answers_per_s, _ in found]) for name, found in loaded.items()}
     return {
         "pair_bytes": graph.pair_bytes,
         "bare_run_ms": asdict(figure_ms(whole)),
@@ -119,7 +121,8 @@ def measured(graph: Graph, ways: Mapping[str, Way], bare: BareRuns, calls: int, 
         "overhead_ms": {name: asdict(figure) for name, figure in overheads.items()},
         "overhead_without_work_ms": {name: asdict(figure) for name, figure in without.items()},
         "pages_per_s": {name: asdict(figure) for name, figure in throughput.items()},
-        "server_cpu_ms": {name: median(found) for name, found in cpu.items()},
+        "server_cpu_ms": {name: median(cpu_ms for _, cpu_ms in found) for name, found in loaded.items()},
+        "bare_runs_ms": {WHOLE: [1e3 * each for each in whole], CUT: [1e3 * each for each in cut]},
         "calls_ms": {name: [1e3 * each.seconds for each in taken] for name, taken in told.items()},
         "overhead_compared": compared(overheads, ways),
         "overhead_without_work_compared": compared(without, ways),

@@ -10,8 +10,9 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TypeVar
 
+import numpy as np
+
 from analysis.service.other_servers.calls import CALL_S, WORK_S, Call
-from analysis.service.other_servers.figures import turned
 from lightpage.progress import track
 
 T = TypeVar("T")
@@ -21,19 +22,23 @@ WARM = 5
 CALLERS = 4
 
 
-def in_turns(calls: Mapping[str, Callable[[], T]], rounds: int, what: str) -> dict[str, list[T]]:
-    """What calls tell of themselves, round by round; each round begins with another one.
+def in_turns(
+    calls: Mapping[str, Callable[[], T]], rounds: int, what: str, rng: np.random.Generator, warm: int = WARM
+) -> dict[str, list[T]]:
+    """What calls tell of themselves, round by round. Each round has an order of its own: none always follows another.
 
     Args:
         calls: by name.
         rounds: that count.
         what: is timed, for the progress.
+        rng: of the orders.
+        warm: rounds before these.
     """
     told: dict[str, list[T]] = {name: [] for name in calls}
-    for number in track(range(WARM + rounds), what, total=WARM + rounds):
-        for name in turned(list(calls), number):
+    for number in track(range(warm + rounds), what, total=warm + rounds):
+        for name in rng.permutation(list(calls)).tolist():
             value = calls[name]()
-            if number >= WARM:
+            if number >= warm:
                 told[name].append(value)
     return told
 

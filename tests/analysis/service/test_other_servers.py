@@ -9,6 +9,7 @@ import struct
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import pytest
 
 from analysis.service.other_servers.calls import Answer, Call, arrays_of, bytes_caller, infer_request
 from analysis.service.other_servers.environments import NAMES, requirements
-from analysis.service.other_servers.figures import Comparison, Figure, turned
+from analysis.service.other_servers.figures import Comparison, Figure
 from analysis.service.other_servers.graphs import Graph, committed
 from analysis.service.other_servers.measuring import Way, compared
 from analysis.service.other_servers.rivals import MLSERVER_HTTP_PORT, MLSERVER_PORT
@@ -45,19 +46,19 @@ def test_a_server_is_better_only_by_more_than_the_larger_spread() -> None:
     assert Comparison.of(own, Figure(4, 5, 6), more_is_better=True).missed_by == -3
 
 
-def test_every_one_of_a_round_begins_once() -> None:
-    assert [turned(["a", "b", "c"], number) for number in range(4)] == [
-        ["a", "b", "c"],
-        ["b", "c", "a"],
-        ["c", "a", "b"],
-        ["a", "b", "c"],
-    ]
-
-
 def test_calls_of_the_warm_up_do_not_count() -> None:
     numbers = {"a": iter(range(100)), "b": iter(range(100, 200))}
-    told = in_turns({name: lambda each=each: float(next(each)) for name, each in numbers.items()}, 3, "calls")
+    calls = {name: partial(next, each) for name, each in numbers.items()}
+    told = in_turns(calls, 3, "calls", np.random.default_rng(0))
     assert told == {"a": [WARM, WARM + 1, WARM + 2], "b": [100 + WARM, 101 + WARM, 102 + WARM]}
+
+
+def test_every_round_calls_each_once_and_in_an_order_of_its_own() -> None:
+    names, order = "abcdef", []
+    in_turns({name: partial(order.append, name) for name in names}, 20, "calls", np.random.default_rng(0), warm=0)
+    rounds = ["".join(order[start : start + 6]) for start in range(0, 120, 6)]
+    assert [sorted(each) for each in rounds] == [list(names)] * 20
+    assert len(set(rounds)) > 10
 
 
 def test_all_callers_connect_and_call_before_the_clock_runs() -> None:
