@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service bench-other-servers dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -108,6 +108,10 @@ bench-service: $(STAMP)  ## the service under load, faults and attack, from outs
 
 dashboard: $(STAMP)  ## draw docs/images/dashboard.png from a service under load: needs prometheus
 	$(BIN)/python -m analysis.service.dashboard --out docs/images/dashboard.png
+
+bench-other-servers: $(STAMP)  ## the service beside MLServer, KServe and Ray Serve with the same graph: installs them first, 1.5 GB
+	@mkdir -p $(BENCH_SERVICE)
+	$(BIN)/python -m analysis.service.other_servers --out $(BENCH_SERVICE)/other-servers --json $(BENCH_SERVICE)/other-servers.json
 
 soak: $(STAMP)  ## 40 minutes at 80% of the service's load: does its memory grow?
 	@mkdir -p $(BENCH_SERVICE)

@@ -88,7 +88,11 @@ def _name(licence: Mapping[str, str]) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Do what the head of the file says."""
-    rows = judged(json.loads(Path(arguments[0]).read_text()))
+    path = Path(arguments[0])
+    if not path.is_file():
+        print(f"{path}: no such file; `make sbom` writes it", file=sys.stderr)
+        return 2
+    rows = judged(json.loads(path.read_text()))
     for name, licence, fault in rows:
         print(f"{name:44} {licence}{f'   <- {fault}' if fault else ''}")
     bad = [name for name, _, fault in rows if fault]

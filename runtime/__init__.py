@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from runtime.decoding.decoder import Decoder
     from runtime.decoding.image_tracker import tracker_for
     from runtime.decoding.page import DecodedPage
+    from runtime.wire.tls import TlsFiles
 
 _HOMES = {
     "Bundle": "runtime.bundle.bundle",
@@ -23,6 +24,7 @@ _HOMES = {
     "Decoder": "runtime.decoding.decoder",
     "Evaluation": "runtime.bulk.evaluation",
     "LightpageClient": "runtime.client.client",
+    "TlsFiles": "runtime.wire.tls",
     "evaluate": "runtime.bulk.evaluation",
     "tracker_for": "runtime.decoding.image_tracker",
 }
@@ -33,6 +35,7 @@ __all__ = [
     "Decoder",
     "Evaluation",
     "LightpageClient",
+    "TlsFiles",
     "evaluate",
     "load",
     "tracker_for",

@@ -39,7 +39,8 @@ from runtime.bundle.manifest import (
     parse_manifest,
     sha256,
 )
-from runtime.bundle.signature import BundleKey, read_signature
+from runtime.bundle.signature import BundleKey
+from runtime.bundle.signature_file import read_signature
 
 MAX_ARRAY_BYTES = MAX_BYTES
 """All arrays of one .npz file, unpacked: it is compressed by itself, and may be a bomb inside a small bundle."""

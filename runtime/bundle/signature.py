@@ -9,33 +9,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from lightpage.errors import BundleError, InvalidInputError
-
-SUFFIX = ".sig"
-"""Behind the name of a bundle, the name of its signature."""
-
-MOST_BYTES = 1 << 10
-"""A signature is less than a hundred bytes."""
-
-
-def signature_path(bundle: Path) -> Path:
-    """Where the signature of a bundle lies."""
-    return bundle.with_name(bundle.name + SUFFIX)
-
-
-def read_signature(bundle: Path) -> bytes:
-    """The signature beside a bundle; empty where there is none.
-
-    Raises:
-        BundleError: it cannot be read.
-    """
-    path = signature_path(bundle)
-    try:
-        with path.open("rb") as file:
-            return file.read(MOST_BYTES)
-    except FileNotFoundError:
-        return b""
-    except OSError as error:
-        raise BundleError(f"signature {path}", error, "a file that can be read") from None
+from runtime.bundle.signature_file import SUFFIX
 
 
 class BundleKey:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lightpage.errors import FrameError, InvalidInputError, LightpageError, PageError
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.recording.frame_pair import FramePair
+from runtime.bundle.signature_file import read_signature
 from runtime.client.answers import (
     Description,
     DisplayOrder,
@@ -167,7 +168,7 @@ class LightpageClient:
         header = self._header(pair, levels, bit_depth, black_level, pilots, correlation_id, options)
         set_fields(header, frame_id=frame_id, captured_s=captured_s)
         if memory is not None:
-            memory.write(pair)
+            header.shared.offset = memory.write(pair)
             header.shared.region = memory.handle
             request = pb.DecodeFramesRequest(header=header)
             return remote_page(self._unary(self._decode_frames, iter([request])))
@@ -639,18 +640,17 @@ class LightpageClient:
         Raises:
             InvalidInputError: no file that can be read.
             ModelExistsError: the service has a model of its version.
-            BundleError: it is damaged, or for another device.
+            BundleError: it is damaged, or for another device, or its signature is no good.
             StoreError: the service has no store, or one that cannot be written.
             LimitError: it is too large.
         """
         path = Path(path)
-        signature = path.with_name(f"{path.name}.sig")
         try:
             with path.open("rb") as file:
                 header = pb.UploadModelHeader(
                     bytes=os.fstat(file.fileno()).st_size,
                     sha256=hashlib.file_digest(file, "sha256").digest(),
-                    signature=signature.read_bytes() if signature.is_file() else b"",
+                    signature=read_signature(path),
                 )
                 file.seek(0)
 

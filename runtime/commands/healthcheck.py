@@ -9,7 +9,8 @@ import click
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from runtime.commands.connection import with_tls
+from lightpage.cli.main import run
+from runtime.commands.connection import tls_options
 from runtime.wire.channel import open_channel
 from runtime.wire.tls import TlsFiles
 
@@ -44,7 +45,7 @@ def is_serving(
 )
 @click.option("--service", default="", help="A full gRPC service name; empty asks for the server as a whole.")
 @click.option("--timeout", "timeout_s", default=3.0, show_default=True, help="Seconds to wait for the answer.")
-@with_tls
+@tls_options(environment=False)  # those of other commands must not change how the image asks
 def main(target: str, service: str, timeout_s: float, tls: TlsFiles | None) -> None:
     """Exit with 0 when the service answers SERVING, else with 1."""
     serving, said = is_serving(target, service=service, timeout_s=timeout_s, tls=tls)
@@ -53,4 +54,4 @@ def main(target: str, service: str, timeout_s: float, tls: TlsFiles | None) -> N
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(main, name="python -m runtime.commands.healthcheck"))

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import platform
 import signal
 import socket
+import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.metadata import version as installed_version
@@ -56,6 +60,9 @@ from runtime.wire.address import check_free, is_local
 from runtime.wire.shared_memory import memory_path
 
 _log = logging.getLogger(__name__)
+
+_REST_S = 3.0
+"""For what still computes once all calls have ended."""
 
 _KEYS = {
     "bundle": ("service", "bundle"),
@@ -170,6 +177,7 @@ def serve(context: click.Context, /, config: Path | None, print_config: bool, **
     written = logging_to_stderr(logs.format, logs.level, logs.lines_per_second)
     with stop_signals() as wait_for_stop, written, reporting(None):  # what work tells of itself is logged too
         _serve(effective, wait_for_stop)
+        _leave_the_rest()
 
 
 def _given(context: click.Context) -> list[Option]:
@@ -251,6 +259,19 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         click.echo("stopping")
         _log.info("stopping with model %s", registry.current.version)
     _log.info("stopped")
+
+
+def _leave_the_rest() -> None:
+    """End the process if its threads do not: a decode that has hung would keep it for ever."""
+    until = time.monotonic() + _REST_S
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread() and not thread.daemon:
+            thread.join(max(0.0, until - time.monotonic()))
+            if thread.is_alive():
+                _log.warning("ended while %s was still at work", thread.name)
+                for stream in (sys.stdout, sys.stderr):
+                    stream.flush()
+                os._exit(0)
 
 
 def _log_start(model: str, source: str, address: str, provider: Provider, given: int) -> None:

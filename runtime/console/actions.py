@@ -12,6 +12,7 @@ from runtime.identity.roles import Role
 from runtime.service.caller import Actor
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
+from runtime.wire.status import without_folders
 
 PAGES = 2
 """Known pages of a recalibration: one to fit, one to judge by."""
@@ -46,7 +47,7 @@ class Actions:
         if not jobs:
             return None
         job = job_info(jobs[0])
-        told = job.step if job.error is None else str(job.error)
+        told = job.step if job.error is None else without_folders(str(job.error))
         return {"id": job.id, "state": job.state, "fraction": job.fraction, "told": told}
 
     def do(self, content: bytes, actor: Actor) -> str:
@@ -58,7 +59,7 @@ class Actions:
         """
         try:
             asked: Any = json.loads(content)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InvalidInputError("action", error, 'a JSON object, {"action": ..., "expected": ...}') from None
         if not isinstance(asked, dict) or asked.keys() != {"action", "expected"}:
             raise InvalidInputError("action", repr(asked)[:100], 'a JSON object, {"action": ..., "expected": ...}')

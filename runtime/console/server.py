@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
+import os
+import socket
 import ssl
 import threading
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Self
 from wsgiref.simple_server import WSGIRequestHandler, make_server
@@ -37,6 +41,11 @@ IDENTITY = "lightpage.identity"
 """Key of a request's caller, an `Identity`, in its environment; it is not there without TLS."""
 _ACTION_BYTES = 1000
 _DRAINED_BYTES = 1 << 16
+MOST_CONNECTIONS = 64
+"""Connections that are answered at once: browsers, Prometheus, and those who say nothing."""
+LONGEST_S = 60.0
+"""For one connection: more than any answer takes, and too little to hold one for hours by a byte now and then."""
+_HANDSHAKE_S = 5.0
 POINTS = 600
 """Most points of a series."""
 RECENT = 50
@@ -99,7 +108,7 @@ class Console:
         if method == "POST" and path == "/actions":
             return self._act(environ, start_response, identity)
         if identity is not None and not identity.may(Role.READ):
-            return _refused(start_response, "403 Forbidden", f"{identity.name} has no role")
+            return _answer(start_response, "403 Forbidden", "text/plain", b"a certificate without a role\n", method)
         if method not in ("GET", "HEAD"):
             return _answer(start_response, "405 Method Not Allowed", "text/plain", b"GET and HEAD only\n", method)
         if path == "/metrics":
@@ -123,13 +132,16 @@ class Console:
         without asking first, which is refused, and says where a request comes from.
         """
         told = environ.get("CONTENT_LENGTH") or "0"
-        size = int(told) if told.isdecimal() else 0
-        content = environ["wsgi.input"].read(min(size, _DRAINED_BYTES))  # whoever is still sending hears no refusal
+        size = int(told) if told.isdecimal() and len(told) < 10 else 0
+        try:
+            content = environ["wsgi.input"].read(min(size, _DRAINED_BYTES))  # whoever is still sending hears no refusal
+        except OSError:
+            return _refused(start_response, "408 Request Timeout", "the rest did not come")
         if identity is None or self._actions is None:
             return _refused(start_response, "403 Forbidden", "actions need TLS, and a certificate with role admin")
         if environ.get("HTTP_ORIGIN", own := f"https://{environ.get('HTTP_HOST', '')}") != own:
             return _refused(start_response, "403 Forbidden", "actions are asked for from the console's own page")
-        if environ.get("CONTENT_TYPE", "") != "application/json":
+        if environ.get("CONTENT_TYPE", "").partition(";")[0].strip().lower() != "application/json":
             return _refused(start_response, "415 Unsupported Media Type", "application/json only")
         if not 0 < size <= _ACTION_BYTES:
             return _refused(start_response, "413 Content Too Large", f"1 to {_ACTION_BYTES} bytes only")
@@ -146,7 +158,7 @@ class Console:
         except Exception:
             _log.exception("console: action of %s", name)
             return _refused(start_response, "500 Internal Server Error", "see the log")
-        return _answer(start_response, "200 OK", "text/plain; charset=utf-8", f"{outcome}\n".encode(), "POST")
+        return _answer(start_response, "200 OK", "text/plain; charset=utf-8", _encoded(outcome), "POST")
 
     def _content(self, path: str, identity: Identity | None) -> tuple[bytes, str] | None:
         if path in _STATIC:
@@ -232,17 +244,47 @@ class ConsoleServer:
 
 
 class _Server(ThreadingWSGIServer):
-    """Takes each connection in a thread of its own, TLS included: a caller that says nothing holds up nobody."""
+    """Takes each connection in a thread of its own, TLS included: a caller that says nothing holds up nobody.
+
+    Beyond `MOST_CONNECTIONS` a connection is closed at once, and each is closed after `LONGEST_S`.
+    """
 
     certificates: Certificates | None = None
     """With which callers are met; None for no TLS."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Begin to answer a connection, if there is room for one more."""
+        if not self._room.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except BaseException:
+            self._room.release()
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer a connection, for a limited time."""
+        ending = threading.Timer(LONGEST_S, _cut_off, [socket.socket(fileno=os.dup(request.fileno()))])
+        ending.daemon = True
+        ending.start()
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            ending.cancel()
+            ending.args[0].close()  # type: ignore[index]  # it was given
+            self._room.release()
 
     def finish_request(self, request: Any, client_address: Any) -> None:
         """Answer the requests of a connection."""
         if self.certificates is None:
             super().finish_request(request, client_address)
             return
-        request.settimeout(_Handler.timeout)
+        request.settimeout(_HANDSHAKE_S)
         try:
             secured = self.certificates.context().wrap_socket(request, server_side=True)
         except (OSError, ValueError) as error:  # an SSLError is an OSError
@@ -261,6 +303,10 @@ class _Handler(WSGIRequestHandler):
 
     timeout = 20
     """A caller that says nothing is hung up on, seconds."""
+
+    def get_stderr(self) -> Any:
+        """Nowhere: a caller that hangs up is no fault, and what the console does not foresee it logs itself."""
+        return io.StringIO()
 
     def get_environ(self) -> WSGIEnvironment:
         """See `WSGIRequestHandler`."""
@@ -298,8 +344,19 @@ def _model(model: Model, current: bool) -> dict[str, Any]:
     }
 
 
+def _cut_off(connection: socket.socket) -> None:
+    """End a connection that another thread reads from."""
+    with suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
+
+
 def _refused(start: StartResponse, status: str, why: str) -> Iterable[bytes]:
-    return _answer(start, status, "text/plain; charset=utf-8", f"{why}\n".encode(), "POST")
+    return _answer(start, status, "text/plain; charset=utf-8", _encoded(why), "POST")
+
+
+def _encoded(text: str) -> bytes:
+    """A line, whatever a caller has put into it."""
+    return f"{text}\n".encode("utf-8", "backslashreplace")
 
 
 def _answer(start: StartResponse, status: str, kind: str, content: bytes, method: str) -> Iterable[bytes]:

@@ -88,11 +88,11 @@ class PhaseRefit:
 def _mean_distance(mu: NDArray[np.float64], kappa: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     """Distance of each phase to the levels about it, the mean over their posterior, radians [symbols]."""
     few = min(_NEIGHBOURS, max(0, round(2 * np.pi / step) - 1) // 2)
-    offsets = np.arange(-few, few + 1) * step
+    offsets = (np.arange(-few, few + 1) * step)[:, None]  # in rows: sums then go over whole arrays
     away = mu - np.rint(mu / step) * step
-    distance = (away[:, None] - offsets).astype(np.float32)
-    weight = np.exp(kappa[:, None].astype(np.float32) * (np.cos(distance) - np.cos(away)[:, None].astype(np.float32)))
-    return np.asarray((weight * distance).sum(axis=1) / weight.sum(axis=1), np.float64)
+    distance = (away - offsets).astype(np.float32)
+    weight = np.exp(kappa.astype(np.float32) * (np.cos(distance) - np.cos(away).astype(np.float32)))
+    return np.asarray((weight * distance).sum(axis=0) / weight.sum(axis=0), np.float64)
 
 
 def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,14 +6,20 @@ import logging
 import os
 import ssl
 import threading
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import grpc
+from cryptography import x509
+from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from lightpage.errors import InvalidInputError
 from runtime.wire.tls import Pem, TlsFiles
 
 _log = logging.getLogger(__name__)
+
+SOON = timedelta(days=14)
+"""A certificate that ends within this time is warned of."""
 
 _Stamp = tuple[tuple[int, int, int], ...]
 """Number, size and time of change of each file."""
@@ -36,7 +42,8 @@ class Certificates:
         self._files = files
         self._lock = threading.Lock()
         self._stamp = self._refused = self._stamp_now()
-        self._pem = files.read()
+        self._pem, self._context = files.read(), self._loaded()
+        _warn_of(self._pem)
 
     def pem(self) -> Pem:
         """Those that count now."""
@@ -44,8 +51,9 @@ class Certificates:
             stamp = self._stamp_now()
             if stamp not in (self._stamp, self._refused):
                 try:
-                    self._pem, self._stamp = self._files.read(), stamp
+                    self._pem, self._context, self._stamp = self._files.read(), self._loaded(), stamp
                     _log.info("certificates: read anew from %s", self._files.certificate)
+                    _warn_of(self._pem)
                 except InvalidInputError as error:
                     self._refused = stamp
                     _log.warning("certificates: the earlier ones stay: %s", error)
@@ -67,12 +75,24 @@ class Certificates:
 
     def context(self) -> ssl.SSLContext:
         """What an HTTP server meets the next caller with, who must have a certificate."""
-        pem = self.pem()
+        self.pem()
+        return self._context
+
+    def _loaded(self) -> ssl.SSLContext:
+        """The context of the files as they are.
+
+        Raises:
+            InvalidInputError: they have changed since they were read.
+        """
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.verify_mode = ssl.CERT_REQUIRED
-        context.load_verify_locations(cadata=pem.ca.decode("ascii"))
-        context.load_cert_chain(self._files.certificate, self._files.key)
+        try:
+            context.load_verify_locations(self._files.ca)
+            context.load_cert_chain(self._files.certificate, self._files.key)
+        except (OSError, ValueError) as error:
+            expected = "files that do not change while they are read"
+            raise InvalidInputError(f"certificate {self._files.certificate}", error, expected) from None
         return context
 
     def _stamp_now(self) -> _Stamp:
@@ -85,6 +105,21 @@ class Certificates:
             else:
                 found.append((status.st_ino, status.st_size, status.st_mtime_ns))
         return tuple(found)
+
+
+def _warn_of(pem: Pem) -> None:
+    """Say what callers will have against the service's own certificate."""
+    own = x509.load_pem_x509_certificate(pem.certificate)
+    left = own.not_valid_after_utc - datetime.now(UTC)
+    if left <= SOON:
+        state = "has expired" if left <= timedelta() else "expires soon"
+        _log.warning("certificates: that of the service %s, at %s", state, own.not_valid_after_utc.isoformat())
+    try:
+        usage = own.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    except x509.ExtensionNotFound:
+        return
+    if ExtendedKeyUsageOID.SERVER_AUTH not in usage:
+        _log.warning("certificates: that of the service is for callers; callers want extendedKeyUsage=serverAuth")
 
 
 def _configuration(pem: Pem, callers_too: bool) -> grpc.ServerCertificateConfiguration:

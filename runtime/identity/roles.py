@@ -84,15 +84,29 @@ class Identity:
 
 LOCAL = Identity("", frozenset(Role))
 """Whoever reaches a service that asks for no certificates: a process of this machine."""
+NOBODY = Identity("nobody", frozenset())
+"""Whoever has no certificate where one is asked for."""
 
 
 @lru_cache(CERTIFICATES_KEPT)
 def identity_of(certificate: bytes) -> Identity:
-    """The owner of a certificate, PEM or DER, that has been verified."""
+    """The owner of a certificate, PEM or DER, that has been verified.
+
+    Raises:
+        NotAllowedError: it cannot be read.
+    """
+    try:
+        return _identity_of(certificate)
+    except (ValueError, x509.DuplicateExtension, x509.UnsupportedGeneralNameType) as error:
+        raise NotAllowedError("certificate of the caller", error, "one that can be read") from None
+
+
+def _identity_of(certificate: bytes) -> Identity:
     is_pem = certificate.startswith(b"-----")
     read = x509.load_pem_x509_certificate(certificate) if is_pem else x509.load_der_x509_certificate(certificate)
     names = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     name = str(names[0].value) if names else f"certificate {read.serial_number:x}"
+    name = name if name.isprintable() else ascii(name)[1:-1]
     try:
         told = read.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         uris = told.get_values_for_type(x509.UniformResourceIdentifier)

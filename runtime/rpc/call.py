@@ -26,7 +26,7 @@ from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
 from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError
-from runtime.identity.roles import LOCAL, NEEDED, Identity, Role, identity_of
+from runtime.identity.roles import LOCAL, NEEDED, NOBODY, Identity, Role, identity_of
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call_log import CallLog, reason_told
 from runtime.service.caller import Actor, Caller
@@ -88,7 +88,8 @@ class Call:
 
     def own(self, name: str) -> str:
         """A name that the caller gave to a session or a request, where other callers' are others; empty for none."""
-        return f"{self.identity.name}/{name}" if name and self.identity.name else name
+        own = self.identity.name
+        return f"{len(own)}:{own}/{name}" if name and own else name
 
     @property
     def is_watch(self) -> bool:
@@ -136,6 +137,7 @@ class Dispatcher:
         limits: of the service.
         metrics: what is counted.
         traces: are told of every call, None for none.
+        secured: whether callers have certificates; then one without has no role.
     """
 
     def __init__(
@@ -145,7 +147,9 @@ class Dispatcher:
         limits: Limits,
         metrics: ServiceMetrics,
         traces: Traces | None = None,
+        secured: bool = False,
     ) -> None:
+        self._secured = secured
         self._services, self._pool, self._limits = tuple(services), pool, limits
         self._metrics, self._traces, self._log = metrics, traces, CallLog()
         self._full_names: dict[str, tuple[str, str]] = {}
@@ -288,7 +292,7 @@ class Dispatcher:
     async def _call(self, name: str, context: Any) -> AsyncIterator[Call]:
         """Admit a call, count it, and turn what it raises into its status."""
         caller = Caller(partial(_seconds_left, context))
-        call = Call(name, caller, self._pool, context.peer(), identity=_identity(context))
+        call = Call(name, caller, self._pool, context.peer())
         call.times = CallTimes(call.begun, partial(self._metrics.timed, name), MOST_PAGES if self._traces else 0)
         headers = dict(context.invocation_metadata() or ()) if self._traces else {}
         task = asyncio.current_task()
@@ -299,6 +303,7 @@ class Dispatcher:
         try:
             if self._refuses:
                 raise _stopping(name)
+            call.identity = self._identity(context)
             call.identity.check(NEEDED.get(name, Role.ADMIN), f"call {name}", time.time())
             if not call.is_watch and len(self._active) > self._limits.concurrent_calls:
                 got, expected = f"{len(self._active) - 1} at once", f"at most {self._limits.concurrent_calls}"
@@ -322,6 +327,17 @@ class Dispatcher:
             call.caller.leave()
             mine.discard(task)
             self._told.discard(task)
+
+    def _identity(self, context: Any) -> Identity:
+        """Who calls, by the certificate of the connection.
+
+        Raises:
+            NotAllowedError: a certificate that cannot be read.
+        """
+        found = context.auth_context().get("x509_pem_cert")
+        if found:
+            return identity_of(found[0])
+        return NOBODY if self._secured else LOCAL
 
     def _ended(self, call: Call, headers: dict[str, Any], code: grpc.StatusCode, error: BaseException | None) -> None:
         """Count a call, before its caller hears of its end."""
@@ -357,12 +373,6 @@ def _parsed(parse: Callable[[bytes], Any], data: bytes, call: Call) -> Any:
     call.correlation_id = getattr(message, "correlation_id", "") or call.correlation_id
     call.caller.actor = call.actor
     return message
-
-
-def _identity(context: Any) -> Identity:
-    """Who calls, by the certificate of the connection."""
-    found = context.auth_context().get("x509_pem_cert")
-    return identity_of(found[0]) if found else LOCAL
 
 
 def _stopping(name: str) -> StoppingError:

@@ -45,7 +45,7 @@ class CallLog:
         unforeseen = error if code is grpc.StatusCode.INTERNAL else None
         fields: dict[str, Any] = {
             "method": call.method,
-            "peer": call.peer,
+            "peer": call.actor.name,
             "correlation_id": call.correlation_id,
             "code": code.name,
             "reason": reason_told(error),

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from collections import defaultdict
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Collection, Mapping
 from contextlib import aclosing, asynccontextmanager
 from functools import partial
 from typing import Any
@@ -19,6 +18,8 @@ from runtime.service.limits import Limits
 from runtime.wire.status import status_of, told, trailers
 
 _LEAST_PLACES = 8
+_STREAM_PLACES = 64
+"""Senders of frames that may pause at once, whatever a message may weigh."""
 _SPARE_PLACES = 16
 """Beyond the calls at once: for those that are turned away, and those that are no load."""
 _RETRY_S = 1.0
@@ -29,23 +30,37 @@ class MessageGate(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]  # gene
 
     gRPC has one limit of a message's size for all methods, and takes any number of messages at once. Behind the gate, a
     message is read only once a service has a place for it; a service has as many places as messages of the largest size
-    fit into `Limits.receive_bytes`. Each service has its own: who stalls in one keeps nobody from another. A message
-    beyond the limit of its method is dropped as soon as it has come.
+    fit into `Limits.receive_bytes`. Each service has its own: who stalls in one keeps nobody from another. Its streams
+    have further ones, since their senders may pause: they keep no short call waiting. A message beyond the limit of its
+    method is dropped as soon as it has come.
 
     Args:
         limits: of the service.
         large: by the full name of a method that takes larger messages than others, e.g. ``"/package.Service/Method"``,
             the bytes of its largest one. It may take as long as a frame pair.
+        streams: full names of the methods whose callers send many messages.
     """
 
-    def __init__(self, limits: Limits, large: Mapping[str, int]) -> None:
+    def __init__(self, limits: Limits, large: Mapping[str, int], streams: Collection[str] = ()) -> None:
+        self._streams = frozenset(streams)
         self.limits, self.large = limits, large
         self.largest = max(limits.message_bytes, *large.values()) if large else limits.message_bytes
         """Bytes of the largest message of any method."""
         fitting = max(_LEAST_PLACES, limits.receive_bytes // self.largest)
-        self.places = min(limits.concurrent_calls + _SPARE_PLACES, fitting)
+        most = limits.concurrent_calls + _SPARE_PLACES
+        self.places = min(most, fitting)
         """Of each service."""
-        self._places: defaultdict[str, asyncio.Semaphore] = defaultdict(lambda: asyncio.Semaphore(self.places))
+        self.stream_places = min(most, max(fitting, _STREAM_PLACES))
+        """Of the streams of each."""
+        self._places: dict[tuple[str, bool], asyncio.Semaphore] = {}
+
+    def _places_of(self, method: str) -> asyncio.Semaphore:
+        """Those that a method shares with others."""
+        is_stream = method in self._streams
+        kind = method.strip("/").partition("/")[0], is_stream
+        if kind not in self._places:
+            self._places[kind] = asyncio.Semaphore(self.stream_places if is_stream else self.places)
+        return self._places[kind]
 
     async def intercept_service(
         self,
@@ -63,8 +78,7 @@ class MessageGate(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]  # gene
         if handler.response_streaming:
             make = grpc.stream_stream_rpc_method_handler
         through: Any = _generated if inspect.isasyncgenfunction(serve) else _answered
-        service = method.strip("/").partition("/")[0]
-        read = partial(_Messages, self, self._places[service], method, handler.request_deserializer)
+        read = partial(_Messages, self, self._places_of(method), method, handler.request_deserializer)
         return make(partial(through, serve, read, handler.request_streaming), None, handler.response_serializer)
 
 

@@ -144,7 +144,8 @@ class LightpageServer:
 
     async def _open(self) -> None:
         limits, metrics = self._plane.limits, self._plane.metrics
-        gate = MessageGate(limits, large_messages(self._plane) if self._inference else {})
+        sent = [f"/{SERVICE.full_name}/{method.name}" for method in SERVICE.methods if method.client_streaming]
+        gate = MessageGate(limits, large_messages(self._plane) if self._inference else {}, sent)
         self._server = grpc.aio.server(
             interceptors=(gate,),
             options=(
@@ -154,7 +155,9 @@ class LightpageServer:
                 ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
             ),
         )
-        self._dispatcher = Dispatcher(self._services, self._pool, limits, metrics, self._traces)
+        self._dispatcher = Dispatcher(
+            self._services, self._pool, limits, metrics, self._traces, secured=self._credentials is not None
+        )
         self._server.add_generic_rpc_handlers(self._dispatcher.rpc_handlers())
         if self._inference:
             self._server.add_generic_rpc_handlers((UnknownCalls(metrics),))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ _SLICE = 1 << 16
 """Typed elements that are taken at a time: the interpreter does nothing else meanwhile."""
 _LARGEST_COUNT = (1 << 32) - 1
 """Of a parameter: the fields that parameters stand for have 32 bits."""
+_FEW = 8
+"""Names or dimensions of a caller's that an error lists."""
 _TYPED_BYTES = {"bool_contents": 1, "uint_contents": 4}
 _ANY_BYTES = 16
 """Memory of a typed element, once parsed; of kinds that no input has, at most."""
@@ -92,8 +95,8 @@ def _check(tensor: Input, expected: Mapping[str, Tensor]) -> None:
     if known is None:
         raise InvalidInputError("inputs", repr(tensor.name), f"one of {', '.join(expected)}")
     if tensor.parameters:
-        raise InvalidInputError(f"{subject}.parameters", ", ".join(sorted(tensor.parameters)), "none")
-    if (tensor.datatype, tuple(tensor.shape)) != (known.datatype, known.shape):
+        raise InvalidInputError(f"{subject}.parameters", _few(tensor.parameters, len(tensor.parameters)), "none")
+    if tensor.datatype != known.datatype or len(tensor.shape) != len(known.shape) or tuple(tensor.shape) != known.shape:
         raise known.wrong(subject, _told(tensor.datatype, tensor.shape), known)
 
 
@@ -172,7 +175,7 @@ def outputs_of(request: Request, known: Collection[str], usual: Sequence[str]) -
         if output.name in names[:index]:
             raise InvalidInputError(f"outputs.{output.name}", "this tensor twice", "once")
         if output.parameters:
-            got = ", ".join(sorted(output.parameters))
+            got = _few(output.parameters, len(output.parameters))
             raise InvalidInputError(f"outputs.{output.name}.parameters", got, "none")
     return names or usual
 
@@ -219,4 +222,10 @@ def _parameter(value: Any) -> oip.InferParameter:
 
 
 def _told(datatype: str, shape: Sequence[int]) -> str:
-    return f"{datatype} [{', '.join(map(str, shape))}]"
+    return f"{datatype} [{_few(map(str, shape[:_FEW]), len(shape))}]"
+
+
+def _few(names: Iterable[str], count: int) -> str:
+    """A list for an error, of which a caller may have sent any number."""
+    told = ", ".join(islice(names, _FEW))
+    return told if count <= _FEW else f"{told} and {count - _FEW} more"

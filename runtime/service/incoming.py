@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Self
 
 from lightpage.errors import BusyError, LightpageError
-from runtime.bundle.signature import read_signature, signature_path
+from runtime.bundle.signature_file import read_signature, signature_path
 from runtime.errors import CallerLeft, StoreError
 from runtime.service.caller import Actor, Caller
 from runtime.service.dataplane import DataPlane

@@ -17,7 +17,7 @@ from lightpage.errors import BundleError, InvalidInputError, LimitError
 from lightpage.files import sync_folder
 from runtime.bundle.bundle import read_manifest
 from runtime.bundle.manifest import Manifest, check_version
-from runtime.bundle.signature import MOST_BYTES, signature_path
+from runtime.bundle.signature_file import MOST_BYTES, signature_path
 from runtime.decoding.decoder import Decoder
 from runtime.errors import CallerLeft, ModelExistsError, StoreError
 from runtime.service.audit import AuditLog
@@ -70,6 +70,7 @@ class Models:
         self.registry, self.store = registry, store
         self._most_bytes, self._in_service = most_bytes, in_service
         self._own_note = Note()
+        registry.made_here = lambda version: self._noted.origins.get(version) is Origin.RECALIBRATED
         self._noting = threading.RLock()
         """Held while the note is changed; taken after the registry's lock and before the store's."""
         self._uploading = threading.Lock()
@@ -262,7 +263,7 @@ class Models:
         Args:
             path: of the zip.
             here: called before it gets its name; what it raises leaves it as it is.
-            signature: of the zip, which is kept beside it; empty for none.
+            signature: of the zip, which is kept beside it where it was asked for; empty for none.
 
         Raises:
             StoreError: there is no store, or it cannot be written.
@@ -285,17 +286,17 @@ class Models:
                 raise ModelExistsError("new bundle: version", version, "one that the service does not have")
             here()
             try:
-                if signature:
-                    with signature_path(final).open("wb") as file:
-                        file.write(signature)
-                        file.flush()
-                        os.fsync(file.fileno())
                 os.link(path, final)  # fails where a rename would replace what came in the meantime
+                if self.registry.wants_signatures:
+                    _write_beside(signature_path(path), signature)
+                    os.replace(signature_path(path), signature_path(final))
                 sync_folder(store.folder)
             except FileExistsError:
                 expected = "one that the service does not have"
                 raise ModelExistsError("new bundle: version", version, expected) from None
             except OSError as error:
+                final.unlink(missing_ok=True)
+                signature_path(path).unlink(missing_ok=True)
                 raise store.failed(error) from None
         try:
             with self._noting:
@@ -408,6 +409,14 @@ class Models:
     @property
     def _room_bytes(self) -> int:
         return 2 * sum(map(len, self.registry.current.decoder.bundle.files.values()))
+
+
+def _write_beside(path: Path, data: bytes) -> None:
+    """Write a file that was not there before, and have it on the disk."""
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 class Upload:

@@ -9,7 +9,7 @@ import numpy as np
 
 from lightpage.errors import FrameError, LimitError
 from lightpage.recording.frame_pair import FramePair
-from runtime.errors import OverloadedError
+from runtime.errors import CallerLeft, OverloadedError
 
 _RETRY_S = 1.0
 
@@ -82,8 +82,10 @@ class PairReceiver:
         self.size = 2 * shape[0] * shape[1] * self._dtype.itemsize
         if self.size > max_bytes:
             raise LimitError("frame pair", f"{self.size} bytes", f"at most {max_bytes}")
+        self._lock = threading.Lock()
+        """Held while bytes are taken in, so that nobody lets go of them meanwhile."""
         self._buffer: np.ndarray[tuple[int], np.dtype[np.uint8]] | None = None
-        self._filled = 0
+        self._filled, self._closed = 0, False
 
     @property
     def filled(self) -> int:
@@ -101,16 +103,20 @@ class PairReceiver:
         Raises:
             FrameError: more bytes than the two frames have.
             OverloadedError: more than the budget has.
+            CallerLeft: it is closed.
         """
-        end = self._filled + len(chunk)
-        if end > self.size:
-            raise FrameError("frame pair", f"at least {end} bytes", f"{self.size} bytes, as the header says")
-        if self._budget is not None:
-            self._budget.take(len(chunk))
-        if self._buffer is None:
-            self._buffer = np.empty(self.size, np.uint8)
-        self._buffer[self._filled : end] = np.frombuffer(chunk, np.uint8)
-        self._filled = end
+        with self._lock:
+            if self._closed:
+                raise CallerLeft
+            end = self._filled + len(chunk)
+            if end > self.size:
+                raise FrameError("frame pair", f"at least {end} bytes", f"{self.size} bytes, as the header says")
+            if self._budget is not None:
+                self._budget.take(len(chunk))
+            if self._buffer is None:
+                self._buffer = np.empty(self.size, np.uint8)
+            self._buffer[self._filled : end] = np.frombuffer(chunk, np.uint8)
+            self._filled = end
 
     def checked(self) -> Self:
         """Itself, if every pixel has come.
@@ -138,7 +144,9 @@ class PairReceiver:
         return FramePair(in_phase, quadrature)
 
     def close(self) -> None:
-        """Give back what it took from the budget."""
-        if self._budget is not None:
-            self._budget.give_back(self._filled)
-        self._filled, self._buffer = 0, None
+        """Give back what it took from the budget, and take no more."""
+        with self._lock:
+            self._closed = True
+            if self._budget is not None:
+                self._budget.give_back(self._filled)
+            self._filled, self._buffer = 0, None

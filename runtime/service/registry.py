@@ -11,7 +11,7 @@ from pathlib import Path
 from lightpage.errors import BundleError, CalibrationError, RecalibrationRefusedError
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import Manifest
-from runtime.bundle.signature import BundleKey, signature_path
+from runtime.bundle.signature import BundleKey
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker, Tracker
 from runtime.errors import ModelExistsError, OtherModelError
@@ -129,6 +129,9 @@ class ModelRegistry:
         make_tracker: makes the tracker of each model.
         kept: models held loaded at most; others of the history are loaded again when they are gone to.
         key: that bundles must be signed with which come from elsewhere; None for none.
+
+    Attributes:
+        made_here: says of a version whether this service has made it: then it needs no signature.
     """
 
     def __init__(
@@ -139,6 +142,7 @@ class ModelRegistry:
         key: BundleKey | None = None,
     ) -> None:
         self._make_tracker, self._kept, self._key = make_tracker, kept, key
+        self.made_here: Callable[[str], bool] = lambda version: False
         self._changing = threading.Lock()
         """Held from the checks of a change to its end, its note included; taken before the lock below."""
         self._lock = threading.Lock()
@@ -273,6 +277,11 @@ class ModelRegistry:
                 with self._lock:
                     self._history = history
 
+    @property
+    def wants_signatures(self) -> bool:
+        """Whether bundles that come from elsewhere must be signed."""
+        return self._key is not None
+
     def opened(self, path: Path, signature: bytes = b"") -> Decoder:
         """The decoder of a bundle that comes from elsewhere.
 
@@ -299,10 +308,10 @@ class ModelRegistry:
             held = self._loaded.get(place.version)
         if held is not None:
             return held
-        if place == self.base or signature_path(place.path).exists():
-            decoder = self.opened(place.path)
-        else:  # what the service has made itself has no signature
+        if place != self.base and self.made_here(place.version):
             decoder = self.current.decoder.of_another(Bundle.open(place.path))
+        else:
+            decoder = self.opened(place.path)
         if decoder.version != place.version:
             raise BundleError(f"{decoder.bundle.subject}: version", decoder.version, place.version)
         return self._tracked(decoder)

@@ -16,15 +16,18 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from lightpage.errors import InvalidInputError, LightpageError, LimitError
 from runtime.errors import OverloadedError
+from runtime.wire.address import check_free
 from runtime.wire.shared_memory import GRANTED, HANDLE_BYTES, REFUSED, SIZE, WHY_BYTES
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 """Nobody changes the size of a region any more: reading beyond the end of a shrunken one would end the service."""
 _LOOK_S = 0.1
+_PAUSE_S = 0.01
+"""After trouble, so that one that lasts takes no core."""
 _RETRY_S = 1.0
 
 _log = logging.getLogger(__name__)
@@ -152,10 +155,11 @@ class SharedMemory:
         """
         if not hasattr(os, "memfd_create"):
             raise InvalidInputError("service.shared_memory", "a system without memfd_create", "Linux")
+        check_free("socket", f"unix:{self._path}")
         self._socket = socket.socket(socket.AF_UNIX)
         try:
             with suppress(FileNotFoundError):
-                self._path.unlink()  # left behind; the service's own socket beside it was found free
+                self._path.unlink()  # left behind by a process that was killed
             self._socket.bind(str(self._path))
             self._socket.listen()
         except OSError as error:
@@ -180,24 +184,29 @@ class SharedMemory:
             selector.register(self._socket, selectors.EVENT_READ)
             while not self._stopping.is_set():
                 for key, _ in selector.select(_LOOK_S):
-                    if key.fileobj is self._socket:
-                        self._accept(selector, clients)
-                    else:
-                        connection: socket.socket = key.fileobj  # type: ignore[assignment]  # it was registered as one
-                        if not self._hear(connection, clients[connection]):
-                            self._hang_up(selector, connection, clients)
+                    try:
+                        self._serve(key.fileobj, selector, clients)
+                    except Exception:  # one client's trouble is nobody else's
+                        _log.exception("shared memory: a client could not be served")
+                        self._stopping.wait(_PAUSE_S)
                 late = time.monotonic() - self._silence_s
                 for connection in [one for one, client in clients.items() if not client.region and client.begun < late]:
                     self._hang_up(selector, connection, clients)
             for connection in list(clients):
                 self._hang_up(selector, connection, clients)
 
+    def _serve(self, source: Any, selector: selectors.BaseSelector, clients: dict[socket.socket, _Client]) -> None:
+        if source is self._socket:
+            self._accept(selector, clients)
+        elif not self._hear(source, clients[source]):
+            self._hang_up(selector, source, clients)
+
     def _accept(self, selector: selectors.BaseSelector, clients: dict[socket.socket, _Client]) -> None:
         try:
             connection, _ = self._socket.accept()
         except OSError as error:  # the client has gone, or there are too many files
             _log.warning("shared memory: a client is not taken: %s", error.strerror or error)
-            self._stopping.wait(0.01)
+            self._stopping.wait(_PAUSE_S)
             return
         connection.setblocking(False)
         if len(clients) >= 2 * self._most_regions:

@@ -13,7 +13,7 @@ class Stage(StrEnum):
     """A part of a page's way through the service."""
 
     RECEIVE = "receive"
-    """Its frames come: from the caller, its wait to send them counted, black level taken off; or from the cameras."""
+    """Its frames come: from the caller, whose wait to send them counts, black level taken off; or from cameras."""
     QUEUE = "queue"
     """It waits: for a slot, for that of a range, for pairs before it in its call, for the same request in another."""
     INFERENCE = "inference"

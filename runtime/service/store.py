@@ -22,7 +22,7 @@ from lightpage.errors import BundleError, InvalidInputError
 from lightpage.files import replace_text
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import sha256
-from runtime.bundle.signature import signature_path
+from runtime.bundle.signature_file import signature_path
 from runtime.errors import StoreError
 from runtime.recalibration.separate_process import SCRATCH
 

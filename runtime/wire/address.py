@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import ipaddress
+import os
 import re
 import socket
 from pathlib import Path
@@ -70,6 +71,8 @@ def _check_socket_free(subject: str, path: str) -> None:
     folder, at = Path(path).parent, Path(path)
     if not folder.is_dir():
         raise InvalidInputError(subject, f"no folder {folder}", "a socket's path in a folder that is there")
+    if not os.access(folder, os.W_OK):
+        raise InvalidInputError(subject, f"a folder {folder} that cannot be written", "one where a socket can be made")
     if not at.exists():
         return
     if not at.is_socket():

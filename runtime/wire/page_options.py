@@ -34,7 +34,10 @@ def options_message(levels: int, options: PageOptions) -> pb.DecodeOptions:
 
     Raises:
         InvalidInputError: values that no message can hold.
+        TypeError: an option that there is not.
     """
+    if unknown := sorted(options.keys() - PageOptions.__annotations__.keys()):
+        raise TypeError(f"unexpected option {', '.join(unknown)}: there are {', '.join(PageOptions.__annotations__)}")
     quantised, stateless = options.get("quantised", False), options.get("stateless", False)
     return message_of(
         pb.DecodeOptions,

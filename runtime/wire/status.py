@@ -126,6 +126,9 @@ _REASONS: dict[Reason, Any] = {reason: pb.LossReason.Value(f"LOSS_REASON_{reason
 _FIELD = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 """The name of a field, as those have that are about one."""
 
+_TOLD, _LOOKED_AT = 1000, 4000
+"""Characters of each part of an error that a caller hears, and of which folders are cut out: a caller's own text may be
+millions of them."""
 _FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")
 """The folders of an absolute path, up to its last name."""
 
@@ -162,7 +165,8 @@ def without_folders(text: str) -> str:
 
 def detail_of(error: LightpageError) -> pb.ErrorDetail:
     """A foreseen error as its message, files named without their folders."""
-    subject, got, expected = (without_folders(text)[:1000] for text in (error.subject, error.got, error.expected))
+    parts = (error.subject, error.got, error.expected)
+    subject, got, expected = (without_folders(text[:_LOOKED_AT])[:_TOLD] for text in parts)
     exact = type(error).__name__
     kind = next(known.__name__ for known in type(error).__mro__ if known.__name__ in _EARLIER_KINDS)
     detail = pb.ErrorDetail(kind=kind, thing=subject, got=got, wanted=expected)
@@ -246,7 +250,11 @@ def error_of(rpc: grpc.RpcError, target: str) -> LightpageError:
     if code == grpc.StatusCode.RESOURCE_EXHAUSTED:
         return LimitError(subject, text, "a smaller or a later request")
     if code == grpc.StatusCode.UNAVAILABLE:
-        return LightpageError(subject, f"no connection ({text})", "a running Lightpage service at this address")
+        return LightpageError(
+            subject,
+            f"no connection ({text})",
+            "a running Lightpage service at this address, and certificates where it asks for them",
+        )
     if code == grpc.StatusCode.UNIMPLEMENTED:
         return LightpageError(subject, f"no such call ({text})", "a Lightpage service, of this version or a later one")
     if code == grpc.StatusCode.DEADLINE_EXCEEDED:

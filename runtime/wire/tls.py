@@ -30,9 +30,9 @@ class TlsFiles:
         key: its private key, PEM, without a password.
     """
 
-    ca: Path
-    certificate: Path
-    key: Path
+    ca: Path | str
+    certificate: Path | str
+    key: Path | str
 
     def read(self) -> Pem:
         """Read the files.
@@ -40,11 +40,11 @@ class TlsFiles:
         Raises:
             InvalidInputError: one cannot be read, or holds no certificate, or the key belongs to another certificate.
         """
-        pem = Pem(*(_read(name, path) for name, path in vars(self).items()))
+        pem = Pem(*(_read(name, Path(path)) for name, path in vars(self).items()))
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
-            context.load_verify_locations(cadata=pem.ca.decode("ascii", "replace"))
-        except (ssl.SSLError, ValueError):
+            context.load_verify_locations(self.ca)
+        except (OSError, ValueError):  # an SSLError is an OSError
             raise InvalidInputError(f"ca {self.ca}", "no certificate", "certificates of authorities, PEM") from None
         try:
             context.load_cert_chain(self.certificate, self.key, password=_no_password)

@@ -12,7 +12,8 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 
 from lightpage.errors import BundleError, InvalidInputError
 from runtime.bundle.bundle import Bundle
-from runtime.bundle.signature import BundleKey, signature_path
+from runtime.bundle.signature import BundleKey
+from runtime.bundle.signature_file import signature_path
 
 
 class Signer:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -68,3 +70,15 @@ def test_a_source_that_has_nothing_to_show_is_told(
         assert not caplog.records
         serve_module._source("camera:mine.toml", None, decoder)
     assert "camera:mine.toml shows pages and has none" in caplog.text
+
+
+def test_a_thread_that_does_not_end_does_not_keep_the_process() -> None:
+    program = """
+import threading
+from runtime.commands import serve
+serve._REST_S = 0.1
+threading.Thread(target=threading.Event().wait, args=(300,), name="hung").start()
+serve._leave_the_rest()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, "hung was still at work" in done.stderr) == (0, True), done.stderr

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
 import ssl
 import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -112,6 +114,7 @@ def test_without_tls_there_are_no_actions(toy_zip: Path) -> None:
         ({"action": "format", "expected": "toy-2"}, {}, 400),
         ({"action": ["roll back"], "expected": "toy-2"}, {}, 400),
         ({"action": "roll back", "expected": ""}, {}, 400),
+        ({"action": "roll back", "expected": "\ud800"}, {}, 409),
         ("roll back", {}, 400),
     ],
 )
@@ -123,8 +126,6 @@ def test_other_requests_change_nothing(
 
 
 def test_a_caller_who_says_nothing_holds_up_nobody(secured: Stage, authority: Authority) -> None:
-    import socket
-
     with socket.create_connection(("localhost", secured.server.port)):
         assert asked(secured, authority.caller("watcher", ["read"]), "/metrics", None)[0] == 200
 
@@ -135,3 +136,62 @@ def test_callers_without_a_certificate_get_no_answer(secured: Stage, authority: 
     with pytest.raises((ssl.SSLError, ConnectionError, http.client.HTTPException)):
         asked(secured, wrong)
     assert secured.plane.registry.current.version == "toy-2"
+
+
+def test_a_body_that_does_not_come_is_refused_and_nothing_else_is_said(
+    toy_zip: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("runtime.console.server._Handler.timeout", 0.2)
+    with stage(toy_zip) as running, socket.create_connection(("localhost", running.server.port)) as connection:
+        connection.sendall(b"POST /actions HTTP/1.1\r\nContent-Length: 100\r\n\r\nx")
+        assert b"408 Request Timeout" in connection.recv(1000)
+    assert capfd.readouterr().err == ""
+
+
+def test_nested_json_is_bad_json(secured: Stage, authority: Authority) -> None:
+    tls = authority.caller("operator 7", ["admin"])
+    context = ssl.create_default_context(cafile=str(tls.ca))
+    context.load_cert_chain(tls.certificate, tls.key)
+    connection = http.client.HTTPSConnection("localhost", secured.server.port, timeout=20, context=context)
+    connection.request("POST", "/actions", b"[" * 999, {"Content-Type": "application/json"})
+    assert connection.getresponse().status == 400
+    connection.close()
+
+
+def test_connections_are_bounded_in_number_and_in_time(toy_zip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runtime.console.server.MOST_CONNECTIONS", 3)
+    monkeypatch.setattr("runtime.console.server.LONGEST_S", 0.5)
+    with stage(toy_zip) as running:
+        place = ("localhost", running.server.port)
+        silent = [socket.create_connection(place) for _ in range(3)]
+        with socket.create_connection(place) as late:
+            late.settimeout(10)
+            assert late.recv(1) == b"", "there is no room for a fourth one"
+        for connection in silent:
+            connection.settimeout(10)
+            assert connection.recv(1) == b"", "it was held for long enough"
+            connection.close()
+        until = time.monotonic() + 10
+        while time.monotonic() < until:
+            try:
+                with urllib.request.urlopen(f"{running.url}/metrics", timeout=10) as reply:
+                    assert reply.status == 200
+                    break
+            except OSError:  # the threads of the others have not all ended yet
+                time.sleep(0.01)
+        else:
+            pytest.fail("nobody is answered any more")
+
+
+def test_a_caller_that_hangs_up_is_no_fault(
+    secured: Stage, authority: Authority, capfd: pytest.CaptureFixture[str]
+) -> None:
+    tls = authority.caller("watcher", ["read"])
+    context = ssl.create_default_context(cafile=str(tls.ca))
+    context.load_cert_chain(tls.certificate, tls.key)
+    for _ in range(5):
+        raw = socket.create_connection(("localhost", secured.server.port))
+        with context.wrap_socket(raw, server_hostname="localhost") as connection:
+            connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+    assert asked(secured, tls, "/metrics", None)[0] == 200
+    assert capfd.readouterr().err == ""

@@ -34,10 +34,10 @@ class Authority:
         builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         (self.folder / "ca.pem").write_bytes(_pem(builder.sign(self._key, hashes.SHA256())))
 
-    def service(self, name: str = "service") -> TlsFiles:
+    def service(self, name: str = "service", valid_for: timedelta = 90 * _DAY) -> TlsFiles:
         """A certificate for a server on this machine."""
         names = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
-        return self._issue(name, names, ExtendedKeyUsageOID.SERVER_AUTH, _DAY)
+        return self._issue(name, names, ExtendedKeyUsageOID.SERVER_AUTH, valid_for)
 
     def caller(self, name: str, roles: Sequence[str] = (), valid_for: timedelta = _DAY) -> TlsFiles:
         """A certificate for a caller."""

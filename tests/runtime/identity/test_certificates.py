@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -87,6 +88,25 @@ def test_half_replaced_files_leave_the_earlier_ones(authority: Authority, caplog
     assert certificates.pem() is not before
 
 
+def test_authorities_may_have_comments_of_any_letters(authority: Authority) -> None:
+    files = authority.service()
+    files.ca.write_bytes("Autorité de l’appareil, 設備\n".encode() + files.ca.read_bytes())
+    certificates = Certificates(files)
+    assert certificates.context().get_ca_certs()
+    assert files.client_context().get_ca_certs()
+
+
+def test_the_console_keeps_the_earlier_certificates_too(authority: Authority) -> None:
+    files, newer = authority.service(), authority.service("newer")
+    certificates = Certificates(files)
+    before = certificates.context()
+    assert certificates.context() is before
+    os.replace(newer.certificate, files.certificate)
+    assert certificates.context() is before
+    os.replace(newer.key, files.key)
+    assert certificates.context() is not before
+
+
 def test_the_commands_for_operators_make_good_certificates(tmp_path: Path) -> None:
     commands, _ = documented()
     subprocess.run(["bash", "-c", f"set -e\n{commands}"], cwd=tmp_path, check=True, capture_output=True, timeout=60)
@@ -101,3 +121,16 @@ def test_the_commands_for_operators_make_good_certificates(tmp_path: Path) -> No
 def _replace(files: TlsFiles, newer: TlsFiles) -> None:
     shutil.copy(newer.certificate, files.certificate)
     shutil.copy(newer.key, files.key)
+
+
+@pytest.mark.parametrize(("days", "told"), [(-1, "has expired"), (13, "expires soon"), (15, "")])
+def test_a_certificate_that_ends_is_warned_of(
+    authority: Authority, caplog: pytest.LogCaptureFixture, days: int, told: str
+) -> None:
+    Certificates(authority.service(valid_for=timedelta(days=days)))
+    assert (told in caplog.text) if told else not caplog.records
+
+
+def test_a_certificate_for_callers_is_warned_of(authority: Authority, caplog: pytest.LogCaptureFixture) -> None:
+    Certificates(authority.caller("caller", ["read"], timedelta(days=90)))
+    assert "serverAuth" in caplog.text

@@ -44,6 +44,18 @@ def test_a_certificate_that_ends_while_connected_is_refused(tmp_path: Path) -> N
         identity.check(Role.READ, "call X", identity.until)
 
 
+def test_a_name_cannot_make_a_line_of_its_own(tmp_path: Path) -> None:
+    authority = Authority(tmp_path)
+    authority.caller("a\nFAKE\x1b[31m", ["read"]).certificate.rename(tmp_path / "odd.pem")
+    assert identity_of((tmp_path / "odd.pem").read_bytes()).name == "a\\nFAKE\\x1b[31m"
+
+
+def test_what_is_no_certificate_is_refused() -> None:
+    for data in (b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n", b"\x30\x03abc"):
+        with pytest.raises(NotAllowedError, match="certificate of the caller"):
+            identity_of(data)
+
+
 def test_who_needs_no_certificate_may_do_everything() -> None:
     assert all(LOCAL.may(role) for role in Role)
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import grpc
@@ -18,14 +20,15 @@ from runtime.client.client import LightpageClient
 from runtime.commands.healthcheck import is_serving
 from runtime.errors import NotAllowedError
 from runtime.identity.certificates import Certificates
-from runtime.identity.roles import NEEDED, Role
+from runtime.identity.roles import NEEDED, Identity, Role
 from runtime.pb.inference import open_inference_pb2_grpc as oip_grpc
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.rpc.call import SERVICE
+from runtime.rpc.call import SERVICE, Call
 from runtime.rpc.health_server import HealthServer
 from runtime.rpc.inference_calls import INFERENCE, PREFIX
 from runtime.rpc.server import LightpageServer
 from runtime.service.audit import AuditLog
+from runtime.service.caller import Caller
 from runtime.wire.channel import open_channel
 from runtime.wire.tls import TlsFiles
 from tests.runtime.identity.authority import Authority
@@ -134,7 +137,37 @@ def test_callers_of_other_names_share_no_session_and_no_request_id(secured: Runn
             answers.append(client.read_page(request_id="shot"))
     assert [answer.replayed for answer in answers] == [False, False, True]
     assert answers[0].page == answers[2].page != answers[1].page
-    assert {name.partition("/")[0] for name in secured.plane.registry.current.sessions._trackers} == {"one", "two"}
+    assert set(secured.plane.registry.current.sessions._trackers) == {"3:one/a", "3:two/a"}
+
+
+def test_names_and_ids_that_look_alike_are_told_apart(secured: Running) -> None:
+    def own(name: str, given: str) -> str:
+        identity = Identity(name, frozenset(Role))
+        return Call("ReadPage", Caller(), ThreadPoolExecutor(1), identity=identity).own(given)
+
+    assert own("line", "7/job") != own("line/7", "job")
+    assert own("", "job") == "job"
+    assert own("line", "") == ""
+
+
+def test_without_a_certificate_a_secured_service_lets_nobody_do_anything(secured: Running) -> None:
+    dispatcher = secured.server._dispatcher
+    context = SimpleNamespace(auth_context=dict)
+    assert not any(dispatcher._identity(context).may(role) for role in Role)
+    dispatcher._secured = False
+    assert all(dispatcher._identity(context).may(role) for role in Role)
+
+
+def test_a_certificate_that_cannot_be_read_is_refused_and_counted(
+    secured: Running, authority: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(_: bytes) -> Identity:
+        raise NotAllowedError("certificate of the caller", "nonsense", "one that can be read")
+
+    monkeypatch.setattr("runtime.rpc.call.identity_of", damaged)
+    tls = authority.caller("good", ["admin"])
+    assert ended(secured.server.target, tls) is grpc.StatusCode.PERMISSION_DENIED
+    assert secured.count("lightpage_calls_total", method="ReadPage", code="PERMISSION_DENIED") == 1
 
 
 def test_new_certificates_count_without_a_restart(start: Start, authority: Authority, tmp_path: Path) -> None:

@@ -263,6 +263,12 @@ WRONG: dict[str, tuple[Change, str, str, str]] = {
     "type": (lambda r: setattr(r.inputs[0], "datatype", "UINT16"), "inputs.in_phase", "UINT16", "FRAME_FORMAT"),
     "shape": (lambda r: r.inputs[1].shape.reverse(), "inputs.quadrature", r"\[96, 64\]", "FRAME_FORMAT"),
     "batch": (lambda r: r.inputs[1].shape.insert(0, 1), "inputs.quadrature", r"\[1, 64, 96\]", "FRAME_FORMAT"),
+    "dimensions without end": (
+        lambda r: r.inputs[1].shape.extend([1] * 100_000),
+        "inputs.quadrature",
+        "and 99994 more",
+        "FRAME_FORMAT",
+    ),
     "negative": (lambda r: r.inputs[1].shape.__setitem__(0, -64), "inputs.quadrature", "-64", "FRAME_FORMAT"),
     "short": (lambda r: r.raw_input_contents.__setitem__(0, b"1"), "inputs.in_phase", "1 bytes", "FRAME_FORMAT"),
     "one content": (lambda r: r.raw_input_contents.pop(), "raw_input_contents", "1 of them", ""),

@@ -58,6 +58,7 @@ def test_there_are_places_for_what_fits_into_the_budget() -> None:
     assert (full_size.largest, full_size.places) == (80 << 20, 12)
     assert MessageGate(Limits(), {LARGE: 1 << 30}).places == 8
     assert MessageGate(Limits(), {LARGE: 10}).largest == 4 << 20
+    assert (full_size.stream_places, MessageGate(Limits(), {}).stream_places) == (64, 192 + 16)
 
 
 def test_each_method_has_its_limit() -> None:
@@ -143,3 +144,18 @@ def test_a_service_of_the_library_gets_its_messages_parsed() -> None:
             await answer(gate, messages())
 
     asyncio.run(all_of_it())
+
+
+def test_senders_who_pause_keep_no_short_call_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(message_gate, "_LEAST_PLACES", 1)
+    monkeypatch.setattr(message_gate, "_STREAM_PLACES", 1)
+    gate = MessageGate(Limits(message_bytes=4, receive_bytes=1, pair_bytes=1, stall_s=5.0), {LARGE: 10}, [LARGE])
+
+    async def both() -> None:
+        never = asyncio.Event()
+        pausing = asyncio.ensure_future(answer(gate, messages(then=never.wait()), LARGE))
+        await asyncio.sleep(0)
+        assert await asyncio.wait_for(answer(gate, messages(b"abcd")), 1.0) == b"ABCD"
+        pausing.cancel()
+
+    asyncio.run(both())

@@ -46,7 +46,7 @@ from runtime.service.limits import Limits
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import KEPT_MODELS, ModelRegistry
 from runtime.wire.messages import KnownPilots
-from runtime.wire.status import without_folders
+from runtime.wire.status import detail_of, without_folders
 from tests.runtime import toy
 from tests.runtime.rpc.stage import Running, Start, a_page, wait_until
 
@@ -418,6 +418,15 @@ def test_a_damaged_recording_on_the_server_is_the_services_own_fault(start: Star
 )
 def test_errors_name_files_without_their_folders(text: str, told: str) -> None:
     assert without_folders(text) == told
+
+
+def test_an_error_of_any_length_is_cut_before_it_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_at: list[int] = []
+    monkeypatch.setattr("runtime.wire.status.without_folders", lambda text: looked_at.append(len(text)) or text)
+    error = LightpageError("a" * 5_000_000, "b" * 5_000_000, "c" * 5_000_000)
+    detail = detail_of(error)
+    assert (len(detail.thing), len(detail.got), len(detail.wanted)) == (1000, 1000, 1000)
+    assert max(looked_at) <= 4000
 
 
 def test_health_is_served_beside_the_service_and_ends_first(start: Start) -> None:

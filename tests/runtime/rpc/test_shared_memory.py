@@ -22,6 +22,7 @@ from runtime.client.shared_memory import SharedMemory as ClientMemory
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.server import LightpageServer
+from runtime.service.receiver import PairReceiver
 from runtime.service.shared_memory import Region, SharedMemory
 from runtime.wire.channel import open_channel
 from runtime.wire.shared_memory import HANDLE_BYTES, SIZE, memory_path
@@ -158,7 +159,7 @@ def test_a_region_that_is_dropped_while_it_is_read_stays_until_then() -> None:
 
 def test_memory_is_bounded(service: Running) -> None:
     target = service.server.target
-    for size in (0, 4 * PAIR + 1, (1 << 64) - 1):
+    for size in (4 * PAIR + 1, (1 << 63) - 1):
         with pytest.raises(LightpageError, match=f"{size} bytes, wanted 1 to {4 * PAIR}"):
             ClientMemory(target, size)
     with ClientMemory(target, 3 * PAIR), pytest.raises(LightpageError, match="try again later"):
@@ -209,6 +210,55 @@ def test_contents_that_change_while_they_are_decoded_harm_nobody(service: Runnin
             thread.join()
         memory.write(pair)
         assert service.client.decode(pair, 16, memory=memory).model_version == "toy-1"
+
+
+def test_a_call_that_is_cancelled_while_it_is_copied_gives_its_memory_back(
+    service: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copying, go_on = threading.Event(), threading.Event()
+    add = PairReceiver.add
+
+    def slow(receiver: PairReceiver, chunk: bytes | memoryview) -> None:
+        copying.set()
+        go_on.wait(10)
+        add(receiver, chunk)
+
+    monkeypatch.setattr(PairReceiver, "add", slow)
+    with service.client.share_memory() as memory, open_channel(service.server.target) as channel:
+        memory.write(a_page()[1])
+        request = pb.DecodeFramesRequest(header=header(memory.handle))
+        call = pb_grpc.LightpageStub(channel).DecodeFrames.future(iter([request]), timeout=10)
+        assert copying.wait(10)
+        call.cancel()
+        assert wait_until(lambda: not service.count("lightpage_calls_in_flight"))
+        go_on.set()
+        monkeypatch.undo()
+        assert service.client.decode(a_page()[1], 16, memory=memory).model_version == "toy-1"
+    assert service.plane.received.used == 0
+
+
+def test_two_pairs_of_one_region_are_told_apart(service: Running) -> None:
+    (first, one), (second, two) = a_page(seed=3), a_page(seed=4)
+    with service.client.share_memory(2 * PAIR) as memory:
+        inside = [memory.frames(toy.SHAPE, "uint8", offset) for offset in (0, PAIR)]
+        for frames, pair in zip(inside, (one, two), strict=True):
+            frames.in_phase[...], frames.quadrature[...] = pair.in_phase, pair.quadrature
+        assert (service.client.decode(inside[1], 16, memory=memory).symbols == second).all()
+        assert (service.client.decode(inside[0], 16, memory=memory).symbols == first).all()
+
+
+@pytest.mark.parametrize("size", [-1, 1 << 63, 1 << 64])
+def test_an_impossible_size_is_named(service: Running, size: int) -> None:
+    with pytest.raises(InvalidInputError, match="size of shared memory"):
+        ClientMemory(service.server.target, size)
+
+
+def test_what_lies_where_the_socket_would_be_stays(tmp_path: Path) -> None:
+    path = tmp_path / "s.memory"
+    path.write_text("mine")
+    with pytest.raises(InvalidInputError, match="something that is no socket"), SharedMemory(str(path), 1, 1, 1.0):
+        pass
+    assert path.read_text() == "mine"
 
 
 def test_a_service_without_shared_memory_says_so(start: Start, tmp_path: Path) -> None:

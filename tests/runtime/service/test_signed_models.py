@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import pytest
 
 from lightpage.errors import BundleError
 from runtime.bundle.bundle import Bundle
-from runtime.bundle.signature import BundleKey, signature_path
+from runtime.bundle.signature import BundleKey
+from runtime.bundle.signature_file import signature_path
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.rpc.server import LightpageServer
@@ -99,6 +101,40 @@ def test_a_stored_bundle_that_was_changed_is_refused(service: Signed, tmp_path: 
     stored.write_bytes(toy.write_toy_bundle(tmp_path / "other.zip", kappa=1.0, version="toy-2").read_bytes())
     with pytest.raises(BundleError, match="of another bundle or key"):
         service.plane.models.activate("toy-2")
+
+
+def test_a_bundle_that_somebody_puts_into_the_store_needs_one(service: Signed, tmp_path: Path) -> None:
+    toy.write_toy_bundle(tmp_path / "store" / "toy-7.zip", version="toy-7")
+    toy.write_toy_bundle(tmp_path / "store" / "toy-1+r9.zip", version="toy-1+r9")
+    good = service.bundle("toy-2", signed=True)
+    service.plane.models.take_in(good, signature=signature_path(good).read_bytes())
+    signature_path(tmp_path / "store" / "toy-2.zip").unlink()
+    for version in ("toy-7", "toy-1+r9", "toy-2"):
+        with pytest.raises(BundleError, match="signature: got none"):
+            service.plane.models.activate(version)
+
+
+def test_without_a_key_no_signature_is_kept(toy_zip: Path, tmp_path: Path) -> None:
+    registry = ModelRegistry(Decoder.load(toy_zip, threads=1))
+    plane = DataPlane(registry, store=ModelStore(tmp_path / "store", registry.current.decoder.bundle))
+    plane.models.take_in(toy.write_toy_bundle(tmp_path / "new.zip", version="toy-2"), signature=b"anything")
+    assert sorted(path.name for path in (tmp_path / "store").glob("*toy*")) == ["toy-2.zip"]
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
+def test_a_signature_that_is_no_plain_file_is_refused(service: Signed, kind: str) -> None:
+    incoming = service.folder / "incoming"
+    incoming.mkdir()
+    secret = service.folder / "secret"
+    secret.write_bytes(b"a private key")
+    path = toy.write_toy_bundle(incoming / "toy-2.zip", version="toy-2")
+    make = {"link": lambda at: at.symlink_to(secret), "pipe": os.mkfifo, "folder": Path.mkdir}
+    make[kind](signature_path(path))
+    taking = Incoming(service.plane, incoming)
+    taking.look()
+    taking.look()
+    assert set(service.plane.models.versions()) == {"toy-1"}
+    assert not list((service.folder / "store").glob("*.sig"))
 
 
 def test_its_own_models_need_none(service: Signed, tmp_path: Path) -> None:
