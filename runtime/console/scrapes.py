@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from urllib.error import URLError
+from urllib.error import HTTPError, URLError
 from urllib.request import HTTPSHandler, ProxyHandler, build_opener
 
 from prometheus_client.parser import text_string_to_metric_families
@@ -19,6 +19,8 @@ WINDOW_S = 60.0
 """Rates and times are those of so many seconds, once it has been scraped for so long."""
 _ANSWER_S = 5.0
 _MOST_BYTES = 16 << 20
+_SAID_BYTES = 200
+"""Of a refusal's text."""
 _SERVES = "lightpage_calls_in_flight"
 """A metric that every service has from its start."""
 
@@ -77,6 +79,10 @@ def scrape(address: str, tls: TlsFiles | None = None) -> Scrape:
             for family in text_string_to_metric_families(text)
             for sample in family.samples
         }
+    except HTTPError as error:
+        with error:
+            said = error.read(_SAID_BYTES).decode("utf-8", "replace").strip()
+        raise LightpageError(subject, f"{error.code} {error.reason}: {said}", expected) from None
     except (URLError, OSError) as error:
         raise LightpageError(subject, getattr(error, "reason", error), expected) from None
     except ValueError:

@@ -176,3 +176,7 @@ def test_a_service_with_tls_is_scraped_with_a_certificate(
         assert "model toy-1" in capsys.readouterr().out
         assert cli_main.run(top, place) == EXIT_ERROR
         assert "metrics at localhost" in capsys.readouterr().err
+        nobody = authority.caller("nobody")
+        files = [word for name, path in vars(nobody).items() for word in (f"--{name}", str(path))]
+        assert cli_main.run(top, [*place, *files]) == EXIT_ERROR
+        assert "403 Forbidden: a certificate without a role" in capsys.readouterr().err
