@@ -15,6 +15,7 @@ import json
 import os
 import re
 import sys
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import Distribution, distributions
@@ -33,6 +34,8 @@ OWN_FILES = frozenset(
     ["pyvenv.cfg", *(f"bin/{name}" for name in ("activate", "activate.csh", "activate.fish", "Activate.ps1")), WHEELS]
 )
 """Files of the environment that come with no package: of venv, and the list of wheels."""
+MOST_LINKS = 40
+"""On the way to a file, as in Linux."""
 INTERPRETER = re.compile(r"python3?|python3\.\d+")
 """Names of venv's links to Python."""
 LEFT_OUT = (
@@ -290,13 +293,20 @@ def check_debian_files(root: Path, package: DebianPackage) -> Iterator[str]:
 
 
 def within(root: Path, name: str) -> Path | None:
-    """A file of the image by its name there, through links of folders that begin at the image's root; None: no file."""
-    path = root
-    for part in Path(name).parts:
-        path = path / part
-        if path.is_symlink():
-            target = path.readlink()
-            path = root / target.relative_to("/") if target.is_absolute() else path.parent / target
+    """A file of the image by its name there, through links that begin and end in the image's root; None: no file."""
+    path, parts, links = root, deque(Path(name).parts), 0
+    while parts:
+        part = parts.popleft()
+        if part == "..":
+            path = path if path == root else path.parent
+        elif part == "/":
+            path = root
+        elif (path / part).is_symlink():
+            if (links := links + 1) > MOST_LINKS:
+                return None
+            parts.extendleft(reversed((path / part).readlink().parts))
+        else:
+            path = path / part
     return path if path.is_file() else None
 
 

@@ -86,7 +86,7 @@ class Traces:
         try:
             from opentelemetry.exporter.otlp.proto.grpc.trace_exporter import OTLPSpanExporter
             from opentelemetry.sdk.resources import Resource
-            from opentelemetry.sdk.trace import SpanLimits, TracerProvider
+            from opentelemetry.sdk.trace import TracerProvider
             from opentelemetry.sdk.trace.export import BatchSpanProcessor
             from opentelemetry.sdk.trace.sampling import ParentBased, TraceIdRatioBased
             from opentelemetry.trace import SpanKind, Status, StatusCode, set_span_in_context
@@ -98,8 +98,7 @@ class Traces:
         version = installed_version("lightpage")
         about = Resource.create({"service.name": "lightpage", "service.version": version})
         self._exporter = OTLPSpanExporter(endpoint, endpoint.startswith("http://"), timeout=_SEND_S)
-        sampler, limits = ParentBased(TraceIdRatioBased(share)), SpanLimits(max_span_attribute_length=MOST_TEXT)
-        self._provider = TracerProvider(sampler, about, shutdown_on_exit=False, span_limits=limits)
+        self._provider = TracerProvider(ParentBased(TraceIdRatioBased(share)), about, shutdown_on_exit=False)
         self._provider.add_span_processor(BatchSpanProcessor(self._exporter, max_queue_size=_QUEUED_SPANS))
         self._tracer = self._provider.get_tracer("lightpage", version)
         self._propagator = TraceContextTextMapPropagator()
@@ -130,7 +129,7 @@ class Traces:
             "lightpage.pages": call.count,
         }
         named = {"lightpage.correlation_id": call.correlation_id, "lightpage.reason": call.reason}
-        attributes |= {name: text for name, text in named.items() if text}
+        attributes |= {name: text[:MOST_TEXT] for name, text in named.items() if text}
 
         def at(seconds: float) -> int:
             return before + round(1e9 * seconds)

@@ -260,6 +260,18 @@ PLANTED: dict[str, tuple[Callable[[Path], object], list[str]]] = {
 }
 
 
+def test_links_of_the_image_end_in_the_image(root: Path, tmp_path: Path) -> None:
+    library = root / "usr/lib/libgood.so.1"
+    library.rename(tmp_path / "outside")  # with the right content, and where no program of the image finds it
+    library.symlink_to("hop")
+    (library.parent / "hop").symlink_to(tmp_path / "outside")
+    assert inventory.take(root).faults == ("libgood1: lib/libgood.so.1: is missing",)
+    relinked(library.parent / "hop", f"{20 * '../'}{tmp_path}/outside")
+    assert inventory.take(root).faults == ("libgood1: lib/libgood.so.1: is missing",)
+    relinked(library.parent / "hop", "libgood.so.1")  # in a circle
+    assert inventory.take(root).faults == ("libgood1: lib/libgood.so.1: is missing",)
+
+
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_difference_is_found(root: Path, document: dict[str, Any], name: str) -> None:
     plant, expected = PLANTED[name]

@@ -130,7 +130,7 @@ def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(toy_zip: Pa
     assert (attributes(live)["rpc.service"], attributes(live)["rpc.method"]) == (INFERENCE.full_name, "ServerLive")
 
 
-def test_a_callers_text_is_cut_before_it_waits_to_be_sent(toy_zip: Path) -> None:
+def test_a_callers_text_is_cut_before_it_waits_to_be_sent(toy_zip: Path, caplog: pytest.LogCaptureFixture) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # nobody listens there
         with traced(toy_zip, f"http://127.0.0.1:{taken.getsockname()[1]}") as (stub, _):
@@ -143,6 +143,7 @@ def test_a_callers_text_is_cut_before_it_waits_to_be_sent(toy_zip: Path) -> None
         stub.ReadPage(pb.ReadPageRequest(correlation_id=2 * MOST_TEXT * "a"), timeout=20)
     [call] = (span for span in receiver.spans if span.kind == Span.SPAN_KIND_SERVER)
     assert attributes(call)["lightpage.correlation_id"] == MOST_TEXT * "a"
+    assert "truncating" not in caplog.text  # a line of the library's for each call
 
 
 def test_a_call_of_many_pages_has_a_span_of_each_up_to_a_number(toy_zip: Path) -> None:
