@@ -37,7 +37,10 @@ from train.runs import load_run
 DEVICE = Device()
 
 
-@pytest.fixture(scope="module", params=["--localizer wave --refinements 0", "--refinements 1"])
+ONE_PASS, TWO_PASSES = "--localizer wave --refinements 0", "--refinements 1"
+
+
+@pytest.fixture(scope="module", params=[ONE_PASS, TWO_PASSES])
 def made(
     request: pytest.FixtureRequest, small_device: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path, float]:
@@ -62,6 +65,7 @@ def test_the_bundle_decodes_without_torch_what_the_run_decoded(
     assert found > load_run(run).validation_air - 0.6 > 1
 
 
+@pytest.mark.parametrize("made", [pytest.param(ONE_PASS, marks=pytest.mark.long), TWO_PASSES], indirect=True)
 def test_half_precision_reads_as_much(made: tuple[Path, Path, float], small_device: list[str], tmp_path: Path) -> None:
     run, bundle, _ = made
     half = tmp_path / "half.zip"
