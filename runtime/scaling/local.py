@@ -1,0 +1,148 @@
+"""Workers that are processes of this machine."""
+
+from __future__ import annotations
+
+import select
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from pydantic import TypeAdapter
+
+from runtime.errors import WorkerError
+from runtime.execution.cpus import available_cpus
+from runtime.helper_process import HelperProcess, same_packages
+from runtime.scaling.engine import ATTEMPTS, given_up
+from runtime.scaling.task import Operation, Outcome, Task
+
+_MODULE = "runtime.scaling.local_worker"
+
+_OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
+
+_START_S, _PAGE_S, _RECALIBRATION_S = 600.0, 60.0, 7200.0
+"""Longest time of a worker's start, of a page, and of a recalibration; one that takes longer is taken for dead."""
+
+_SEND_S = 60.0
+"""A task is a few kilobytes, and the worker waits for it."""
+
+THREADS_OF_WORKER = 2
+"""Of an inference, where nothing else is asked for and there are as many cores: a second thread is worth nearly one
+core, and a worker takes as much memory as `lightpage evaluate`."""
+
+
+def default_workers() -> int:
+    """How many workers this machine's cores keep busy."""
+    return max(1, available_cpus() // THREADS_OF_WORKER)
+
+
+@dataclass
+class _Attempt:
+    """A task on its way.
+
+    Attributes:
+        task: what is asked.
+        number: how many workers have died at it.
+        deadline: until when it must be done, `time.monotonic` seconds.
+    """
+
+    task: Task
+    number: int = 0
+    deadline: float = 0.0
+
+
+class LocalEngine:
+    """Has processes of this machine do tasks; see `runtime.scaling.engine.Engine`.
+
+    A worker has one task at a time, and is started with its first one.
+
+    Args:
+        workers: how many.
+        threads: of each one's inferences; by default its share of the cores.
+    """
+
+    def __init__(self, workers: int, threads: int | None = None) -> None:
+        self.workers = workers
+        self.threads = threads or max(1, available_cpus() // workers)
+        self.restarts = 0
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
+        """See `Engine`."""
+        following, again = iter(tasks), deque[_Attempt]()
+        busy: dict[HelperProcess, _Attempt] = {}
+        free: list[HelperProcess] = []
+        try:
+            while True:
+                while len(busy) < self.workers:
+                    attempt = again.popleft() if again else _next(following)
+                    if attempt is None:
+                        break
+                    worker = free.pop() if free else self._start()
+                    busy[worker] = attempt
+                    self._hand_over(worker, attempt)
+                if not busy:
+                    return
+                for worker in _heard(busy):
+                    attempt = busy.pop(worker)
+                    try:
+                        line = worker.line(attempt.deadline)
+                    except (ConnectionError, TimeoutError) as error:
+                        worker.end(grace_s=1.0)
+                        self.restarts += 1
+                        attempt.number += 1
+                        if attempt.number < ATTEMPTS:
+                            again.append(attempt)
+                        else:
+                            yield given_up(attempt.task, _told(worker, error))
+                        continue
+                    free.append(worker)
+                    yield _OUTCOME.validate_json(line)
+        finally:
+            for worker in (*busy, *free):
+                worker.end()
+
+    def _start(self) -> HelperProcess:
+        try:
+            return HelperProcess(
+                _MODULE, str(self.threads), subject="a worker", environment=same_packages(self.threads)
+            )
+        except OSError as error:
+            raise WorkerError("a worker", error, "a process that can be started") from error
+
+    @staticmethod
+    def _hand_over(worker: HelperProcess, attempt: _Attempt) -> None:
+        """Send a task; a worker that cannot take it has died, which its socket tells."""
+        task = attempt.task
+        recalibrating = task.operation is Operation.RECALIBRATE
+        work_s = _RECALIBRATION_S if recalibrating else _PAGE_S * len(task.pages)
+        attempt.deadline = time.monotonic() + _START_S + work_s
+        try:
+            worker.send(task.model_dump_json().encode() + b"\n", time.monotonic() + _SEND_S)
+        except (TimeoutError, OSError):
+            worker.end()
+
+
+def _next(tasks: Iterator[Task]) -> _Attempt | None:
+    task = next(tasks, None)
+    return None if task is None else _Attempt(task)
+
+
+def _heard(busy: dict[HelperProcess, _Attempt]) -> list[HelperProcess]:
+    """Workers that have answered or ended, at least one; those whose time is up among them."""
+    ended = [worker for worker in busy if worker.fileno() < 0]
+    if ended:
+        return ended
+    left = min(attempt.deadline for attempt in busy.values()) - time.monotonic()
+    ready, _, _ = select.select(list(busy), [], [], max(0.0, left))
+    now = time.monotonic()
+    return ready or [worker for worker, attempt in busy.items() if attempt.deadline <= now]
+
+
+def _told(worker: HelperProcess, error: Exception) -> str:
+    """How a worker has ended, for people."""
+    if isinstance(error, TimeoutError):
+        return "no answer in time"
+    status = worker.status
+    if status is not None and status < 0:
+        return f"the end of its worker by signal {-status}"
+    return f"the end of its worker with status {status}"

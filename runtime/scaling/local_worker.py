@@ -1,0 +1,44 @@
+"""A worker's process: `python -m runtime.scaling.local_worker THREADS`, started by `runtime.scaling.local`."""
+
+from __future__ import annotations
+
+import os
+import queue
+import sys
+import threading
+
+from runtime.execution.memory import share_freed_memory
+from runtime.helper_process import parent_link
+from runtime.scaling.task import Task
+from runtime.scaling.work import Worker
+
+_DRIVER_GONE = 3
+
+
+def main(threads: int) -> None:
+    """Do one task after the other until the driver is gone or wants no more, whatever is being done then.
+
+    Args:
+        threads: of an inference.
+    """
+    share_freed_memory()
+    link = parent_link()
+    tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def listen() -> None:
+        try:
+            with link.makefile("rb") as lines:
+                for line in lines:
+                    tasks.put(line)
+        finally:
+            os._exit(_DRIVER_GONE)
+
+    threading.Thread(target=listen, name="lightpage-driver", daemon=True).start()
+    worker = Worker(threads)
+    while True:
+        outcome = worker.work(Task.model_validate_json(tasks.get()))
+        link.sendall(outcome.model_dump_json().encode() + b"\n")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))
