@@ -56,6 +56,7 @@ ROOMS = (
     "runtime.recalibration",
     "runtime.wire",
     "runtime.client",
+    "runtime.scaling",
     "runtime.service",
     "runtime.identity",
     "runtime.console",

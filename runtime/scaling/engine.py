@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from typing import Protocol
 
 from runtime.scaling.task import Failed, Outcome, Problem, Task
@@ -17,11 +17,12 @@ class Engine(Protocol):
     restarts: int
     """Workers that died until now."""
 
-    def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
+    def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """What became of each task, in whatever order they end; each exactly once.
 
         Tasks are taken from the iterable as workers become free, so that few are held at once. A worker that dies costs
-        the range that it was at; that is given to another one, `ATTEMPTS` times in all. Workers end with the iterator.
+        the range that it was at; that is given to another one, `ATTEMPTS` times in all. Workers end with
+        the generator.
 
         Raises:
             WorkerError: there are no workers.

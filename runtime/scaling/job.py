@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import hashlib
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -109,6 +109,11 @@ class Job(Plain):
             expected = "what `lightpage bulk` of this version has written"
             raise InvalidInputError(f"job {path}", error, expected) from None
 
+    def looked_at_again(self) -> Job:
+        """The same; recordings that could not be opened before are tried once more."""
+        again = (s if s.problem is None else look_at(s.device, s.path, s.bundle) for s in self.sources)
+        return self.model_copy(update={"sources": tuple(again)})
+
     def check(self, folder: Path, asked: Job) -> None:
         """Check that a run asks what was asked before; files that have gone or changed are the workers' to tell.
 
@@ -170,8 +175,10 @@ def found_recordings(patterns: Sequence[str]) -> list[Path]:
     return list(found)
 
 
-def look_at(device: str, path: Path, bundle: int) -> Source:
-    """A recording as it is now; one that cannot be opened is kept with its problem."""
+def look_at(device: str, path: Path, bundle: int, known: Mapping[tuple[str, Path], Source] | None = None) -> Source:
+    """A recording as it is now, or as it is known; one that cannot be opened is kept with its problem."""
+    if known and (source := known.get((device, path))) is not None:
+        return source.model_copy(update={"bundle": bundle})
     try:
         stamp = Stamp.of(path)
         with Recording.open(path) as recording:
@@ -183,16 +190,21 @@ def look_at(device: str, path: Path, bundle: int) -> Source:
     return Source(device=device, path=path, bundle=bundle, stamp=None, pages=0, problem=problem)
 
 
-def of_recordings(choices: Choices, patterns: Sequence[str], bundle: str) -> Job:
+def of_recordings(choices: Choices, patterns: Sequence[str], bundle: str, before: Job | None) -> Job:
     """A run over recordings of one device, or of devices that share a bundle.
+
+    Args:
+        choices: how.
+        patterns: of the recordings' names.
+        bundle: a path, or the name of a shipped one.
+        before: what the folder was asked before; recordings that are in it are not opened.
 
     Raises:
         LightpageError: no such bundle, or no such files.
     """
-    paths = found_recordings(patterns)
-    return Job(
-        choices=choices, bundles=(named_bundle(bundle),), sources=tuple(look_at("", path, 0) for path in paths)
-    )
+    known = _known(before)
+    sources = tuple(look_at("", path, 0, known) for path in found_recordings(patterns))
+    return Job(choices=choices, bundles=(named_bundle(bundle),), sources=sources)
 
 
 class _Device(Plain):
@@ -205,8 +217,12 @@ class _Fleet(Plain):
     device: tuple[_Device, ...]
 
 
-def of_fleet(choices: Choices, path: Path) -> Job:
+def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
     """A run over the devices that a file names, each with its bundle and recordings; paths are relative to the file.
+
+    Args:
+        choices, before: see `of_recordings`.
+        path: of the file.
 
     Raises:
         InvalidInputError: the file cannot be read, or two devices have one name.
@@ -221,12 +237,16 @@ def of_fleet(choices: Choices, path: Path) -> Job:
     if not names or len(set(names)) < len(names):
         raise InvalidInputError(subject, f"devices {', '.join(names) or 'none'}", "devices of different names")
     bundles: dict[str, int] = {}
-    sources = []
+    sources, known = [], _known(before)
     for device in fleet.device:
         place = bundles.setdefault(_beside(path, device.bundle), len(bundles))
         patterns = [str(path.parent / pattern) for pattern in device.recordings]
-        sources += [look_at(device.name, found, place) for found in found_recordings(patterns)]
+        sources += [look_at(device.name, found, place, known) for found in found_recordings(patterns)]
     return Job(choices=choices, bundles=tuple(map(named_bundle, bundles)), sources=tuple(sources))
+
+
+def _known(job: Job | None) -> dict[tuple[str, Path], Source]:
+    return {} if job is None else {(source.device, source.path): source for source in job.sources}
 
 
 def _beside(fleet: Path, bundle: str) -> str:

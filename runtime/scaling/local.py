@@ -5,7 +5,7 @@ from __future__ import annotations
 import select
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 
 from pydantic import TypeAdapter
@@ -16,7 +16,7 @@ from runtime.helper_process import HelperProcess, same_packages
 from runtime.scaling.engine import ATTEMPTS, given_up
 from runtime.scaling.task import Operation, Outcome, Task
 
-_MODULE = "runtime.scaling.local_worker"
+WORKER = "runtime.scaling.local_worker"
 
 _OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
 
@@ -59,14 +59,15 @@ class LocalEngine:
     Args:
         workers: how many.
         threads: of each one's inferences; by default its share of the cores.
+        module: what a worker runs.
     """
 
-    def __init__(self, workers: int, threads: int | None = None) -> None:
-        self.workers = workers
+    def __init__(self, workers: int, threads: int | None = None, module: str = WORKER) -> None:
+        self.workers, self._module = workers, module
         self.threads = threads or max(1, available_cpus() // workers)
         self.restarts = 0
 
-    def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
+    def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """See `Engine`."""
         following, again = iter(tasks), deque[_Attempt]()
         busy: dict[HelperProcess, _Attempt] = {}
@@ -86,7 +87,7 @@ class LocalEngine:
                     attempt = busy.pop(worker)
                     try:
                         line = worker.line(attempt.deadline)
-                    except (ConnectionError, TimeoutError) as error:
+                    except OSError as error:
                         worker.end(grace_s=1.0)
                         self.restarts += 1
                         attempt.number += 1
@@ -104,7 +105,7 @@ class LocalEngine:
     def _start(self) -> HelperProcess:
         try:
             return HelperProcess(
-                _MODULE, str(self.threads), subject="a worker", environment=same_packages(self.threads)
+                self._module, str(self.threads), subject="a worker", environment=same_packages(self.threads)
             )
         except OSError as error:
             raise WorkerError("a worker", error, "a process that can be started") from error
@@ -118,7 +119,7 @@ class LocalEngine:
         attempt.deadline = time.monotonic() + _START_S + work_s
         try:
             worker.send(task.model_dump_json().encode() + b"\n", time.monotonic() + _SEND_S)
-        except (TimeoutError, OSError):
+        except OSError:
             worker.end()
 
 

@@ -15,12 +15,8 @@ from runtime.scaling.work import Worker
 _DRIVER_GONE = 3
 
 
-def main(threads: int) -> None:
-    """Do one task after the other until the driver is gone or wants no more, whatever is being done then.
-
-    Args:
-        threads: of an inference.
-    """
+def main(worker: Worker) -> None:
+    """Have it do one task after the other until the driver is gone or wants no more, whatever is being done then."""
     share_freed_memory()
     link = parent_link()
     tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -34,11 +30,10 @@ def main(threads: int) -> None:
             os._exit(_DRIVER_GONE)
 
     threading.Thread(target=listen, name="lightpage-driver", daemon=True).start()
-    worker = Worker(threads)
     while True:
         outcome = worker.work(Task.model_validate_json(tasks.get()))
         link.sendall(outcome.model_dump_json().encode() + b"\n")
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(Worker(int(sys.argv[1])))

@@ -6,9 +6,10 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from lightpage.codec.header import parse_header
 from lightpage.codec.page_bytes import FILE_BYTES, FileFacts, PageBytes
@@ -50,7 +51,7 @@ class PageRecord(Plain):
     reason: str = ""
     recalibration_due: bool = False
     confirmed_bits: float | None = None
-    figures: dict[str, float | int | None] = {}
+    figures: dict[str, float | int | None] = Field(default_factory=dict)
 
     @property
     def well(self) -> bool:
@@ -79,7 +80,7 @@ class ShardRecord(Plain):
     pages: tuple[PageRecord, ...]
     seconds: float
     confidence_bins: tuple[ConfidenceBin, ...] = ()
-    summary: dict[str, float | str | None] = {}
+    summary: dict[str, float | str | None] = Field(default_factory=dict)
 
     @property
     def lost(self) -> dict[str, int]:
@@ -105,7 +106,9 @@ class ShardRecord(Plain):
         try:
             return cls.model_validate_json(path.read_bytes())
         except (OSError, ValidationError) as error:
-            raise InvalidInputError(f"shard {path}", error, "what a bulk run has written; delete it to redo it") from None
+            raise InvalidInputError(
+                f"shard {path}", error, "what a bulk run has written; delete it to redo it"
+            ) from None
 
 
 def record_of(shard: Path) -> Path:
@@ -129,7 +132,7 @@ def write_user_bytes(shard: Path, pages: Sequence[tuple[int, PageBytes]]) -> Non
         for number, page in pages
         if page.header is not None and page.file is not None and page.data is not None
     ]
-    arrays = {
+    arrays: dict[str, Any] = {
         "pages": np.array([page for page, *_ in told], np.int64),
         "headers": np.array([list(header) for _, header, *_ in told], np.uint8),
         "files": np.array([list(facts) for _, _, facts, _ in told], np.uint8),

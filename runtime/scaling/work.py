@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -111,7 +110,9 @@ class Worker:
         if self._warm is None or self._warm[0] != bundle:
             self._warm = None
             if (found := bundle_sha256(bundle.path)) != bundle.sha256:
-                raise BundleError(f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as the run began with")
+                raise BundleError(
+                    f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as the run began with"
+                )
             self._warm = bundle, _Warm(Decoder.load(bundle.path, self._threads))
         return self._warm[1]
 
@@ -155,9 +156,7 @@ class _Range:
         records: list[PageRecord] = []
 
         def decode(frames: FramePair, symbols: NDArray[np.uint8] | None) -> DecodedPage:
-            pilots = (
-                self.decoder.pilots(levels, mask) if symbols is None else Pilots.of_symbols(mask, symbols, levels)
-            )
+            pilots = self.decoder.pilots(levels, mask) if symbols is None else Pilots.of_symbols(mask, symbols, levels)
             return self.tracker.decode(narrow(frames, self.recording.bit_depth), levels, pilots)
 
         def read(append: Callable[[_Page], None] | None) -> None:
@@ -209,9 +208,7 @@ class _Range:
 
     def recovered(self) -> ShardRecord:
         """User bytes."""
-        reader = page_reader(
-            self.decoder, self.recording, self.tracker, code_of(self.recording, self.decoder.bundle)
-        )
+        reader = page_reader(self.decoder, self.recording, self.tracker, code_of(self.recording, self.decoder.bundle))
         kept: list[tuple[int, PageBytes]] = []
         records: list[PageRecord] = []
         for page, frames in self._read(self.recording.frames):
@@ -247,14 +244,10 @@ class _Page:
 
 def lost_page(page: int, error: LightpageError) -> PageRecord:
     """The page that an error is about."""
-    known = isinstance(error, LostPageError)
-    return PageRecord(
-        page=page,
-        state=PageState.LOST,
-        loss=error.reason.value if known else type(error).__name__,
-        reason=str(error),
-        recalibration_due=known and error.recalibration_due,
-    )
+    due, loss = False, type(error).__name__
+    if isinstance(error, LostPageError):
+        due, loss = error.recalibration_due, error.reason.value
+    return PageRecord(page=page, state=PageState.LOST, loss=loss, reason=str(error), recalibration_due=due)
 
 
 def _check_stamp(task: Task) -> None:
