@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Protocol
 
-from runtime.scaling.task import Failed, Outcome, Problem, Task
+from runtime.scaling.task import Failed, Operation, Outcome, Problem, Task
 
 ATTEMPTS = 3
 """Times that a range is given to a worker; a range that has cost so many workers their life is left alone."""
+
+THREADS_OF_WORKER = 2
+"""Of an inference, where nothing else is asked for and there are as many cores: a second thread is worth nearly one
+core, and a worker takes as much memory as `lightpage evaluate`."""
+
+_START_S, _PAGE_S, _RECALIBRATION_S = 600.0, 60.0, 7200.0
+"""Longest time of a worker's start, of a page, and of a recalibration; one that takes longer is taken for dead."""
 
 
 class Engine(Protocol):
@@ -27,6 +35,32 @@ class Engine(Protocol):
         Raises:
             WorkerError: there are no workers.
         """
+
+
+@dataclass
+class Attempt:
+    """A task on its way.
+
+    Attributes:
+        task: what is asked.
+        number: how many workers have died at it.
+        deadline: until when it must be done, `time.monotonic` seconds.
+    """
+
+    task: Task
+    number: int = 0
+    deadline: float = 0.0
+
+
+def next_attempt(tasks: Iterator[Task]) -> Attempt | None:
+    """The first attempt at the next task; None after the last."""
+    task = next(tasks, None)
+    return None if task is None else Attempt(task)
+
+
+def longest_s(task: Task) -> float:
+    """Seconds after which a worker that has not done a task is taken for dead."""
+    return _START_S + (_RECALIBRATION_S if task.operation is Operation.RECALIBRATE else _PAGE_S * len(task.pages))
 
 
 def given_up(task: Task, got: str) -> Failed:

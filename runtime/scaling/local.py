@@ -5,50 +5,27 @@ from __future__ import annotations
 import select
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Generator, Iterable
 
 from pydantic import TypeAdapter
 
 from runtime.errors import WorkerError
 from runtime.execution.cpus import available_cpus
 from runtime.helper_process import HelperProcess, same_packages
-from runtime.scaling.engine import ATTEMPTS, given_up
-from runtime.scaling.task import Operation, Outcome, Task
+from runtime.scaling.engine import ATTEMPTS, THREADS_OF_WORKER, Attempt, given_up, longest_s, next_attempt
+from runtime.scaling.task import Outcome, Task
 
 WORKER = "runtime.scaling.local_worker"
 
 _OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
 
-_START_S, _PAGE_S, _RECALIBRATION_S = 600.0, 60.0, 7200.0
-"""Longest time of a worker's start, of a page, and of a recalibration; one that takes longer is taken for dead."""
-
 _SEND_S = 60.0
 """A task is a few kilobytes, and the worker waits for it."""
-
-THREADS_OF_WORKER = 2
-"""Of an inference, where nothing else is asked for and there are as many cores: a second thread is worth nearly one
-core, and a worker takes as much memory as `lightpage evaluate`."""
 
 
 def default_workers() -> int:
     """How many workers this machine's cores keep busy."""
     return max(1, available_cpus() // THREADS_OF_WORKER)
-
-
-@dataclass
-class _Attempt:
-    """A task on its way.
-
-    Attributes:
-        task: what is asked.
-        number: how many workers have died at it.
-        deadline: until when it must be done, `time.monotonic` seconds.
-    """
-
-    task: Task
-    number: int = 0
-    deadline: float = 0.0
 
 
 class LocalEngine:
@@ -69,13 +46,13 @@ class LocalEngine:
 
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """See `Engine`."""
-        following, again = iter(tasks), deque[_Attempt]()
-        busy: dict[HelperProcess, _Attempt] = {}
+        following, again = iter(tasks), deque[Attempt]()
+        busy: dict[HelperProcess, Attempt] = {}
         free: list[HelperProcess] = []
         try:
             while True:
                 while len(busy) < self.workers:
-                    attempt = again.popleft() if again else _next(following)
+                    attempt = again.popleft() if again else next_attempt(following)
                     if attempt is None:
                         break
                     worker = free.pop() if free else self._start()
@@ -111,24 +88,16 @@ class LocalEngine:
             raise WorkerError("a worker", error, "a process that can be started") from error
 
     @staticmethod
-    def _hand_over(worker: HelperProcess, attempt: _Attempt) -> None:
+    def _hand_over(worker: HelperProcess, attempt: Attempt) -> None:
         """Send a task; a worker that cannot take it has died, which its socket tells."""
-        task = attempt.task
-        recalibrating = task.operation is Operation.RECALIBRATE
-        work_s = _RECALIBRATION_S if recalibrating else _PAGE_S * len(task.pages)
-        attempt.deadline = time.monotonic() + _START_S + work_s
+        attempt.deadline = time.monotonic() + longest_s(attempt.task)
         try:
-            worker.send(task.model_dump_json().encode() + b"\n", time.monotonic() + _SEND_S)
+            worker.send(attempt.task.model_dump_json().encode() + b"\n", time.monotonic() + _SEND_S)
         except OSError:
             worker.end()
 
 
-def _next(tasks: Iterator[Task]) -> _Attempt | None:
-    task = next(tasks, None)
-    return None if task is None else _Attempt(task)
-
-
-def _heard(busy: dict[HelperProcess, _Attempt]) -> list[HelperProcess]:
+def _heard(busy: dict[HelperProcess, Attempt]) -> list[HelperProcess]:
     """Workers that have answered or ended, at least one; those whose time is up among them."""
     ended = [worker for worker in busy if worker.fileno() < 0]
     if ended:
