@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import builtins
 import os
 import signal
 import sys
 import uuid
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -31,15 +29,7 @@ def test_without_ray_the_extra_is_named(
     toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     toy.write_toy_recording(tmp_path / "a.h5", toy.ToyDevice(), 16, 2)
-    load = builtins.__import__
-
-    def refuse(name: str, *rest: Any) -> Any:
-        if name == "ray":
-            raise ModuleNotFoundError("No module named 'ray'", name="ray")
-        return load(name, *rest)
-
-    monkeypatch.delitem(sys.modules, "ray", raising=False)
-    monkeypatch.setattr(builtins, "__import__", refuse)
+    monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not there
     words = ["decode", str(tmp_path / "out"), "--recordings", str(tmp_path / "a.h5"), "--bundle", str(toy_zip)]
     assert run_command(command.bulk, [*words, "--engine", "ray"]) == 2
     assert "pip install 'lightpage[cluster]'" in capsys.readouterr().err
@@ -85,11 +75,9 @@ def working(mark: str) -> list[int]:
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            if (
-                b"ray::_work" in (folder / "cmdline").read_bytes()
-                and mark.encode() in (folder / "environ").read_bytes()
-            ):
-                found.append(int(folder.name))
+            name, environment = ((folder / part).read_bytes() for part in ("cmdline", "environ"))
         except OSError:
             continue
+        if b"ray::_work" in name and mark.encode() in environment:
+            found.append(int(folder.name))
     return found
