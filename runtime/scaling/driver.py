@@ -65,7 +65,7 @@ class Progressed:
     def state(self) -> str:
         """For a bar."""
         parts = {"lost": self.lost, "failed": self.failed, "workers died": self.restarts}
-        return ", ".join(f"{count} {name}" for name, count in parts.items() if count)
+        return ", ".join(f"{name} {count}" for name, count in parts.items() if count)
 
 
 def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:

@@ -11,7 +11,7 @@ from lightpage.codec.volume_file import ranges
 from lightpage.metrics.reliability import ConfidenceBin, calibration_error
 from runtime.scaling.job import Job, Source
 from runtime.scaling.ledger import Ledger
-from runtime.scaling.shard import PageRecord, PageState, ShardRecord
+from runtime.scaling.shard import BUNDLE, PageRecord, PageState, ShardRecord, with_end
 from runtime.scaling.task import NamedBundle, Operation, Task
 
 AIR = "air_bits_per_symbol"
@@ -223,7 +223,9 @@ def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: 
         row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
     if source.problem is not None:
         row["problem"] = str(source.problem)
-    found.recordings.append(row | ({"recalibration": summary} if summary else {}))
+    if summary:
+        row["recalibration"] = {**summary, "bundle": str(with_end(ledger.shard(index, 0), BUNDLE))}
+    found.recordings.append(row)
 
 
 def _pages(

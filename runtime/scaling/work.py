@@ -44,13 +44,10 @@ from runtime.recalibration.outcome import RecalibrationOutcome, Refit
 from runtime.recalibration.recalibration import next_version, recalibrate
 from runtime.recalibration.refit import refit
 from runtime.scaling.job import bundle_sha256
-from runtime.scaling.shard import SYMBOLS, PageRecord, PageState, ShardRecord, with_end, write_user_bytes
+from runtime.scaling.shard import BUNDLE, SYMBOLS, PageRecord, PageState, ShardRecord, with_end, write_user_bytes
 from runtime.scaling.task import Done, Failed, NamedBundle, Operation, Outcome, Problem, Stamp, Task
 
 T = TypeVar("T")
-
-BUNDLE = ".zip"
-"""End of the name of a recalibrated bundle."""
 
 
 class Changed(RecordingError):
