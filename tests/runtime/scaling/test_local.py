@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from lightpage.cli.main import run as run_command
+from runtime.commands import bulk as command
 from runtime.scaling.driver import run
 from runtime.scaling.engine import ATTEMPTS
 from runtime.scaling.inline import InlineEngine
@@ -49,14 +52,16 @@ def test_a_killed_worker_costs_its_range_only_and_nothing_comes_out_differently(
         (tmp_path / f"a.{first}{KILLS}").write_text(str(kills))
     engine = LocalEngine(2, 1, WORKER)
     with Ledger(tmp_path / "killed") as ledger:
+        job.write(ledger.folder)
         made = run(ledger, job, lambda: engine)
         found = totals(ledger, job)
     assert (made.restarts, made.failed, made.ranges) == (1 + ATTEMPTS, 1, 3)
     assert "pages 6-8: got the end of its worker by signal 9" in str(made.problems[0])
     assert (found.tally.read, found.tally.missing) == (PAGES - RANGE, RANGE)
-    with Ledger(tmp_path / "killed") as ledger:  # the next run does what is missing
-        made = run(ledger, job, lambda: InlineEngine(Worker(1)))
-    assert (made.pages, made.restarts) == (RANGE, 0)
+    told = tmp_path / "J.json"  # the next run does what is missing, by the command and with the usual workers
+    words = ["decode", str(tmp_path / "killed"), "--workers", "1", "--threads", "1", "--json", str(told)]
+    assert run_command(command.bulk, words) == 0
+    assert json.loads(told.read_text())["this_run"]["pages"] == RANGE
     assert pages(tmp_path / "killed") == pages(tmp_path / "single")
 
 
