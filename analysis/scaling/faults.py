@@ -47,7 +47,7 @@ from runtime.scaling.work import Worker
 
 WORKERS, THREADS = 2, 1
 WARM_PAGES = 200
-"""After which memory should be flat."""
+"""After which memory should be flat, unless told otherwise."""
 
 LEDGER_PAGES = 10_000
 MARK = "LIGHTPAGE_BENCH_MARK"
@@ -206,8 +206,8 @@ def bare_pages_per_s(job: Job) -> float:
     return sum((end - first) / took for (first, end), took in zip(parts, seconds, strict=True))
 
 
-def in_peace(bulk: BulkRun, job: Job) -> dict[str, Any]:
-    """Speed against bare loops, and memory."""
+def in_peace(bulk: BulkRun, job: Job, warm_pages: int) -> dict[str, Any]:
+    """Speed against bare loops, and growth of memory after so many pages."""
     bare = [bare_pages_per_s(job)]
     bulk.start()
     step = job.choices.range_pages
@@ -220,8 +220,8 @@ def in_peace(bulk: BulkRun, job: Job) -> dict[str, Any]:
         "pages_per_s": speed,
         "bare_pages_per_s": bare,
         "share_of_bare": speed / mean,
-        "memory_growth": watch.growth(WARM_PAGES),
-        "memory_growth_after_pages": WARM_PAGES,
+        "memory_growth": watch.growth(warm_pages),
+        "memory_growth_after_pages": warm_pages,
     }
 
 
@@ -256,6 +256,7 @@ def _nodes(engine: str, mark: str) -> Iterator[Cluster | None]:
 @click.option("--range-pages", default=32, show_default=True, type=click.IntRange(1))
 @click.option("--kills", default=20, show_default=True, type=click.IntRange(0), help="SIGKILLs of workers.")
 @click.option("--nodes", default=3, show_default=True, type=click.IntRange(0), help="Nodes that are lost, with Ray.")
+@click.option("--warm-pages", default=WARM_PAGES, show_default=True, type=click.IntRange(0), help="Memory may grow.")
 @click.option("--ledger-pages", default=LEDGER_PAGES, show_default=True, type=click.IntRange(1))
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
 @click.option("--out", required=True, type=OutputFolder(), help="Archive and runs; the archive is kept.")
@@ -267,6 +268,7 @@ def main(
     range_pages: int,
     kills: int,
     nodes: int,
+    warm_pages: int,
     ledger_pages: int,
     seed: int,
     out: Path,
@@ -289,7 +291,7 @@ def main(
         made: Callable[[str], BulkRun] = partial(_run, job, out, options, mark)
         figures |= killed(made("killed"), job, kills, nodes, cluster, seed)
         figures |= compared(job, out / "killed", out / "single")
-        figures |= in_peace(made("peace"), job)
+        figures |= in_peace(made("peace"), job, warm_pages)
     like = next(path for path in sorted(_records(out / "single")))
     figures["second_run"] = second_run(job, out / "finished", like.with_suffix(""), ledger_pages)
     click.echo(json.dumps(figures, indent=2))

@@ -11,6 +11,7 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from lightpage.errors import InvalidInputError
 from runtime.errors import WorkerError
 from runtime.execution.cpus import available_cpus
 from runtime.helper_process import same_packages
@@ -38,12 +39,12 @@ class RayEngine:
     Args:
         address: of a cluster, `auto` for one that runs on this machine; None to start one here, for this run.
         workers: most ranges at once; by default as many as the cluster's CPUs allow at any time.
-        threads: CPUs of a worker, and of its inferences.
+        threads: CPUs of a worker, and threads of its inferences; by default `THREADS_OF_WORKER`, or what a node has.
     """
 
     def __init__(self, address: str | None = None, workers: int | None = None, threads: int | None = None) -> None:
         self._address, self._workers = address, workers
-        self._threads = threads or (THREADS_OF_WORKER if address else min(THREADS_OF_WORKER, available_cpus()))
+        self._threads = threads
         self.restarts = 0
 
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
@@ -51,20 +52,22 @@ class RayEngine:
 
         Raises:
             WorkerError: no cluster, or one that does not answer.
+            InvalidInputError: no node has as many CPUs as a worker takes.
             ModuleNotFoundError: Ray is not installed: the extra cluster brings it.
         """
         with _connected(self._address) as ray:
             yield from self._run(ray, iter(tasks))
 
     def _run(self, ray: Any, following: Iterator[Task]) -> Generator[Outcome, None, None]:
-        work = ray.remote(_work).options(num_cpus=self._threads, max_retries=0)
+        threads = self._threads_of(ray)
+        work = ray.remote(_work).options(num_cpus=threads, max_retries=0)
         again = deque[Attempt]()
         busy: dict[Any, Attempt] = {}
         try:
             while True:
-                most = self._most(ray)
+                most = self._most(ray, threads)
                 while len(busy) < most and (attempt := again.popleft() if again else next_attempt(following)):
-                    busy[work.remote(attempt.task, self._threads)] = attempt
+                    busy[work.remote(attempt.task, threads)] = attempt
                 if not busy:
                     return
                 limit_s = max(longest_s(attempt.task) for attempt in busy.values())
@@ -87,11 +90,24 @@ class RayEngine:
             for ref in busy:
                 ray.cancel(ref, force=True)
 
-    def _most(self, ray: Any) -> int:
+    def _threads_of(self, ray: Any) -> int:
+        """CPUs of a worker, at most as many as the largest node has.
+
+        Raises:
+            InvalidInputError: more are asked for.
+        """
+        largest = max((int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]), default=0)
+        if self._threads is not None and self._threads > largest:
+            raise InvalidInputError(
+                "--threads", f"{self._threads}, and nodes of {largest} CPUs", "a node that has them"
+            )
+        return self._threads or max(1, min(THREADS_OF_WORKER, largest))
+
+    def _most(self, ray: Any, threads: int) -> int:
         """Tasks that may be on their way, as the cluster is now."""
         if self._workers is not None:
             return self._workers
-        return max(1, int(ray.cluster_resources().get("CPU", 0)) // self._threads) * _AHEAD
+        return max(1, int(ray.cluster_resources().get("CPU", 0)) // threads) * _AHEAD
 
 
 _worker: Worker | None = None
