@@ -141,7 +141,7 @@ def _bulk(
     if json_path is not None:
         write_json(json_path, figures(job, made, found, files))
     click.echo(table(job, made, found, files))
-    if (error := failure(out, made, found, files)) is not None:
+    if (error := failure(out, job, made, found, files)) is not None:
         raise error
 
 
@@ -248,19 +248,19 @@ def table(job: Job, made: Progressed, found: Totals, files: list[RecoveredFile])
     return "\n".join(f"{name:<20} {value}" for name, value in rows if value)
 
 
-def failure(out: Path, made: Progressed, found: Totals, files: list[RecoveredFile]) -> LightpageError | None:
+def failure(out: Path, job: Job, made: Progressed, found: Totals, files: list[RecoveredFile]) -> LightpageError | None:
     """The error that a run ends with where something is lost; None where nothing is."""
     subject, tally = f"bulk run {out}", found.tally
     lost = tally.lost.total()
-    told = [str(problem) for problem in made.problems]
-    told += [f"recording {path}: page {page}: {reason}" for path, page, reason in found.lost]
+    told = [*map(str, made.problems), *found.lost]
     if (more := made.failed + lost - len(told)) > 0:
         told.append(f"and {more} more")
     got = f"{lost} of {tally.pages} lost and {tally.missing} missing ({'; '.join(told)})"
-    if broken := [file for file in files if file.error is not None]:
-        names = ranges([file.volume.id for file in broken])
-        return LostDataError(subject, f"volumes {names} without a file; {got}", "pages that suffice for every file")
-    if files and not made.failed:
+    if job.choices.operation is Operation.RECOVER and not made.failed:
+        broken = ranges([file.volume.id for file in files if file.error is not None])
+        if broken or (lost and not files):
+            what = f"volumes {broken} without a file" if broken else "no file"
+            return LostDataError(subject, f"{what}; {got}", "pages that suffice for every file")
         if lost:
             warn(f"{subject}: {got}; every file is whole all the same")
         return None

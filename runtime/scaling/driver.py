@@ -48,7 +48,7 @@ class Progressed:
     def count(self, outcome: Outcome) -> int:
         """Count an outcome and return how much of the work it was worth."""
         if isinstance(outcome, Failed):
-            self.fail(outcome.problem)
+            self.fail(outcome.problem.about(outcome.task.device))
             return 0
         self.ranges += 1
         self.pages += outcome.task.weight
@@ -87,7 +87,7 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:
     ledger.sweep()
     for source in job.sources:
         if source.problem is not None:
-            made.fail(source.problem)
+            made.fail(source.problem.about(source.device))
     unit = "device" if job.choices.operation is Operation.RECALIBRATE else "page"
     try:
         for number in range(1 + len(job.rounds)):
@@ -113,19 +113,20 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:
 
 def _steps(engine: Engine, tasks: Iterable[Task], made: Progressed) -> Generator[None, None, None]:
     """Once for every page that is behind."""
-    given_up: set[Path] = set()
+    given_up: set[tuple[str, Path]] = set()
     died = made.restarts
 
     def wanted() -> Iterator[Task]:
-        return (task for task in tasks if task.recording not in given_up)
+        return (task for task in tasks if (task.device, task.recording) not in given_up)
 
     with closing(engine.run(wanted())) as outcomes:
         for outcome in outcomes:
             made.restarts = died + engine.restarts
             if isinstance(outcome, Failed) and outcome.whole_recording:
-                if outcome.task.recording in given_up:
+                key = outcome.task.device, outcome.task.recording
+                if key in given_up:
                     continue  # it was under way when the recording was found to be unreadable, and is told already
-                given_up.add(outcome.task.recording)
+                given_up.add(key)
             for _ in range(made.count(outcome)):
                 yield None
     made.restarts = died + engine.restarts

@@ -122,6 +122,7 @@ class Ledger:
         for first in range(0, count, step):
             yield Task(
                 operation=choices.operation,
+                device=source.device,
                 recording=source.path,
                 stamp=source.stamp,
                 pages=tuple(range(first, min(first + step, count))),

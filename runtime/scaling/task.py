@@ -38,6 +38,10 @@ class Problem(Plain):
         """That of an error."""
         return cls(subject=error.subject, got=error.got, expected=error.expected)
 
+    def about(self, device: str) -> Problem:
+        """The same, and of which device of a fleet it is; itself without a fleet."""
+        return self.model_copy(update={"subject": f"device {device}: {self.subject}"}) if device else self
+
     def __str__(self) -> str:
         return f"{self.subject}: got {self.got}, wanted {self.expected}"
 
@@ -78,6 +82,7 @@ class Task(Plain):
 
     Attributes:
         operation: what to do.
+        device: its name in the fleet; empty without a fleet.
         recording: path of the file.
         stamp: of the recording as it was when the run began.
         pages: their numbers; to recalibrate, as many known pages as are wanted.
@@ -88,6 +93,7 @@ class Task(Plain):
     """
 
     operation: Operation
+    device: str = ""
     recording: Path
     stamp: Stamp
     pages: tuple[int, ...]
@@ -104,7 +110,7 @@ class Task(Plain):
     @property
     def name(self) -> str:
         """Of the range, for people."""
-        whole = self.operation is Operation.RECALIBRATE or not self.pages
+        whole = self.operation is Operation.RECALIBRATE
         return f"recording {self.recording}" + ("" if whole else f": pages {self.pages[0]}-{self.pages[-1]}")
 
 

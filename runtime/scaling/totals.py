@@ -157,7 +157,7 @@ class Totals:
         confidence_bins: of all pages of an evaluation together.
         rounds: what later readings have brought.
         recordings: a row each.
-        lost: the first lost pages: recording, page and reason.
+        lost: the first lost pages, or devices, and why.
     """
 
     tally: Tally = field(default_factory=Tally)
@@ -165,7 +165,7 @@ class Totals:
     confidence_bins: dict[tuple[float, float], list[float]] = field(default_factory=dict)
     rounds: list[Round] = field(default_factory=list)
     recordings: list[dict[str, Any]] = field(default_factory=list)
-    lost: list[tuple[str, int, str]] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
 
     @property
     def ece(self) -> float | None:
@@ -217,7 +217,7 @@ def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: 
             elif page.state is PageState.LOST:
                 lost.setdefault(page.loss or "unknown", []).append(page.page)
                 if len(found.lost) < TOLD:
-                    found.lost.append((str(source.path), page.page, page.reason))
+                    found.lost.append(f"{_name(source, task, page)}: {page.reason}")
     row = {"device": source.device, "recording": str(source.path), **own.to_json()}
     if job.choices.operation is not Operation.RECALIBRATE:
         row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
@@ -251,6 +251,12 @@ def _pages(
             if page.better_than(before):
                 best[page.page] = again, page
     yield from best.values()
+
+
+def _name(source: Source, task: Task, page: PageRecord) -> str:
+    device = f"device {source.device}: " if source.device else ""
+    number = "" if task.operation is Operation.RECALIBRATE else f": page {page.page}"
+    return f"{device}recording {source.path}{number}"
 
 
 def _air(page: PageRecord) -> float:

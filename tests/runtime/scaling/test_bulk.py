@@ -274,6 +274,17 @@ def test_a_file_whose_pages_do_not_suffice_is_not_written(archive: Archive, caps
     assert "volumes 9 without a file" in capsys.readouterr().err
 
 
+def test_pages_without_any_bytes_are_lost_data(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
+    bundle = coded.bundle(archive.folder / "coded.zip")
+    status, figures = archive.run("recover", "--no-tracking", "--bundle", str(bundle))
+    assert (status, figures["files"], figures["pages_missing"]) == (2, [], 14)  # of other levels than the code
+    for name in "ab":
+        toy.write_toy_recording(archive.folder / f"{name}.h5", toy.ToyDevice(), coded.CODE.levels, 2)
+    shutil.rmtree(archive.out)
+    assert archive.run("recover", "--no-tracking", "--bundle", str(bundle))[0] == 3
+    assert "no file; 4 of 4 lost" in capsys.readouterr().err
+
+
 def test_a_poisoned_device_fails_by_name_and_the_rest_of_the_fleet_is_recalibrated(
     archive: Archive, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -297,7 +308,7 @@ def test_a_poisoned_device_fails_by_name_and_the_rest_of_the_fleet_is_recalibrat
         made = Bundle.open(rows[name]["recalibration"]["bundle"])
         assert made.version == "toy-1+r1"
         assert made.table["reference_in_phase"].mean() == pytest.approx(drifted[0])
-    assert "bad.h5" in capsys.readouterr().err
+    assert f"device poisoned: recording {archive.folder / 'bad.h5'}: " in capsys.readouterr().err
     assert archive.run("recalibrate", *fleet, asked=False)[0] == 2
     assert archive.tasks == []
 
