@@ -23,7 +23,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import click
 import h5py
@@ -78,7 +79,7 @@ class Cluster:
 
 
 class BulkRun:
-    """`lightpage bulk decode` in a process of its own.
+    """`lightpage bulk decode` in a process of its own; it runs in a `with` statement.
 
     Args:
         job: what it is asked.
@@ -93,11 +94,17 @@ class BulkRun:
         asked += ["--range-pages", str(job.choices.range_pages), "--json", str(self._json)]
         self._command = [*_BULK, "decode", str(folder), *asked, *options]
 
-    def start(self) -> None:
-        """Start it."""
-        self.begun = time.time()
+    def __enter__(self) -> Self:
         environment = {**same_packages(THREADS), MARK: self._mark, "RAY_USAGE_STATS_ENABLED": "0"}
         self.process = subprocess.Popen(self._command, env=environment, stdout=subprocess.DEVNULL)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
 
     def wait(self) -> dict[str, Any]:
         """Wait for its end and return its figures.
@@ -143,20 +150,20 @@ def killed(bulk: BulkRun, job: Job, kills: int, nodes: int, cluster: Cluster | N
         [(chance.randrange(1, max(2, ranges - 2)), "worker") for _ in range(kills)]
         + [(chance.randrange(1, max(2, ranges - 2)), "node") for _ in range(nodes if cluster is not None else 0)]
     )
-    bulk.start()
     done = Counter[str]()
-    for moment, kind in moments:
-        for _ in until(time.monotonic() + LIMIT_S, _LOOK_S):
-            if bulk.process.poll() is not None or (bulk.shards() >= moment and bulk.workers()):
-                break
-        time.sleep(chance.random() * 0.5)
-        if kind == "node" and cluster is not None:
-            cluster.lose_a_node()
-            done[kind] += 1
-        elif workers := bulk.workers():
-            os.kill(chance.choice(workers), 9)
-            done[kind] += 1
-    figures = bulk.wait()
+    with bulk:
+        for moment, kind in moments:
+            for _ in until(time.monotonic() + LIMIT_S, _LOOK_S):
+                if bulk.process.poll() is not None or (bulk.shards() >= moment and bulk.workers()):
+                    break
+            time.sleep(chance.random() * 0.5)
+            if kind == "node" and cluster is not None:
+                cluster.lose_a_node()
+                done[kind] += 1
+            elif workers := bulk.workers():
+                os.kill(chance.choice(workers), 9)
+                done[kind] += 1
+        figures = bulk.wait()
     return {
         "kills": done["worker"],
         "nodes_lost": done["node"],
@@ -209,9 +216,11 @@ def bare_pages_per_s(job: Job) -> float:
 def in_peace(bulk: BulkRun, job: Job, warm_pages: int) -> dict[str, Any]:
     """Speed against bare loops, and growth of memory after so many pages."""
     bare = [bare_pages_per_s(job)]
-    bulk.start()
     step = job.choices.range_pages
-    with Watch(lambda: {"driver": [bulk.process.pid], "worker": bulk.workers()}, lambda: step * bulk.shards()) as watch:
+    with (
+        bulk,
+        Watch(lambda: {"driver": [bulk.process.pid], "worker": bulk.workers()}, lambda: step * bulk.shards()) as watch,
+    ):
         bulk.wait()
     bare.append(bare_pages_per_s(job))  # before and after: other work on the machine comes and goes
     speed = bulk.pages_per_s(job.sources[0].pages)
