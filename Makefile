@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service bench-other-servers dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test test-long bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -116,6 +116,11 @@ bench-other-servers: $(STAMP)  ## the service beside MLServer, KServe and Ray Se
 soak: $(STAMP)  ## 40 minutes at 80% of the service's load: does its memory grow?
 	@mkdir -p $(BENCH_SERVICE)
 	$(BIN)/python -m analysis.service.soak --json $(BENCH_SERVICE)/soak.json
+
+BENCH_SCALING := runs/bench-scaling
+bench-scaling: $(STAMP)  ## bulk runs whose workers and Ray nodes are killed, speed, memory and a second run: in hours
+	$(ONE_THREAD) $(BIN)/python -m analysis.scaling.faults --out $(BENCH_SCALING) --json $(BENCH_SCALING)/local.json
+	$(ONE_THREAD) $(BIN)/python -m analysis.scaling.faults --engine ray --out $(BENCH_SCALING) --json $(BENCH_SCALING)/ray.json
 
 bench: $(STAMP)  ## time one page: inference alone, whole decode, through gRPC
 	$(BIN)/lightpage bench

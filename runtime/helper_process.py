@@ -7,7 +7,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 _RECEIVE_BYTES = 65536
 
@@ -20,12 +21,20 @@ class HelperProcess:
         arguments: of the module.
         files: file descriptors that it inherits under the same numbers.
         subject: for errors, e.g. ``the process of its window``.
+        environment: its variables; those of this process if left out.
 
     Raises:
         OSError: it cannot be started.
     """
 
-    def __init__(self, module: str, *arguments: str, files: Sequence[int] = (), subject: str) -> None:
+    def __init__(
+        self,
+        module: str,
+        *arguments: str,
+        files: Sequence[int] = (),
+        subject: str,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         self._subject = subject
         self._received = b""
         self._link, other = socket.socketpair()
@@ -38,6 +47,7 @@ class HelperProcess:
                     stdout=subprocess.DEVNULL,
                     start_new_session=True,
                     pass_fds=files,
+                    env=environment,
                 )
             except OSError:
                 self._link.close()
@@ -68,9 +78,18 @@ class HelperProcess:
         line, _, self._received = self._received.partition(b"\n")
         return line
 
+    def fileno(self) -> int:
+        """Of the socket, for `select`: there is something to read of it once the process has answered or ended."""
+        return self._link.fileno()
+
     def ended(self) -> bool:
         """Whether it runs no more."""
         return self._process.poll() is not None
+
+    @property
+    def status(self) -> int | None:
+        """Its exit status, negative where a signal has ended it; None while it runs."""
+        return self._process.poll()
 
     def end(self, grace_s: float = 0.0) -> None:
         """End it; it has `grace_s` to do so by itself once the socket is closed."""
@@ -80,6 +99,18 @@ class HelperProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+
+def same_packages(threads: int) -> dict[str, str]:
+    """Environment of a process that finds the same packages as this one.
+
+    Args:
+        threads: of its numerical libraries.
+    """
+    own = str(Path(__file__).resolve().parents[1])
+    paths = [own, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
+    return {**os.environ, **limits, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def parent_link() -> socket.socket:

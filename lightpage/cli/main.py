@@ -37,10 +37,12 @@ RUNTIME = "onnxruntime"
 EXTRAS = {
     "train": frozenset({"torch", "torchmetrics", "lightning", "tensorboard", "jinja2", "onnx", "onnxscript"}),
     "camera": frozenset({"harvesters", "genicam"}),
+    "cluster": frozenset({"ray"}),
 }
 
 SUMMARIES = {
     "bench": "Measure speed: inference alone, whole decode, through gRPC.",
+    "bulk": "Read archives of recordings, or recalibrate a fleet, with many workers.",
     "console": "Open the web page of a running service.",
     "top": "Show live how a running service fares.",
     "code": "Choose how user bytes are protected on a device's pages.",

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.metrics.accumulator import Accumulator
@@ -22,7 +23,7 @@ from runtime.bulk.refused import RefusedPage, refusal, unconfirmed
 from runtime.bundle.manifest import GOLDEN
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
-from runtime.decoding.page import Timings
+from runtime.decoding.page import DecodedPage, Timings
 from runtime.decoding.tracking import Tracker
 from runtime.errors import LostPageError
 
@@ -140,6 +141,36 @@ def check_recording(decoder: Decoder, recording: Recording) -> None:
         )
 
 
+def pilots_of(decoder: Decoder, recording: Recording) -> NDArray[np.bool_]:
+    """Where the pilots of a recording's pages are, [ny, nx]: as it says itself, or else the bundle's."""
+    own = recording.pilots()
+    return decoder.bundle.pilot_mask if own is None else own
+
+
+def decode_unseen(
+    decoder: Decoder,
+    recording: Recording,
+    tracker: Tracker,
+    mask: NDArray[np.bool_],
+    frames: FramePair,
+    symbols: NDArray[np.uint8] | None,
+) -> DecodedPage | None:
+    """A page of a recording, decoded by its own pilots; None where its symbols are unknown, or the bundle has seen it.
+
+    Args:
+        decoder, recording, tracker: see `evaluate`.
+        mask: where the pilots are, see `pilots_of`.
+        frames, symbols: the page.
+
+    Raises:
+        InvalidInputError, LostPageError: see `Tracker.decode`.
+    """
+    if symbols is None or was_seen(decoder, frames):
+        return None
+    pilots = Pilots.of_symbols(mask, symbols, recording.levels)
+    return tracker.decode(narrow(frames, recording.bit_depth), recording.levels, pilots)
+
+
 def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evaluation:
     """Decode all unseen pages in their order and measure them against their symbols; a bad page is left out and told.
 
@@ -157,8 +188,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     if not recording.has_symbols:
         raise RecordingError(f"recording {recording.path}", "no symbols", "known symbols to measure against")
     levels = recording.levels
-    own = recording.pilots()
-    mask = decoder.bundle.pilot_mask if own is None else own
+    mask = pilots_of(decoder, recording)
     data = ~mask
     accumulator = Accumulator(levels, data, recording.pages)
     timings: list[Timings] = []
@@ -169,9 +199,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         page = None
         try:
             frames, symbols = read.result()
-            if symbols is not None and not was_seen(decoder, frames):
-                pair, pilots = narrow(frames, recording.bit_depth), Pilots.of_symbols(mask, symbols, levels)
-                page = tracker.decode(pair, levels, pilots)
+            page = decode_unseen(decoder, recording, tracker, mask, frames, symbols)
         except (InvalidInputError, LostPageError) as error:
             refused.append(RefusedPage.of(index, error))
         if page is not None and symbols is not None:

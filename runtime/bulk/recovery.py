@@ -201,20 +201,12 @@ def recover(
             each other, or no room.
         LostDataError: the file that was put together is not the one that was encoded.
     """
-    check_recording(decoder, recording)
-    bundle = decoder.bundle
-    if recording.declared_levels not in (None, code.levels):
-        raise RecordingError(f"recording {recording.path}: levels", recording.levels, f"{code.levels}, as the code has")
-    own = recording.pilots()
-    if own is not None and not np.array_equal(own, bundle.pilot_mask):
-        raise RecordingError(f"recording {recording.path}: pilots", "other places", "those of the bundle")
-    codec = PageCodec(code, bundle.pilot_mask)
-    pilots = decoder.written_pilots(code.levels)
-    reader = PageReader(codec, lambda pair: tracker.decode(pair, code.levels, pilots))
+    reader = page_reader(decoder, recording, tracker, code)
+    codec, bundle = reader.codec, decoder.bundle
     pages: list[RecoveredPage] = []
     with VolumeFiles(out) as files:
         for index, read in track(read_ahead(recording.frames, recording.pages), "recover", total=recording.pages):
-            pages += [_read_page(reader, recording, index, read, files)]
+            pages += [read_page(reader, recording, index, read, files.add)]
         file = files.chosen(volume_id, checksum)
         done = Restored((), ()) if file is None else file.restore()
         if file is not None and (holes or not done.lost):
@@ -279,10 +271,39 @@ class PageReader:
         self._next = self._next.after()
 
 
-def _read_page(
-    reader: PageReader, recording: Recording, index: int, read: Future[FramePair], files: VolumeFiles
+def page_reader(decoder: Decoder, recording: Recording, tracker: Tracker, code: Code) -> PageReader:
+    """What reads the pages of a recording.
+
+    Raises:
+        RecordingError: another device's recording, or one of other levels or pilots.
+    """
+    check_recording(decoder, recording)
+    bundle = decoder.bundle
+    if recording.declared_levels not in (None, code.levels):
+        raise RecordingError(f"recording {recording.path}: levels", recording.levels, f"{code.levels}, as the code has")
+    own = recording.pilots()
+    if own is not None and not np.array_equal(own, bundle.pilot_mask):
+        raise RecordingError(f"recording {recording.path}: pilots", "other places", "those of the bundle")
+    pilots = decoder.written_pilots(code.levels)
+    return PageReader(PageCodec(code, bundle.pilot_mask), lambda pair: tracker.decode(pair, code.levels, pilots))
+
+
+def read_page(
+    reader: PageReader,
+    recording: Recording,
+    index: int,
+    read: Future[FramePair],
+    take: Callable[[PageBytes], Volume | None],
 ) -> RecoveredPage:
-    """Read one page of a recording into the files."""
+    """Read one page of a recording.
+
+    Args:
+        reader: of its pages.
+        recording: where the page's symbols are, if they are known.
+        index: of the page.
+        read: its frames.
+        take: takes the page, and says which volume it belongs to.
+    """
     expected = reader.expected
     try:
         pair = narrow(read.result(), recording.bit_depth)
@@ -291,7 +312,7 @@ def _read_page(
         reader.skip()
         number, volume = (None, None) if expected is None else (expected.page, expected.volume)
         return RecoveredPage(index, number, volume, Loss.OPTICS, str(error))
-    reader.follow(files.add(found), found.header)
+    reader.follow(take(found), found.header)
     header = found.header if found.header is not None else expected
     symbols, data = recording.symbols(index), ~reader.codec.pilots
     rate = None if symbols is None else air_bits(page, symbols, data, reader.codec.code.levels)

@@ -8,17 +8,37 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError
 from lightpage.files import move_into_place
-from runtime.wire.pages import RemotePage
 
 FORMAT = "lightpage-decoded"
 VERSION = 1
+
+
+class WrittenPage(Protocol):
+    """What is written of a page; see `runtime.wire.pages.RemotePage`."""
+
+    @property
+    def symbols(self) -> NDArray[np.uint8]:
+        """Symbols [ny, nx]."""
+
+    @property
+    def confidence(self) -> NDArray[np.float32]:
+        """Of each symbol [ny, nx]."""
+
+    @property
+    def model_version(self) -> str:
+        """Which model decoded it."""
+
+    @property
+    def page(self) -> int | None:
+        """Its number; the one after the last if None."""
 
 
 class DecodedWriter:
@@ -52,7 +72,7 @@ class DecodedWriter:
         self._versions: list[str] = []
         self._pages: list[int] = []
 
-    def append(self, page: RemotePage) -> None:
+    def append(self, page: WrittenPage) -> None:
         """Add one page.
 
         Raises:

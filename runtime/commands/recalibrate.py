@@ -23,12 +23,11 @@ from runtime.client.answers import JobInfo, Recalibrated
 from runtime.client.client import RECALIBRATION_S, LightpageClient
 from runtime.commands.connection import TARGET, with_tls
 from runtime.decoding.decoder import Decoder
-from runtime.recalibration.known_pages import KnownPages
+from runtime.recalibration.known_pages import KnownPages, read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.recalibration.recalibration import next_version
 from runtime.recalibration.recalibration import recalibrate as recalibrate_bundle
 from runtime.recalibration.refit import refit
-from runtime.service.recalibrator import read_recorded
 from runtime.wire.tls import TlsFiles
 
 DEFAULT_PAGES = 2

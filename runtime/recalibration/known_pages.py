@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import FrameError, InvalidInputError
+from lightpage.errors import FrameError, InvalidInputError, PageError
 from lightpage.page.symbols import check_symbols
 from lightpage.progress import warn
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import hash_frames
+from lightpage.recording.reader import Recording, hash_frames
 from runtime.decoding.decoder import Decoder
-from runtime.decoding.frames import named
+from runtime.decoding.frames import named, narrow
 
 MIN_PAGES = 2
 """One to fit on, one to judge by."""
@@ -96,3 +97,26 @@ class KnownPages:
     def part(self, pages: slice) -> KnownPages:
         """Some of the pages, the rest as it is."""
         return replace(self, pairs=self.pairs[pages], symbols=self.symbols[pages])
+
+
+def read_recorded(recording: Recording, pages: Sequence[int], heard: Callable[[], None] = lambda: None) -> KnownPages:
+    """Pages of a recording with their symbols.
+
+    Args:
+        recording: where they are.
+        pages: their numbers.
+        heard: called before each page; it may raise to stop.
+
+    Raises:
+        RecordingError: unreadable.
+        PageError: the recording holds no symbols.
+    """
+    symbols = [found for index in pages if (found := recording.symbols(index)) is not None]
+    if len(symbols) != len(pages):
+        raise PageError(f"recording {recording.path}", "no symbols", "a recording with known symbols")
+    bits, pairs = recording.bit_depth, []
+    for index in pages:
+        heard()
+        pairs.append(narrow(recording.frames(index), bits))
+    references = narrow(recording.references(), bits)
+    return KnownPages(tuple(pairs), tuple(symbols), recording.levels, references, recording.pilots())

@@ -21,6 +21,7 @@ from lightpage.progress import Progress
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import Tracker
 from runtime.errors import WorkerError
+from runtime.helper_process import same_packages
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.recalibration.work import Job, WorkFolder, heard_step
@@ -122,7 +123,7 @@ def _run(command: Sequence[str], log: IO[bytes], progress: Progress, check: Call
     try:
         # Its input is a pipe that nobody writes to: once it is closed, the worker ends.
         process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=_environment()
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=same_packages(THREADS)
         )
     except OSError as error:
         raise WorkerError(_SUBJECT, error, "one that can be started") from error
@@ -165,14 +166,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
     if process.stdout is not None:
         process.stdout.close()
-
-
-def _environment() -> dict[str, str]:
-    """The worker finds the same packages as this process, and its libraries start no threads of their own."""
-    own = str(Path(__file__).resolve().parents[2])
-    paths = [own, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(THREADS))
-    return {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def _show(log: IO[bytes]) -> None:

@@ -15,7 +15,6 @@ from pathlib import Path
 from lightpage.errors import (
     InvalidInputError,
     LimitError,
-    PageError,
     RecalibrationRefusedError,
     RecordingError,
 )
@@ -25,10 +24,9 @@ from runtime.acquisition.source import FrameSource, own_fault
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.archive import check_name
 from runtime.bundle.bundle import Bundle
-from runtime.decoding.frames import narrow
 from runtime.errors import CallerLeft, JobCancelledError, NoSourceError, OtherModelError, SourceError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.recalibration.known_pages import KnownPages
+from runtime.recalibration.known_pages import KnownPages, read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
 from runtime.recalibration.recalibration import next_version, recalibrate
 from runtime.recalibration.separate_process import recalibrate_apart
@@ -402,29 +400,6 @@ def read_known(
         raise SourceError(f"pages of {source.name}", "unknown symbols", "pages whose symbols are known")
     mask = found[0].pilot_mask if found else None
     return KnownPages(tuple(p.pair for p in found), tuple(symbols), source.levels, references, mask)
-
-
-def read_recorded(recording: Recording, pages: Sequence[int], heard: Callable[[], None] = _nothing) -> KnownPages:
-    """Pages of a recording with their symbols.
-
-    Args:
-        recording: where they are.
-        pages: their numbers.
-        heard: called before each page; it may raise to stop.
-
-    Raises:
-        RecordingError: unreadable.
-        PageError: the recording holds no symbols.
-    """
-    symbols = [found for index in pages if (found := recording.symbols(index)) is not None]
-    if len(symbols) != len(pages):
-        raise PageError(f"recording {recording.path}", "no symbols", "a recording with known symbols")
-    bits, pairs = recording.bit_depth, []
-    for index in pages:
-        heard()
-        pairs.append(narrow(recording.frames(index), bits))
-    references = narrow(recording.references(), bits)
-    return KnownPages(tuple(pairs), tuple(symbols), recording.levels, references, recording.pilots())
 
 
 def _follow(

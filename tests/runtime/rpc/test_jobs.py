@@ -41,13 +41,13 @@ from runtime.errors import (
 )
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.recalibration.known_pages import KnownPages
+from runtime.recalibration.known_pages import KnownPages, read_recorded
 from runtime.recalibration.outcome import Refit, RefitResult
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits
 from runtime.service.monitor import Monitor
-from runtime.service.recalibrator import Recalibrator, read_recorded
+from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
 from runtime.service.self_calibration import SelfCalibration, SelfCalibrationSettings
 from runtime.service.store import ModelStore

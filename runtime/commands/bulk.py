@@ -1,0 +1,267 @@
+"""`lightpage bulk`: archives and fleets, page range by page range, with many workers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lightpage.cli.main import RESUME_KEY
+from lightpage.cli.paths import OutputFile, OutputFolder, check_outputs
+from lightpage.codec.volume_file import ranges
+from lightpage.errors import InvalidInputError, LightpageError, LostDataError
+from lightpage.files import write_json
+from lightpage.progress import warn
+from runtime.bundle.shipped import DEFAULT
+from runtime.scaling.driver import Progressed, run
+from runtime.scaling.engine import Engine
+from runtime.scaling.job import KNOWN_PAGES, RANGE_PAGES, Choices, Job, named_bundle, of_fleet, of_recordings
+from runtime.scaling.ledger import Ledger
+from runtime.scaling.local import LocalEngine, default_workers
+from runtime.scaling.task import Operation
+from runtime.scaling.totals import AIR, Totals, totals
+from runtime.scaling.volumes import RecoveredFile, recovered_files
+
+LOCAL, RAY = "local", "ray"
+
+
+@click.group()
+def bulk() -> None:
+    """Read archives of recordings, or recalibrate a fleet, with many workers.
+
+    Results and a ledger of every page go into the folder OUT. The same command again does only what is missing; without
+    --recordings and --fleet it goes on with what was asked before. Exit status 2 says that pages or recordings are
+    lost, 3 that a file is.
+    """
+
+
+def _options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options of all operations."""
+    for option in (
+        click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file."),
+        click.option(
+            "--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of the cores."
+        ),
+        click.option("--workers", type=click.IntRange(1), help="How many; by default one for every two cores."),
+        click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
+        click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),
+        click.option("--bundle", help=f"A bundle's path, or the name of a shipped one; {DEFAULT} by default."),
+        click.option(
+            "--fleet", type=click.Path(path_type=Path), help="TOML file of devices: name, bundle, recordings."
+        ),
+        click.option(
+            "--recordings", multiple=True, metavar="GLOB", help="HDF5 recordings; may be given several times."
+        ),
+        click.argument("out", type=OutputFolder()),
+    ):
+        command = option(command)
+    return command
+
+
+def _pages_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options of operations on page ranges."""
+    for option in (
+        click.option("--again-with", metavar="BUNDLE", help="Read pages again that were not read well."),
+        click.option("--tracking/--no-tracking", default=None, help="Follow the image within a range; the default."),
+        click.option("--range-pages", type=click.IntRange(1), help=f"Pages of a range; {RANGE_PAGES} by default."),
+    ):
+        command = option(command)
+    return command
+
+
+@bulk.command()
+@_options
+@_pages_options
+@click.option("--symbols/--no-symbols", default=None, help="Keep symbols and confidences; the default.")
+def decode(**asked: Any) -> None:
+    """Decode all pages of recordings into symbols and confidences."""
+    _bulk(Operation.DECODE, **asked)
+
+
+@bulk.command()
+@_options
+@_pages_options
+def recover(**asked: Any) -> None:
+    """Read the files back whose pages recordings show; the pages of a file may be in several recordings."""
+    _bulk(Operation.RECOVER, **asked)
+
+
+@bulk.command()
+@_options
+@_pages_options
+def evaluate(**asked: Any) -> None:
+    """Measure bundles on the pages of recordings that they have not seen."""
+    _bulk(Operation.EVALUATE, **asked)
+
+
+@bulk.command()
+@_options
+@click.option("--pages", type=click.IntRange(2), help=f"Known pages to use; {KNOWN_PAGES} by default.")
+def recalibrate(pages: int | None, **asked: Any) -> None:
+    """Recalibrate devices, each from a recording of its own; the new bundles are in OUT."""
+    _bulk(Operation.RECALIBRATE, known_pages=pages, **asked)
+
+
+def _bulk(
+    operation: Operation,
+    out: Path,
+    recordings: tuple[str, ...],
+    fleet: Path | None,
+    bundle: str | None,
+    engine: str,
+    address: str | None,
+    workers: int | None,
+    threads: int | None,
+    json_path: Path | None,
+    again_with: str | None = None,
+    **chosen: bool | int | None,
+) -> None:
+    """Run an operation; see the options. Choices that are None are as before, or the default."""
+    context = click.get_current_context()
+    check_outputs(context)
+    context.meta[RESUME_KEY] = "what is done stays; run the same command again to do the rest"
+    if address is not None and engine != RAY:
+        raise InvalidInputError("--address", f"with --engine {engine}", f"--engine {RAY}")
+    with Ledger(out) as ledger:
+        before = Job.read(ledger.folder)
+        given = {name: value for name, value in chosen.items() if value is not None}
+        choices = (Choices(operation=operation) if before is None else before.choices).model_copy(
+            update={"operation": operation, **given}
+        )
+        job = _job(ledger.folder, before, choices, recordings, fleet, bundle)
+        if again_with is not None:
+            job = _with_round(job, again_with)
+        job.write(ledger.folder)
+        made = run(ledger, job, partial(_engine, engine, address, workers, threads))
+        found = totals(ledger, job)
+        files = recovered_files(ledger, job) if operation is Operation.RECOVER else []
+    if json_path is not None:
+        write_json(json_path, figures(job, made, found, files))
+    click.echo(table(job, made, found, files))
+    if (error := failure(out, job, made, found, files)) is not None:
+        raise error
+
+
+def _engine(name: str, address: str | None, workers: int | None, threads: int | None) -> Engine:
+    if name == RAY:
+        from runtime.scaling.ray_engine import RayEngine
+
+        return RayEngine(address, workers, threads)
+    return LocalEngine(workers or default_workers(), threads)
+
+
+def _job(
+    folder: Path,
+    before: Job | None,
+    choices: Choices,
+    recordings: tuple[str, ...],
+    fleet: Path | None,
+    bundle: str | None,
+) -> Job:
+    """What is asked; that of the folder, where it is the same question or none.
+
+    Raises:
+        InvalidInputError: neither asked now nor before, or something else before.
+    """
+    if recordings and fleet is not None:
+        raise InvalidInputError("options", "--recordings and --fleet", "one of them")
+    if fleet is not None and bundle is not None:
+        raise InvalidInputError("--bundle", "with --fleet", "the bundles that the fleet's file names")
+    if fleet is not None:
+        asked = of_fleet(choices, fleet, before)
+    elif recordings:
+        default = DEFAULT if before is None else str(before.bundles[0].path)
+        asked = of_recordings(choices, recordings, bundle or default, before)
+    elif before is None:
+        got = f"no --recordings and no --fleet, and no run in {folder}"
+        raise InvalidInputError("options", got, "one of them")
+    else:
+        asked = before.model_copy(update={"choices": choices})
+        if bundle is not None:
+            asked = asked.model_copy(update={"bundles": (named_bundle(bundle),) * len(before.bundles)})
+    if before is None:
+        return asked
+    before.check(folder, asked)
+    return before.looked_at_again()
+
+
+def _with_round(job: Job, bundle: str) -> Job:
+    """A job with one more round, if it does not have it."""
+    model = named_bundle(bundle)
+    known = any(model.sha256 == other.sha256 for other in job.rounds)
+    return job if known else job.model_copy(update={"rounds": (*job.rounds, model)})
+
+
+def figures(job: Job, made: Progressed, found: Totals, files: list[RecoveredFile]) -> dict[str, Any]:
+    """All that is known, under the names that other programs read."""
+    return {
+        "operation": str(job.choices.operation),
+        "bundles": [bundle.model_dump(mode="json") for bundle in job.bundles],
+        "this_run": {
+            "pages": made.pages,
+            "ranges": made.ranges,
+            "failed": made.failed,
+            "problems": [str(problem) for problem in made.problems],
+            "seconds": made.seconds,
+            "pages_per_s": made.pages_per_s,
+            "worker_restarts": made.restarts,
+        },
+        **found.to_json(),
+        **({"files": [file.to_json() for file in files]} if job.choices.operation is Operation.RECOVER else {}),
+    }
+
+
+def table(job: Job, made: Progressed, found: Totals, files: list[RecoveredFile]) -> str:
+    """The figures for people."""
+    tally, air = found.tally, found.figures.value(AIR)
+    unit = "devices" if job.choices.operation is Operation.RECALIBRATE else "pages"
+    speed = "" if made.pages_per_s is None else f" in {made.seconds:.1f} s, {made.pages_per_s:.2f} a second"
+    causes = ", ".join(f"{count} {cause}" for cause, count in tally.lost.most_common())
+    rows = [
+        (unit, f"{tally.pages} of {len(job.sources)} recordings"),
+        ("this run", f"{made.pages} {unit}{speed}" if made.pages else "nothing was missing"),
+        ("read", f"{tally.read}"),
+        ("left out", f"{tally.left_out} that a bundle was made from" if tally.left_out else ""),
+        ("lost", f"{tally.lost.total()} ({causes})" if causes else "0"),
+        ("missing", f"{tally.missing}, the next run tries them again" if tally.missing else ""),
+        ("models", ", ".join(f"{version}: {count}" for version, count in tally.models.items())),
+        ("device has changed", f"by {tally.recalibration_due} pages" if tally.recalibration_due else ""),
+        ("AIR", "" if air is None else f"{air:.3f} bit/symbol"),
+        ("workers that died", f"{made.restarts}" if made.restarts else ""),
+    ]
+    for each in found.rounds:
+        gain = ""
+        if each.air_before.value is not None and each.air_after.value is not None:
+            gain = f"; AIR of them {each.air_before.value:.3f} before, {each.air_after.value:.3f} now"
+        told = f"{each.pages} pages: {each.won} won, {each.better} better, {each.lost} lost still{gain}"
+        rows.append((f"again, {each.model.version}", told))
+    for row in found.recordings if job.choices.operation is Operation.RECALIBRATE else ():
+        if new := row.get("recalibration"):
+            told = f"{new['version']}, AIR {new['air_before']:.3f} before, {new['air_after']:.3f} now"
+            rows.append((row["device"] or Path(row["recording"]).name, told))
+    rows += [
+        (f"volume {file.volume.id}", file.error or f"{file.path}, {file.volume.file_bytes} bytes") for file in files
+    ]
+    return "\n".join(f"{name:<20} {value}" for name, value in rows if value)
+
+
+def failure(out: Path, job: Job, made: Progressed, found: Totals, files: list[RecoveredFile]) -> LightpageError | None:
+    """The error that a run ends with where something is lost; None where nothing is."""
+    subject, tally = f"bulk run {out}", found.tally
+    lost = tally.lost.total()
+    told = [*map(str, made.problems), *found.lost]
+    if (more := made.failed + lost - len(told)) > 0:
+        told.append(f"and {more} more")
+    got = f"{lost} of {tally.pages} lost and {tally.missing} missing ({'; '.join(told)})"
+    if job.choices.operation is Operation.RECOVER and not made.failed:
+        broken = ranges([file.volume.id for file in files if file.error is not None])
+        if broken or (lost and not files):
+            what = f"volumes {broken} without a file" if broken else "no file"
+            return LostDataError(subject, f"{what}; {got}", "pages that suffice for every file")
+        if lost:
+            warn(f"{subject}: {got}; every file is whole all the same")
+        return None
+    return InvalidInputError(subject, got, "pages that can be read") if lost or made.failed else None

@@ -1,0 +1,1 @@
+"""Archives and fleets: page ranges of many recordings, read by many workers, each result written once."""

@@ -1,0 +1,139 @@
+"""Runs a job: hands out what is missing, counts what comes back, and holds no results."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lightpage.progress import track, warn
+from runtime.scaling.engine import Engine
+from runtime.scaling.job import Job
+from runtime.scaling.ledger import Ledger
+from runtime.scaling.task import Failed, Operation, Outcome, Problem, Task
+
+TOLD = 5
+"""Ranges without a result whose reasons are kept; the others are counted."""
+
+
+@dataclass
+class Progressed:
+    """What one run has done.
+
+    Attributes:
+        pages: that were read, or are lost.
+        lost: of these, those that are lost.
+        ranges: that have a result now.
+        failed: ranges, or recordings, without one.
+        problems: why, of the first of them.
+        restarts: workers that died.
+        seconds: that it took.
+    """
+
+    pages: int = 0
+    lost: int = 0
+    ranges: int = 0
+    failed: int = 0
+    problems: list[Problem] = field(default_factory=list)
+    restarts: int = 0
+    seconds: float = 0.0
+
+    @property
+    def pages_per_s(self) -> float | None:
+        """Of all workers together; None where nothing was to do."""
+        return self.pages / self.seconds if self.pages else None
+
+    def count(self, outcome: Outcome) -> int:
+        """Count an outcome and return how much of the work it was worth."""
+        if isinstance(outcome, Failed):
+            self.fail(outcome.problem.about(outcome.task.device))
+            return 0
+        self.ranges += 1
+        self.pages += outcome.task.weight
+        self.lost += sum(outcome.lost.values())
+        return outcome.task.weight
+
+    def fail(self, problem: Problem) -> None:
+        """Count what has no result."""
+        self.failed += 1
+        if len(self.problems) < TOLD:
+            self.problems.append(problem)
+        warn(str(problem))
+
+    def state(self) -> str:
+        """For a bar."""
+        parts = {"lost": self.lost, "failed": self.failed, "workers died": self.restarts}
+        return ", ".join(f"{name} {count}" for name, count in parts.items() if count)
+
+
+def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:
+    """Do all that is missing of a job: its first reading, then its rounds one after the other.
+
+    What has failed is told and left to the next run; all else goes on.
+
+    Args:
+        ledger: of the job, which belongs to this process.
+        job: what was asked.
+        engine: makes the engine; not called where nothing is missing.
+
+    Raises:
+        WorkerError: there are no workers.
+        InvalidInputError: a shard cannot be read.
+    """
+    start = time.perf_counter()
+    made = Progressed()
+    ledger.sweep()
+    for source in job.sources:
+        if source.problem is not None:
+            made.fail(source.problem.about(source.device))
+    unit = "device" if job.choices.operation is Operation.RECALIBRATE else "page"
+    try:
+        for number in range(1 + len(job.rounds)):
+
+            def missing(number: int = number) -> Iterator[Task]:
+                return ledger.missing_again(job, number) if number else ledger.missing(job)
+
+            todo = sum(task.weight for task in missing())
+            if not todo:
+                continue
+            total = todo if number else _all(ledger, job)
+            what = f"{job.choices.operation} again" if number else str(job.choices.operation)
+            works = engine()
+            steps = _steps(works, missing(), made)
+            with closing(steps):
+                for _ in track(steps, what, unit=unit, total=total, done=total - todo, state=made.state):
+                    pass
+    finally:
+        ledger.sweep()
+    made.seconds = time.perf_counter() - start
+    return made
+
+
+def _steps(engine: Engine, tasks: Iterable[Task], made: Progressed) -> Generator[None, None, None]:
+    """Once for every page that is behind."""
+    given_up: set[tuple[str, Path]] = set()
+    died = made.restarts
+
+    def wanted() -> Iterator[Task]:
+        return (task for task in tasks if (task.device, task.recording) not in given_up)
+
+    with closing(engine.run(wanted())) as outcomes:
+        for outcome in outcomes:
+            made.restarts = died + engine.restarts
+            if isinstance(outcome, Failed) and outcome.whole_recording:
+                key = outcome.task.device, outcome.task.recording
+                if key in given_up:
+                    continue  # it was under way when the recording was found to be unreadable, and is told already
+                given_up.add(key)
+            for _ in range(made.count(outcome)):
+                yield None
+    made.restarts = died + engine.restarts
+
+
+def _all(ledger: Ledger, job: Job) -> int:
+    """Pages of the whole job, or devices."""
+    if job.choices.operation is Operation.RECALIBRATE:
+        return sum(source.stamp is not None for source in job.sources)
+    return sum(source.pages for source in job.sources)

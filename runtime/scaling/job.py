@@ -1,0 +1,254 @@
+"""What a bulk run was asked: written into its folder once, so that the next run goes on with the same question."""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+from pydantic import ValidationError
+
+from lightpage.errors import BundleError, InvalidInputError, RecordingError
+from lightpage.files import replace_text
+from lightpage.recording.reader import Recording
+from runtime.bundle.bundle import Bundle
+from runtime.bundle.manifest import MANIFEST
+from runtime.bundle.shipped import bundle_path
+from runtime.scaling.task import NamedBundle, Operation, Plain, Problem, Stamp
+
+FILE = "job.json"
+
+RANGE_PAGES = 32
+"""Of a range, unless told otherwise: what a worker that dies costs at most, and often enough that its first page, whose
+image is looked for, costs little."""
+
+KNOWN_PAGES = 2
+"""Pages that a device is recalibrated with, unless told otherwise."""
+
+
+class Source(Plain):
+    """A recording of a run.
+
+    Attributes:
+        device: its name in the fleet; empty without a fleet.
+        path: of the file, absolute.
+        bundle: place of its bundle among the run's.
+        stamp: of the file when the run began; None where it could not be opened.
+        pages: that it has.
+        problem: why it could not be opened; None where it could.
+    """
+
+    device: str
+    path: Path
+    bundle: int
+    stamp: Stamp | None
+    pages: int
+    problem: Problem | None = None
+
+
+class Choices(Plain):
+    """What is asked beside recordings and bundles.
+
+    Attributes:
+        operation: what is done.
+        range_pages: pages of a range.
+        tracking: whether the image is followed within a range.
+        symbols: whether decoding keeps symbols and confidences.
+        known_pages: that a device is recalibrated with.
+    """
+
+    operation: Operation
+    range_pages: int = RANGE_PAGES
+    tracking: bool = True
+    symbols: bool = True
+    known_pages: int = KNOWN_PAGES
+
+
+class Job(Plain):
+    """What a run was asked.
+
+    Attributes:
+        format, version: of this file.
+        choices: how.
+        bundles: what to decode with.
+        sources: what to decode.
+        rounds: bundles that pages which were not read well are read again with, in this order.
+    """
+
+    format: Literal["lightpage-bulk"] = "lightpage-bulk"
+    version: Literal[1] = 1
+    choices: Choices
+    bundles: tuple[NamedBundle, ...]
+    sources: tuple[Source, ...]
+    rounds: tuple[NamedBundle, ...] = ()
+
+    def write(self, folder: Path) -> None:
+        """Write it into the folder of the run.
+
+        Raises:
+            InvalidInputError: it cannot be written.
+        """
+        replace_text(folder / FILE, self.model_dump_json(indent=1) + "\n", "job")
+
+    @classmethod
+    def read(cls, folder: Path) -> Job | None:
+        """That of a folder; None where no run has begun there.
+
+        Raises:
+            InvalidInputError: it cannot be read.
+        """
+        path = folder / FILE
+        try:
+            return cls.model_validate_json(path.read_bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError) as error:
+            expected = "what `lightpage bulk` of this version has written"
+            raise InvalidInputError(f"job {path}", error, expected) from None
+
+    def looked_at_again(self) -> Job:
+        """The same; recordings that could not be opened before are tried once more."""
+        again = (s if s.problem is None else look_at(s.device, s.path, s.bundle) for s in self.sources)
+        return self.model_copy(update={"sources": tuple(again)})
+
+    def check(self, folder: Path, asked: Job) -> None:
+        """Check that a run asks what was asked before; files that have gone or changed are the workers' to tell.
+
+        Raises:
+            InvalidInputError: it asks something else.
+        """
+        subject, expected = f"bulk run {folder}", "the same question, or another folder"
+        for name, before in vars(self.choices).items():
+            if (now := getattr(asked.choices, name)) != before:
+                raise InvalidInputError(f"{subject}: {name}", f"{now}, and {before} before", expected)
+        before_paths = {(s.device, s.path): self.bundles[s.bundle] for s in self.sources}
+        for source in asked.sources:
+            bundle = before_paths.pop((source.device, source.path), None)
+            if bundle is None:
+                raise InvalidInputError(subject, f"recording {source.path}, which was not asked for before", expected)
+            now = asked.bundles[source.bundle]
+            if now.sha256 != bundle.sha256:
+                got = f"{now.version} ({now.sha256[:12]}), and {bundle.version} ({bundle.sha256[:12]}) before"
+                raise InvalidInputError(f"{subject}: bundle", got, f"{expected}; --again-with reads anew what was lost")
+        if left_out := [str(path) for _, path in before_paths if path.exists()]:
+            raise InvalidInputError(subject, f"no recording {left_out[0]}, which was asked for before", expected)
+
+
+def bundle_sha256(path: Path) -> str:
+    """SHA-256 of a bundle that is a zip; of a folder, that of its manifest, which names those of its files.
+
+    Raises:
+        BundleError: it cannot be read.
+    """
+    try:
+        with (path / MANIFEST if path.is_dir() else path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise BundleError(f"bundle {path}", error, "a bundle that can be read") from None
+
+
+def named_bundle(name_or_path: str) -> NamedBundle:
+    """A bundle as a run names it.
+
+    Raises:
+        BundleError: it is none.
+    """
+    path = bundle_path(name_or_path).absolute()
+    return NamedBundle(path=path, sha256=bundle_sha256(path), version=Bundle.open(path).version)
+
+
+def found_recordings(patterns: Sequence[str]) -> list[Path]:
+    """Files that the patterns name, each once, sorted within a pattern.
+
+    Raises:
+        InvalidInputError: a pattern that names none.
+    """
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        names = sorted(glob.glob(pattern, recursive=True)) or ([pattern] if not glob.has_magic(pattern) else [])
+        if not names:
+            raise InvalidInputError(f"--recordings {pattern}", "no file", "a pattern of files that are there")
+        found |= dict.fromkeys(Path(name).absolute() for name in names)
+    return list(found)
+
+
+def look_at(device: str, path: Path, bundle: int, known: Mapping[tuple[str, Path], Source] | None = None) -> Source:
+    """A recording as it is now, or as it is known; one that cannot be opened is kept with its problem."""
+    if known and (source := known.get((device, path))) is not None:
+        return source.model_copy(update={"bundle": bundle})
+    try:
+        stamp = Stamp.of(path)
+        with Recording.open(path) as recording:
+            return Source(device=device, path=path, bundle=bundle, stamp=stamp, pages=recording.pages)
+    except RecordingError as error:
+        problem = Problem.of(error)
+    except OSError as error:
+        problem = Problem.of(RecordingError(f"recording {path}", error, "a recording"))
+    return Source(device=device, path=path, bundle=bundle, stamp=None, pages=0, problem=problem)
+
+
+def of_recordings(choices: Choices, patterns: Sequence[str], bundle: str, before: Job | None) -> Job:
+    """A run over recordings of one device, or of devices that share a bundle.
+
+    Args:
+        choices: how.
+        patterns: of the recordings' names.
+        bundle: a path, or the name of a shipped one.
+        before: what the folder was asked before; recordings that are in it are not opened.
+
+    Raises:
+        LightpageError: no such bundle, or no such files.
+    """
+    known = _known(before)
+    sources = tuple(look_at("", path, 0, known) for path in found_recordings(patterns))
+    return Job(choices=choices, bundles=(named_bundle(bundle),), sources=sources)
+
+
+class _Device(Plain):
+    name: str
+    bundle: str
+    recordings: tuple[str, ...]
+
+
+class _Fleet(Plain):
+    device: tuple[_Device, ...]
+
+
+def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
+    """A run over the devices that a file names, each with its bundle and recordings; paths are relative to the file.
+
+    Args:
+        choices, before: see `of_recordings`.
+        path: of the file.
+
+    Raises:
+        InvalidInputError: the file cannot be read, or two devices have one name.
+        LightpageError: no such bundle, or no such files.
+    """
+    subject = f"fleet {path}"
+    try:
+        fleet = _Fleet.model_validate(tomllib.loads(path.read_text("utf-8")))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, ValidationError) as error:
+        raise InvalidInputError(subject, error, "[[device]] tables with name, bundle and recordings") from None
+    names = [device.name for device in fleet.device]
+    if not names or len(set(names)) < len(names):
+        raise InvalidInputError(subject, f"devices {', '.join(names) or 'none'}", "devices of different names")
+    bundles: dict[str, int] = {}
+    sources, known = [], _known(before)
+    for device in fleet.device:
+        place = bundles.setdefault(_beside(path, device.bundle), len(bundles))
+        patterns = [str(path.parent / pattern) for pattern in device.recordings]
+        sources += [look_at(device.name, found, place, known) for found in found_recordings(patterns)]
+    return Job(choices=choices, bundles=tuple(map(named_bundle, bundles)), sources=tuple(sources))
+
+
+def _known(job: Job | None) -> dict[tuple[str, Path], Source]:
+    return {} if job is None else {(source.device, source.path): source for source in job.sources}
+
+
+def _beside(fleet: Path, bundle: str) -> str:
+    """The name of a shipped bundle, or a path relative to the fleet's file."""
+    return bundle if bundle_path(bundle) != Path(bundle) else str(fleet.parent / bundle)

@@ -1,0 +1,118 @@
+"""Workers that are processes of this machine."""
+
+from __future__ import annotations
+
+import select
+import time
+from collections import deque
+from collections.abc import Generator, Iterable
+
+from pydantic import TypeAdapter
+
+from runtime.errors import WorkerError
+from runtime.execution.cpus import available_cpus
+from runtime.helper_process import HelperProcess, same_packages
+from runtime.scaling.engine import ATTEMPTS, THREADS_OF_WORKER, Attempt, given_up, longest_s, next_attempt
+from runtime.scaling.task import Outcome, Task
+
+WORKER = "runtime.scaling.local_worker"
+
+_OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
+
+_SEND_S = 60.0
+"""A task is a few kilobytes, and the worker waits for it."""
+
+
+def default_workers() -> int:
+    """How many workers this machine's cores keep busy."""
+    return max(1, available_cpus() // THREADS_OF_WORKER)
+
+
+class LocalEngine:
+    """Has processes of this machine do tasks; see `runtime.scaling.engine.Engine`.
+
+    A worker has one task at a time, and is started with its first one.
+
+    Args:
+        workers: how many.
+        threads: of each one's inferences; by default its share of the cores.
+        module: what a worker runs.
+    """
+
+    def __init__(self, workers: int, threads: int | None = None, module: str = WORKER) -> None:
+        self.workers, self._module = workers, module
+        self.threads = threads or max(1, available_cpus() // workers)
+        self.restarts = 0
+
+    def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
+        """See `Engine`."""
+        following, again = iter(tasks), deque[Attempt]()
+        busy: dict[HelperProcess, Attempt] = {}
+        free: list[HelperProcess] = []
+        try:
+            while True:
+                while len(busy) < self.workers:
+                    attempt = again.popleft() if again else next_attempt(following)
+                    if attempt is None:
+                        break
+                    worker = free.pop() if free else self._start()
+                    busy[worker] = attempt
+                    self._hand_over(worker, attempt)
+                if not busy:
+                    return
+                for worker in _heard(busy):
+                    attempt = busy.pop(worker)
+                    try:
+                        line = worker.line(attempt.deadline)
+                    except OSError as error:
+                        worker.end(grace_s=1.0)
+                        self.restarts += 1
+                        attempt.number += 1
+                        if attempt.number < ATTEMPTS:
+                            again.append(attempt)
+                        else:
+                            yield given_up(attempt.task, _told(worker, error))
+                        continue
+                    free.append(worker)
+                    yield _OUTCOME.validate_json(line)
+        finally:
+            for worker in (*busy, *free):
+                worker.end()
+
+    def _start(self) -> HelperProcess:
+        try:
+            return HelperProcess(
+                self._module, str(self.threads), subject="a worker", environment=same_packages(self.threads)
+            )
+        except OSError as error:
+            raise WorkerError("a worker", error, "a process that can be started") from error
+
+    @staticmethod
+    def _hand_over(worker: HelperProcess, attempt: Attempt) -> None:
+        """Send a task; a worker that cannot take it has died, which its socket tells."""
+        attempt.deadline = time.monotonic() + longest_s(attempt.task)
+        try:
+            worker.send(attempt.task.model_dump_json().encode() + b"\n", time.monotonic() + _SEND_S)
+        except OSError:
+            worker.end()
+
+
+def _heard(busy: dict[HelperProcess, Attempt]) -> list[HelperProcess]:
+    """Workers that have answered or ended, at least one; those whose time is up among them."""
+    ended = [worker for worker in busy if worker.fileno() < 0]
+    if ended:
+        return ended
+    left = min(attempt.deadline for attempt in busy.values()) - time.monotonic()
+    ready, _, _ = select.select(list(busy), [], [], max(0.0, left))
+    now = time.monotonic()
+    return ready or [worker for worker, attempt in busy.items() if attempt.deadline <= now]
+
+
+def _told(worker: HelperProcess, error: Exception) -> str:
+    """How a worker has ended, for people."""
+    if isinstance(error, TimeoutError):
+        return "no answer in time"
+    status = worker.status
+    if status is not None and status < 0:
+        return f"the end of its worker by signal {-status}"
+    return f"the end of its worker with status {status}"

@@ -1,0 +1,39 @@
+"""A worker's process: `python -m runtime.scaling.local_worker THREADS`, started by `runtime.scaling.local`."""
+
+from __future__ import annotations
+
+import os
+import queue
+import sys
+import threading
+
+from runtime.execution.memory import share_freed_memory
+from runtime.helper_process import parent_link
+from runtime.scaling.task import Task
+from runtime.scaling.work import Worker
+
+_DRIVER_GONE = 3
+
+
+def main(worker: Worker) -> None:
+    """Have it do one task after the other until the driver is gone or wants no more, whatever is being done then."""
+    share_freed_memory()
+    link = parent_link()
+    tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def listen() -> None:
+        try:
+            with link.makefile("rb") as lines:
+                for line in lines:
+                    tasks.put(line)
+        finally:
+            os._exit(_DRIVER_GONE)
+
+    threading.Thread(target=listen, name="lightpage-driver", daemon=True).start()
+    while True:
+        outcome = worker.work(Task.model_validate_json(tasks.get()))
+        link.sendall(outcome.model_dump_json().encode() + b"\n")
+
+
+if __name__ == "__main__":
+    main(Worker(int(sys.argv[1])))

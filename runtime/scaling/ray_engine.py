@@ -1,0 +1,164 @@
+"""Workers on a Ray cluster, or on one that is started on this machine. Ray is imported when it is asked for."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from lightpage.errors import InvalidInputError
+from runtime.errors import WorkerError
+from runtime.execution.cpus import available_cpus
+from runtime.helper_process import same_packages
+from runtime.scaling.engine import ATTEMPTS, THREADS_OF_WORKER, Attempt, given_up, longest_s, next_attempt
+from runtime.scaling.task import Outcome, Task
+
+if TYPE_CHECKING:
+    from runtime.scaling.work import Worker
+
+_AHEAD = 2
+"""Tasks on their way for each that the cluster can work on: a worker that ends one finds the next one waiting."""
+
+_STORE_BYTES = 128 << 20
+"""Of the object store of a cluster that is started here; tasks and outcomes are a few kilobytes."""
+
+_LOOPBACK = "127.0.0.1"
+
+
+class RayEngine:
+    """Has Ray tasks do tasks; see `runtime.scaling.engine.Engine`.
+
+    A process of Ray keeps its decoder from one task to the next. Ray's own retries are off: a task of a worker or node
+    that dies is given out again by this engine. Recordings, bundles and the run's folder must be there on every node.
+
+    Args:
+        address: of a cluster, `auto` for one that runs on this machine; None to start one here, for this run.
+        workers: most ranges at once; by default as many as the cluster's CPUs allow at any time.
+        threads: CPUs of a worker, and threads of its inferences; by default `THREADS_OF_WORKER`, or what a node has.
+    """
+
+    def __init__(self, address: str | None = None, workers: int | None = None, threads: int | None = None) -> None:
+        self._address, self._workers = address, workers
+        self._threads = threads
+        self.restarts = 0
+
+    def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
+        """See `Engine`.
+
+        Raises:
+            WorkerError: no cluster, or one that does not answer.
+            InvalidInputError: no node has as many CPUs as a worker takes.
+            ModuleNotFoundError: Ray is not installed: the extra cluster brings it.
+        """
+        with _connected(self._address) as ray:
+            yield from self._run(ray, iter(tasks))
+
+    def _run(self, ray: Any, following: Iterator[Task]) -> Generator[Outcome, None, None]:
+        threads = self._threads_of(ray)
+        work = ray.remote(_work).options(num_cpus=threads, max_retries=0)
+        again = deque[Attempt]()
+        busy: dict[Any, Attempt] = {}
+        try:
+            while True:
+                most = self._most(ray, threads)
+                while len(busy) < most and (attempt := again.popleft() if again else next_attempt(following)):
+                    busy[work.remote(attempt.task, threads)] = attempt
+                if not busy:
+                    return
+                limit_s = max(longest_s(attempt.task) for attempt in busy.values())
+                ready, _ = ray.wait(list(busy), num_returns=1, timeout=limit_s)
+                if not ready:
+                    raise WorkerError("the Ray cluster", f"no answer within {limit_s:.0f} s", "nodes that work")
+                for ref in ready:
+                    attempt = busy.pop(ref)
+                    try:
+                        outcome: Outcome = ray.get(ref)
+                    except ray.exceptions.RayError as error:
+                        self.restarts += 1
+                        attempt.number += 1
+                        if attempt.number < ATTEMPTS:
+                            again.append(attempt)
+                            continue
+                        outcome = given_up(attempt.task, _told(error))
+                    yield outcome
+        finally:
+            for ref in busy:
+                ray.cancel(ref, force=True)
+
+    def _threads_of(self, ray: Any) -> int:
+        """CPUs of a worker, at most as many as the largest node has.
+
+        Raises:
+            InvalidInputError: more are asked for.
+        """
+        largest = max((int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]), default=0)
+        if self._threads is not None and self._threads > largest:
+            raise InvalidInputError(
+                "--threads", f"{self._threads}, and nodes of {largest} CPUs", "a node that has them"
+            )
+        return self._threads or max(1, min(THREADS_OF_WORKER, largest))
+
+    def _most(self, ray: Any, threads: int) -> int:
+        """Tasks that may be on their way, as the cluster is now."""
+        if self._workers is not None:
+            return self._workers
+        return max(1, int(ray.cluster_resources().get("CPU", 0)) // threads) * _AHEAD
+
+
+_worker: Worker | None = None
+"""Of a process of Ray: its decoder stays warm."""
+
+
+def _work(task: Task, threads: int) -> Outcome:
+    """In a process of Ray: do a task."""
+    global _worker
+    if _worker is None:
+        from runtime.execution.memory import share_freed_memory
+        from runtime.scaling.work import Worker
+
+        share_freed_memory()
+        _worker = Worker(threads)
+    return _worker.work(task)
+
+
+@contextmanager
+def _connected(address: str | None) -> Iterator[Any]:
+    """Ray, connected to a cluster; a cluster that was started for it ends with it."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # before it is imported: nothing is sent to anybody
+    import ray
+
+    if ray.is_initialized():
+        yield ray
+        return
+    settings: dict[str, Any] = {"address": address} if address else {}
+    folder = None
+    if address is None:
+        folder = tempfile.mkdtemp(prefix="ray-")  # a socket's path must be short
+        settings = {
+            "num_cpus": available_cpus(),
+            "include_dashboard": False,
+            "object_store_memory": _STORE_BYTES,
+            "_temp_dir": folder,
+            "_node_ip_address": _LOOPBACK,
+        }
+    packages = {"env_vars": {"PYTHONPATH": same_packages(1)["PYTHONPATH"]}}
+    try:
+        try:
+            ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=packages, **settings)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise WorkerError(f"Ray cluster {address or 'of this machine'}", error, "one that answers") from error
+        yield ray
+    finally:
+        ray.shutdown()
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _told(error: Exception) -> str:
+    """The first line of what Ray says."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)

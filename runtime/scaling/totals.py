@@ -1,0 +1,263 @@
+"""What a bulk run has found, added up from its shards one after the other."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from lightpage.codec.volume_file import ranges
+from lightpage.metrics.reliability import ConfidenceBin, calibration_error
+from runtime.scaling.job import Job, Source
+from runtime.scaling.ledger import Ledger
+from runtime.scaling.shard import BUNDLE, PageRecord, PageState, ShardRecord, with_end
+from runtime.scaling.task import NamedBundle, Operation, Task
+
+AIR = "air_bits_per_symbol"
+
+TOLD = 5
+"""Lost pages that are told with their reasons."""
+
+
+class Mean:
+    """A mean that holds no values."""
+
+    def __init__(self) -> None:
+        self._sum, self._count = 0.0, 0
+
+    def add(self, value: float | None) -> None:
+        """Count a value, if it is one."""
+        if value is not None:
+            self._sum, self._count = self._sum + value, self._count + 1
+
+    @property
+    def value(self) -> float | None:
+        """None of no values."""
+        return self._sum / self._count if self._count else None
+
+
+class Means:
+    """Means of the figures of pages, by name."""
+
+    def __init__(self) -> None:
+        self._means: dict[str, Mean] = {}
+
+    def add(self, figures: dict[str, float | int | None]) -> None:
+        """Count a page."""
+        for name, value in figures.items():
+            self._means.setdefault(name, Mean()).add(value)
+
+    def value(self, name: str) -> float | None:
+        """The mean of a figure; None where no page has it."""
+        return self._means[name].value if name in self._means else None
+
+    def to_json(self) -> dict[str, float | None]:
+        """All of them."""
+        return {name: mean.value for name, mean in self._means.items()}
+
+
+@dataclass
+class Tally:
+    """Pages of a recording, or of all.
+
+    Attributes:
+        pages: all of them; of a fleet that is recalibrated, its devices.
+        read, left_out: how many were.
+        lost: by cause.
+        recalibration_due: read, and show that the device has changed.
+        models: pages by the version of what read them.
+    """
+
+    pages: int = 0
+    read: int = 0
+    left_out: int = 0
+    lost: Counter[str] = field(default_factory=Counter)
+    recalibration_due: int = 0
+    models: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def missing(self) -> int:
+        """Pages without a result."""
+        return self.pages - self.read - self.left_out - self.lost.total()
+
+    def add(self, page: PageRecord) -> None:
+        """Count a page that has a result."""
+        self.read += page.state is PageState.READ
+        self.left_out += page.state is PageState.LEFT_OUT
+        self.recalibration_due += page.recalibration_due and page.state is PageState.READ
+        if page.state is PageState.LOST:
+            self.lost[page.loss or "unknown"] += 1
+
+    def to_json(self) -> dict[str, Any]:
+        """The counts under the names that other programs read."""
+        return {
+            "pages": self.pages,
+            "pages_read": self.read,
+            "pages_left_out": self.left_out,
+            "pages_lost": self.lost.total(),
+            "pages_missing": self.missing,
+            "lost": dict(self.lost),
+            "pages_recalibration_due": self.recalibration_due,
+        }
+
+
+@dataclass
+class Round:
+    """What a later reading has brought.
+
+    Attributes:
+        model: what read.
+        pages: that were read again.
+        won: that were lost before, and are read now.
+        better: that were read before, and are read better now.
+        lost: that are lost still.
+        air_before, air_after: mean AIR of all of them where it is known, a lost page counting nothing.
+    """
+
+    model: NamedBundle
+    pages: int = 0
+    won: int = 0
+    better: int = 0
+    lost: int = 0
+    air_before: Mean = field(default_factory=Mean)
+    air_after: Mean = field(default_factory=Mean)
+
+    def add(self, before: PageRecord, now: PageRecord) -> None:
+        """Count a page that was read again."""
+        took = now.better_than(before)
+        self.pages += 1
+        self.won += took and before.state is PageState.LOST
+        self.better += took and before.state is PageState.READ
+        self.lost += not took and before.state is PageState.LOST
+        if AIR in now.figures or AIR in before.figures:
+            self.air_before.add(_air(before))
+            self.air_after.add(_air(now if took else before))
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures under the names that other programs read."""
+        return {
+            "version": self.model.version,
+            "pages": self.pages,
+            "pages_won": self.won,
+            "pages_better": self.better,
+            "pages_lost_still": self.lost,
+            "air_before": self.air_before.value,
+            "air_after": self.air_after.value,
+        }
+
+
+@dataclass
+class Totals:
+    """What a run has found.
+
+    Attributes:
+        tally: of all pages.
+        figures: means over the pages that were read.
+        confidence_bins: of all pages of an evaluation together.
+        rounds: what later readings have brought.
+        recordings: a row each.
+        lost: the first lost pages, or devices, and why.
+    """
+
+    tally: Tally = field(default_factory=Tally)
+    figures: Means = field(default_factory=Means)
+    confidence_bins: dict[tuple[float, float], list[float]] = field(default_factory=dict)
+    rounds: list[Round] = field(default_factory=list)
+    recordings: list[dict[str, Any]] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+
+    @property
+    def ece(self) -> float | None:
+        """Of an evaluation."""
+        bins = [
+            ConfidenceBin(low, high, int(count), claimed / count, right / count)
+            for (low, high), (count, claimed, right) in self.confidence_bins.items()
+        ]
+        return calibration_error(bins) if bins else None
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures under the names that other programs read."""
+        return {
+            **self.tally.to_json(),
+            "models": dict(self.tally.models),
+            "figures": {**self.figures.to_json(), **({} if self.ece is None else {"ece": self.ece})},
+            "rounds": [each.to_json() for each in self.rounds],
+            "recordings": self.recordings,
+        }
+
+
+def totals(ledger: Ledger, job: Job) -> Totals:
+    """Add up what the shards of a job say; a shard is read at a time.
+
+    Raises:
+        InvalidInputError: a shard cannot be read.
+    """
+    found = Totals(rounds=[Round(model) for model in job.rounds])
+    for index, source in enumerate(job.sources):
+        _add_recording(found, ledger, job, index, source)
+    return found
+
+
+def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: Source) -> None:
+    own, figures, there = Tally(), Means(), ledger.results(index)
+    lost: dict[str, list[int]] = {}
+    summary: dict[str, float | str | None] = {}
+    for task in ledger.ranges(job, index, source):
+        own.pages += task.weight
+        found.tally.pages += task.weight
+        for record, page in _pages(found, ledger, job, index, task, there):
+            summary = record.summary
+            for tally in (own, found.tally):
+                tally.add(page)
+                tally.models[record.model.version] += 1
+            if page.state is PageState.READ:
+                figures.add(page.figures)
+                found.figures.add(page.figures)
+            elif page.state is PageState.LOST:
+                lost.setdefault(page.loss or "unknown", []).append(page.page)
+                if len(found.lost) < TOLD:
+                    found.lost.append(f"{_name(source, task, page)}: {page.reason}")
+    row = {"device": source.device, "recording": str(source.path), **own.to_json()}
+    if job.choices.operation is not Operation.RECALIBRATE:
+        row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
+    if source.problem is not None:
+        row["problem"] = str(source.problem)
+    if summary:
+        row["recalibration"] = {**summary, "bundle": str(with_end(ledger.shard(index, 0), BUNDLE))}
+    found.recordings.append(row)
+
+
+def _pages(
+    found: Totals, ledger: Ledger, job: Job, index: int, task: Task, there: frozenset[str]
+) -> Iterator[tuple[ShardRecord, PageRecord]]:
+    """The readings that count of the pages of a range, each with the shard that it is from; rounds are counted."""
+    if task.shard.name not in there:
+        return
+    first = ShardRecord.read(task.shard)
+    for part in first.confidence_bins:
+        sums = found.confidence_bins.setdefault((part.low, part.high), [0.0, 0.0, 0.0])
+        for place, value in enumerate((part.count, part.count * part.confidence, part.count * part.accuracy)):
+            sums[place] += value
+    best = {page.page: (first, page) for page in first.pages}
+    for number in range(1, 1 + len(job.rounds)):
+        shard = ledger.shard(index, task.pages[0], number)
+        if shard.name not in there:
+            continue
+        again = ShardRecord.read(shard)
+        for page in again.pages:
+            before = best[page.page][1]
+            found.rounds[number - 1].add(before, page)
+            if page.better_than(before):
+                best[page.page] = again, page
+    yield from best.values()
+
+
+def _name(source: Source, task: Task, page: PageRecord) -> str:
+    device = f"device {source.device}: " if source.device else ""
+    number = "" if task.operation is Operation.RECALIBRATE else f": page {page.page}"
+    return f"{device}recording {source.path}{number}"
+
+
+def _air(page: PageRecord) -> float:
+    return float(page.figures.get(AIR) or 0.0) if page.state is PageState.READ else 0.0

@@ -1,0 +1,315 @@
+"""What a worker does with a range: a warm decoder reads its pages in order and writes the shard."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.known_pages import first_lit_pages
+from lightpage.codec.page_bytes import PageBytes
+from lightpage.codec.volume import Volume
+from lightpage.errors import (
+    BundleError,
+    CalibrationError,
+    InvalidInputError,
+    LightpageError,
+    RecalibrationRefusedError,
+    RecordingError,
+)
+from lightpage.metrics.accumulator import Accumulator
+from lightpage.metrics.measures import PageMeasures, measure
+from lightpage.page.pilots import Pilots
+from lightpage.progress import warn
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
+from runtime.bulk.evaluation import check_recording, decode_unseen, pilots_of
+from runtime.bulk.read_ahead import read_ahead
+from runtime.bulk.recovery import RecoveredPage, code_of, page_reader, read_page
+from runtime.client.decoded_file import DecodedWriter
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.frames import narrow
+from runtime.decoding.image_tracker import tracker_for
+from runtime.decoding.page import DecodedPage
+from runtime.decoding.tracking import NoTracker, Tracker
+from runtime.errors import LostPageError
+from runtime.recalibration.known_pages import read_recorded
+from runtime.recalibration.outcome import RecalibrationOutcome, Refit
+from runtime.recalibration.recalibration import next_version, recalibrate
+from runtime.recalibration.refit import refit
+from runtime.scaling.job import bundle_sha256
+from runtime.scaling.shard import BUNDLE, SYMBOLS, PageRecord, PageState, ShardRecord, with_end, write_user_bytes
+from runtime.scaling.task import Done, Failed, NamedBundle, Operation, Outcome, Problem, Stamp, Task
+
+T = TypeVar("T")
+
+
+class Changed(RecordingError):
+    """A recording that is not the one that the run began with."""
+
+
+class Worker:
+    """Reads ranges one after the other; the decoder of the last one's bundle stays warm.
+
+    Args:
+        threads: of an inference.
+        fit: how a device is re-fitted.
+    """
+
+    def __init__(self, threads: int, fit: Refit = refit) -> None:
+        self._threads, self._fit = threads, fit
+        self._warm: tuple[NamedBundle, _Warm] | None = None
+
+    def work(self, task: Task) -> Outcome:
+        """Read a range and write its shard, or say why there is none.
+
+        Errors that nobody foresaw are raised: they end the worker, and the range goes to another one.
+        """
+        start = time.perf_counter()
+        whole = True
+        try:
+            _check_stamp(task)
+            warm = self._opened(task.bundle)
+            with Recording.open(task.recording) as recording:
+                check_recording(warm.decoder, recording)
+                record = self._record(task, recording, warm)
+            whole = False
+            _check_stamp(task)
+            record = record.model_copy(update={"seconds": time.perf_counter() - start})
+            record.write(task.shard)
+        except LightpageError as error:
+            return Failed(task=task, problem=Problem.of(error), whole_recording=whole)
+        return Done(task=task, lost=record.lost, seconds=record.seconds)
+
+    def _record(self, task: Task, recording: Recording, warm: _Warm) -> ShardRecord:
+        if task.operation is Operation.RECALIBRATE:
+            return self._recalibrated(task, recording, warm.decoder)
+        tracker = warm.tracker.anew() if task.tracking else NoTracker(warm.decoder)
+        reading = _Range(task, recording, warm.decoder, tracker)
+        return {
+            Operation.DECODE: reading.decoded,
+            Operation.EVALUATE: reading.evaluated,
+            Operation.RECOVER: reading.recovered,
+        }[task.operation]()
+
+    def _opened(self, bundle: NamedBundle) -> _Warm:
+        """The decoder of a bundle; the one before it is let go first, so that there is one at a time.
+
+        Raises:
+            BundleError: another bundle than was named.
+        """
+        if self._warm is None or self._warm[0] != bundle:
+            self._warm = None
+            if (found := bundle_sha256(bundle.path)) != bundle.sha256:
+                raise BundleError(
+                    f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as the run began with"
+                )
+            self._warm = bundle, _Warm(Decoder.load(bundle.path, self._threads))
+        return self._warm[1]
+
+    def _recalibrated(self, task: Task, recording: Recording, decoder: Decoder) -> ShardRecord:
+        """Recalibrate a device; that its pages fit no geometry is a result too."""
+        out = with_end(task.shard, BUNDLE)
+        out.unlink(missing_ok=True)  # of a worker that was killed before it wrote the record
+        try:
+            known = read_recorded(recording, first_lit_pages(recording, len(task.pages), warn))
+            outcome = recalibrate(decoder, known, out, next_version(decoder.version), self._fit, lambda *_: None)
+        except (RecalibrationRefusedError, CalibrationError, InvalidInputError) as error:
+            lost = PageRecord(page=0, state=PageState.LOST, loss=type(error).__name__, reason=str(error))
+            return ShardRecord(model=task.bundle, pages=(lost,), seconds=0.0)
+        read = PageRecord(page=0, state=PageState.READ)
+        return ShardRecord(model=task.bundle, pages=(read,), seconds=0.0, summary=_summary(outcome))
+
+
+class _Warm:
+    """A decoder, and a tracker of which each range gets one that has learnt nothing."""
+
+    def __init__(self, decoder: Decoder) -> None:
+        self.decoder = decoder
+
+    @cached_property
+    def tracker(self) -> Tracker:
+        return tracker_for(self.decoder)
+
+
+@dataclass(frozen=True)
+class _Range:
+    """The pages of a range on their way."""
+
+    task: Task
+    recording: Recording
+    decoder: Decoder
+    tracker: Tracker
+
+    def decoded(self) -> ShardRecord:
+        """Symbols, confidences, and figures where the symbols are known."""
+        levels, mask = self.recording.levels, pilots_of(self.decoder, self.recording)
+        records: list[PageRecord] = []
+
+        def decode(frames: FramePair, symbols: NDArray[np.uint8] | None) -> DecodedPage:
+            pilots = self.decoder.pilots(levels, mask) if symbols is None else Pilots.of_symbols(mask, symbols, levels)
+            return self.tracker.decode(narrow(frames, self.recording.bit_depth), levels, pilots)
+
+        def read(append: Callable[[_Page], None] | None) -> None:
+            for page, shown in self._read(self.recording.shown):
+                try:
+                    frames, symbols = shown.result()
+                    found = decode(frames, symbols)
+                except (InvalidInputError, LostPageError) as error:
+                    records.append(lost_page(page, error))
+                    continue
+                if append is not None:
+                    append(_Page(found.symbols, found.confidence, self.decoder.version, page))
+                figures = None if symbols is None else _measured(found, symbols, ~mask)
+                records.append(_read_record(page, found, figures))
+
+        if self.task.symbols:
+            with DecodedWriter(with_end(self.task.shard, SYMBOLS), levels) as writer:
+                read(writer.append)
+        else:
+            read(None)
+        return self._shard(records)
+
+    def evaluated(self) -> ShardRecord:
+        """Figures of the pages that the bundle has not seen.
+
+        Raises:
+            RecordingError: the recording has no symbols.
+        """
+        if not self.recording.has_symbols:
+            expected = "known symbols to measure against"
+            raise RecordingError(f"recording {self.recording.path}", "no symbols", expected)
+        mask = pilots_of(self.decoder, self.recording)
+        accumulator = Accumulator(self.recording.levels, ~mask, len(self.task.pages))
+        records: list[PageRecord] = []
+        for page, shown in self._read(self.recording.shown):
+            try:
+                frames, symbols = shown.result()
+                found = decode_unseen(self.decoder, self.recording, self.tracker, mask, frames, symbols)
+            except (InvalidInputError, LostPageError) as error:
+                records.append(lost_page(page, error))
+                continue
+            if found is None or symbols is None:
+                records.append(PageRecord(page=page, state=PageState.LEFT_OUT))
+                continue
+            accumulator.add(found.phase[~mask], found.concentration[~mask], symbols[~mask])
+            records.append(_read_record(page, found, accumulator.pages[-1]))
+        record = self._shard(records)
+        return record.model_copy(update={"confidence_bins": tuple(accumulator.confidence_bins())})
+
+    def recovered(self) -> ShardRecord:
+        """User bytes."""
+        reader = page_reader(self.decoder, self.recording, self.tracker, code_of(self.recording, self.decoder.bundle))
+        kept: list[tuple[int, PageBytes]] = []
+        records: list[PageRecord] = []
+        for page, frames in self._read(self.recording.frames):
+
+            def take(found: PageBytes, page: int = page) -> Volume | None:
+                volume = Volume.of_page(found)
+                if volume is not None:
+                    kept.append((page, found))
+                return volume
+
+            records.append(_recovered_record(read_page(reader, self.recording, page, frames, take)))
+        write_user_bytes(self.task.shard, kept)
+        return self._shard(records)
+
+    def _read(self, read: Callable[[int], T]) -> Iterator[tuple[int, Future[T]]]:
+        pages = self.task.pages
+        for index, future in read_ahead(lambda at: read(pages[at]), len(pages)):
+            yield pages[index], future
+
+    def _shard(self, records: list[PageRecord]) -> ShardRecord:
+        return ShardRecord(model=self.task.bundle, pages=tuple(records), seconds=0.0)
+
+
+@dataclass(frozen=True)
+class _Page:
+    """A page as `DecodedWriter` takes it."""
+
+    symbols: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    model_version: str
+    page: int | None
+
+
+def lost_page(page: int, error: LightpageError) -> PageRecord:
+    """The page that an error is about."""
+    due, loss = False, type(error).__name__
+    if isinstance(error, LostPageError):
+        due, loss = error.recalibration_due, error.reason.value
+    return PageRecord(page=page, state=PageState.LOST, loss=loss, reason=str(error), recalibration_due=due)
+
+
+def _check_stamp(task: Task) -> None:
+    """Check that a recording is the one that the run began with.
+
+    Raises:
+        RecordingError: it has gone or has changed.
+    """
+    subject = f"recording {task.recording}"
+    try:
+        found = Stamp.of(task.recording)
+    except OSError as error:
+        raise RecordingError(subject, error, "the file that the run began with") from None
+    if found != task.stamp:
+        expected = f"{task.stamp.size} bytes, changed when the run began: begin another run with the new file"
+        raise Changed(subject, f"{found.size} bytes, changed since", expected)
+
+
+def _read_record(page: int, found: DecodedPage, measures: PageMeasures | None) -> PageRecord:
+    known: dict[str, float | int | None] = {} if measures is None else dict(vars(measures))
+    return PageRecord(
+        page=page,
+        state=PageState.READ,
+        recalibration_due=found.check.recalibration_due,
+        confirmed_bits=found.check.confirmed_bits,
+        figures={
+            "mean_confidence": float(found.confidence.mean()),
+            "pilot_trust": found.pilot_trust,
+            "claimed_bits": found.check.claimed_bits,
+            **known,
+        },
+    )
+
+
+def _recovered_record(page: RecoveredPage) -> PageRecord:
+    return PageRecord(
+        page=page.page,
+        state=PageState.READ if page.loss is None else PageState.LOST,
+        loss=page.loss,
+        reason=page.reason,
+        figures={
+            "number": page.number,
+            "volume": page.volume,
+            "margin_bits": page.margin_bits,
+            "corrected": page.corrected,
+            "failed_blocks": page.failed_blocks,
+            "air_bits_per_symbol": page.air_bits,
+        },
+    )
+
+
+def _measured(page: DecodedPage, symbols: NDArray[np.uint8], data: NDArray[np.bool_]) -> PageMeasures | None:
+    if not data.any():
+        return None
+    return measure(page.phase[data], page.concentration[data], symbols[data], page.levels)
+
+
+def _summary(outcome: RecalibrationOutcome) -> dict[str, float | str | None]:
+    """What became of a device, for people and programs."""
+    return {
+        "version": outcome.version,
+        "previous_version": outcome.previous_version,
+        "angle_deg": outcome.report.angle_deg,
+        "air_before": outcome.air_before,
+        "air_after": outcome.air_after,
+        "pages_used": outcome.pages_used,
+        "pages_held_back": outcome.pages_held_back,
+    }
