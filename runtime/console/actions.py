@@ -64,7 +64,7 @@ class Actions:
         if not isinstance(asked, dict) or asked.keys() != {"action", "expected"}:
             raise InvalidInputError("action", repr(asked)[:100], 'a JSON object, {"action": ..., "expected": ...}')
         name, expected = asked["action"], asked["expected"]
-        if not isinstance(expected, str) or not expected:
+        if not isinstance(expected, str) or not expected.isprintable() or not expected:
             raise InvalidInputError("expected", repr(expected)[:100], "the version of the model in service")
         if not isinstance(name, str) or name not in self._named:
             raise InvalidInputError("action", repr(name)[:100], " or ".join(self._named))
