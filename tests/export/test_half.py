@@ -86,6 +86,7 @@ def test_a_graph_without_a_network_is_refused() -> None:
         in_half(model.SerializeToString(), ())
 
 
+@pytest.mark.long
 def test_a_network_that_halves_its_resolution_runs_in_half_precision() -> None:
     profile, device = small_profile(), Device()
     parameters = true_parameters(profile, device)

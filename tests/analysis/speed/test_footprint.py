@@ -19,6 +19,7 @@ from runtime.bundle.manifest import DECODER, FIELD, GOLDEN, MANIFEST, PILOTS, TW
 from tests.lightpage.small import small_profile
 
 
+@pytest.mark.long
 def test_every_file_is_weighed_and_pages_are_decoded_in_a_process_of_their_own(tmp_path: Path) -> None:
     profile, figures = tmp_path / "small.toml", tmp_path / "F.json"
     profile.write_text(small_profile().to_toml())

@@ -52,7 +52,7 @@ def test_one_text_says_what_the_service_does(toy_zip: Path, capsys: pytest.Captu
             "recalibration",
             "not due",
             "cores",
-            "MiB",
+            "iB",
             "inference",
             "post processing",
             "0 of 2",

@@ -6,6 +6,7 @@ import socket
 import sys
 import threading
 import time
+import tracemalloc
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -34,7 +35,7 @@ from runtime.service.registry import ModelRegistry
 from runtime.service.traces import MOST_PAGES, Traces
 from tests.runtime import toy
 from tests.runtime.rpc.stage import a_page
-from tests.runtime.rpc.test_edge import parts, resident
+from tests.runtime.rpc.test_edge import parts
 
 TRACE, CALLER = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
 SAMPLED, UNSAMPLED = (f"00-{TRACE}-{CALLER}-0{flag}" for flag in (1, 0))
@@ -135,10 +136,15 @@ def test_a_callers_text_is_cut_before_it_waits_to_be_sent(toy_zip: Path, caplog:
         taken.bind(("127.0.0.1", 0))  # nobody listens there
         with traced(toy_zip, f"http://127.0.0.1:{taken.getsockname()[1]}") as (stub, _):
             stub.ReadPage(pb.ReadPageRequest(correlation_id="a"), timeout=20)
-            before, size, count = resident(), 2 << 20, 40
-            for _ in range(count):
-                stub.ReadPage(pb.ReadPageRequest(correlation_id=size * "a"), timeout=20)
-            assert resident() - before < count * size / 2
+            size, count = 2 << 20, 20
+            tracemalloc.start()
+            try:
+                for _ in range(count):
+                    stub.ReadPage(pb.ReadPageRequest(correlation_id=size * "a"), timeout=60)
+                held, _ = tracemalloc.get_traced_memory()
+            finally:
+                tracemalloc.stop()
+            assert held < count * size / 4
     with receiving() as (receiver, endpoint), traced(toy_zip, endpoint) as (stub, _):
         stub.ReadPage(pb.ReadPageRequest(correlation_id=2 * MOST_TEXT * "a"), timeout=20)
     [call] = (span for span in receiver.spans if span.kind == Span.SPAN_KIND_SERVER)
