@@ -109,7 +109,11 @@ class Certificates:
 
 def _warn_of(pem: Pem) -> None:
     """Say what callers will have against the service's own certificate."""
-    own = x509.load_pem_x509_certificate(pem.certificate)
+    try:
+        own = x509.load_pem_x509_certificate(pem.certificate)
+    except ValueError as error:  # OpenSSL takes what this library does not
+        _log.warning("certificates: that of the service cannot be looked at: %s", error)
+        return
     left = own.not_valid_after_utc - datetime.now(UTC)
     if left <= SOON:
         state = "has expired" if left <= timedelta() else "expires soon"
