@@ -37,7 +37,7 @@ from runtime.bulk.recovery import Recovery, recover
 from runtime.bundle.shipped import bundle_path
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
-from train.models.decoder import COHERENT
+from train.models.decoder import COHERENT, WAVE
 from train.models.presets import FAST
 
 WEIGHTS = Path("analysis/weights")
@@ -89,7 +89,7 @@ def data_sets(pages: int) -> dict[str, DataSet]:
         DataSet("bright", lambda _: bundle_path("bench"), load_profile("bench"), Device(), 120, pages),
         kept("32e", "bench/-0.6deg-32e-4px", 120, pages),
         kept("full-size 4x4", "paper/-0.6deg-32e-4px", 8, 4),
-        kept("full-size 4x4 standard", "paper/-0.6deg-32e-4px", 8, 4, COHERENT, 0),
+        kept("full-size 4x4 standard", "paper/-0.6deg-32e-4px", 8, 4, WAVE, 0),
         kept("full-size 4x4 fast", "paper/-0.6deg-32e-4px", 8, 4, FAST, 0),
         kept("full-size 2x2", "paper/-0.6deg-32e-2px", 8, 4),
     ]

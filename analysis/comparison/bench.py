@@ -141,12 +141,14 @@ class Bench:
     def extractor(self, method: str) -> FeatureExtractor:
         """Of the calibrated device; the true one for an oracle's further pass, the signal's power left in."""
         localizer = "coherent" if method in (ORACLE, FAST) else method
-        return FeatureExtractor(self.calibrated_device(method), localizer, PRESETS[FAST] if method == FAST else None)
+        return FeatureExtractor(
+            self.calibrated_device(method), localizer, PRESETS[FAST].choices if method == FAST else None
+        )
 
     def symbol_method(self, name: str, size: str, choices: Hyperparameters) -> Outcome:
         """Features, then the network at symbol pitch."""
         if name == FAST:
-            choices = replace(PRESETS[FAST], steps=choices.steps, seed=choices.seed)
+            choices = replace(PRESETS[FAST].choices, steps=choices.steps, seed=choices.seed)
             size = f"{choices.channels}x{choices.blocks}x{choices.depth}"
         else:
             channels, blocks, depth = map(int, size.split("x"))
@@ -217,7 +219,7 @@ class Bench:
         """What the features of a method depend on, beside the recording."""
         if name == ORACLE:
             return ""
-        return self.fitted.to_toml() + (PRESETS[FAST].first_pass if name == FAST else "")
+        return self.fitted.to_toml() + (PRESETS[FAST].choices.first_pass if name == FAST else "")
 
     def features_of(
         self, name: str, recording: Recording, pages: Sequence[int], start: int, shift: tuple[float, float]

@@ -48,7 +48,7 @@ _KINDS = {
     **dict.fromkeys(("Concat", "Gather", "GatherND", "Pad", "Slice", "Split", "Transpose"), LAYOUT),
 }
 """Of operators; all others work number by number, or sum."""
-_DECODERS = "As `analysis.speed.speed` names it: coherent is the preset standard, refined is accurate."
+_DECODERS = "As `analysis.speed.speed` names it: wave is the preset standard, refined is accurate."
 _FREE = frozenset(["Constant", "Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"])
 """Operators that move nothing."""
 

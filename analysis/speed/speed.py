@@ -57,7 +57,7 @@ FIRST_LOOK = Hyperparameters()
 OWN = {
     "coherent": ("coherent", FIRST_LOOK),
     "refined": ("coherent", Hyperparameters(refinements=1)),
-    FAST: ("coherent", PRESETS[FAST]),
+    FAST: ("coherent", PRESETS[FAST].choices),
     "wave": ("wave", FIRST_LOOK),
 }
 """Decoders at symbol pitch: localizer and choices by name."""

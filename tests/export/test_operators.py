@@ -35,7 +35,7 @@ def exported(localizer: str, preset: str, frame_dtype: str = "uint8") -> bytes:
     """A small device's decoder; what operators it has does not depend on the network's size."""
     profile, device = small_profile(), Device()
     parameters = true_parameters(profile, device)
-    choices = replace(PRESETS[preset], channels=8, blocks=1)
+    choices = replace(PRESETS[preset].choices, channels=8, blocks=1)
     graph = DecoderGraph(profile, SymbolDecoder(profile, parameters, localizer, choices), 1.0).eval()
     table = sampling_table(TorchTwin(RayTwin(profile)), parameters, device.homodyne.turn_rad, profile)
     tensors = table_tensors(graph, table, Simulator(profile, device, seed=1).references())

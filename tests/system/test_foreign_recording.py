@@ -99,7 +99,7 @@ def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decod
     assert abs(angle - device.parameters.pipe_angle_deg) <= 0.03, f"seed {seed}"
 
     lightpage("train", "--profile", "bench", "--recording", str(recording), "--calibration", str(calibration),
-              "--localizer", "coherent", *choices, "--synthetic-pages", str(synthetic),
+              *choices, "--synthetic-pages", str(synthetic),
               "--out", str(run))  # fmt: skip
     lightpage("export", str(run), "--out", str(bundle))
     lightpage("evaluate", "--bundle", str(bundle), "--recording", str(recording), "--json", str(figures))

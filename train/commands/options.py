@@ -122,7 +122,7 @@ CHOICES = (
         "--refinements",
         click.IntRange(min=0, max=4),
         "Further passes, for what the symbols decoded so far do not explain.",
-        PRESETS[ACCURATE].refinements,
+        PRESETS[ACCURATE].choices.refinements,
         localizers=LOCALIZERS,
         of_preset=True,
     ),
@@ -209,6 +209,11 @@ def with_choices(command: C) -> C:
     return command
 
 
+def chosen_localizer(localizer: str | None, preset: str | None) -> str:
+    """The localizer: the preset's where none is chosen, and the default preset's where that is not chosen either."""
+    return PRESETS[preset or ACCURATE].localizer if localizer is None else localizer
+
+
 def given_choices(localizer: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """The options of `CHOICES` that were given, by name.
 
@@ -248,7 +253,7 @@ def chosen_trainer(
     preset = given.pop("preset", ACCURATE)
     if preset == FAST and localizer not in _COHERENT:
         raise InvalidInputError(f"--preset {FAST}", f"--localizer {localizer}", f"--localizer {' or '.join(_COHERENT)}")
-    choices = replace(PRESETS[preset], **given)
+    choices = replace(PRESETS[preset].choices, **given)
     choices.grid(profile)
     trainer = SymbolTrainer(localizer, choices, synthetic, start)
     trainer.check_start(profile)

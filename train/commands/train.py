@@ -23,7 +23,7 @@ from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording, hash_frames
 from train.commands.calibrate import DEFAULT_PAGES, calibrate_recording
-from train.commands.options import chosen_trainer, given_choices, with_choices
+from train.commands.options import chosen_localizer, chosen_trainer, given_choices, with_choices
 from train.data.features import FeatureExtractor
 from train.data.training_inputs import TrainingInputs
 from train.fitting.memory import keep_freed_memory
@@ -56,9 +56,8 @@ _RECORDED = "--recording (SHA-256 of its frames and symbols)"
 @click.option(
     "--localizer",
     type=click.Choice([*PUBLISHED, *LOCALIZERS]),
-    default="coherent",
-    show_default=True,
-    help="none, mode and ray are the published decoders: their network and way of training.",
+    help="coherent follows rays, wave follows waves; none, mode and ray are the published decoders, with their network "
+    "and way of training. [default: the preset's]",
 )
 @click.option("--out", required=True, type=OutputFolder(), help="Folder of the run; resumed if it is there.")
 @click.option("--calibration", "calibration_path", type=click.Path(path_type=Path), help="Made here if left out.")
@@ -80,7 +79,7 @@ _RECORDED = "--recording (SHA-256 of its frames and symbols)"
 def train(
     profile_name: str,
     recording_path: Path,
-    localizer: str,
+    localizer: str | None,
     out: Path,
     calibration_path: Path | None,
     validation_share: float,
@@ -91,6 +90,7 @@ def train(
 ) -> None:
     """Train a decoder on known pages; the last pages of the recording stay unseen for `lightpage evaluate`."""
     keep_freed_memory()
+    localizer = chosen_localizer(localizer, chosen["preset"])
     given = given_choices(localizer, chosen)
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"

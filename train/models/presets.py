@@ -2,15 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+from train.models.decoder import COHERENT, WAVE
 from train.models.hyperparameters import Hyperparameters
 from train.models.localizers.coherent import BILINEAR
 
 FAST, STANDARD, ACCURATE = "fast", "standard", "accurate"
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A decoder to choose.
+
+    Attributes:
+        localizer: of its first pass, where none is chosen.
+        choices: all else.
+    """
+
+    localizer: str
+    choices: Hyperparameters
+
+
 PRESETS = {
-    FAST: Hyperparameters(channels=48, field_rounds=0, binning=2, field_step=3, samples=3, interpolation=BILINEAR),
-    STANDARD: Hyperparameters(),
-    ACCURATE: Hyperparameters(refinements=1),
+    FAST: Preset(
+        COHERENT,
+        Hyperparameters(channels=48, field_rounds=0, binning=2, field_step=3, samples=3, interpolation=BILINEAR),
+    ),
+    STANDARD: Preset(WAVE, Hyperparameters()),
+    ACCURATE: Preset(COHERENT, Hyperparameters(refinements=1)),
 }
 """One quick pass, one pass, two passes.
 
-A second pass adds more than anything else does, and takes about as long as a first."""
+A pass by waves reads more than one by branches, and takes longer. Before a second pass that gain is lost again, and
+branches are the quicker first pass. A second pass adds more than anything else does, and takes about as long as a first."""

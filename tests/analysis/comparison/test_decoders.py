@@ -231,7 +231,7 @@ def test_what_was_kept_under_earlier_names_is_taken_up(tmp_path: Path) -> None:
     for name in (BEGUN, CALIBRATION):
         shutil.copyfile(kept / name, tmp_path / name)
     run = tmp_path / "fast" / "48x2x0-6000"
-    options = asdict(replace(PRESETS[FAST], steps=6000, seed=5000))
+    options = asdict(replace(PRESETS[FAST].choices, steps=6000, seed=5000))
     assert "levels" in json.loads((kept / run.relative_to(tmp_path) / BEGUN).read_text())
     assert not WeightStore(tmp_path, kept).bring(run, options | {"depth": 1})
     assert WeightStore(tmp_path, kept).bring(run, options)

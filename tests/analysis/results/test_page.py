@@ -21,7 +21,7 @@ README = {
     "published, ray localizer": "ray",
     "published, mode localizer": "mode",
     "Lightpage, `--preset fast`": "fast",
-    "Lightpage, `--preset standard` (one pass)": "coherent",
+    "Lightpage, `--preset standard` (one pass)": "wave",
     "Lightpage, `--preset accurate` (two passes; the default)": "refined",
     "told the device's true state (oracle), two passes": "oracle-refined",
 }

@@ -30,7 +30,7 @@ from tests.conftest import SMALL_PAGES
 from tests.lightpage.small import small_profile
 from tests.told import Told
 from train.commands import train as cli_train
-from train.commands.options import chosen_trainer
+from train.commands.options import chosen_localizer, chosen_trainer
 from train.commands.train import _own_pilots, train
 from train.data.feature_store import FeatureStore
 from train.fitting import provenance as origin
@@ -407,8 +407,19 @@ def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
         assert isinstance(trainer, SymbolTrainer)
         return trainer.choices
 
-    assert chosen() == PRESETS["accurate"] == Hyperparameters(refinements=1)
+    assert chosen() == PRESETS["accurate"].choices == Hyperparameters(refinements=1)
     assert chosen(preset="standard") == Hyperparameters()
-    assert chosen(preset="fast", channels=8) == replace(PRESETS["fast"], channels=8)
+    assert chosen(preset="fast", channels=8) == replace(PRESETS["fast"].choices, channels=8)
     with pytest.raises(InvalidInputError, match="--preset fast: got --localizer wave, wanted --localizer coherent"):
         chosen_trainer("wave", profile, 6, {"preset": "fast"})
+
+
+def test_a_preset_says_which_localizer_it_has_unless_one_is_chosen() -> None:
+    assert [chosen_localizer(None, preset) for preset in (None, *PRESETS)] == [
+        "coherent",
+        "coherent",
+        "wave",
+        "coherent",
+    ]
+    assert chosen_localizer("coherent", "standard") == "coherent"
+    assert chosen_localizer("ray", None) == "ray"

@@ -1,0 +1,335 @@
+"""What an execution provider makes of bundles: how fast, how exact, and whether every node runs there.
+
+    python -m analysis.speed.provider --provider cuda --bundle fast.zip --bundle accurate.zip --recording pages.h5
+
+Pages of a recording with known symbols are decoded by the provider and by the CPU. AIR is of the provider's answers,
+and p is compared with the CPU's in float32. Several callers at once decode different pages, as those of a service do:
+frames of one are copied while another's are computed. On a GPU the kernels of a page are counted and timed by torch's
+profiler.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from export.half import PRECISIONS, deviation, in_half
+from lightpage.cli.main import run
+from lightpage.cli.paths import OutputFile
+from lightpage.errors import RecordingError
+from lightpage.files import write_json
+from lightpage.metrics.information import achievable_rate
+from lightpage.page.pilots import Pilots
+from lightpage.progress import track
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
+from runtime.bundle.bundle import Bundle
+from runtime.bundle.manifest import DECODER, FLOAT32, Precision
+from runtime.decoding.decoder import PAGE_INPUTS, Decoder
+from runtime.decoding.page import DecodedPage
+from runtime.execution.constant_table import GraphFile
+from runtime.execution.providers import ON_CPU, WANTED, Provider
+from runtime.execution.session import VERSION
+from runtime.execution.table_graph import TableGraph
+
+_ALONE = 11
+"""Pages of a single caller, whose median is told."""
+_WARM_UP = 2
+_KERNELS_TOLD = 8
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Frames of a page and the symbols that it was written with."""
+
+    pair: FramePair
+    symbols: np.ndarray
+    pilots: Pilots
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Runs of one kernel of a GPU in a page."""
+
+    name: str
+    runs: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a provider makes of one bundle in one precision.
+
+    Attributes:
+        bundle: its name.
+        precision: of network and waves.
+        provider: as options name it.
+        load_s: until the golden page was proven.
+        nodes: that run for a page, by ONNX Runtime's name of what they run on.
+        air: of the provider's answers, bits a symbol, mean of the pages.
+        deviation: of p from the CPU's in float32, over its length, 99th percentile of the symbols, worst page.
+        symbols_changed: share that is another symbol than the CPU's.
+        infer_s: of a single caller, median.
+        decode_s: of a single caller, post-processing included, median.
+        pages_per_s: by how many callers decode at once.
+        frame_bytes: of a pair.
+        user_bytes: that a page holds by the bundle's code; None without one.
+        device_bytes: of the GPU's memory that are taken after all of that, by all programs; None without a GPU.
+        busy_s: that the GPU computes for a page, copies included; None without a GPU.
+        kernels: that take longest, and how many there are in all; empty without a GPU.
+        kernel_count: runs of kernels and copies for a page.
+    """
+
+    bundle: str
+    precision: str
+    provider: str
+    load_s: float
+    nodes: dict[str, int]
+    air: float
+    deviation: float
+    symbols_changed: float
+    infer_s: float
+    decode_s: float
+    pages_per_s: dict[int, float]
+    frame_bytes: int
+    user_bytes: int | None
+    device_bytes: int | None
+    busy_s: float | None
+    kernels: tuple[Kernel, ...]
+    kernel_count: int | None
+
+
+def pages_of(path: Path, count: int, mask: np.ndarray) -> tuple[list[Shown], int]:
+    """The first pages of a recording and its levels.
+
+    Raises:
+        RecordingError: no known symbols.
+    """
+    with Recording.open(path) as recording:
+        if not recording.has_symbols:
+            raise RecordingError(f"recording {path}", "no dataset 'symbols'", "known symbols to compare with")
+        shown = []
+        for index in range(min(count, recording.pages)):
+            symbols = recording.symbols(index)
+            assert symbols is not None
+            shown.append(Shown(recording.frames(index), symbols, Pilots.of_symbols(mask, symbols, recording.levels)))
+        return shown, recording.levels
+
+
+def in_precision(bundle: Bundle, precision: Precision) -> Bundle:
+    """A bundle of float32, or what an export in half precision makes of it."""
+    if precision == FLOAT32:
+        return bundle
+    files = {**bundle.files, DECODER: in_half(bundle.files[DECODER], PAGE_INPUTS)}
+    return replace(bundle, manifest=bundle.manifest.model_copy(update={"precision": precision}), files=files)
+
+
+def placed(bundle: Bundle, provider: Provider) -> dict[str, int]:
+    """How many nodes run for a page on each provider, by ONNX Runtime's profile."""
+    file = GraphFile(bundle.files[DECODER], bundle.subject)
+    pair = bundle.golden.pair
+    with tempfile.TemporaryDirectory() as folder:
+        graph = TableGraph(
+            file, bundle.subject, PAGE_INPUTS, None, bundle.table, profile=Path(folder) / "p", provider=provider
+        )
+        graph.run(["p"], {"in_phase": pair.in_phase, "quadrature": pair.quadrature})
+        events = json.loads(Path(graph.session.end_profiling()).read_text())
+    named = (event["args"] for event in events if event.get("cat") == "Node" and "args" in event)
+    return dict(Counter(each["provider"] for each in named if each.get("provider")))
+
+
+def rate(decoder: Decoder, shown: Sequence[Shown], levels: int, callers: int, seconds: float) -> float:
+    """Pages a second of several callers at once.
+
+    Raises:
+        LightpageError: as `Decoder.decode` does.
+    """
+    begun, failures = threading.Barrier(callers + 1), list[Exception]()
+    ends = [0.0] * callers
+    counts = [0] * callers
+
+    def calls(caller: int) -> None:
+        try:
+            begun.wait()
+            stop = time.perf_counter() + seconds
+            while time.perf_counter() < stop:
+                decoder.decode(shown[(caller + counts[caller]) % len(shown)].pair, levels)
+                counts[caller] += 1
+            ends[caller] = time.perf_counter()
+        except Exception as error:
+            failures.append(error)
+
+    threads = [threading.Thread(target=calls, args=[caller]) for caller in range(callers)]
+    for thread in threads:
+        thread.start()
+    begun.wait()
+    start = time.perf_counter()
+    for thread in threads:
+        thread.join()
+    if failures:
+        raise failures[0]
+    return sum(counts) / (max(ends) - start)
+
+
+def median_s(call: Any, shown: Sequence[Shown]) -> float:
+    """Median time of a call with pages in turn."""
+    taken = []
+    for index in range(_WARM_UP + _ALONE):
+        pair = shown[index % len(shown)].pair
+        start = time.perf_counter()
+        call(pair)
+        taken.append(time.perf_counter() - start)
+    return float(np.median(taken[_WARM_UP:]))
+
+
+def device_bytes(provider: Provider) -> int | None:
+    """Memory of a GPU that is taken; None on the CPU."""
+    if provider.memory == ON_CPU.memory:
+        return None
+    asked = ["nvidia-smi", f"--id={provider.device}", "--query-gpu=memory.used", "--format=csv,noheader,nounits"]
+    return int(subprocess.run(asked, capture_output=True, text=True, check=True, timeout=60).stdout) << 20
+
+
+def kernels_of(decoder: Decoder, pair: FramePair) -> list[Kernel]:
+    """The kernels and copies of a page on a GPU, the longest first."""
+    from torch.profiler import ProfilerActivity, profile
+
+    with profile(activities=[ProfilerActivity.CUDA]) as watched:
+        decoder.infer(pair)
+    found = [Kernel(event.key, event.count, event.device_time_total * 1e-6) for event in watched.key_averages()]
+    return sorted(found, key=lambda kernel: -kernel.seconds)
+
+
+def made_by(
+    provider: Provider,
+    bundle: Bundle,
+    precision: Precision,
+    shown: Sequence[Shown],
+    levels: int,
+    usual: Sequence[DecodedPage],
+    callers: Sequence[int],
+    seconds: float,
+) -> Made:
+    """Figures of one bundle; arguments as the attributes of `Made` and the options of the command name them.
+
+    Args:
+        usual: the CPU's answers in float32.
+    """
+    nodes = placed(bundle, provider)
+    start = time.perf_counter()
+    decoder = Decoder(bundle, provider=provider)
+    load_s = time.perf_counter() - start
+    data = ~decoder.bundle.pilot_mask
+    rates, deviations, changed = [], [], []
+    for page, known in zip(shown, usual, strict=True):
+        own = decoder.decode(page.pair, levels, pilots=page.pilots)
+        rates.append(achievable_rate(own.phase[data], own.concentration[data], page.symbols[data], levels).mean())
+        deviations.append(deviation(_p(known)[:, data], _p(own)[:, data]))
+        changed.append((own.symbols != known.symbols)[data].mean())
+    infer_s = median_s(decoder.infer, shown)
+    decode_s = median_s(lambda pair: decoder.decode(pair, levels), shown)
+    pages_per_s = {count: rate(decoder, shown, levels, count, seconds) for count in callers}
+    on_gpu = provider.memory != ON_CPU.memory
+    kernels = kernels_of(decoder, shown[0].pair) if on_gpu else []
+    return Made(
+        bundle=bundle.path.stem,
+        precision=precision,
+        provider=str(provider),
+        load_s=load_s,
+        nodes=nodes,
+        air=float(np.mean(rates)),
+        deviation=max(deviations),
+        symbols_changed=float(np.mean(changed)),
+        infer_s=infer_s,
+        decode_s=decode_s,
+        pages_per_s=pages_per_s,
+        frame_bytes=shown[0].pair.in_phase.nbytes + shown[0].pair.quadrature.nbytes,
+        user_bytes=None if bundle.code is None else decoder.page_codec.user_bytes,
+        device_bytes=device_bytes(provider),
+        busy_s=sum(kernel.seconds for kernel in kernels) if on_gpu else None,
+        kernels=tuple(kernels[:_KERNELS_TOLD]),
+        kernel_count=sum(kernel.runs for kernel in kernels) if on_gpu else None,
+    )
+
+
+def _p(page: DecodedPage) -> np.ndarray:
+    """A page's answers as real and imaginary parts."""
+    p = page.concentration * np.exp(1j * page.phase)
+    return np.stack([p.real, p.imag])
+
+
+def lines(made: Made) -> list[str]:
+    """What people read of it."""
+    told = [
+        f"{made.bundle}, {made.precision}, {made.provider}: loaded in {made.load_s:.1f} s, nodes "
+        + ", ".join(f"{count} on {name}" for name, count in made.nodes.items()),
+        f"  AIR {made.air:.4f}, p off by {made.deviation:.2g} (99th percentile), {made.symbols_changed:.3%} of symbols "
+        "differ from the CPU's in float32",
+        f"  one caller: {1e3 * made.infer_s:.1f} ms the graph, {1e3 * made.decode_s:.1f} ms decoded",
+    ]
+    for callers, pages in made.pages_per_s.items():
+        user = "" if made.user_bytes is None else f", {pages * made.user_bytes / 1e6:.2f} MB/s of user bytes"
+        told.append(
+            f"  {callers} at once: {pages:.1f} pages/s, {pages * made.frame_bytes / 1e9:.2f} GB/s of frames{user}"
+        )
+    if made.device_bytes is not None and made.busy_s is not None:
+        told.append(
+            f"  {made.device_bytes / 1e9:.2f} GB of the GPU's memory; computes for {1e3 * made.busy_s:.1f} ms a page, "
+            f"in {made.kernel_count} kernels and copies:"
+        )
+        told += [f"    {1e3 * each.seconds:7.2f} ms in {each.runs:5} of {each.name[:90]}" for each in made.kernels]
+    return told
+
+
+@click.command()
+@click.option("--bundle", "paths", multiple=True, required=True, type=click.Path(path_type=Path), help="Bundles.")
+@click.option("--recording", required=True, type=click.Path(path_type=Path), help="Pages with known symbols.")
+@click.option("--provider", "text", default="cpu", show_default=True, help=f"What computes pages: {WANTED}.")
+@click.option("--pages", default=2, show_default=True, type=click.IntRange(1, 1000), help="Of the recording.")
+@click.option("--precision", "precisions", multiple=True, type=click.Choice(PRECISIONS), default=PRECISIONS)
+@click.option(
+    "--callers", multiple=True, type=click.IntRange(1, 64), default=(1, 2, 4), show_default=True, help="At once."
+)
+@click.option("--seconds", default=5.0, show_default=True, type=click.FloatRange(0.01, 600), help="For each of them.")
+@click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
+def main(
+    paths: tuple[Path, ...],
+    recording: Path,
+    text: str,
+    pages: int,
+    precisions: tuple[Precision, ...],
+    callers: tuple[int, ...],
+    seconds: float,
+    json_path: Path | None,
+) -> None:
+    """Print what a provider makes of bundles of one device: rate, exactness, and where each node runs."""
+    provider = Provider.parse(text)
+    made: list[Made] = []
+    for path in paths:
+        bundle = Bundle.open(path)
+        shown, levels = pages_of(recording, pages, bundle.pilot_mask)
+        on_cpu = Decoder(bundle)
+        usual = [on_cpu.decode(page.pair, levels, pilots=page.pilots) for page in track(shown, "cpu")]
+        del on_cpu
+        for precision in dict.fromkeys(precisions):
+            form = in_precision(bundle, precision)
+            made.append(made_by(provider, form, precision, shown, levels, usual, callers, seconds))
+            click.echo("\n".join(lines(made[-1])))
+            if json_path is not None:  # after each: the next may fail
+                write_json(json_path, {"onnxruntime": VERSION, "made": [asdict(each) for each in made]})
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, name="python -m analysis.speed.provider"))
