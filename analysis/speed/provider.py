@@ -208,7 +208,8 @@ def kernels_of(decoder: Decoder, pair: FramePair) -> list[Kernel]:
 
     with profile(activities=[ProfilerActivity.CUDA]) as watched:
         decoder.infer(pair)
-    found = [Kernel(event.key, event.count, event.device_time_total * 1e-6) for event in watched.key_averages()]
+    events = [event for event in watched.key_averages() if event.self_device_time_total > 0]
+    found = [Kernel(event.key, event.count, event.self_device_time_total * 1e-6) for event in events]
     return sorted(found, key=lambda kernel: -kernel.seconds)
 
 
