@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import onnx
 from onnx import shape_inference
@@ -85,6 +86,34 @@ def shape_computations(model: bytes) -> list[str]:
             sizes.update(node.output)
         elif inputs and inputs <= sizes and all(graph.tensor(name).dtype == "int64" for name in node.output):
             sizes.update(node.output)
+            found.append(_name(node))
+    return found
+
+
+def repeated_products(model: bytes) -> list[str]:
+    """Products that repeat both of their factors, each along another axis, by name.
+
+    Onnxruntime's CUDA provider computes them wrongly where the factors hold equally many matrices: of a product of
+    [2, 1, I, J] and [1, 2, J, K] half is left zero. Seen on an H200 with onnxruntime-gpu 1.31.1; the CPU is right.
+
+    Raises:
+        InvalidInputError: a product of tensors whose shapes cannot be inferred.
+    """
+    graph = shape_inference.infer_shapes(onnx.load_from_string(model), data_prop=True).graph
+    shapes = {tensor.name: list(tensor.dims) for tensor in graph.initializer}
+    for value in (*graph.value_info, *graph.input, *graph.output):
+        axes = value.type.tensor_type.shape.dim
+        shapes[value.name] = [axis.dim_value if axis.HasField("dim_value") else -1 for axis in axes]
+    found = []
+    for node in graph.node:
+        if node.op_type != "MatMul":
+            continue
+        if unknown := [name for name in node.input if -1 in shapes.get(name, [-1])]:
+            raise InvalidInputError(
+                f"node {_name(node)}", f"no shape of {', '.join(unknown)}", "shapes of both factors"
+            )
+        pairs = list(zip_longest(*(shapes[name][-3::-1] for name in node.input), fillvalue=1))
+        if any(left < right for left, right in pairs) and any(left > right for left, right in pairs):
             found.append(_name(node))
     return found
 

@@ -14,7 +14,7 @@ from onnx import TensorProto, helper, parser
 
 from export.graph import DecoderGraph, table_tensors
 from export.onnx_files import OPSET, decoder_onnx
-from export.operators.check import fallbacks, page_part, shape_computations
+from export.operators.check import fallbacks, page_part, repeated_products, shape_computations
 from export.operators.collect import collect
 from export.operators.operator_list import PROVIDERS, OperatorList
 from lightpage.calibration.sampling_table import sampling_table
@@ -61,6 +61,7 @@ def test_no_node_of_a_fast_decoder_leaves_the_provider(fast: bytes) -> None:
     for provider in PROVIDERS:
         assert fallbacks(fast, provider) == [], provider
     assert shape_computations(fast) == []
+    assert repeated_products(fast) == []
 
 
 @pytest.mark.parametrize(
@@ -76,6 +77,30 @@ def test_nor_does_one_of_the_others(localizer: str, preset: str) -> None:
     for provider in PROVIDERS:
         assert fallbacks(part, provider) == [], provider
     assert shape_computations(part) == []
+    assert repeated_products(part) == []
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "repeated"),
+    [
+        ("2, 1, 3, 4", "1, 2, 4, 5", True),
+        ("2, 1, 3, 4", "2, 1, 1, 4, 5", True),
+        ("2, 3, 4", "2, 1, 4, 5", True),
+        ("2, 1, 3, 4", "2, 2, 4, 5", False),
+        ("3, 4", "2, 2, 4, 5", False),
+        ("2, 2, 3, 4", "1, 2, 4, 5", False),
+        ("3, 4", "4, 5", False),
+    ],
+)
+def test_a_product_that_repeats_both_of_its_factors_is_found(left: str, right: str, repeated: bool) -> None:
+    model = small("y = MatMul (a, b)", f"agraph (float[{left}] a, float[{right}] b) => (float[N] y)")
+    assert repeated_products(model) == (["y"] if repeated else [])
+
+
+def test_a_product_of_unknown_shapes_is_not_passed_over() -> None:
+    model = small("y = MatMul (a, b)", "agraph (float[N, 4] a, float[4, 5] b) => (float[N, 5] y)")
+    with pytest.raises(InvalidInputError, match="node y: got no shape of a, wanted shapes of both factors"):
+        repeated_products(model)
 
 
 def test_frames_of_16_bits_are_converted_elsewhere_by_tensorrt_alone() -> None:

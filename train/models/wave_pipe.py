@@ -83,14 +83,19 @@ class TiledPipe(nn.Module):
         """From facet to facet, [cells_y - 1, cells_x - 1] both.
 
         Both parts and all parities go through each product as one stack [2, 2, 2, Ky, Kx]: an exported graph is made
-        and run node by node.
+        and run node by node. To modes and back, the parities of an axis are one matrix: no product repeats both of its
+        factors, which ONNX Runtime gets wrong on a GPU (`export.operators.check.repeated_products`).
         """
-        y_cells, x_cells = self._cells
-        y_modes, x_modes = _sine_modes(self.y_numbers, y_cells)[:, None], _sine_modes(self.x_numbers, x_cells)[None]
-        modes = y_modes @ torch.stack(field)[:, None, None] @ x_modes.transpose(-1, -2)
+        y_modes, x_modes = (
+            _sine_modes(numbers, cells).flatten(0, 1)
+            for numbers, cells in zip((self.y_numbers, self.x_numbers), self._cells, strict=True)
+        )
+        together = y_modes @ torch.stack(field) @ x_modes.transpose(-1, -2)
+        modes = together.unflatten(-1, (2, -1)).unflatten(1, (2, -1)).transpose(2, 3)
         done = [block(modes, own, backwards=backwards) for block, own in zip(self._blocks, at, strict=True)]
         rows = [torch.cat(done[first : first + self._across], dim=-1) for first in range(0, len(done), self._across)]
-        real, imaginary = (y_modes.transpose(-1, -2) @ torch.cat(rows, dim=-2) @ x_modes).sum(dim=(1, 2))
+        together = torch.cat(rows, dim=-2).transpose(2, 3).flatten(3, 4).flatten(1, 2)
+        real, imaginary = y_modes.transpose(-1, -2) @ together @ x_modes
         return real, imaginary
 
 
