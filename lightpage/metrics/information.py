@@ -39,8 +39,9 @@ def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], level
         PageError: shapes differ, a phase that is not finite, a concentration that is negative or not a number.
     """
     m, phase, k = _checked_estimate(mu, kappa, levels)
-    log_partition, away = _partition(phase, k, m)
-    return np.asarray(np.log2(m) - (log_partition + k * away) / np.log(2))
+    shape, phase, k = phase.shape, phase.ravel(), k.ravel()
+    claimed = np.log2(m) - (_log_partition(phase, k, m) + k * _mean_away(phase, k, m)) / np.log(2)
+    return np.asarray(claimed.reshape(shape))
 
 
 def page_kilobytes(bits_per_symbol: float, data_symbols: int) -> float:
@@ -51,7 +52,8 @@ def page_kilobytes(bits_per_symbol: float, data_symbols: int) -> float:
 def decide(mu: NDArray[np.floating], levels: int) -> NDArray[np.uint8]:
     """The level nearest to each phase `mu` (radians, any winding); same shape, uint8."""
     check_levels(levels)
-    return np.asarray(np.rint(np.asarray(mu, np.float64) * (levels / (2 * np.pi))) % levels, np.uint8)
+    nearest = np.rint(np.asarray(mu, np.float64) * (levels / (2 * np.pi)))
+    return np.asarray(nearest.astype(np.int64) % levels, np.uint8)
 
 
 def log_posterior(
@@ -65,17 +67,24 @@ def log_posterior(
         PageError: shapes differ, a symbol outside 0..M-1, a phase or concentration that is not finite.
     """
     m, phase, k, s = checked(mu, kappa, symbols, levels)
-    error = s * (2 * np.pi / m) - phase
-    return np.asarray(k * (np.cos(error) - 1) - _partition(phase, k, m)[0])
+    away = 2 * np.sin(0.5 * (s * (2 * np.pi / m) - phase)) ** 2
+    return np.asarray(-k * away - _log_partition(phase.ravel(), k.ravel(), m).reshape(phase.shape))
 
 
 def decide_with_confidence(
     mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Nearest levels (uint8) and the posterior of each among the M levels (float32, 1/M..1); shapes as `mu`."""
-    symbols = decide(mu, levels)
-    confidence = np.exp(log_posterior(mu, kappa, symbols, levels))
-    return symbols, np.clip(confidence, 1 / levels, 1).astype(np.float32)
+    phase, k = np.asarray(mu), np.asarray(kappa)
+    if phase.shape != k.shape:
+        raise PageError("phase, concentration", (phase.shape, k.shape), "two equal shapes")
+    symbols, confidence = np.empty(phase.shape, np.uint8), np.empty(phase.shape, np.float32)
+    for rows in _chunks(phase.size):  # some at a time stay near the processor through all steps
+        part = phase.ravel()[rows]
+        decided = symbols.ravel()[rows] = decide(part, levels)
+        posterior = np.exp(log_posterior(part, k.ravel()[rows], decided, levels))
+        confidence.ravel()[rows] = np.clip(posterior, 1 / levels, 1)
+    return symbols, confidence
 
 
 def achievable_rate(
@@ -114,33 +123,68 @@ def gray_rate(
     return total
 
 
-def _partition(phase: Floats, kappa: Floats, levels: int) -> tuple[Floats, Floats]:
-    """log Z, Z = sum_k exp(kappa (cos(theta_k - mu) - 1)), and the posterior's mean of 1 - cos(theta_k - mu).
+def _log_partition(phase: Floats, kappa: Floats, levels: int) -> Floats:
+    """log Z, Z = sum_k exp(kappa (cos(theta_k - mu) - 1)), without M terms a symbol; within 1e-9 of the plain sum.
 
-    Without M terms a symbol; log Z agrees with the plain sum to 1e-9. Z is M (I0 + 2 sum_n I_nM cos(n M mu))
-    exp(-kappa): for kappa << M^2 only I0 counts. For a larger kappa only the levels near mu count.
+    Z is M (I0 + 2 sum_n I_nM cos(n M mu)) exp(-kappa): for kappa << M^2 only I0 counts. For a larger kappa only the
+    levels near mu count.
     """
-    if levels <= 2 * _WINDOW + 1:
-        return _window_sums(phase, kappa, levels, np.arange(levels))
-    smooth = kappa <= levels**2 / _ALIASING
-    log_partition, away = np.log(levels) + np.log(i0e(kappa)), 1 - mean_resultant(kappa)
-    if not smooth.all():
-        near = _window_sums(phase[~smooth], kappa[~smooth], levels, np.arange(-_WINDOW, _WINDOW + 1))
-        log_partition[~smooth], away[~smooth] = near
-    return np.asarray(log_partition), np.asarray(away)
+    found = np.empty_like(kappa)
+    near = _is_narrow(kappa, levels)
+    found[~near] = np.log(levels * i0e(kappa[~near]))
+    totals = [sum(weight for weight, _ in window) for window in _windows(phase[near], kappa[near], levels)]
+    if totals:
+        found[near] = np.log(np.concatenate(totals)) - kappa[near] * _closest(phase[near], levels)
+    return found
 
 
-def _window_sums(phase: Floats, kappa: Floats, levels: int, offsets: NDArray[np.int_]) -> tuple[Floats, Floats]:
+def _mean_away(phase: Floats, kappa: Floats, levels: int) -> Floats:
+    """The posterior's mean of 1 - cos(theta_k - mu), by the same sums."""
+    found = np.empty_like(kappa)
+    near = _is_narrow(kappa, levels)
+    found[~near] = 1 - mean_resultant(kappa[~near])
+    means = []
+    for window in _windows(phase[near], kappa[near], levels):
+        weights, further = zip(*((weight, weight * more) for weight, more in window), strict=True)
+        means.append(sum(further) / sum(weights))
+    if means:
+        found[near] = np.concatenate(means) + _closest(phase[near], levels)
+    return found
+
+
+def _is_narrow(kappa: Floats, levels: int) -> NDArray[np.bool_]:
+    """Where the sum over a window of levels is the one to take."""
+    few = levels <= 2 * _WINDOW + 1
+    return np.asarray(few | (kappa > levels**2 / _ALIASING))
+
+
+def _closest(phase: Floats, levels: int) -> Floats:
+    """1 - cos of the distance to the nearest level."""
+    return np.asarray(2 * np.sin(0.5 * _beside(phase, levels)) ** 2)
+
+
+def _beside(phase: Floats, levels: int) -> Floats:
+    """From each phase to its nearest level, radians."""
     step = 2 * np.pi / levels
-    nearest = np.rint(phase / step) * step
-    total, away = np.zeros_like(phase), np.zeros_like(phase)
-    closest = 1 - np.cos(nearest - phase)
-    for offset in offsets:
-        distance = 1 - np.cos(nearest + offset * step - phase)
-        weight = np.exp(kappa * (closest - distance))
-        total += weight
-        away += weight * distance
-    return np.asarray(np.log(total) - kappa * closest), np.asarray(away / total)
+    return np.asarray(np.rint(phase / step) * step - phase)
+
+
+def _windows(phase: Floats, kappa: Floats, levels: int) -> Iterator[Iterator[tuple[Floats, Floats]]]:
+    """Of some symbols at a time: the levels about mu, or all if they are few, one after the other.
+
+    Of each level: its probability over the nearest level's, and by how much its 1 - cos(theta_k - mu) is more.
+    """
+    few = levels <= 2 * _WINDOW + 1
+    angles = (np.arange(levels) if few else np.arange(-_WINDOW, _WINDOW + 1)) * (2 * np.pi / levels)
+
+    def window(k: Floats, beside: Floats) -> Iterator[tuple[Floats, Floats]]:
+        cos, sin = np.cos(beside), np.sin(beside)
+        for angle in angles:
+            more = sin * np.sin(angle) + cos * (2 * np.sin(0.5 * angle) ** 2)
+            yield np.exp(-k * more), more
+
+    for rows in _chunks(kappa.size):
+        yield window(kappa[rows], _beside(phase[rows], levels))
 
 
 def _logits(phase: Floats, kappa: Floats, levels: int) -> Floats:
