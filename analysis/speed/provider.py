@@ -17,10 +17,9 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import click
 import numpy as np
@@ -40,6 +39,7 @@ from runtime.bundle.manifest import DECODER, FLOAT32, Precision
 from runtime.decoding.decoder import PAGE_INPUTS, Decoder
 from runtime.decoding.page import DecodedPage
 from runtime.execution.constant_table import GraphFile
+from runtime.execution.memory import share_freed_memory
 from runtime.execution.providers import ON_CPU, WANTED, Provider
 from runtime.execution.session import VERSION
 from runtime.execution.table_graph import TableGraph
@@ -83,6 +83,7 @@ class Made:
         symbols_changed: share that is another symbol than the CPU's.
         infer_s: of a single caller, median.
         decode_s: of a single caller, post-processing included, median.
+        inferences_per_s: by how many callers run the graph at once.
         pages_per_s: by how many callers decode at once.
         frame_bytes: of a pair.
         user_bytes: that a page holds by the bundle's code; None without one.
@@ -102,6 +103,7 @@ class Made:
     symbols_changed: float
     infer_s: float
     decode_s: float
+    inferences_per_s: dict[int, float]
     pages_per_s: dict[int, float]
     frame_bytes: int
     user_bytes: int | None
@@ -150,12 +152,8 @@ def placed(bundle: Bundle, provider: Provider) -> dict[str, int]:
     return dict(Counter(each["provider"] for each in named if each.get("provider")))
 
 
-def rate(decoder: Decoder, shown: Sequence[Shown], levels: int, callers: int, seconds: float) -> float:
-    """Pages a second of several callers at once.
-
-    Raises:
-        LightpageError: as `Decoder.decode` does.
-    """
+def rate(call: Callable[[FramePair], object], shown: Sequence[Shown], callers: int, seconds: float) -> float:
+    """Calls a second of several callers at once, with pages in turn; raises what a call does."""
     begun, failures = threading.Barrier(callers + 1), list[Exception]()
     ends = [0.0] * callers
     counts = [0] * callers
@@ -165,7 +163,7 @@ def rate(decoder: Decoder, shown: Sequence[Shown], levels: int, callers: int, se
             begun.wait()
             stop = time.perf_counter() + seconds
             while time.perf_counter() < stop:
-                decoder.decode(shown[(caller + counts[caller]) % len(shown)].pair, levels)
+                call(shown[(caller + counts[caller]) % len(shown)].pair)
                 counts[caller] += 1
             ends[caller] = time.perf_counter()
         except Exception as error:
@@ -183,7 +181,7 @@ def rate(decoder: Decoder, shown: Sequence[Shown], levels: int, callers: int, se
     return sum(counts) / (max(ends) - start)
 
 
-def median_s(call: Any, shown: Sequence[Shown]) -> float:
+def median_s(call: Callable[[FramePair], object], shown: Sequence[Shown]) -> float:
     """Median time of a call with pages in turn."""
     taken = []
     for index in range(_WARM_UP + _ALONE):
@@ -241,7 +239,8 @@ def made_by(
         changed.append((own.symbols != known.symbols)[data].mean())
     infer_s = median_s(decoder.infer, shown)
     decode_s = median_s(lambda pair: decoder.decode(pair, levels), shown)
-    pages_per_s = {count: rate(decoder, shown, levels, count, seconds) for count in callers}
+    inferences_per_s = {count: rate(decoder.infer, shown, count, seconds) for count in callers}
+    pages_per_s = {count: rate(lambda pair: decoder.decode(pair, levels), shown, count, seconds) for count in callers}
     on_gpu = provider.memory != ON_CPU.memory
     kernels = kernels_of(decoder, shown[0].pair) if on_gpu else []
     return Made(
@@ -255,6 +254,7 @@ def made_by(
         symbols_changed=float(np.mean(changed)),
         infer_s=infer_s,
         decode_s=decode_s,
+        inferences_per_s=inferences_per_s,
         pages_per_s=pages_per_s,
         frame_bytes=shown[0].pair.in_phase.nbytes + shown[0].pair.quadrature.nbytes,
         user_bytes=None if bundle.code is None else decoder.page_codec.user_bytes,
@@ -283,7 +283,8 @@ def lines(made: Made) -> list[str]:
     for callers, pages in made.pages_per_s.items():
         user = "" if made.user_bytes is None else f", {pages * made.user_bytes / 1e6:.2f} MB/s of user bytes"
         told.append(
-            f"  {callers} at once: {pages:.1f} pages/s, {pages * made.frame_bytes / 1e9:.2f} GB/s of frames{user}"
+            f"  {callers} at once: {made.inferences_per_s[callers]:.1f} graphs/s; {pages:.1f} pages/s, "
+            f"{pages * made.frame_bytes / 1e9:.2f} GB/s of frames{user}"
         )
     if made.device_bytes is not None and made.busy_s is not None:
         told.append(
@@ -317,6 +318,7 @@ def main(
 ) -> None:
     """Print what a provider makes of bundles of one device: rate, exactness, and where each node runs."""
     provider = Provider.parse(text)
+    share_freed_memory()  # as a service does
     made: list[Made] = []
     for path in paths:
         bundle = Bundle.open(path)

@@ -91,7 +91,7 @@ class TiledPipe(nn.Module):
             for numbers, cells in zip((self.y_numbers, self.x_numbers), self._cells, strict=True)
         )
         together = y_modes @ torch.stack(field) @ x_modes.transpose(-1, -2)
-        modes = together.unflatten(-1, (2, -1)).unflatten(1, (2, -1)).transpose(2, 3)
+        modes = together.reshape(2, 2, self.y_numbers.shape[1], 2, self.x_numbers.shape[1]).transpose(2, 3)
         done = [block(modes, own, backwards=backwards) for block, own in zip(self._blocks, at, strict=True)]
         rows = [torch.cat(done[first : first + self._across], dim=-1) for first in range(0, len(done), self._across)]
         together = torch.cat(rows, dim=-2).transpose(2, 3).flatten(3, 4).flatten(1, 2)
