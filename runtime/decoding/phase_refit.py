@@ -44,11 +44,16 @@ class PhaseRefit:
         ny, nx = page_shape
         y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
         walls = np.zeros((2, ny, nx)) if positions is None else np.rint(np.abs(positions)) % 2
-        zones = walls[0] + 2 * walls[1]
-        plane = np.stack([np.ones_like(x), x, y])
-        self._basis = np.concatenate([plane * (zones == zone) for zone in np.unique(zones)]).reshape(-1, ny * nx)
-        self._shape = page_shape
-        self._taken = np.arange(0, ny * nx, -(-ny * nx // _MOST_SYMBOLS))
+        _, zones = np.unique((walls[0] + 2 * walls[1]).ravel(), return_inverse=True)
+        self._planes = np.stack([np.ones(ny * nx), x.ravel(), y.ravel()])
+        self._shape, self._zones = page_shape, zones
+        taken = np.arange(0, ny * nx, -(-ny * nx // _MOST_SYMBOLS))
+        self._taken = taken[np.argsort(zones[taken], kind="stable")]  # zone behind zone
+        own = zones[self._taken]
+        self._starts = np.flatnonzero(np.diff(own, prepend=-1))
+        planes = self._planes[:, self._taken]
+        self._products = planes[:, None] * planes
+        self._filled, self._sizes = own[self._starts], np.diff(self._starts, append=len(own))
 
     def error(
         self,
@@ -73,26 +78,40 @@ class PhaseRefit:
         is_known = ~np.isnan(truth)
         mu = np.asarray(phase, np.float64).ravel()[self._taken]
         kappa = np.minimum(np.asarray(concentration, np.float64).ravel()[self._taken], _CAP)
-        basis = self._basis[:, self._taken]
-        normal = (basis * kappa) @ basis.T + np.eye(len(basis)) / _PRIOR_RAD**2
-        step, coefficients = 2 * np.pi / levels, np.zeros(len(basis))
+        planes = self._planes[:, self._taken]
+        # sums and no matrix products: those wake threads, which go on looking for work on cores that others need
+        normal = np.moveaxis(self._sums(self._products * kappa), -1, 0) + np.eye(len(planes)) / _PRIOR_RAD**2
+        step, coefficients = 2 * np.pi / levels, np.zeros((len(self._filled), len(planes)))
         for _ in range(rounds):
-            left = mu - coefficients @ basis
+            left = mu - _at(planes, np.repeat(coefficients.T, self._sizes, axis=1))
             distance = _mean_distance(left, kappa, step)
             distance[is_known] = _wrapped(left[is_known] - truth[is_known])
-            gradient = basis @ (kappa * distance) - coefficients / _PRIOR_RAD**2
-            coefficients = coefficients + np.linalg.solve(normal, gradient)
-        return np.asarray((coefficients @ self._basis).reshape(self._shape), np.float32)
+            gradient = self._sums(planes * (kappa * distance)).T - coefficients / _PRIOR_RAD**2
+            coefficients = coefficients + np.linalg.solve(normal, gradient[..., None])[..., 0]
+        of_zones = np.zeros((self._zones.max() + 1, len(planes)))
+        of_zones[self._filled] = coefficients
+        return np.asarray(_at(self._planes, of_zones.T[:, self._zones]).reshape(self._shape), np.float32)
+
+    def _sums(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Over the symbols taken of each zone that has any: [..., symbols] to [..., zones]."""
+        return np.asarray(np.add.reduceat(values, self._starts, axis=-1))
+
+
+def _at(planes: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What each symbol's coefficients [3, symbols] make of the planes [3, symbols] there."""
+    first, *others = planes * coefficients
+    return np.asarray(sum(others, first))
 
 
 def _mean_distance(mu: NDArray[np.float64], kappa: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     """Distance of each phase to the levels about it, the mean over their posterior, radians [symbols]."""
     few = min(_NEIGHBOURS, max(0, round(2 * np.pi / step) - 1) // 2)
-    offsets = (np.arange(-few, few + 1) * step)[:, None]  # in rows: sums then go over whole arrays
-    away = mu - np.rint(mu / step) * step
-    distance = (away - offsets).astype(np.float32)
-    weight = np.exp(kappa.astype(np.float32) * (np.cos(distance) - np.cos(away).astype(np.float32)))
-    return np.asarray((weight * distance).sum(axis=0) / weight.sum(axis=0), np.float64)
+    offsets = np.float32(step) * np.arange(-few, few + 1, dtype=np.float32)[:, None]  # in rows: sums take whole arrays
+    away = (mu - np.rint(mu / step) * step).astype(np.float32)
+    near, k = np.cos(away), kappa.astype(np.float32)
+    # cos(away - offset) - cos(away), without a cosine each
+    weight = np.exp(np.sin(offsets) * (k * np.sin(away)) - 2 * np.sin(0.5 * offsets) ** 2 * (k * near))
+    return np.asarray(away - (offsets * weight).sum(axis=0) / weight.sum(axis=0), np.float64)
 
 
 def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
