@@ -192,9 +192,7 @@ def test_parts_run_beside_each_other_but_not_twice_nor_beside_the_whole(
 
 
 @pytest.mark.parametrize("text", ["2/2", "-1/2", "1", "a/b", "0/0", "1/2/3"])
-def test_a_part_that_makes_no_sense_is_refused(
-    archive: Archive, text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_part_that_makes_no_sense_is_refused(archive: Archive, text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert archive.run("decode", "--part", text)[0] == 2
     assert f"--part: got '{text}', wanted K/N" in capsys.readouterr().err
     assert not archive.out.exists()
