@@ -49,6 +49,11 @@ def test_every_file_is_used_and_what_is_used_is_there() -> None:
     assert used == {path for path in FOLDER.rglob("*") if path.is_file()}
 
 
+def test_every_folder_is_documented() -> None:
+    rows = re.findall(r"^\| `([\w/]+)` \|", (ROOT / "docs" / "kubernetes.md").read_text(), re.MULTILINE)
+    assert sorted(rows) == [str(path.parent.relative_to(FOLDER)) for path in manifests.kustomizations()]
+
+
 @pytest.mark.parametrize("name", ALL)
 def test_a_manifest_is_valid(name: str) -> None:
     assert manifests.problems(ALL[name]) == []
