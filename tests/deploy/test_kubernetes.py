@@ -7,7 +7,7 @@ import shlex
 import shutil
 import subprocess
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -89,31 +89,37 @@ def test_a_wrong_value_is_seen(kind: str, name: str, path: tuple[str | int, ...]
     assert manifests.problems(manifest)
 
 
-def rendered(folder: Path) -> subprocess.CompletedProcess[str]:
-    """What kustomize makes of a folder."""
+@pytest.fixture(scope="module")
+def kustomize() -> Callable[[Path], subprocess.CompletedProcess[str]]:
+    """Has kustomize make what is in a folder."""
+
+    def kubectl(*words: str | Path) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(["kubectl", *words], capture_output=True, text=True, timeout=60)
+
     if shutil.which("kubectl") is None:
         pytest.skip(NO_KUSTOMIZE)
-    told = subprocess.run(["kubectl", "version", "--client"], capture_output=True, text=True, timeout=60).stdout
-    if not re.search(r"Kustomize Version: v[5-9]", told):
+    if not re.search(r"Kustomize Version: v[5-9]", kubectl("version", "--client").stdout):
         pytest.skip(NO_KUSTOMIZE)
-    return subprocess.run(["kubectl", "kustomize", folder], capture_output=True, text=True, timeout=60)
+    return lambda folder: kubectl("kustomize", folder)
 
 
-def test_what_kustomize_makes_of_the_folders_is_valid(tmp_path: Path) -> None:
+def test_what_kustomize_makes_of_the_folders_is_valid(
+    kustomize: Callable[[Path], subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
     for kustomization in manifests.kustomizations():
-        done = rendered(kustomization.parent)
+        done = kustomize(kustomization.parent)
         assert done.returncode == 0, done.stderr
         made = list(yaml.safe_load_all(done.stdout))
         assert made
         assert [problem for each in made for problem in manifests.problems(each)] == []
-    made = list(yaml.safe_load_all(rendered(FOLDER / "overlays/gpu").stdout))
+    made = list(yaml.safe_load_all(kustomize(FOLDER / "overlays/gpu").stdout))
     (gpu,) = [each for each in made if each["kind"] == "StatefulSet"]
     container = manifests.container(gpu)
     assert (container["image"], container["resources"]["limits"]["nvidia.com/gpu"]) == ("lightpage:gpu", 1)
     shutil.copytree(FOLDER / "service", tmp_path / "service")
     file = tmp_path / "service" / KUSTOMIZATION
     file.write_text(file.read_text() + "resorces: []\n")
-    assert "resorces" in rendered(file.parent).stderr
+    assert "resorces" in kustomize(file.parent).stderr
 
 
 # ---- what belongs together ------------------------------------------------------------------------------------------
