@@ -1,5 +1,5 @@
 # The decoder as a service: `runtime` without torch, `camera` with the drivers of cameras and of a modulator on a monitor,
-# `deep` with torch, to train and export in the device, `gpu` that decodes on an NVIDIA GPU.
+# `deep` with torch, to train and export in the device, `gpu` that decodes on an NVIDIA GPU, `ray` for a cluster of KubeRay.
 #
 #   docker build --target runtime -t lightpage:runtime .
 #   docker run --read-only --tmpfs /tmp -v bundles:/bundles -v state:/state -p 127.0.0.1:50051:50051 \
@@ -108,6 +108,16 @@ RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
 FROM service AS gpu
 COPY --from=build-gpu /opt/lightpage /opt/lightpage
 ENV LIGHTPAGE_SERVICE__PROVIDER=cuda
+
+FROM build AS build-ray
+RUN --mount=type=secret,id=pip_conf,target=/etc/pip.conf \
+    --mount=type=secret,id=ca_bundle,target=/run/secrets/ca_bundle \
+    --mount=type=bind,from=packages,target=/run/packages \
+    packaging/install_locked.sh packaging/locks/ray.txt /opt/lightpage
+
+FROM service AS ray
+COPY --from=build-ray /opt/lightpage /opt/lightpage
+ENV RAY_USAGE_STATS_ENABLED=0
 
 # What a plain `docker build .` makes.
 FROM runtime

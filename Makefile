@@ -152,7 +152,7 @@ results: $(STAMP)  ## write docs/results.md from analysis/results: RESULTS_ARGS=
 proto: $(STAMP)  ## regenerate the gRPC stubs from proto/
 	$(BIN)/python proto/generate.py
 
-image:  ## build the container image (IMAGE_TARGET=runtime, camera, deep or gpu; RELEASE=1 BASE=NAME@sha256:DIGEST; IMAGE_PLATFORM)
+image:  ## build the container image (IMAGE_TARGET=runtime, camera, deep, gpu or ray; RELEASE=1 BASE=NAME@sha256:DIGEST; IMAGE_PLATFORM)
 	LIGHTPAGE_RELEASE=$(RELEASE) LIGHTPAGE_BASE=$(BASE) LIGHTPAGE_PLATFORM=$(IMAGE_PLATFORM) \
 	    packaging/build_image.sh $(IMAGE_TARGET) $(IMAGE_TAG)
 

@@ -85,5 +85,9 @@ class BusyError(LightpageError):
     job: str | None = None
 
 
+class TakenError(BusyError):
+    """Another process has the resource; once that has ended, the same command may go well."""
+
+
 class LimitError(LightpageError):
     """A request is larger than the service accepts."""

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Builds a target of the Dockerfile with whatever this machine has: a Docker engine, or buildah without any daemon.
 #
-#   packaging/build_image.sh [TARGET] [TAG]        TARGET: runtime (default), camera, deep or gpu; TAG: lightpage:TARGET
+#   packaging/build_image.sh [TARGET] [TAG]        TARGET: runtime (default), camera, deep, gpu or ray; TAG: lightpage:TARGET
 #
 # Environment:
 #   LIGHTPAGE_BUILDER   docker or buildah; unset, the first that answers
@@ -19,8 +19,8 @@ cd "$(dirname "$0")/.."
 target="${1:-runtime}"
 tag="${2:-lightpage:$target}"
 case "$target" in
-  runtime | camera | deep | gpu) ;;
-  *) echo "build_image: target '$target' is none of runtime, camera, deep, gpu" >&2; exit 2 ;;
+  runtime | camera | deep | gpu | ray) ;;
+  *) echo "build_image: target '$target' is none of runtime, camera, deep, gpu, ray" >&2; exit 2 ;;
 esac
 
 # ---- what is to be built, before anything is -------------------------------------------------------------------------

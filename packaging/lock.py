@@ -48,6 +48,7 @@ TARGETS: Mapping[str, Target] = {
     "camera": Target(("cpu", "camera", "screen", "traces"), ("x86_64",), "genicam has no wheel for it"),
     "deep": Target(("cpu", "train", "traces"), ("x86_64",), "the lock holds PyTorch's CPU build for x86_64 alone"),
     "gpu": Target(("gpu", "traces")),
+    "ray": Target(("cpu", "kuberay", "traces")),
 }
 """The stages of the Dockerfile."""
 BUILD = "build"

@@ -21,6 +21,7 @@ from runtime.scaling.engine import Engine
 from runtime.scaling.job import KNOWN_PAGES, RANGE_PAGES, Choices, Job, named_bundle, of_fleet, of_recordings
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.local import LocalEngine, default_workers
+from runtime.scaling.part import WHOLE, Part
 from runtime.scaling.task import Operation
 from runtime.scaling.totals import AIR, Totals, totals
 from runtime.scaling.volumes import RecoveredFile, recovered_files
@@ -34,7 +35,7 @@ def bulk() -> None:
 
     Results and a ledger of every page go into the folder OUT. The same command again does only what is missing; without
     --recordings and --fleet it goes on with what was asked before. Exit status 2 says that pages or recordings are
-    lost, 3 that a file is.
+    lost, 3 that a file is, 75 that another run is at work on the same.
     """
 
 
@@ -42,6 +43,9 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options of all operations."""
     for option in (
         click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file."),
+        click.option(
+            "--part", metavar="K/N", help="Do every Nth recording or device from the Kth, K from 0; others do the rest."
+        ),
         click.option(
             "--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of the cores."
         ),
@@ -116,6 +120,7 @@ def _bulk(
     workers: int | None,
     threads: int | None,
     json_path: Path | None,
+    part: str | None,
     again_with: str | None = None,
     **chosen: bool | int | None,
 ) -> None:
@@ -125,23 +130,26 @@ def _bulk(
     context.meta[RESUME_KEY] = "what is done stays; run the same command again to do the rest"
     if address is not None and engine != RAY:
         raise InvalidInputError("--address", f"with --engine {engine}", f"--engine {RAY}")
-    with Ledger(out) as ledger:
-        before = Job.read(ledger.folder)
-        given = {name: value for name, value in chosen.items() if value is not None}
-        choices = (Choices(operation=operation) if before is None else before.choices).model_copy(
-            update={"operation": operation, **given}
-        )
-        job = _job(ledger.folder, before, choices, recordings, fleet, bundle)
-        if again_with is not None:
-            job = _with_round(job, again_with)
-        job.write(ledger.folder)
+    own = WHOLE if part is None else Part.parse(part)
+    with Ledger(out, own) as ledger:
+        with ledger.question():
+            before = Job.read(ledger.folder)
+            given = {name: value for name, value in chosen.items() if value is not None}
+            given |= {} if part is None else {"parts": own.count}
+            choices = (Choices(operation=operation) if before is None else before.choices).model_copy(
+                update={"operation": operation, **given}
+            )
+            job = _job(ledger.folder, before, choices, recordings, fleet, bundle)
+            if again_with is not None:
+                job = _with_round(job, again_with)
+            job.write(ledger.folder)
         made = run(ledger, job, partial(_engine, engine, address, workers, threads))
         found = totals(ledger, job)
-        files = recovered_files(ledger, job) if operation is Operation.RECOVER else []
+        files = recovered_files(ledger, job) if operation is Operation.RECOVER and own == WHOLE else []
     if json_path is not None:
-        write_json(json_path, figures(job, made, found, files))
-    click.echo(table(job, made, found, files))
-    if (error := failure(out, job, made, found, files)) is not None:
+        write_json(json_path, figures(job, own, made, found, files))
+    click.echo(table(job, own, made, found, files))
+    if (error := failure(out, job, own, made, found, files)) is not None:
         raise error
 
 
@@ -195,10 +203,11 @@ def _with_round(job: Job, bundle: str) -> Job:
     return job if known else job.model_copy(update={"rounds": (*job.rounds, model)})
 
 
-def figures(job: Job, made: Progressed, found: Totals, files: list[RecoveredFile]) -> dict[str, Any]:
+def figures(job: Job, part: Part, made: Progressed, found: Totals, files: list[RecoveredFile]) -> dict[str, Any]:
     """All that is known, under the names that other programs read."""
     return {
         "operation": str(job.choices.operation),
+        "part": None if part == WHOLE else str(part),
         "bundles": [bundle.model_dump(mode="json") for bundle in job.bundles],
         "this_run": {
             "pages": made.pages,
@@ -214,14 +223,15 @@ def figures(job: Job, made: Progressed, found: Totals, files: list[RecoveredFile
     }
 
 
-def table(job: Job, made: Progressed, found: Totals, files: list[RecoveredFile]) -> str:
+def table(job: Job, part: Part, made: Progressed, found: Totals, files: list[RecoveredFile]) -> str:
     """The figures for people."""
     tally, air = found.tally, found.figures.value(AIR)
     unit = "devices" if job.choices.operation is Operation.RECALIBRATE else "pages"
     speed = "" if made.pages_per_s is None else f" in {made.seconds:.1f} s, {made.pages_per_s:.2f} a second"
     causes = ", ".join(f"{count} {cause}" for cause, count in tally.lost.most_common())
     rows = [
-        (unit, f"{tally.pages} of {len(job.sources)} recordings"),
+        ("part", "" if part == WHOLE else f"{part}; without --part, the same command says it of all parts"),
+        (unit, f"{tally.pages} of {len(found.recordings)} recordings"),
         ("this run", f"{made.pages} {unit}{speed}" if made.pages else "nothing was missing"),
         ("read", f"{tally.read}"),
         ("left out", f"{tally.left_out} that a bundle was made from" if tally.left_out else ""),
@@ -248,7 +258,9 @@ def table(job: Job, made: Progressed, found: Totals, files: list[RecoveredFile])
     return "\n".join(f"{name:<20} {value}" for name, value in rows if value)
 
 
-def failure(out: Path, job: Job, made: Progressed, found: Totals, files: list[RecoveredFile]) -> LightpageError | None:
+def failure(
+    out: Path, job: Job, part: Part, made: Progressed, found: Totals, files: list[RecoveredFile]
+) -> LightpageError | None:
     """The error that a run ends with where something is lost; None where nothing is."""
     subject, tally = f"bulk run {out}", found.tally
     lost = tally.lost.total()
@@ -258,10 +270,11 @@ def failure(out: Path, job: Job, made: Progressed, found: Totals, files: list[Re
     got = f"{lost} of {tally.pages} lost and {tally.missing} missing ({'; '.join(told)})"
     if job.choices.operation is Operation.RECOVER and not made.failed:
         broken = ranges([file.volume.id for file in files if file.error is not None])
-        if broken or (lost and not files):
+        if broken or (lost and not files and part == WHOLE):
             what = f"volumes {broken} without a file" if broken else "no file"
             return LostDataError(subject, f"{what}; {got}", "pages that suffice for every file")
         if lost:
-            warn(f"{subject}: {got}; every file is whole all the same")
+            then = "every file is whole all the same" if part == WHOLE else "the files come when all parts are done"
+            warn(f"{subject}: {got}; {then}")
         return None
     return InvalidInputError(subject, got, "pages that can be read") if lost or made.failed else None

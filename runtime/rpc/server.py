@@ -22,6 +22,7 @@ from runtime.rpc.health_servicer import HealthServicer
 from runtime.rpc.inference_calls import INFERENCE, PREFIX, InferenceCalls, UnknownCalls, large_messages
 from runtime.rpc.message_gate import MessageGate
 from runtime.service.dataplane import DataPlane
+from runtime.service.limits import Limits
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.store_health import StoreHealth
 from runtime.service.traces import Traces
@@ -153,6 +154,7 @@ class LightpageServer:
                 ("grpc.max_send_message_length", limits.reply_bytes),
                 ("grpc.so_reuseport", 0),  # a second server on the port is a mistake, not a helper
                 ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
+                *_connection_ages(limits),
             ),
         )
         self._dispatcher = Dispatcher(
@@ -212,3 +214,12 @@ class LightpageServer:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._pool.shutdown(wait=False)
+
+
+def _connection_ages(limits: Limits) -> list[tuple[str, int]]:
+    """gRPC's options of how old a connection may become, and of the calls that are then still on it."""
+    ages = {
+        "grpc.max_connection_age_ms": limits.connection_age_s,
+        "grpc.max_connection_age_grace_ms": limits.connection_grace_s,
+    }
+    return [(name, max(1, round(1000 * seconds))) for name, seconds in ages.items() if seconds is not None]

@@ -74,7 +74,7 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:
     What has failed is told and left to the next run; all else goes on.
 
     Args:
-        ledger: of the job, which belongs to this process.
+        ledger: of the job, which belongs to this process, or a part of it.
         job: what was asked.
         engine: makes the engine; not called where nothing is missing.
 
@@ -84,8 +84,8 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:
     """
     start = time.perf_counter()
     made = Progressed()
-    ledger.sweep()
-    for source in job.sources:
+    ledger.sweep(job)
+    for _, source in ledger.sources(job):
         if source.problem is not None:
             made.fail(source.problem.about(source.device))
     unit = "device" if job.choices.operation is Operation.RECALIBRATE else "page"
@@ -106,7 +106,7 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:
                 for _ in track(steps, what, unit=unit, total=total, done=total - todo, state=made.state):
                     pass
     finally:
-        ledger.sweep()
+        ledger.sweep(job)
     made.seconds = time.perf_counter() - start
     return made
 
@@ -133,7 +133,8 @@ def _steps(engine: Engine, tasks: Iterable[Task], made: Progressed) -> Generator
 
 
 def _all(ledger: Ledger, job: Job) -> int:
-    """Pages of the whole job, or devices."""
+    """Pages of the ledger's part of the job, or devices."""
+    sources = [source for _, source in ledger.sources(job)]
     if job.choices.operation is Operation.RECALIBRATE:
-        return sum(source.stamp is not None for source in job.sources)
-    return sum(source.pages for source in job.sources)
+        return sum(source.stamp is not None for source in sources)
+    return sum(source.pages for source in sources)

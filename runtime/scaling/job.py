@@ -58,6 +58,7 @@ class Choices(Plain):
         tracking: whether the image is followed within a range.
         symbols: whether decoding keeps symbols and confidences.
         known_pages: that a device is recalibrated with.
+        parts: that processes do independently of each other.
     """
 
     operation: Operation
@@ -65,6 +66,7 @@ class Choices(Plain):
     tracking: bool = True
     symbols: bool = True
     known_pages: int = KNOWN_PAGES
+    parts: int = 1
 
 
 class Job(Plain):

@@ -5,56 +5,106 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from lightpage.errors import BusyError, InvalidInputError
+from lightpage.errors import InvalidInputError, TakenError
 from runtime.scaling.job import Job, Source
+from runtime.scaling.part import WHOLE, Part
 from runtime.scaling.shard import RECORD, PageRecord, ShardRecord
 from runtime.scaling.task import Operation, Task
 
-_LOCK, _SHARDS = "lock", "shards"
+_LOCK, _QUESTION, _SHARDS = "lock", "lock-job", "shards"
+
+_QUESTION_S, _AGAIN_S = 600.0, 0.1
+"""Longest wait for another part that writes down what is asked, and the time between two tries."""
 
 
 class Ledger:
-    """The folder of a run; in a `with` statement it belongs to this process.
+    """The folder of a run; in a `with` statement it belongs to this process, or a part of its recordings does.
 
     Args:
         folder: of the run, there or yet to be made.
+        part: what this process does of it.
 
     Raises:
-        BusyError: another run is at work there.
+        TakenError: another run is at work there, or on this part of it.
         InvalidInputError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder.absolute()
+    def __init__(self, folder: Path, part: Part = WHOLE) -> None:
+        self.folder, self.part = folder.absolute(), part
+        self._subject = f"bulk run {self.folder}"
 
     def __enter__(self) -> Self:
-        subject = f"bulk run {self.folder}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
-            raise InvalidInputError(subject, error, "a folder that can be written") from None
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(self._lock)
-            raise BusyError(subject, "another run at work there", "its end, or another folder") from None
+            raise self._not_writable(error) from None
+        with ExitStack() as stack:
+            if self.part == WHOLE:
+                stack.callback(os.close, self._locked(_LOCK, fcntl.LOCK_EX))
+            else:
+                stack.callback(os.close, self._locked(_LOCK, fcntl.LOCK_SH))
+                stack.callback(os.close, self._locked(f"{_LOCK}-{self.part.index}", fcntl.LOCK_EX))
+            self._locks = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        os.close(self._lock)
+        self._locks.close()
 
-    def sweep(self) -> None:
-        """Remove what workers that were killed have left half-written; none may be at work."""
-        for left in (self.folder / _SHARDS).glob("*/.*"):
-            shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+    @contextmanager
+    def question(self) -> Iterator[None]:
+        """No other part reads or writes what is asked.
+
+        Raises:
+            TakenError: another one has not ended with it in time.
+        """
+        until = time.monotonic() + _QUESTION_S
+        while True:
+            try:
+                lock = self._locked(_QUESTION, fcntl.LOCK_EX)
+                break
+            except TakenError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(_AGAIN_S)
+        try:
+            yield
+        finally:
+            os.close(lock)
+
+    def _locked(self, name: str, kind: int) -> int:
+        """A descriptor that holds a lock until it is closed."""
+        try:
+            lock = os.open(self.folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise self._not_writable(error) from None
+        try:
+            fcntl.flock(lock, kind | fcntl.LOCK_NB)
+        except OSError:
+            os.close(lock)
+            raise TakenError(self._subject, "another run at work there", "its end, or another folder") from None
+        return lock
+
+    def _not_writable(self, error: OSError) -> InvalidInputError:
+        return InvalidInputError(self._subject, error, "a folder that can be written")
+
+    def sources(self, job: Job) -> Iterator[tuple[int, Source]]:
+        """Recordings of the part, each with its place among the run's."""
+        return self.part.sources(job)
+
+    def sweep(self, job: Job) -> None:
+        """Remove what workers that were killed have left half-written; none of this part may be at work."""
+        for index, _ in self.sources(job):
+            for left in self.shard(index, 0).parent.glob(".*"):
+                shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
 
     def shard(self, source: int, first: int, number: int = 0) -> Path:
         """Path of a range's result, without the end of its name.
@@ -69,7 +119,7 @@ class Ledger:
 
     def missing(self, job: Job) -> Iterator[Task]:
         """Ranges of the first reading that have no result, recording by recording."""
-        for index, source in enumerate(job.sources):
+        for index, source in self.sources(job):
             there = self.results(index)
             yield from (task for task in self.ranges(job, index, source) if task.shard.name not in there)
 
@@ -83,7 +133,7 @@ class Ledger:
         Raises:
             InvalidInputError: a shard that cannot be read.
         """
-        for index, source in enumerate(job.sources):
+        for index, source in self.sources(job):
             there = self.results(index)
             for task in self.ranges(job, index, source):
                 shard = self.shard(index, task.pages[0], number)

@@ -188,13 +188,13 @@ class Totals:
 
 
 def totals(ledger: Ledger, job: Job) -> Totals:
-    """Add up what the shards of a job say; a shard is read at a time.
+    """Add up what the shards of a job say, or of the ledger's part of it; a shard is read at a time.
 
     Raises:
         InvalidInputError: a shard cannot be read.
     """
     found = Totals(rounds=[Round(model) for model in job.rounds])
-    for index, source in enumerate(job.sources):
+    for index, source in ledger.sources(job):
         _add_recording(found, ledger, job, index, source)
     return found
 

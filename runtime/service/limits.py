@@ -89,7 +89,8 @@ _Count = Annotated[int, Field(ge=1, le=4096)]
 class Limits(TomlTable):
     """The limits that one service runs under: the table [limits] of its settings.
 
-    Each default has its reason above, where it is named.
+    Each default has its reason above, where it is named. A connection has no longest age unless one is set: a device's
+    only controller would gain nothing by a new one, and lose its session. Nor are calls ended for it.
     """
 
     model_config = ConfigDict(strict=True)
@@ -120,3 +121,5 @@ class Limits(TomlTable):
     range_s: _Seconds = RANGE_S
     concurrent_watches: _Count = CONCURRENT_WATCHES
     grace_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = GRACE_S
+    connection_age_s: _Seconds | None = None
+    connection_grace_s: _Seconds | None = None

@@ -326,6 +326,12 @@ class ServiceSettings(TomlTable):
             f"at most limits.receive_s, which is {limits.receive_s:g}",
         )
         _want(
+            limits.connection_grace_s is None or limits.connection_age_s is not None,
+            "limits.connection_grace_s",
+            limits.connection_grace_s,
+            "limits.connection_age_s too: the age after which it begins",
+        )
+        _want(
             own.longest_s >= own.least_s,
             "self_calibration.longest_s",
             own.longest_s,

@@ -21,6 +21,11 @@ OF_CUDA = ("nvidia-", "cuda-", "triton")
 """How names of packages begin that PyTorch's build for GPUs brings. A developer may have it; no lock does."""
 BEYOND_CONSTRAINTS = ("nvidia-",)
 """What the image `gpu` alone installs. constraints.txt leaves them open: torch for GPUs needs other versions."""
+OF_THE_DASHBOARD = {
+    *("aiohttp-cors", "colorful", "google-api-core", "google-auth", "opencensus", "opencensus-context", "proto-plus"),
+    *("opentelemetry-exporter-prometheus", "py-spy", "pyasn1", "pyasn1-modules", "smart-open", "wrapt"),
+}
+"""What the image `ray` alone installs, and nobody here: of Ray's dashboard, by which KubeRay hands over jobs."""
 
 
 def constrained() -> dict[str, str]:
@@ -47,7 +52,7 @@ def closure(requirements: Iterable[Requirement], machine: str) -> set[str]:
             continue
         seen.add((name, extras))
         found.add(name)
-        for line in distribution(name).requires or ():
+        for line in () if name in OF_THE_DASHBOARD else distribution(name).requires or ():
             inner = Requirement(line)
             environments = [{"platform_machine": machine, "extra": extra} for extra in (*extras, "")]
             wanted = inner.marker is None or any(inner.marker.evaluate(each) for each in environments)
@@ -87,6 +92,13 @@ def test_the_lock_for_gpus_is_what_pyproject_asks_for_and_the_libraries_of_cuda(
     assert {"nvidia-cublas", "nvidia-cudnn-cu13"} <= locked.keys()
 
 
+def test_the_lock_for_ray_is_what_a_worker_needs_and_rays_dashboard() -> None:
+    locked = lock.read_lock(LOCKS / "ray.txt")
+    needed = closure([*asked("ray"), Requirement("six")], "x86_64") | OF_THE_DASHBOARD  # opencensus needs six
+    assert disagreements(locked, constrained(), needed) == []
+    assert all(locked[requirement.name].version in requirement.specifier for requirement in asked("ray"))
+
+
 def test_the_tools_that_build_wheels_are_locked() -> None:
     locked = lock.read_lock(LOCKS / "build.txt")
     assert disagreements(locked, constrained(), closure([Requirement("setuptools")], "x86_64")) == []
@@ -102,10 +114,13 @@ def test_every_stage_that_installs_does_it_by_its_lock() -> None:
         assert "--require-hashes" in line or "--no-index" in line, line
 
 
-@pytest.mark.parametrize("target", ["runtime", "camera", "deep"])
+@pytest.mark.parametrize("target", ["runtime", "camera", "deep", "ray"])
 def test_every_locked_package_has_a_licence_that_is_allowed(target: str) -> None:
     locked = lock.read_lock(LOCKS / f"{target}.txt")
-    found = {name: licences.spdx(name, inventory.licence_of(distribution(name))) for name in locked}
+    here = locked.keys() - OF_THE_DASHBOARD  # of the others, licences.toml must say it
+    found = {
+        name: licences.spdx(name, inventory.licence_of(distribution(name)) if name in here else "") for name in locked
+    }
     assert {name: licence for name, licence in found.items() if licence is None or licences.refused(licence)} == {}
 
 

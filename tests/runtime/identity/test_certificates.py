@@ -75,6 +75,33 @@ def test_new_files_count(authority: Authority) -> None:
     assert certificates.pem().certificate == newer.certificate.read_bytes() != before.certificate
 
 
+def _mounted(folder: Path, files: TlsFiles, version: str) -> TlsFiles:
+    """Have a folder hold files as kubelet mounts a Secret: names that never change, behind one link that is swapped."""
+    names = {"ca": "ca.crt", "certificate": "tls.crt", "key": "tls.key"}
+    (folder / f"..{version}").mkdir(parents=True)
+    for kind, name in names.items():
+        shutil.copy(getattr(files, kind), folder / f"..{version}" / name)
+        if not (folder / name).is_symlink():
+            (folder / name).symlink_to(f"..data/{name}")
+    earlier = (folder / "..data").readlink() if (folder / "..data").is_symlink() else None
+    (folder / "..data_tmp").symlink_to(f"..{version}")
+    os.replace(folder / "..data_tmp", folder / "..data")
+    if earlier is not None:
+        shutil.rmtree(folder / earlier)
+    return TlsFiles(**{kind: folder / name for kind, name in names.items()})
+
+
+def test_new_files_of_a_mounted_secret_count(authority: Authority, tmp_path: Path) -> None:
+    mounted = _mounted(tmp_path / "mount", authority.service(), "2026_01_01")
+    certificates = Certificates(mounted)
+    before, context = certificates.pem(), certificates.context()
+    assert certificates.pem() is before
+    newer = authority.service("newer")
+    assert _mounted(tmp_path / "mount", newer, "2026_02_01") == mounted
+    assert certificates.pem().certificate == newer.certificate.read_bytes() != before.certificate
+    assert certificates.context() is not context
+
+
 def test_half_replaced_files_leave_the_earlier_ones(authority: Authority, caplog: pytest.LogCaptureFixture) -> None:
     files, newer = authority.service(), authority.service("newer")
     certificates = Certificates(files)

@@ -20,9 +20,11 @@ from runtime.bundle.bundle import Bundle
 from runtime.commands import bulk as command
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
+from runtime.scaling import ledger as ledger_module
 from runtime.scaling.engine import Engine
 from runtime.scaling.inline import InlineEngine
 from runtime.scaling.ledger import Ledger
+from runtime.scaling.part import Part
 from runtime.scaling.shard import ShardRecord
 from runtime.scaling.task import Task
 from runtime.scaling.work import Worker
@@ -154,9 +156,55 @@ def test_another_operation_or_bundle_is_refused_too(archive: Archive, capsys: py
 
 def test_a_second_driver_is_refused(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
     with Ledger(archive.out):
-        assert archive.run("decode")[0] == 2
+        assert archive.run("decode")[0] == 75
+        assert archive.run("decode", "--part", "0/2")[0] == 75
     assert "another run at work there" in capsys.readouterr().err
     assert archive.run("decode")[0] == 0
+
+
+def test_each_part_does_its_recordings_and_the_whole_is_added_up_without_parts(archive: Archive) -> None:
+    shutil.copy(archive.folder / "a.h5", archive.folder / "c.h5")
+    done = []
+    for part, names in (("1/2", {"b.h5"}), ("0/2", {"a.h5", "c.h5"})):
+        status, figures = archive.run("evaluate", "--part", part)
+        assert {task.recording.name for task in archive.tasks} == names
+        assert (status, figures["part"], figures["pages_missing"]) == (0, part, 0)
+        assert figures["pages"] == figures["this_run"]["pages"] == PAGES * len(names)
+        done += [row["recording"] for row in figures["recordings"]]
+    status, figures = archive.run("evaluate", asked=False)
+    assert (status, archive.tasks, figures["part"], figures["pages_read"]) == (0, [], None, 3 * PAGES)
+    assert sorted(done) == [row["recording"] for row in figures["recordings"]]
+
+
+def test_parts_run_beside_each_other_but_not_twice_nor_beside_the_whole(
+    archive: Archive, capsys: pytest.CaptureFixture[str]
+) -> None:
+    left = archive.out / "shards/000000/.00000003.h5-abc"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"of part 0, which is at work")
+    with Ledger(archive.out, Part(index=0, count=2)):
+        assert archive.run("decode", "--part", "0/2")[0] == 75
+        assert archive.run("decode")[0] == 75
+        assert archive.run("decode", "--part", "1/2")[0] == 0
+    assert left.exists()
+    assert archive.run("decode", "--part", "0/3")[0] == 2
+    assert "parts: got 3, and 2 before" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["2/2", "-1/2", "1", "a/b", "0/0", "1/2/3"])
+def test_a_part_that_makes_no_sense_is_refused(archive: Archive, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert archive.run("decode", "--part", text)[0] == 2
+    assert f"--part: got '{text}', wanted K/N" in capsys.readouterr().err
+    assert not archive.out.exists()
+
+
+def test_a_part_waits_for_another_one_that_writes_down_what_is_asked(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(ledger_module, "_QUESTION_S", 0.0)
+    with Ledger(archive.out, Part(index=0, count=2)) as ledger, ledger.question():
+        assert archive.run("decode", "--part", "1/2")[0] == 75
+    assert archive.run("decode", "--part", "1/2")[0] == 0
 
 
 def test_recordings_that_vanish_or_change_are_named_and_the_others_go_on(
@@ -260,6 +308,12 @@ def test_files_come_back_from_pages_in_several_recordings(archive: Archive) -> N
     made = file.stat().st_mtime_ns
     assert archive.run("recover", asked=False)[0] == 0
     assert file.stat().st_mtime_ns == made
+    shutil.rmtree(archive.out)
+    for part, lost in (("0/2", 1), ("1/2", 0)):
+        status, figures = archive.run("recover", "--no-tracking", "--bundle", str(bundle), "--part", part)
+        assert (status, figures["pages_lost"], figures["files"]) == (0, lost, [])
+    status, figures = archive.run("recover", asked=False)
+    assert (status, archive.tasks, file.read_bytes()) == (0, [], coded.CONTENT)
 
 
 def test_a_file_whose_pages_do_not_suffice_is_not_written(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
@@ -299,7 +353,11 @@ def test_a_poisoned_device_fails_by_name_and_the_rest_of_the_fleet_is_recalibrat
     lines += ['[[device]]\nname = "poisoned"\nbundle = "toy.zip"\nrecordings = ["bad.h5"]']
     (archive.folder / "fleet.toml").write_text("\n".join(lines))
     fleet = ("--fleet", str(archive.folder / "fleet.toml"))
+    for index, name in enumerate(offsets):  # one part, one device
+        status, figures = archive.run("recalibrate", *fleet, "--part", f"{index}/3", asked=False)
+        assert (status, [row["device"] for row in figures["recordings"]]) == (0, [name])
     status, figures = archive.run("recalibrate", *fleet, asked=False)
+    assert [task.device for task in archive.tasks] == ["poisoned"]
     assert (status, figures["pages_read"], figures["pages_lost"]) == (2, 2, 1)
     rows = {row["device"]: row for row in figures["recordings"]}
     assert rows["poisoned"]["pages_lost"] == 1

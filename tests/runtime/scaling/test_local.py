@@ -65,6 +65,39 @@ def test_a_killed_worker_costs_its_range_only_and_nothing_comes_out_differently(
     assert pages(tmp_path / "killed") == pages(tmp_path / "single")
 
 
+BULK = """
+import sys
+from lightpage.cli.main import run
+from runtime.commands.bulk import bulk
+sys.exit(run(bulk))
+"""
+
+
+def test_two_parts_as_two_processes_do_every_page_once(toy_zip: Path, tmp_path: Path) -> None:
+    for number in range(3):
+        toy.write_toy_recording(tmp_path / f"{number}.h5", toy.ToyDevice(seed=number), 16, PAGES, number)
+    asked = ["--recordings", str(tmp_path / "?.h5"), "--bundle", str(toy_zip), "--range-pages", str(RANGE)]
+    words = [sys.executable, "-c", BULK, "decode", str(tmp_path / "out"), "--no-symbols", *asked]
+    words += ["--workers", "1", "--threads", "1"]
+    parts = [
+        subprocess.Popen([*words, "--part", f"{index}/2", "--json", str(tmp_path / f"{index}.json")], cwd=ROOT)
+        for index in range(2)
+    ]
+    try:
+        assert [part.wait(LIMIT_S) for part in parts] == [0, 0]
+    finally:
+        for part in parts:
+            part.kill()
+            part.wait()
+    told = [json.loads((tmp_path / f"{index}.json").read_text()) for index in range(2)]
+    assert [each["this_run"]["pages"] for each in told] == [2 * PAGES, PAGES]
+    with Ledger(tmp_path / "out") as ledger:
+        job = Job.read(ledger.folder)
+        assert job is not None
+        assert list(ledger.missing(job)) == []
+        assert totals(ledger, job).tally.read == 3 * PAGES
+
+
 DRIVER = """
 import sys
 from pathlib import Path

@@ -43,9 +43,8 @@ def test_the_example_has_every_key_and_its_examples_are_right() -> None:
 
 
 def test_every_limit_can_be_set(tmp_path: Path) -> None:
-    wanted = {
-        name: 0.5 * value if isinstance(value, float) else value // 2 for name, value in Limits().model_dump().items()
-    }
+    defaults = {name: 7.0 if value is None else value for name, value in Limits().model_dump().items()}
+    wanted = {name: 0.5 * value if isinstance(value, float) else value // 2 for name, value in defaults.items()}
     text = "[limits]\n" + "\n".join(f"{name} = {value}" for name, value in wanted.items())
     assert of_file(tmp_path, text).settings.limits.model_dump() == wanted
     variables = {f"LIGHTPAGE_LIMITS__{name.upper()}": str(value) for name, value in wanted.items()}
@@ -110,6 +109,7 @@ def test_the_short_name_of_the_store_counts_less_than_the_long_one() -> None:
         ("[limits]\nchunk_bytes = 4194304", r"chunk_bytes = 4194304, wanted at least 1024 less than limits\.message_"),
         ("[limits]\npair_bytes = 2000000000", r"wanted at least limits\.pair_bytes"),
         ("[limits]\nstall_s = 31", r"stall_s = 31\.0, wanted at most limits\.receive_s, which is 30"),
+        ("[limits]\nconnection_grace_s = 9", r"connection_grace_s = 9\.0, wanted limits\.connection_age_s too"),
         ("[service]\naddress = 'here'", r"got service\.address = 'here', wanted HOST:PORT"),
         ("[service]\nstore = ''", r"service\.store = '', wanted a path that is not empty"),
         ("[service]\npages = 'p.h5'", r"service\.pages = 'p\.h5', wanted service\.source"),

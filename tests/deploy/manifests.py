@@ -1,0 +1,109 @@
+"""The manifests of deploy/kubernetes, and the schemas that they are held against."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+from jsonschema import Draft202012Validator
+from referencing import Registry, Resource
+
+from tests.deploy.promql import DEPLOY
+
+FOLDER = DEPLOY / "kubernetes"
+SCHEMAS = Path(__file__).parent / "schemas"
+KUSTOMIZATION = "kustomization.yaml"
+FREE = {"labels", "matchLabels", "requests", "limits", "rayStartParams", "data"}
+OWN = {"app.kubernetes.io/name"}
+"""Tables whose keys are names of the user's own: by their own name, or by a key."""
+
+_schemas = {path.name: json.loads(path.read_text()) for path in sorted(SCHEMAS.glob("*.json"))}
+_registry: Registry[Any] = Registry().with_resources(
+    (name, Resource.from_contents(schema)) for name, schema in _schemas.items()
+)
+_files = {kind: name for name, schema in _schemas.items() for kind in schema["kinds"]}
+
+
+def kind_of(manifest: dict[str, Any]) -> str:
+    """Its `apiVersion kind`, as the schemas name it."""
+    return f"{manifest['apiVersion']} {manifest['kind']}"
+
+
+def problems(manifest: dict[str, Any]) -> list[str]:
+    """What the schema of its kind has against a manifest."""
+    kind = kind_of(manifest)
+    place = kind.replace("~", "~0").replace("/", "~1").replace(" ", "%20")
+    validator = Draft202012Validator({"$ref": f"{_files[kind]}#/kinds/{place}"}, registry=_registry)
+    return [f"{error.json_path}: {error.message}" for error in validator.iter_errors(manifest)]
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """The documents of a file."""
+    return [document for document in yaml.safe_load_all(path.read_text()) if document is not None]
+
+
+def kustomizations() -> list[Path]:
+    """All of them."""
+    return sorted(FOLDER.rglob(KUSTOMIZATION))
+
+
+def manifests() -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every manifest that a kustomization lists as a resource, with a name for it."""
+    for kustomization in kustomizations():
+        (whole,) = read(kustomization)
+        for name in whole["resources"]:
+            if (path := kustomization.parent / name).is_file():
+                for document in read(path):
+                    yield f"{path.relative_to(FOLDER)}: {document['kind']} {document['metadata']['name']}", document
+
+
+def manifest(kind: str, name: str) -> dict[str, Any]:
+    """The one of that kind and name."""
+    (found,) = [one for _, one in manifests() if (one["kind"], one["metadata"]["name"]) == (kind, name)]
+    return found
+
+
+def tables(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Where the tables are whose keys a schema knows."""
+    if isinstance(value, dict):
+        if not (path and (path[-1] in FREE or value.keys() & OWN)):
+            yield path
+        for key, each in value.items():
+            yield from tables(each, (*path, key))
+    elif isinstance(value, list):
+        for index, each in enumerate(value):
+            yield from tables(each, (*path, index))
+
+
+def planted(manifest: dict[str, Any], path: tuple[str | int, ...], key: str = "planted") -> dict[str, Any]:
+    """A copy with a key that nobody knows in the table at a path."""
+    changed = copy.deepcopy(manifest)
+    table: Any = changed
+    for step in path:
+        table = table[step]
+    table[key] = 1
+    return changed
+
+
+def templates(value: Any) -> Iterator[dict[str, Any]]:
+    """The pods that a manifest makes: their `spec` and `metadata`."""
+    if isinstance(value, dict):
+        if "containers" in value.get("spec", {}):
+            yield value
+        for each in value.values():
+            yield from templates(each)
+    elif isinstance(value, list):
+        for each in value:
+            yield from templates(each)
+
+
+def container(manifest: dict[str, Any]) -> dict[str, Any]:
+    """The only container of the only pod that a manifest makes."""
+    (template,) = templates(manifest)
+    (found,) = template["spec"]["containers"]
+    assert isinstance(found, dict)
+    return found

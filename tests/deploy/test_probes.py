@@ -1,0 +1,182 @@
+"""The probes of the manifest, asked as kubelet asks them, of the service that the manifest starts."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import grpc
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
+from runtime.rpc.health_server import HealthServer
+from runtime.wire.tls import TlsFiles
+from tests.deploy import manifests
+from tests.runtime.identity.authority import Authority
+from tests.runtime.rpc.test_edge import header
+
+ROOT = manifests.FOLDER.parents[1]
+PROBES = ("startupProbe", "readinessProbe", "livenessProbe")
+LIMIT_S = 60
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Pod:
+    """The container of the manifest on this machine: its command line and settings, with folders and ports of its own.
+
+    Args:
+        folder: in place of the container's root.
+        bundle: what it serves.
+    """
+
+    def __init__(self, folder: Path, bundle: Path) -> None:
+        whole = manifests.manifest("StatefulSet", "lightpage")
+        self.container = manifests.container(whole)
+        self.grace_s = whole["spec"]["template"]["spec"]["terminationGracePeriodSeconds"]
+        self.ports = {port["containerPort"]: free_port() for port in self.container["ports"]}
+        self.folder, self.tls = folder, self._mounted(folder, bundle)
+        settings = (manifests.FOLDER / "service" / "service.toml").read_text()
+        mounts = [mount["mountPath"] for mount in self.container["volumeMounts"]]
+        for mount in mounts:
+            (folder / mount.lstrip("/")).mkdir(exist_ok=True)
+        settings = re.sub(rf'"({"|".join(mounts)})/', rf'"{folder}\1/', settings)
+        for inside, outside in self.ports.items():
+            settings = settings.replace(f'"0.0.0.0:{inside}"', f'"127.0.0.1:{outside}"')
+            settings = settings.replace(f"port = {inside}", f"port = {outside}")
+        self.settings = folder / "settings" / "service.toml"
+        self.settings.write_text(settings.replace('"0.0.0.0"', '"127.0.0.1"'))
+
+    @staticmethod
+    def _mounted(folder: Path, bundle: Path) -> TlsFiles:
+        """What the cluster's administrator provides; returns the certificate of a caller."""
+        authority = Authority(folder / "authority")
+        for name in ("tls", "bundles", "bundle-key"):
+            (folder / name).mkdir()
+        for path, name in zip(vars(authority.service()).values(), ("ca.crt", "tls.crt", "tls.key"), strict=True):
+            shutil.copy(path, folder / "tls" / name)
+        key = ec.generate_private_key(ec.SECP256R1())
+        content = shutil.copy(bundle, folder / "bundles" / "device.zip").read_bytes()
+        (folder / "bundles" / "device.zip.sig").write_bytes(key.sign(content, ec.ECDSA(hashes.SHA256())))
+        public = (serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
+        (folder / "bundle-key" / "signing.pem").write_bytes(key.public_key().public_bytes(*public))
+        return authority.caller("controller", ["decode"])
+
+    def target(self, name: str) -> str:
+        """Where a named port is."""
+        (inside,) = [port["containerPort"] for port in self.container["ports"] if port["name"] == name]
+        return f"127.0.0.1:{self.ports[inside]}"
+
+    @contextmanager
+    def running(self) -> Iterator[subprocess.Popen[str]]:
+        """Its process, which ends with the block."""
+        arguments = [word.replace("/settings", str(self.settings.parent)) for word in self.container["args"]]
+        environment = {"LIGHTPAGE_STORE": str(self.folder / "state" / "models"), "PYTHONUNBUFFERED": "1"}
+        environment |= {each["name"]: "1" for each in self.container["env"]}
+        process = subprocess.Popen(
+            [sys.executable, "-m", "lightpage.cli.main", "serve", *arguments],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=os.environ | environment,
+        )
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+    def answers(self, name: str) -> bool:
+        """Whether a probe succeeds: kubelet asks once, without TLS, within the probe's time."""
+        probe: dict[str, Any] = self.container[name]
+        assert probe.keys() - {"periodSeconds", "timeoutSeconds", "failureThreshold"} == {"grpc"}
+        target = f"127.0.0.1:{self.ports[probe['grpc']['port']]}"
+        with grpc.insecure_channel(target, options=[("grpc.enable_http_proxy", 0)]) as channel:
+            request = health_pb2.HealthCheckRequest(service=probe["grpc"].get("service", ""))
+            try:
+                reply = health_pb2_grpc.HealthStub(channel).Check(request, timeout=probe["timeoutSeconds"])
+            except grpc.RpcError:
+                return False
+        return bool(reply.status == health_pb2.HealthCheckResponse.SERVING)
+
+
+def soon(condition: Callable[[], bool], process: subprocess.Popen[str]) -> bool:
+    """Whether it holds while the process runs, within the time."""
+    until = time.monotonic() + LIMIT_S
+    while time.monotonic() < until and process.poll() is None:
+        if condition():
+            return True
+    return False
+
+
+def test_the_probes_say_no_before_yes_while_it_serves_and_no_while_it_ends(tmp_path: Path, toy_zip: Path) -> None:
+    pod = Pod(tmp_path, toy_zip)
+    assert not any(pod.answers(name) for name in PROBES)
+    with pod.running() as process:
+        assert not pod.answers("readinessProbe")  # it loads its bundle
+        assert soon(lambda: pod.answers("startupProbe"), process), process.stdout.read()  # type: ignore[union-attr]
+        assert all(pod.answers(name) for name in PROBES)
+        with grpc.secure_channel(pod.target("grpc"), pod.tls.channel_credentials()) as channel:
+            ended = False
+
+            def frames() -> Iterator[pb.DecodeFramesRequest]:
+                yield pb.DecodeFramesRequest(header=header())
+                while not ended:  # so slowly that it is in flight all the time
+                    yield pb.DecodeFramesRequest(chunk=b"\0")
+                    time.sleep(0.1)
+
+            call = pb_grpc.LightpageStub(channel).DecodeFrames.future(frames(), timeout=LIMIT_S)
+            assert soon(lambda: calls_in_flight(pod) == 1, process)
+            began = time.monotonic()
+            process.terminate()
+            assert soon(lambda: not pod.answers("readinessProbe"), process)
+            assert process.poll() is None  # it ends, and has not ended
+            assert not call.done()
+            ended = True
+            before = pod.container["lifecycle"]["preStop"]["sleep"]["seconds"]
+            out, _ = process.communicate(timeout=pod.grace_s - before)
+        assert process.returncode == 0, out
+        assert time.monotonic() - began < pod.grace_s - before
+    assert not any(pod.answers(name) for name in PROBES)
+
+
+def calls_in_flight(pod: Pod) -> int:
+    """What the metrics say, over the port and with the certificate that the ServiceMonitor's Prometheus has."""
+    connection = http.client.HTTPSConnection(pod.target("metrics"), context=pod.tls.client_context(), timeout=LIMIT_S)
+    try:
+        connection.request("GET", "/metrics")
+        text = connection.getresponse().read().decode()
+    finally:
+        connection.close()
+    found = re.search(r"^lightpage_calls_in_flight (\S+)$", text, re.MULTILINE)
+    assert found is not None
+    return int(float(found[1]))
+
+
+def test_a_health_port_with_tls_is_nothing_for_kubelet(tmp_path: Path, toy_zip: Path) -> None:
+    pod = Pod(tmp_path, toy_zip)
+    tls = TlsFiles(*(tmp_path / "tls" / name for name in ("ca.crt", "tls.crt", "tls.key")))
+    for files, expected in ((tls, False), (None, True)):
+        with HealthServer(pod.target("health"), lambda: {"": True}, files):
+            until = time.monotonic() + LIMIT_S
+            while expected and not pod.answers("readinessProbe"):
+                assert time.monotonic() < until
+            assert pod.answers("readinessProbe") is expected
