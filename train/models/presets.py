@@ -35,4 +35,4 @@ PRESETS = {
 """One quick pass, one pass, two passes.
 
 A pass by waves reads more than one by branches, and takes longer. Before a second pass that gain is lost again, and
-branches are the quicker first pass. A second pass adds more than anything else does, and takes about as long as a first."""
+branches are the quicker first pass. A second pass adds more than anything else does."""
