@@ -45,7 +45,7 @@ class RayEngine:
     def __init__(self, address: str | None = None, workers: int | None = None, threads: int | None = None) -> None:
         self._address, self._workers = address, workers
         self._threads = threads
-        self.restarts = 0
+        self.restarts, self.in_flight, self.workers_alive = 0, 0, 0
 
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """See `Engine`.
@@ -68,6 +68,7 @@ class RayEngine:
                 most = self._most(ray, threads)
                 while len(busy) < most and (attempt := again.popleft() if again else next_attempt(following)):
                     busy[work.remote(attempt.task, threads)] = attempt
+                self.in_flight = len(busy)
                 if not busy:
                     return
                 limit_s = max(longest_s(attempt.task) for attempt in busy.values())
@@ -76,6 +77,7 @@ class RayEngine:
                     raise WorkerError("the Ray cluster", f"no answer within {limit_s:.0f} s", "nodes that work")
                 for ref in ready:
                     attempt = busy.pop(ref)
+                    self.in_flight = len(busy)
                     try:
                         outcome: Outcome = ray.get(ref)
                     except ray.exceptions.RayError as error:
@@ -89,6 +91,7 @@ class RayEngine:
         finally:
             for ref in busy:
                 ray.cancel(ref, force=True)
+            self.in_flight = self.workers_alive = 0
 
     def _threads_of(self, ray: Any) -> int:
         """CPUs of a worker, at most as many as the largest node has.
@@ -105,9 +108,9 @@ class RayEngine:
 
     def _most(self, ray: Any, threads: int) -> int:
         """Tasks that may be on their way, as the cluster is now."""
-        if self._workers is not None:
-            return self._workers
-        return max(1, int(ray.cluster_resources().get("CPU", 0)) // threads) * _AHEAD
+        room = int(ray.cluster_resources().get("CPU", 0)) // threads
+        self.workers_alive = room if self._workers is None else min(room, self._workers)
+        return self._workers or max(1, room) * _AHEAD
 
 
 _worker: Worker | None = None
