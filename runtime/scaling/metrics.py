@@ -20,9 +20,10 @@ from runtime.scaling.task import Failed, Operation, Outcome
 _SECONDS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 60.0, 300.0, 1800.0)
 """From a page of the fast preset to the recalibration of a large device."""
 
+_UNCONFIRMED = (Reason.PILOTS_DISAGREE, Reason.IMAGE_NOT_FOUND, Reason.TOO_FEW_PILOTS)
 _CAUSES: dict[Operation, Iterable[str]] = {
-    Operation.DECODE: Reason,
-    Operation.EVALUATE: Reason,
+    Operation.DECODE: _UNCONFIRMED,
+    Operation.EVALUATE: _UNCONFIRMED,
     Operation.RECOVER: Loss,
 }
 """What pages may be lost by; errors of other names may come beside them."""
