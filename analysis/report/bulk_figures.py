@@ -123,7 +123,7 @@ def losses(causes: Sequence[tuple[str, int, float, str]], unit: str) -> Picture:
     bars = axis.barh(range(len(names)), counts, color=ORANGE, height=0.6)
     axis.bar_label(bars, [f" {count:,}" for count in counts])
     axis.set_yticks(range(len(names)), names)
-    axis.set(xlabel=f"{unit} lost", xlim=(0, 1.15 * max(counts)), ylim=(-0.8, max(len(names), 3) - 0.2))
+    axis.set(xlabel=f"{unit} lost", xlim=(0, 1.15 * max(counts)), ylim=(-1, len(names)))
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     told = ", ".join(f"{count:,} {cause}" for cause, count, *_ in causes)
     return as_picture(figure, f"Losses by cause: {told}.", f"{unit.capitalize()} lost, by cause.")
@@ -146,7 +146,7 @@ def by_device(devices: Sequence[Device], measure: str, fleet: bool) -> Picture:
         axis.axvline(0, color=GREY, linestyle="dashed", linewidth=1)
     figure.legend(frameon=False, loc="outside upper center", ncols=2)
     who = "device" if fleet else "recording"
-    caption = f"{MEASURES[measure][0].upper()}{MEASURES[measure][1:]} by {who}: mean of the pages that were read."
+    caption = f"{MEASURES[measure][0].upper()}{MEASURES[measure][1:]}, by {who}: mean of the pages that were read."
     return as_picture(figure, f"{caption[:-1]}, {len(known)} of them.", caption)
 
 

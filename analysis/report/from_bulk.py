@@ -23,6 +23,8 @@ from runtime.scaling.volumes import known_files
 MARGIN = "margin_bits"
 MEASURES = {AIR: "AIR", MARGIN: "margin", CONFIRMED: "confirmed by pilots"}
 """What is told of a device, bits a symbol, where it is known."""
+PAUSE_S = 15.0
+"""With nobody at work for longer, a run had stopped."""
 LISTED = 200
 """Devices, workers or files that are listed; the worst, or the first, of more."""
 _NAMED = 20
@@ -286,7 +288,7 @@ def _file(told: dict[str, Any]) -> File:
     return File(told["volume"], told["file_bytes"], result, whole=True)
 
 
-def sessions(readings: Sequence[Reading], pause_s: float = 60.0) -> list[tuple[float, float]]:
+def sessions(readings: Sequence[Reading], pause_s: float = PAUSE_S) -> list[tuple[float, float]]:
     """When somebody was at work: begin and end, seconds since 1970; a pause that is shorter does not count as one."""
     spans = sorted((reading.finished_s - reading.seconds, reading.finished_s) for reading in readings)
     found: list[tuple[float, float]] = []

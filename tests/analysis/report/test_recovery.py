@@ -194,9 +194,7 @@ def one(**changes: Any) -> dict[str, Any]:
 )
 def test_figures_that_cannot_be_are_refused(changes: dict[str, Any], named: str, tmp_path: Path) -> None:
     path = written(WHOLE, tmp_path / "r.json", **changes)
-    with pytest.raises(
-        InvalidInputError, match=rf"r\.json: got {named}.*wanted a finished training run, a bulk run"
-    ):
+    with pytest.raises(InvalidInputError, match=rf"r\.json: got {named}.*wanted a finished training run, a bulk run"):
         run(report, path, "--out", tmp_path / "r.html")
     assert not (tmp_path / "r.html").exists()
 
