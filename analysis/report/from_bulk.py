@@ -38,10 +38,12 @@ class Device:
     Attributes:
         name: of it.
         group: what was found of it.
+        told: its first problem, for people.
     """
 
     name: str
     group: Group
+    told: str
 
     def text(self, measure: str, *, least: bool = False) -> str:
         """A mean, or the least, of its pages; empty where it is not known."""
@@ -162,7 +164,8 @@ def report_of_bulk(folder: Path) -> BulkData:
     tally = found.tally
     recalibrated = operation is Operation.RECALIBRATE
     unit = "devices" if recalibrated else "pages"
-    devices = _devices(found)
+    common = _common_folder(job)
+    devices = _devices(found, common)
     return BulkData(
         title=f"Bulk run {folder.absolute().name}: {operation}",
         told=_told(job, found, unit),
@@ -171,7 +174,7 @@ def report_of_bulk(folder: Path) -> BulkData:
         unit=unit,
         found=found,
         causes=[
-            (cause, count, count / tally.pages, _meaning(cause, found.examples.get(cause, "")))
+            (cause, count, count / tally.pages, _meaning(cause, found.examples.get(cause, "").replace(common, "")))
             for cause, count in tally.lost.most_common()
         ],
         devices=devices,
@@ -246,13 +249,15 @@ def _facts(job: Job, found: Totals) -> list[tuple[str, str]]:
     return facts
 
 
-def _devices(found: Totals) -> list[Device]:
+def _common_folder(job: Job) -> str:
+    """The beginning of all recordings' paths, which need not be told each time; empty where there is none."""
+    return os.path.join(os.path.commonpath([source.path.parent for source in job.sources]), "") if job.sources else ""
+
+
+def _devices(found: Totals, common: str) -> list[Device]:
     """The worst first: by the share of pages lost, then by the first measure that is known."""
-    paths = [Path(name).parent for name, _ in found.groups.items() if os.path.isabs(name)]
-    common = os.path.commonpath(paths) if paths else ""
     devices = [
-        Device(os.path.relpath(name, common) if common and os.path.isabs(name) else name, group)
-        for name, group in found.groups.items()
+        Device(name.removeprefix(common), group, group.told.replace(common, "")) for name, group in found.groups.items()
     ]
 
     def rank(device: Device) -> tuple[float, float]:

@@ -41,7 +41,8 @@ from runtime.scaling.shard import RECORD
 DRIFTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Of each device, as shares of the demo's drift."""
 LEVELS, RANGE_PAGES = 256, 4
-WIDTH_PX, HEIGHT_PX = 1240, 1500
+WIDTH_PX, HEIGHT_PX = 1240, 900
+_SHOWN = "nav, #losses, #rounds, #workers { display: none }"
 _LIMIT_S = 1800.0
 _LOOK_S = 0.1
 _PAUSE_S = PAUSE_S + 5.0
@@ -59,7 +60,7 @@ def fleet(folder: Path, pages: int) -> Path:
         with RecordingWriter(path, profile, LEVELS, device.sensor.bit_depth, simulator.references()) as writer:
             for page in symbols:
                 writer.append(page, simulator.page(page))
-        with h5py.File(path, "r+") as recording:
+        with h5py.File(str(path), "r+") as recording:
             if number in (1, 3):
                 recording["in_phase"][number] = 0
             if number == 4:
@@ -93,7 +94,7 @@ def disturbed_run(folder: Path, fleet_file: Path) -> None:
 
 
 def photograph(page: Path, out: Path) -> None:
-    """Take the upper part of a page as a browser shows it.
+    """Take a page as a browser shows it, without the sections that most readers skip.
 
     Raises:
         InvalidInputError: there is no browser.
@@ -105,7 +106,8 @@ def photograph(page: Path, out: Path) -> None:
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
         seen = browser.new_page(viewport={"width": WIDTH_PX, "height": HEIGHT_PX}, color_scheme="light")
         seen.goto(page.absolute().as_uri())
-        seen.screenshot(path=str(out))
+        seen.add_style_tag(content=_SHOWN)
+        seen.screenshot(path=str(out), full_page=True)
         browser.close()
 
 

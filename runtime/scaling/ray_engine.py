@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from runtime.scaling.task import Outcome, Task
 if TYPE_CHECKING:
     from runtime.scaling.work import Worker
 
-_AHEAD = 2
+AHEAD = 2
 """Tasks on their way for each that the cluster can work on: a worker that ends one finds the next one waiting."""
 
 _STORE_BYTES = 128 << 20
@@ -40,10 +40,17 @@ class RayEngine:
         address: of a cluster, `auto` for one that runs on this machine; None to start one here, for this run.
         workers: most ranges at once; by default as many as the cluster's CPUs allow at any time.
         threads: CPUs of a worker, and threads of its inferences; by default `THREADS_OF_WORKER`, or what a node has.
+        work: what a worker does with a task and so many threads.
     """
 
-    def __init__(self, address: str | None = None, workers: int | None = None, threads: int | None = None) -> None:
-        self._address, self._workers = address, workers
+    def __init__(
+        self,
+        address: str | None = None,
+        workers: int | None = None,
+        threads: int | None = None,
+        work: Callable[[Task, int], Outcome] | None = None,
+    ) -> None:
+        self._address, self._workers, self._work = address, workers, work or _work
         self._threads = threads
         self.restarts, self.in_flight, self.workers_alive = 0, 0, 0
 
@@ -55,12 +62,12 @@ class RayEngine:
             InvalidInputError: no node has as many CPUs as a worker takes.
             ModuleNotFoundError: Ray is not installed: the extra cluster brings it.
         """
-        with _connected(self._address) as ray:
+        with connected(self._address) as ray:
             yield from self._run(ray, iter(tasks))
 
     def _run(self, ray: Any, following: Iterator[Task]) -> Generator[Outcome, None, None]:
         threads = self._threads_of(ray)
-        work = ray.remote(_work).options(num_cpus=threads, max_retries=0)
+        work = ray.remote(self._work).options(num_cpus=threads, max_retries=0)
         again = deque[Attempt]()
         busy: dict[Any, Attempt] = {}
         try:
@@ -110,7 +117,7 @@ class RayEngine:
         """Tasks that may be on their way, as the cluster is now."""
         room = int(ray.cluster_resources().get("CPU", 0)) // threads
         self.workers_alive = room if self._workers is None else min(room, self._workers)
-        return self._workers or max(1, room) * _AHEAD
+        return self._workers or max(1, room) * AHEAD
 
 
 _worker: Worker | None = None
@@ -130,7 +137,7 @@ def _work(task: Task, threads: int) -> Outcome:
 
 
 @contextmanager
-def _connected(address: str | None) -> Iterator[Any]:
+def connected(address: str | None) -> Iterator[Any]:
     """Ray, connected to a cluster; a cluster that was started for it ends with it."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # before it is imported: nothing is sent to anybody
     import ray
