@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from analysis.report.drawing import BLUE, GREEN, GREY, ORANGE
+from analysis.report.drawing import BLUE, ORANGE
 from analysis.scaling.archive import archive
 from analysis.scaling.cluster_model import (
     Cluster,
@@ -30,7 +30,7 @@ from analysis.scaling.cluster_model import (
     simulated,
     whole_job_pages_per_s,
 )
-from analysis.scaling.node_figures import DriverFigures, NodeFigures, measure
+from analysis.scaling.node_figures import DriverFigures, NodeFigures, RunFigures, measure
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.errors import InvalidInputError
@@ -44,8 +44,10 @@ ETHERNET_BYTES_PER_S = 1.25e9
 FULL_SIZE_S, FULL_SIZE_BYTES, FULL_SIZE_SYMBOLS = 3.324, 2 * 5472 * 3648.0, 350 * 225
 """Of a page of two passes on two cores (docs/experiments/full-size.md), of its frames, and on it."""
 BENCH_SYMBOLS = 87 * 56
-_MOST_STEPS = 4_000_000
-"""Pages of a simulation, about: larger clusters do fewer ranges a worker."""
+_DRAWS = 20
+"""Jobs whose mean is compared with one that was run."""
+PAGES, _LEAST_RANGES, _MOST_RANGES = 500_000, 12, 400
+"""Pages of a simulation, about, and ranges that each of its workers does at least and at most."""
 
 
 @dataclass(frozen=True)
@@ -97,31 +99,25 @@ def checks(figures: NodeFigures) -> list[dict[str, float]]:
     other, which the model does not know.
     """
     alone = min(figures.measured, key=lambda run: run.workers)
-    rows = []
-    for own, checked in zip(figures.measured, figures.checked, strict=True):
-        driver = Driver(max(each.cpu_s for each in figures.local), 0.0, ahead=1)
-        cluster = Cluster(1, checked.workers, storage_bytes_per_s=1e15, link_bytes_per_s=1e15)
-        ranges = -(-figures.pages // figures.range_pages)
-        predicted = [
-            whole_job_pages_per_s(
-                cluster,
-                Work(
-                    run.page_seconds, figures.read_bytes, figures.written_bytes, figures.record_s, figures.range_pages
-                ),
-                driver,
-                ranges,
-            )
-            for run in (own, alone)
-        ]
-        rows.append(
-            {
-                "workers": checked.workers,
-                "measured_pages_per_s": checked.pages_per_s,
-                "predicted_pages_per_s": predicted[0],
-                "predicted_from_one_worker": predicted[1],
-            }
-        )
-    return rows
+    driver = Driver(max(each.cpu_s for each in figures.local), 0.0, ahead=1)
+    ranges = -(-figures.pages // figures.range_pages)
+
+    def predicted(run: RunFigures, workers: int) -> float:
+        moved = figures.read_bytes, figures.written_bytes
+        work = Work(run.page_seconds, *moved, figures.record_s, figures.range_pages)
+        cluster = Cluster(1, workers, storage_bytes_per_s=1e15, link_bytes_per_s=1e15)
+        rates = [whole_job_pages_per_s(cluster, work, driver, ranges, seed) for seed in range(_DRAWS)]
+        return float(np.mean(rates))
+
+    return [
+        {
+            "workers": checked.workers,
+            "measured_pages_per_s": checked.pages_per_s,
+            "predicted_pages_per_s": predicted(own, checked.workers),
+            "predicted_from_one_worker": predicted(alone, checked.workers),
+        }
+        for own, checked in zip(figures.measured, figures.checked, strict=True)
+    ]
 
 
 def curve(kind: Kind, cluster: Cluster, driver: Driver, nodes: Sequence[int], seed: int) -> list[Rate]:
@@ -129,8 +125,9 @@ def curve(kind: Kind, cluster: Cluster, driver: Driver, nodes: Sequence[int], se
     rates = []
     for count in track(nodes, f"simulate {kind.name}", unit="cluster"):
         own = replace(cluster, nodes=count, workers=kind.workers)
-        steps = _MOST_STEPS // (count * kind.workers * kind.work.range_pages)
-        rates.append(simulated(own, kind.work, driver, ranges_per_worker=max(8, min(40, steps)), seed=seed))
+        ranges = PAGES // (count * kind.workers * kind.work.range_pages)
+        ranges = max(_LEAST_RANGES, min(_MOST_RANGES, ranges))
+        rates.append(simulated(own, kind.work, driver, ranges_per_worker=ranges, seed=seed))
     return rates
 
 
@@ -168,8 +165,9 @@ def picture(curves: dict[str, list[Rate]], limits: dict[str, dict[str, float]], 
         right.plot(nodes, [rate.efficiency for rate in rates], "o-", color=colour, markersize=4, label=name)
         for (part, at), style in zip(sorted(limits[name].items()), (":", "-."), strict=False):
             if at <= 2 * nodes[-1]:
-                right.axvline(at, color=GREEN if part == "storage" else GREY, linestyle=style, linewidth=1)
-                right.annotate(f" {part}, {name}", (at, 0.02), rotation=90, va="bottom", fontsize=7)
+                right.axvline(at, color=colour, linestyle=style, linewidth=1)
+                told = f"{part} full, {name} "
+                right.annotate(told, (at, 0.03), rotation=90, va="bottom", ha="right", fontsize=7, color=colour)
     left.set(xlabel="nodes", ylabel="pages/s", xscale="log", yscale="log")
     right.set(xlabel="nodes", ylabel="of what workers that never wait would read", xscale="log", ylim=(0, 1.05))
     left.legend(frameon=False)

@@ -115,6 +115,17 @@ def test_a_fleet_that_was_recalibrated_tells_why_a_device_failed(archive: Archiv
     assert rows["bad"].told in told(text)
 
 
+def test_a_recording_that_could_not_be_opened_is_named_by_what_tells_it_from_others(
+    archive: Archive, tmp_path: Path
+) -> None:
+    (archive.folder / "c.h5").write_bytes(b"no recording")
+    archive.run("decode")
+    text, _ = page_of(archive.out, tmp_path / "r.html")
+    assert "Finished: none is lost. 1 recording could not be opened." in told(text)
+    assert re.search(r"c\.h5 0 0 0 0 recording c\.h5: got ", told(text))
+    assert str(archive.folder) not in text
+
+
 def test_ranges_whose_time_was_not_noted_have_that_of_their_file(archive: Archive) -> None:
     archive.run("decode")
     for path in archive.out.glob("shards/*/*.json"):

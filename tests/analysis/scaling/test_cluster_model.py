@@ -44,6 +44,9 @@ def test_the_nodes_that_saturate_a_part_by_arithmetic_do_so_in_the_queues(part: 
     driver = Driver(base_s=0.02, in_flight_s=0.001, ahead=2) if part == "driver" else IDLE
     cluster = replace(WIDE, storage_bytes_per_s=1e15 if part == "driver" else 40e6)
     nodes = nodes_that_saturate(cluster, WORK, driver)[part]
+    asked = nodes * cluster.workers / WORK.mean_s  # pages a second
+    busy = asked / WORK.range_pages * (driver.base_s + driver.in_flight_s * driver.ahead * nodes * cluster.workers)
+    assert (busy if part == "driver" else asked * 1.01e6 / 40e6) == pytest.approx(1)
     below, above = (simulated(replace(cluster, nodes=round(share * nodes)), WORK, driver) for share in (0.5, 2.0))
     assert (below.bound, above.bound) == ("workers", part)
     assert below.efficiency > 0.95
