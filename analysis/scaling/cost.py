@@ -46,7 +46,7 @@ FULL_SIZE_S, FULL_SIZE_BYTES, FULL_SIZE_SYMBOLS = 3.324, 2 * 5472 * 3648.0, 350 
 BENCH_SYMBOLS = 87 * 56
 _DRAWS = 20
 """Jobs whose mean is compared with one that was run."""
-PAGES, _LEAST_RANGES, _MOST_RANGES = 500_000, 12, 400
+PAGES, _LEAST_RANGES, _MOST_RANGES = 500_000, 24, 400
 """Pages of a simulation, about, and ranges that each of its workers does at least and at most."""
 
 

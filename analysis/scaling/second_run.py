@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import resource
 import shutil
 import statistics
 import subprocess
@@ -87,19 +88,27 @@ def finished(folder: Path, recording: Path, operation: Operation, pages: int, ra
 
 def second_run(folder: Path, operation: Operation, repeats: int) -> dict[str, Any]:
     """How long runs over finished work take, and what they found."""
-    out, took = folder / "second.json", list[float]()
+    out, took, cpu = folder / "second.json", list[float](), list[float]()
     figures: dict[str, Any] = {}
     for _ in range(repeats):
-        begun = time.perf_counter()
+        begun, before = time.perf_counter(), _cpu_s()
         _lightpage("bulk", str(operation), str(folder / "run"), "--json", str(out))
         took.append(time.perf_counter() - begun)
+        cpu.append(_cpu_s() - before)
         figures = json.loads(out.read_text())
     return {
         "pages": figures["pages_read"],
         "pages_decoded": figures["this_run"]["pages"],
         "seconds": statistics.median(took),
         "seconds_most": max(took),
+        "cpu_seconds": statistics.median(cpu),
     }
+
+
+def _cpu_s() -> float:
+    """Of all processes that were started and have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _lightpage(*words: str) -> None:
@@ -121,7 +130,9 @@ def main(pages: int, range_pages: int, repeats: int, seed: int, out: Path, json_
     """Print how long a second run takes, Python's start included, and that it decodes nothing."""
     out.mkdir(parents=True, exist_ok=True)
     recording = coded_recording(out, seed)
-    click.echo(f"{'operation':<10} {'recordings':>10} {'pages':>7} {'decoded':>8} {'s, median':>10} {'s, most':>8}")
+    click.echo(
+        f"{'operation':<10} {'recordings':>10} {'pages':>7} {'decoded':>8} {'s, median':>10} {'s, most':>8} {'CPU s':>6}"
+    )
     figures: dict[str, Any] = {"wanted_s": WANTED_S, "range_pages": range_pages, "operations": {}}
     for operation in OPERATIONS:
         folder = out / f"finished-{operation}"
@@ -131,7 +142,7 @@ def main(pages: int, range_pages: int, repeats: int, seed: int, out: Path, json_
         figures["operations"][str(operation)] = {"recordings": recordings, **found}
         click.echo(
             f"{operation:<10} {recordings:>10} {found['pages']:>7} {found['pages_decoded']:>8}"
-            f" {found['seconds']:>10.2f} {found['seconds_most']:>8.2f}"
+            f" {found['seconds']:>10.2f} {found['seconds_most']:>8.2f} {found['cpu_seconds']:>6.2f}"
         )
     worst = max(found["seconds_most"] for found in figures["operations"].values())
     click.echo(f"slowest {worst:.2f} s; at most {WANTED_S:g} s wanted for 10,000 pages")
