@@ -130,9 +130,8 @@ def main(pages: int, range_pages: int, repeats: int, seed: int, out: Path, json_
     """Print how long a second run takes, Python's start included, and that it decodes nothing."""
     out.mkdir(parents=True, exist_ok=True)
     recording = coded_recording(out, seed)
-    click.echo(
-        f"{'operation':<10} {'recordings':>10} {'pages':>7} {'decoded':>8} {'s, median':>10} {'s, most':>8} {'CPU s':>6}"
-    )
+    titles = f"{'recordings':>10} {'pages':>7} {'decoded':>8} {'s, median':>10} {'s, most':>8} {'CPU s':>6}"
+    click.echo(f"{'operation':<10} {titles}")
     figures: dict[str, Any] = {"wanted_s": WANTED_S, "range_pages": range_pages, "operations": {}}
     for operation in OPERATIONS:
         folder = out / f"finished-{operation}"
