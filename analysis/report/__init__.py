@@ -1,1 +1,1 @@
-"""The report of a training run, an evaluation or a recovery: one HTML page for people."""
+"""The report of a training run, an evaluation, a recovery or a bulk run: one HTML page for people."""

@@ -100,8 +100,3 @@ def exit_centroids(profile: Profile, calibration: Calibration) -> Real:
     """
     positions = TorchTwin(RayTwin(profile)).trace(calibration.vector, symbol_centres(profile)).positions
     return np.ascontiguousarray(positions.T.reshape(2, *profile.page_shape))
-
-
-def how_long(seconds: float) -> str:
-    """Seconds as people say them."""
-    return f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.1f} s"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from analysis.report.data import Golden, Real, ReportData
 from analysis.report.drawing import BLUE, GREEN, GREY, ORANGE, Picture, as_picture, new_figure, one_axis
-from analysis.report.tables import number, signed
+from analysis.report.words import number, signed
 from train.fitting.curves import Curve
 from train.published.rays import RayTracer
 

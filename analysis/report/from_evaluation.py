@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from analysis.report.data import Golden, Rays, ReportData, how_long
+from analysis.report.data import Golden, Rays, ReportData
 from analysis.report.json_file import Bits, JsonFile, Part, Seconds, Share
+from analysis.report.words import how_long
 from lightpage.calibration.document import parse_calibration
 from lightpage.device.profile import parse_profile
 from lightpage.errors import InvalidInputError

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.utils.data import Dataset
 
-from analysis.report.data import Golden, Rays, ReportData, how_long
+from analysis.report.data import Golden, Rays, ReportData
+from analysis.report.words import how_long
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.information import decide

@@ -14,7 +14,9 @@ from lightpage.errors import InvalidInputError
 from lightpage.page.levels import MAX_LEVELS
 
 EVALUATE, RECOVER = "evaluate", "recover"
-EXPECTED = f"a finished training run, or the JSON that this version's `lightpage {EVALUATE}` or `{RECOVER}` writes"
+EXPECTED = (
+    f"a finished training run, a bulk run, or the JSON that this version's `lightpage {EVALUATE}` or `{RECOVER}` writes"
+)
 
 Bits = Annotated[float, Field(le=math.log2(MAX_LEVELS) + 1e-6)]
 """An AIR may be as negative as a decoder is sure of what is wrong."""

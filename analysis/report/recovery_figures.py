@@ -11,9 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from analysis.report.drawing import BLUE, GREY, ORANGE, Picture, as_picture, one_axis
-from analysis.report.from_recovery import UNDECODED, PageResult
-from analysis.report.tables import number
+from analysis.report.from_recovery import UNDECODED, PageResult, RecoveryData
+from analysis.report.words import number
 from lightpage.codec.page_bytes import Loss
+
+TEMPLATE = "recovery.html.j2"
 
 _MARKERS = {Loss.OPTICS: "x", Loss.HEADER: "^", Loss.CODE: "s", Loss.BODY: "v", Loss.CHECKSUM: "D"}
 _LOST_STYLE: dict[str, Any] = {"linestyle": "none", "color": ORANGE, "fillstyle": "none", "markersize": 6}
@@ -21,6 +23,13 @@ _MOST_LINES = 2000
 """Pages that are drawn as lines; more are drawn as an image, which does not grow with them."""
 _EDGE = 0.03
 """Of the height: where pages without a margin are marked."""
+
+
+def shown(data: RecoveryData) -> dict[str, Any]:
+    """The pictures, as the template takes them."""
+    if not data.pages:
+        return {"pictures": []}
+    return {"pictures": [margins(data.pages), failed_codewords(data.pages, data.blocks_per_page)]}
 
 
 def margins(pages: Sequence[PageResult]) -> Picture:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.report.data import Real, ReportData
+from analysis.report.words import number, signed
 from lightpage.calibration.parameters import PARAMETERS, Parameter
 
 GROUPS = {
@@ -140,13 +141,3 @@ def _zone(name: str, reflections: tuple[int, int], data: ReportData, where: NDAr
         error_deg=float(np.rad2deg(data.maps.error_rad[where].mean())),
         worst_air=float(np.quantile(air, WORST_SHARE)),
     )
-
-
-def number(value: float, digits: int) -> str:
-    """A number with so many digits behind the point; no zero is negative."""
-    return f"{value:z.{digits}f}".replace("-", "−")
-
-
-def signed(count: int) -> str:
-    """A whole number with its sign, zero without."""
-    return f"{count:+d}".replace("-", "−") if count else "0"

@@ -4,8 +4,8 @@
     python -m analysis.scaling.faults --engine ray --pages 5000 --fields 300 --kills 20 --nodes 3 --out FOLDER
 
 It reads an archive of bench pages in this process, then with two workers that are killed by SIGKILL in a seeded order,
-then with two workers in peace beside two bare decode loops, and compares. At last it looks at what a second run over
-finished work costs. With Ray there are two nodes on this machine, of which one is killed and added again.
+then with two workers in peace beside two bare decode loops, and compares. With Ray there are two nodes on this machine,
+of which one is killed and added again.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import click
 import h5py
 import numpy as np
 
-from analysis.scaling.archive import archive, finished_ledger
+from analysis.scaling.archive import archive
 from analysis.scaling.processes import Watch, children, with_mark
 from analysis.service.running import until
 from lightpage.cli.main import run as run_command
@@ -50,7 +50,6 @@ WORKERS, THREADS = 2, 1
 WARM_PAGES = 200
 """After which memory should be flat, unless told otherwise."""
 
-LEDGER_PAGES = 10_000
 MARK = "LIGHTPAGE_BENCH_MARK"
 LIMIT_S = 6 * 3600.0
 _LOOK_S = 0.05
@@ -234,17 +233,6 @@ def in_peace(bulk: BulkRun, job: Job, warm_pages: int) -> dict[str, Any]:
     }
 
 
-def second_run(job: Job, folder: Path, like: Path, pages: int) -> dict[str, Any]:
-    """How long a run over finished work takes."""
-    finished_ledger(folder, ShardRecord.read(like), pages, job.bundles[0].path)
-    out = folder / "second.json"
-    begun = time.perf_counter()
-    command = [*_BULK, "evaluate", str(folder / "run"), "--json", str(out)]
-    subprocess.run(command, env=same_packages(THREADS), stdout=subprocess.DEVNULL, check=True, timeout=LIMIT_S)
-    seconds, figures = time.perf_counter() - begun, json.loads(out.read_text())
-    return {"seconds": seconds, "pages": figures["pages_read"], "pages_decoded": figures["this_run"]["pages"]}
-
-
 @contextmanager
 def _nodes(engine: str, mark: str) -> Iterator[Cluster | None]:
     if engine == "local":
@@ -266,7 +254,6 @@ def _nodes(engine: str, mark: str) -> Iterator[Cluster | None]:
 @click.option("--kills", default=20, show_default=True, type=click.IntRange(0), help="SIGKILLs of workers.")
 @click.option("--nodes", default=3, show_default=True, type=click.IntRange(0), help="Nodes that are lost, with Ray.")
 @click.option("--warm-pages", default=WARM_PAGES, show_default=True, type=click.IntRange(0), help="Memory may grow.")
-@click.option("--ledger-pages", default=LEDGER_PAGES, show_default=True, type=click.IntRange(1))
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
 @click.option("--out", required=True, type=OutputFolder(), help="Archive and runs; the archive is kept.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
@@ -278,17 +265,16 @@ def main(
     kills: int,
     nodes: int,
     warm_pages: int,
-    ledger_pages: int,
     seed: int,
     out: Path,
     json_path: Path | None,
 ) -> None:
-    """Print what was missing, twice or different, what was done again, how fast it was, and what a second run costs."""
+    """Print what was missing, twice or different, what was done again and how fast it was."""
     out.mkdir(parents=True, exist_ok=True)
     recording = archive(out, pages, fields, seed)
     choices = Choices(operation=Operation.DECODE, range_pages=range_pages)
     job = of_recordings(choices, [str(recording)], str(bundle_path(DEFAULT)), None)
-    for name in ("single", "killed", "peace", "finished"):
+    for name in ("single", "killed", "peace"):
         shutil.rmtree(out / name, ignore_errors=True)
     single(job, out / "single")
     mark = uuid.uuid4().hex
@@ -301,8 +287,6 @@ def main(
         figures |= killed(made("killed"), job, kills, nodes, cluster, seed)
         figures |= compared(job, out / "killed", out / "single")
         figures |= in_peace(made("peace"), job, warm_pages)
-    like = next(path for path in sorted(_records(out / "single")))
-    figures["second_run"] = second_run(job, out / "finished", like.with_suffix(""), ledger_pages)
     click.echo(json.dumps(figures, indent=2))
     if json_path is not None:
         write_json(json_path, figures)

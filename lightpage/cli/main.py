@@ -59,7 +59,7 @@ SUMMARIES = {
     "recalibrate": "Re-fit a drifted device's geometry and write a new bundle.",
     "record": "Record pages of cameras, or of any other source.",
     "recover": "Read a file back from recorded pages.",
-    "report": "Show a training run, an evaluation or a recovery as an HTML page.",
+    "report": "Show a training run, an evaluation, a recovery or a bulk run as an HTML page.",
     "rollback": "Put a service's previous model back in service.",
     "serve": "Run the service.",
     "simulate": "Record pages of a simulated device.",

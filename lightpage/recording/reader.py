@@ -131,6 +131,12 @@ class Recording:
         return None
 
     @property
+    def stored_page_bytes(self) -> float:
+        """Bytes that the frame pair of a page takes in the file, compressed as it is; mean over the pages."""
+        stored = sum(int(self._file[name].id.get_storage_size()) for name in FRAMES)
+        return stored / max(1, self.pages)
+
+    @property
     def has_symbols(self) -> bool:
         """Whether the written symbols are known."""
         return "symbols" in self._file

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,7 +17,7 @@ from lightpage.errors import InvalidInputError, LightpageError, LostDataError
 from lightpage.files import write_json
 from lightpage.progress import warn
 from runtime.bundle.shipped import DEFAULT
-from runtime.scaling.driver import Progressed, run
+from runtime.scaling.driver import Progressed, Watch, run
 from runtime.scaling.engine import Engine
 from runtime.scaling.job import KNOWN_PAGES, RANGE_PAGES, Choices, Job, named_bundle, of_fleet, of_recordings
 from runtime.scaling.ledger import Ledger
@@ -25,8 +26,14 @@ from runtime.scaling.part import WHOLE, Part
 from runtime.scaling.task import Operation
 from runtime.scaling.totals import AIR, Totals, totals
 from runtime.scaling.volumes import RecoveredFile, recovered_files
+from runtime.wire.address import check_address, is_local
+
+if TYPE_CHECKING:
+    from runtime.console.server import ConsoleServer
+    from runtime.scaling.metrics import BulkMetrics
 
 LOCAL, RAY = "local", "ray"
+METRICS_SUFFIX = ".prom"
 
 
 @click.group()
@@ -42,6 +49,9 @@ def bulk() -> None:
 def _options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options of all operations."""
     for option in (
+        click.option("--metrics-file", type=OutputFile(), help="Write metrics at the end, for node_exporter: *.prom."),
+        click.option("--metrics-insecure", is_flag=True, help="Let other machines read the metrics, without TLS."),
+        click.option("--metrics", "metrics_address", metavar="HOST:PORT", help="Show metrics there while it runs."),
         click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file."),
         click.option(
             "--part", metavar="K/N", help="Do every Nth recording or device from the Kth, K from 0; others do the rest."
@@ -121,6 +131,9 @@ def _bulk(
     threads: int | None,
     json_path: Path | None,
     part: str | None,
+    metrics_address: str | None,
+    metrics_insecure: bool,
+    metrics_file: Path | None,
     again_with: str | None = None,
     **chosen: bool | int | None,
 ) -> None:
@@ -130,6 +143,7 @@ def _bulk(
     context.meta[RESUME_KEY] = "what is done stays; run the same command again to do the rest"
     if address is not None and engine != RAY:
         raise InvalidInputError("--address", f"with --engine {engine}", f"--engine {RAY}")
+    _check_metrics(metrics_address, metrics_insecure, metrics_file)
     own = WHOLE if part is None else Part.parse(part)
     with Ledger(out, own) as ledger:
         with ledger.question():
@@ -143,7 +157,8 @@ def _bulk(
             if again_with is not None:
                 job = _with_round(job, again_with)
             job.write(ledger.folder)
-        made = run(ledger, job, partial(_engine, engine, address, workers, threads))
+        with _watched(ledger.folder.name, operation, metrics_address, metrics_file) as watch:
+            made = run(ledger, job, partial(_engine, engine, address, workers, threads), watch)
         found = totals(ledger, job)
         files = recovered_files(ledger, job) if operation is Operation.RECOVER and own == WHOLE else []
     if json_path is not None:
@@ -159,6 +174,59 @@ def _engine(name: str, address: str | None, workers: int | None, threads: int | 
 
         return RayEngine(address, workers, threads)
     return LocalEngine(workers or default_workers(), threads)
+
+
+def _check_metrics(address: str | None, insecure: bool, file: Path | None) -> None:
+    if file is not None and file.suffix != METRICS_SUFFIX:
+        raise InvalidInputError("--metrics-file", file, f"*{METRICS_SUFFIX}: node_exporter reads no others")
+    if address is None:
+        return
+    check_address("--metrics", address, least_port=0)
+    if address.startswith("unix:"):
+        raise InvalidInputError("--metrics", address, "HOST:PORT")
+    if not insecure and not is_local(address):
+        expected = "an address of this machine alone, since others reach it; or --metrics-insecure"
+        raise InvalidInputError("--metrics", address, expected)
+
+
+@contextmanager
+def _watched(run_name: str, operation: Operation, address: str | None, file: Path | None) -> Iterator[Watch]:
+    """What keeps the metrics that were asked for; the file is written however the run ends."""
+    if address is None and file is None:
+        yield Watch()
+        return
+    from runtime.scaling.metrics import BulkMetrics  # prometheus_client, for who asks for it
+
+    metrics = BulkMetrics(run_name, operation)
+    try:
+        with ExitStack() as stack:
+            if address is not None:
+                stack.enter_context(_shown(metrics, address))
+            yield metrics
+    finally:
+        metrics.end()
+        if file is not None:
+            metrics.write(file)
+
+
+def _shown(metrics: BulkMetrics, address: str) -> ConsoleServer:
+    """The metrics at an address, until it is closed.
+
+    Raises:
+        InvalidInputError: nobody can listen there.
+    """
+    from prometheus_client import make_wsgi_app
+
+    from runtime.console.server import ConsoleServer
+
+    host, _, port = address.rpartition(":")
+    try:
+        server = ConsoleServer(make_wsgi_app(metrics.registry), int(port), host.strip("[]"))
+    except OSError as error:
+        got, expected = error.strerror or error, "an address of this machine and a free port"
+        raise InvalidInputError(f"--metrics {address}", got, expected) from None
+    click.echo(f"metrics at http://{host}:{server.port}/metrics", err=True)
+    return server
 
 
 def _job(

@@ -33,7 +33,7 @@ from runtime.service.registry import Model, ModelRegistry
 from runtime.wire.status import without_folders
 
 if TYPE_CHECKING:
-    from _typeshed.wsgi import StartResponse, WSGIEnvironment
+    from _typeshed.wsgi import StartResponse, WSGIApplication, WSGIEnvironment
 
 _log = logging.getLogger(__name__)
 
@@ -208,7 +208,7 @@ class ConsoleServer:
     """Serves a console until it is closed; use it in a `with` statement.
 
     Args:
-        console: what to serve.
+        console: what to serve, a `Console` or any other application.
         port: 0 takes a free one.
         host: to listen on.
         certificates: with which it meets its callers, who must have some too; None for no TLS.
@@ -218,7 +218,7 @@ class ConsoleServer:
     """
 
     def __init__(
-        self, console: Console, port: int, host: str = "127.0.0.1", certificates: Certificates | None = None
+        self, console: WSGIApplication, port: int, host: str = "127.0.0.1", certificates: Certificates | None = None
     ) -> None:
         self._server = make_server(host, port, console, _Server, handler_class=_Handler)
         self._server.certificates = certificates

@@ -68,7 +68,26 @@ class Progressed:
         return ", ".join(f"{name} {count}" for name, count in parts.items() if count)
 
 
-def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:
+class Watch:
+    """Is told how a run fares; this one makes nothing of it."""
+
+    def wanted(self, total: int, left: int) -> None:
+        """So many pages has the job, or devices, and so many are to be read now."""
+
+    def begin(self, engine: Engine) -> None:
+        """This engine works from now on."""
+
+    def count(self, outcome: Outcome) -> None:
+        """This has become of a range."""
+
+    def deaths(self, count: int) -> None:
+        """So many workers have died."""
+
+
+_NOBODY = Watch()
+
+
+def run(ledger: Ledger, job: Job, engine: Callable[[], Engine], watch: Watch = _NOBODY) -> Progressed:
     """Do all that is missing of a job: its first reading, then its rounds one after the other.
 
     What has failed is told and left to the next run; all else goes on.
@@ -77,6 +96,7 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:
         ledger: of the job, which belongs to this process, or a part of it.
         job: what was asked.
         engine: makes the engine; not called where nothing is missing.
+        watch: is told how it fares.
 
     Raises:
         WorkerError: there are no workers.
@@ -96,12 +116,15 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:
                 return ledger.missing_again(job, number) if number else ledger.missing(job)
 
             todo = sum(task.weight for task in missing())
+            whole = _all(ledger, job)
+            watch.wanted(whole, todo)
             if not todo:
                 continue
-            total = todo if number else _all(ledger, job)
+            total = todo if number else whole
             what = f"{job.choices.operation} again" if number else str(job.choices.operation)
             works = engine()
-            steps = _steps(works, missing(), made)
+            watch.begin(works)
+            steps = _steps(works, missing(), made, watch)
             with closing(steps):
                 for _ in track(steps, what, unit=unit, total=total, done=total - todo, state=made.state):
                     pass
@@ -111,25 +134,30 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine]) -> Progressed:
     return made
 
 
-def _steps(engine: Engine, tasks: Iterable[Task], made: Progressed) -> Generator[None, None, None]:
+def _steps(engine: Engine, tasks: Iterable[Task], made: Progressed, watch: Watch) -> Generator[None, None, None]:
     """Once for every page that is behind."""
     given_up: set[tuple[str, Path]] = set()
     died = made.restarts
+
+    def count_deaths() -> None:
+        more, made.restarts = died + engine.restarts - made.restarts, died + engine.restarts
+        watch.deaths(more)
 
     def wanted() -> Iterator[Task]:
         return (task for task in tasks if (task.device, task.recording) not in given_up)
 
     with closing(engine.run(wanted())) as outcomes:
         for outcome in outcomes:
-            made.restarts = died + engine.restarts
+            count_deaths()
             if isinstance(outcome, Failed) and outcome.whole_recording:
                 key = outcome.task.device, outcome.task.recording
                 if key in given_up:
                     continue  # it was under way when the recording was found to be unreadable, and is told already
                 given_up.add(key)
+            watch.count(outcome)
             for _ in range(made.count(outcome)):
                 yield None
-    made.restarts = died + engine.restarts
+    count_deaths()
 
 
 def _all(ledger: Ledger, job: Job) -> int:

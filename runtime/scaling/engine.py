@@ -25,6 +25,12 @@ class Engine(Protocol):
     restarts: int
     """Workers that died until now."""
 
+    in_flight: int
+    """Ranges that were handed out and have not come back."""
+
+    workers_alive: int
+    """Workers that are at work or wait for it; of a cluster, for how many its CPUs suffice."""
+
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """What became of each task, in whatever order they end; each exactly once.
 

@@ -15,7 +15,7 @@ class InlineEngine:
         worker: that does them.
     """
 
-    restarts = 0
+    restarts, in_flight, workers_alive = 0, 0, 1
 
     def __init__(self, worker: Worker) -> None:
         self._worker = worker
@@ -23,4 +23,7 @@ class InlineEngine:
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """See `Engine`; an error that nobody foresaw ends it."""
         for task in tasks:
-            yield self._worker.work(task)
+            self.in_flight = 1
+            outcome = self._worker.work(task)
+            self.in_flight = 0
+            yield outcome

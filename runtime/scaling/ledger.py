@@ -121,7 +121,10 @@ class Ledger:
         """Ranges of the first reading that have no result, recording by recording."""
         for index, source in self.sources(job):
             there = self.results(index)
-            yield from (task for task in self.ranges(job, index, source) if task.shard.name not in there)
+            for task in self.ranges(job, index, source):
+                if task.shard.name not in there:
+                    _make(task.shard.parent)
+                    yield task
 
     def missing_again(self, job: Job, number: int) -> Iterator[Task]:
         """Pages that were not read well before a round, and have no result in it, range by range.
@@ -186,7 +189,15 @@ class Ledger:
         """Names of the shards that a recording has."""
         folder = self.shard(source, 0).parent
         try:
-            folder.mkdir(parents=True, exist_ok=True)
             return frozenset(name.removesuffix(RECORD) for name in os.listdir(folder) if name.endswith(RECORD))
+        except FileNotFoundError:
+            return frozenset()
         except OSError as error:
-            raise InvalidInputError(f"folder {folder}", error, "a folder that can be written") from None
+            raise InvalidInputError(f"folder {folder}", error, "a folder that can be read") from None
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(f"folder {folder}", error, "a folder that can be written") from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import select
 import time
 from collections import deque
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sized
 
 from pydantic import TypeAdapter
 
@@ -42,7 +42,7 @@ class LocalEngine:
     def __init__(self, workers: int, threads: int | None = None, module: str = WORKER) -> None:
         self.workers, self._module = workers, module
         self.threads = threads or max(1, available_cpus() // workers)
-        self.restarts = 0
+        self.restarts, self.in_flight, self.workers_alive = 0, 0, 0
 
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """See `Engine`."""
@@ -58,6 +58,7 @@ class LocalEngine:
                     worker = free.pop() if free else self._start()
                     busy[worker] = attempt
                     self._hand_over(worker, attempt)
+                self._count(busy, free)
                 if not busy:
                     return
                 for worker in _heard(busy):
@@ -67,6 +68,7 @@ class LocalEngine:
                     except OSError as error:
                         worker.end(grace_s=1.0)
                         self.restarts += 1
+                        self._count(busy, free)
                         attempt.number += 1
                         if attempt.number < ATTEMPTS:
                             again.append(attempt)
@@ -74,10 +76,15 @@ class LocalEngine:
                             yield given_up(attempt.task, _told(worker, error))
                         continue
                     free.append(worker)
+                    self._count(busy, free)
                     yield _OUTCOME.validate_json(line)
         finally:
             for worker in (*busy, *free):
                 worker.end()
+            self._count({}, [])
+
+    def _count(self, busy: Sized, free: Sized) -> None:
+        self.in_flight, self.workers_alive = len(busy), len(busy) + len(free)
 
     def _start(self) -> HelperProcess:
         try:

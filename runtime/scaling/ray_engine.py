@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from runtime.scaling.task import Outcome, Task
 if TYPE_CHECKING:
     from runtime.scaling.work import Worker
 
-_AHEAD = 2
+AHEAD = 2
 """Tasks on their way for each that the cluster can work on: a worker that ends one finds the next one waiting."""
 
 _STORE_BYTES = 128 << 20
@@ -40,12 +40,19 @@ class RayEngine:
         address: of a cluster, `auto` for one that runs on this machine; None to start one here, for this run.
         workers: most ranges at once; by default as many as the cluster's CPUs allow at any time.
         threads: CPUs of a worker, and threads of its inferences; by default `THREADS_OF_WORKER`, or what a node has.
+        work: what a worker does with a task and so many threads.
     """
 
-    def __init__(self, address: str | None = None, workers: int | None = None, threads: int | None = None) -> None:
-        self._address, self._workers = address, workers
+    def __init__(
+        self,
+        address: str | None = None,
+        workers: int | None = None,
+        threads: int | None = None,
+        work: Callable[[Task, int], Outcome] | None = None,
+    ) -> None:
+        self._address, self._workers, self._work = address, workers, work or _work
         self._threads = threads
-        self.restarts = 0
+        self.restarts, self.in_flight, self.workers_alive = 0, 0, 0
 
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """See `Engine`.
@@ -55,12 +62,12 @@ class RayEngine:
             InvalidInputError: no node has as many CPUs as a worker takes.
             ModuleNotFoundError: Ray is not installed: the extra cluster brings it.
         """
-        with _connected(self._address) as ray:
+        with connected(self._address) as ray:
             yield from self._run(ray, iter(tasks))
 
     def _run(self, ray: Any, following: Iterator[Task]) -> Generator[Outcome, None, None]:
         threads = self._threads_of(ray)
-        work = ray.remote(_work).options(num_cpus=threads, max_retries=0)
+        work = ray.remote(self._work).options(num_cpus=threads, max_retries=0)
         again = deque[Attempt]()
         busy: dict[Any, Attempt] = {}
         try:
@@ -68,6 +75,7 @@ class RayEngine:
                 most = self._most(ray, threads)
                 while len(busy) < most and (attempt := again.popleft() if again else next_attempt(following)):
                     busy[work.remote(attempt.task, threads)] = attempt
+                self.in_flight = len(busy)
                 if not busy:
                     return
                 limit_s = max(longest_s(attempt.task) for attempt in busy.values())
@@ -76,6 +84,7 @@ class RayEngine:
                     raise WorkerError("the Ray cluster", f"no answer within {limit_s:.0f} s", "nodes that work")
                 for ref in ready:
                     attempt = busy.pop(ref)
+                    self.in_flight = len(busy)
                     try:
                         outcome: Outcome = ray.get(ref)
                     except ray.exceptions.RayError as error:
@@ -89,6 +98,7 @@ class RayEngine:
         finally:
             for ref in busy:
                 ray.cancel(ref, force=True)
+            self.in_flight = self.workers_alive = 0
 
     def _threads_of(self, ray: Any) -> int:
         """CPUs of a worker, at most as many as the largest node has.
@@ -105,9 +115,9 @@ class RayEngine:
 
     def _most(self, ray: Any, threads: int) -> int:
         """Tasks that may be on their way, as the cluster is now."""
-        if self._workers is not None:
-            return self._workers
-        return max(1, int(ray.cluster_resources().get("CPU", 0)) // threads) * _AHEAD
+        room = int(ray.cluster_resources().get("CPU", 0)) // threads
+        self.workers_alive = room if self._workers is None else min(room, self._workers)
+        return self._workers or max(1, room) * AHEAD
 
 
 _worker: Worker | None = None
@@ -127,7 +137,7 @@ def _work(task: Task, threads: int) -> Outcome:
 
 
 @contextmanager
-def _connected(address: str | None) -> Iterator[Any]:
+def connected(address: str | None) -> Iterator[Any]:
     """Ray, connected to a cluster; a cluster that was started for it ends with it."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # before it is imported: nothing is sent to anybody
     import ray

@@ -72,6 +72,9 @@ class ShardRecord(Plain):
         model: what read them.
         pages: one each, in order.
         seconds: that it took.
+        finished_s: when it was done, seconds since 1970 by the worker's clock; None of a record of earlier versions.
+        worker: who did it, host and process; empty of such a record.
+        read_bytes: of frames, as they lie in the recording.
         confidence_bins: of an evaluation, see `lightpage.metrics.accumulator`.
         summary: of a recalibration, what `lightpage recalibrate --json` says; else empty.
     """
@@ -79,6 +82,9 @@ class ShardRecord(Plain):
     model: NamedBundle
     pages: tuple[PageRecord, ...]
     seconds: float
+    finished_s: float | None = None
+    worker: str = ""
+    read_bytes: int = 0
     confidence_bins: tuple[ConfidenceBin, ...] = ()
     summary: dict[str, float | str | None] = Field(default_factory=dict)
 
@@ -86,6 +92,11 @@ class ShardRecord(Plain):
     def lost(self) -> dict[str, int]:
         """Pages that are lost, by cause."""
         return dict(Counter(page.loss or "" for page in self.pages if page.state is PageState.LOST))
+
+    @property
+    def left_out(self) -> int:
+        """Pages that the bundle was made from."""
+        return sum(page.state is PageState.LEFT_OUT for page in self.pages)
 
     def write(self, shard: Path) -> None:
         """Write it, whole or not at all; the range is done then.

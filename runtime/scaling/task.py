@@ -120,13 +120,17 @@ class Done(Plain):
     Attributes:
         task: what was asked.
         lost: pages that are lost, by cause.
+        left_out: pages that the bundle was made from.
         seconds: that it took the worker.
+        read_bytes: of frames, as they lie in the recording.
     """
 
     kind: Literal["done"] = "done"
     task: Task
     lost: dict[str, int]
+    left_out: int = 0
     seconds: float
+    read_bytes: int = 0
 
 
 class Failed(Plain):

@@ -5,31 +5,34 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from lightpage.codec.volume_file import ranges
 from lightpage.metrics.reliability import ConfidenceBin, calibration_error
 from runtime.scaling.job import Job, Source
 from runtime.scaling.ledger import Ledger
-from runtime.scaling.shard import BUNDLE, PageRecord, PageState, ShardRecord, with_end
+from runtime.scaling.shard import BUNDLE, PageRecord, PageState, ShardRecord, record_of, with_end
 from runtime.scaling.task import NamedBundle, Operation, Task
 
-AIR = "air_bits_per_symbol"
+AIR, CONFIRMED = "air_bits_per_symbol", "confirmed_bits"
 
 TOLD = 5
 """Lost pages that are told with their reasons."""
 
 
 class Mean:
-    """A mean that holds no values."""
+    """A mean that holds no values, and the least of them; None of no values."""
 
     def __init__(self) -> None:
         self._sum, self._count = 0.0, 0
+        self.least: float | None = None
 
     def add(self, value: float | None) -> None:
         """Count a value, if it is one."""
         if value is not None:
             self._sum, self._count = self._sum + value, self._count + 1
+            self.least = value if self.least is None else min(self.least, value)
 
     @property
     def value(self) -> float | None:
@@ -51,6 +54,10 @@ class Means:
     def value(self, name: str) -> float | None:
         """The mean of a figure; None where no page has it."""
         return self._means[name].value if name in self._means else None
+
+    def least(self, name: str) -> float | None:
+        """The least of them."""
+        return self._means[name].least if name in self._means else None
 
     def to_json(self) -> dict[str, float | None]:
         """All of them."""
@@ -147,6 +154,50 @@ class Round:
         }
 
 
+@dataclass(frozen=True)
+class Reading:
+    """A range that a worker has done, in whichever round.
+
+    Attributes:
+        finished_s: when, seconds since 1970.
+        seconds: that it took.
+        pages: how many, or one device.
+        worker: who did it; empty where that was not noted.
+        read_bytes: of frames, as they lie in the recording; 0 where that was not noted.
+    """
+
+    finished_s: float
+    seconds: float
+    pages: int
+    worker: str
+    read_bytes: int
+
+    @classmethod
+    def of(cls, shard: Path, record: ShardRecord, pages: int) -> Reading:
+        """That of a shard; where no time was noted, it is that of the file."""
+        finished_s = record_of(shard).stat().st_mtime if record.finished_s is None else record.finished_s
+        return cls(finished_s, record.seconds, pages, record.worker, record.read_bytes)
+
+
+@dataclass
+class Group:
+    """What was found of a device, or of a recording where there is no fleet.
+
+    Attributes:
+        recordings: that it has.
+        tally: of their pages.
+        figures: of those that were read.
+        told: the first problem that anything of it had, for people; empty without one.
+        summary: of its recalibration, see `runtime.scaling.shard.ShardRecord`.
+    """
+
+    recordings: int = 0
+    tally: Tally = field(default_factory=Tally)
+    figures: Means = field(default_factory=Means)
+    told: str = ""
+    summary: dict[str, float | str | None] = field(default_factory=dict)
+
+
 @dataclass
 class Totals:
     """What a run has found.
@@ -158,6 +209,9 @@ class Totals:
         rounds: what later readings have brought.
         recordings: a row each.
         lost: the first lost pages, or devices, and why.
+        examples: the first one of each cause.
+        groups: by device; by recording where there is no fleet.
+        readings: all ranges that were done, a few numbers each.
     """
 
     tally: Tally = field(default_factory=Tally)
@@ -166,6 +220,9 @@ class Totals:
     rounds: list[Round] = field(default_factory=list)
     recordings: list[dict[str, Any]] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
+    examples: dict[str, str] = field(default_factory=dict)
+    groups: dict[str, Group] = field(default_factory=dict)
+    readings: list[Reading] = field(default_factory=list)
 
     @property
     def ece(self) -> float | None:
@@ -203,21 +260,30 @@ def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: 
     own, figures, there = Tally(), Means(), ledger.results(index)
     lost: dict[str, list[int]] = {}
     summary: dict[str, float | str | None] = {}
+    group = found.groups.setdefault(source.device or str(source.path), Group())
+    group.recordings += 1
+    if source.problem is not None:
+        group.told = group.told or str(source.problem)
     for task in ledger.ranges(job, index, source):
-        own.pages += task.weight
-        found.tally.pages += task.weight
+        for tally in (own, group.tally, found.tally):
+            tally.pages += task.weight
         for record, page in _pages(found, ledger, job, index, task, there):
-            summary = record.summary
-            for tally in (own, found.tally):
+            summary = group.summary = record.summary
+            for tally in (own, group.tally, found.tally):
                 tally.add(page)
                 tally.models[record.model.version] += 1
             if page.state is PageState.READ:
-                figures.add(page.figures)
-                found.figures.add(page.figures)
+                for means in (figures, group.figures, found.figures):
+                    means.add(page.figures)
+                    if page.confirmed_bits is not None:
+                        means.add({CONFIRMED: page.confirmed_bits})
             elif page.state is PageState.LOST:
-                lost.setdefault(page.loss or "unknown", []).append(page.page)
+                told, cause = f"{_name(source, task, page)}: {page.reason}", page.loss or "unknown"
+                lost.setdefault(cause, []).append(page.page)
+                found.examples.setdefault(cause, told)
+                group.told = group.told or page.reason
                 if len(found.lost) < TOLD:
-                    found.lost.append(f"{_name(source, task, page)}: {page.reason}")
+                    found.lost.append(told)
     row = {"device": source.device, "recording": str(source.path), **own.to_json()}
     if job.choices.operation is not Operation.RECALIBRATE:
         row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
@@ -235,6 +301,7 @@ def _pages(
     if task.shard.name not in there:
         return
     first = ShardRecord.read(task.shard)
+    found.readings.append(Reading.of(task.shard, first, task.weight))
     for part in first.confidence_bins:
         sums = found.confidence_bins.setdefault((part.low, part.high), [0.0, 0.0, 0.0])
         for place, value in enumerate((part.count, part.count * part.confidence, part.count * part.accuracy)):
@@ -245,6 +312,7 @@ def _pages(
         if shard.name not in there:
             continue
         again = ShardRecord.read(shard)
+        found.readings.append(Reading.of(shard, again, len(again.pages)))
         for page in again.pages:
             before = best[page.page][1]
             found.rounds[number - 1].add(before, page)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,13 @@ from typing import Any
 from lightpage.codec.volume import Volume
 from lightpage.codec.volume_file import VolumeFile, ranges
 from lightpage.errors import InvalidInputError, LostDataError
+from lightpage.files import write_json
 from runtime.scaling.job import Job
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.shard import read_user_bytes
 
-FOLDER = "files"
+FOLDER, TOLD = "files", "files.json"
+"""Of a run's folder: the files that are whole, and what became of each at the end of the last run."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class RecoveredFile:
         volume: how it lies on its pages.
         path: where the file is, if it is whole.
         read: pages that gave bytes, parity pages included.
-        restored, lost: see `lightpage.codec.volume_file.Restored`; empty where the file was there already.
+        restored, lost: see `lightpage.codec.volume_file.Restored`.
         error: why there is no file; None where there is.
     """
 
@@ -48,7 +51,7 @@ class RecoveredFile:
 
 
 def recovered_files(ledger: Ledger, job: Job) -> list[RecoveredFile]:
-    """Make the file of every volume whose pages suffice; one that was made before stays as it is.
+    """Make the file of every volume whose pages suffice, and note what became of each; one that is there stays.
 
     Of the shards one is held at a time, and of the volumes their names.
 
@@ -61,7 +64,26 @@ def recovered_files(ledger: Ledger, job: Job) -> list[RecoveredFile]:
             if (volume := Volume.of_page(page)) is not None:
                 there = shards.setdefault(volume, {})
                 there[shard] = there.get(shard, 0) + 1
-    return [_file(ledger.folder / FOLDER, volume, there) for volume, there in shards.items()]
+    before = {file["file"]: tuple(file["restored"]) for file in known_files(ledger.folder) or ()}
+    files = [_file(ledger.folder / FOLDER, volume, there, before) for volume, there in shards.items()]
+    write_json(ledger.folder / TOLD, [file.to_json() for file in files])
+    return files
+
+
+def known_files(folder: Path) -> list[dict[str, Any]] | None:
+    """What became of the files of a run at the end of its last run; None where none has ended.
+
+    Raises:
+        InvalidInputError: it cannot be read.
+    """
+    path = folder / TOLD
+    try:
+        found: list[dict[str, Any]] = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise InvalidInputError(f"files {path}", error, "what a bulk run has written; delete it") from None
+    return found
 
 
 def _shards(ledger: Ledger, job: Job) -> list[Path]:
@@ -74,10 +96,10 @@ def _shards(ledger: Ledger, job: Job) -> list[Path]:
     return found
 
 
-def _file(folder: Path, volume: Volume, shards: dict[Path, int]) -> RecoveredFile:
+def _file(folder: Path, volume: Volume, shards: dict[Path, int], before: dict[str, tuple[int, ...]]) -> RecoveredFile:
     path, read = folder / f"{volume.id}-{volume.checksum:08x}", sum(shards.values())
     if path.exists():
-        return RecoveredFile(volume, path, read)
+        return RecoveredFile(volume, path, read, before.get(str(path), ()))
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:

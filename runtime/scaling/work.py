@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -79,13 +81,30 @@ class Worker:
             with Recording.open(task.recording) as recording:
                 check_recording(warm.decoder, recording)
                 record = self._record(task, recording, warm)
+                read_bytes = round(recording.stored_page_bytes * len(task.pages))
             whole = False
             _check_stamp(task)
-            record = record.model_copy(update={"seconds": time.perf_counter() - start})
+            record = record.model_copy(update=self._told(start, read_bytes))
             record.write(task.shard)
         except LightpageError as error:
             return Failed(task=task, problem=Problem.of(error), whole_recording=whole)
-        return Done(task=task, lost=record.lost, seconds=record.seconds)
+        return Done(
+            task=task,
+            lost=record.lost,
+            left_out=record.left_out,
+            seconds=record.seconds,
+            read_bytes=record.read_bytes,
+        )
+
+    @staticmethod
+    def _told(start: float, read_bytes: int) -> dict[str, float | int | str]:
+        """Who has done a range since a `time.perf_counter` moment, and when."""
+        return {
+            "seconds": time.perf_counter() - start,
+            "finished_s": time.time(),
+            "worker": f"{socket.gethostname()}:{os.getpid()}",
+            "read_bytes": read_bytes,
+        }
 
     def _record(self, task: Task, recording: Recording, warm: _Warm) -> ShardRecord:
         if task.operation is Operation.RECALIBRATE:

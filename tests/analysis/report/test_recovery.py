@@ -194,7 +194,7 @@ def one(**changes: Any) -> dict[str, Any]:
 )
 def test_figures_that_cannot_be_are_refused(changes: dict[str, Any], named: str, tmp_path: Path) -> None:
     path = written(WHOLE, tmp_path / "r.json", **changes)
-    with pytest.raises(InvalidInputError, match=rf"r\.json: got {named}.*wanted a finished training run, or the JSON"):
+    with pytest.raises(InvalidInputError, match=rf"r\.json: got {named}.*wanted a finished training run, a bulk run"):
         run(report, path, "--out", tmp_path / "r.html")
     assert not (tmp_path / "r.html").exists()
 
@@ -220,7 +220,8 @@ def test_what_is_not_finite_is_refused(tmp_path: Path) -> None:
 )
 def test_other_json_is_named(content: Any, named: str, tmp_path: Path) -> None:
     (path := tmp_path / "j.json").write_text(json.dumps(content))
-    wanted = "wanted a finished training run, or the JSON that this version's `lightpage evaluate` or `recover` writes"
+    json_of = "or the JSON that this version's `lightpage evaluate` or `recover` writes"
+    wanted = f"wanted a finished training run, a bulk run, {json_of}"
     with pytest.raises(InvalidInputError, match=f"j.json: got {named}, {wanted}"):
         run(report, path, "--out", tmp_path / "r.html")
     for text in (b"\xff", b"[" * 100_000, b""):

@@ -277,7 +277,10 @@ def test_what_is_no_source_is_refused(
         (tmp_path / f"{name}.json").write_text(json.dumps(json.loads(evaluation.read_text()) | {name: value}))
     for source, named in (
         (tmp_path / "unfinished", r"unfinished: got .*wanted a finished training run"),
-        (tmp_path / "notes.txt", r"notes.txt: got text that is no JSON.*wanted a finished training run, or the JSON"),
+        (
+            tmp_path / "notes.txt",
+            r"notes.txt: got text that is no JSON.*wanted a finished training run, a bulk run",
+        ),
         (tmp_path / "other.json", r"other.json: got pages_left_out \(Field required\).* more, wanted"),
         (tmp_path / "short.json", r"maps: got 27 rows of \[44\] symbols, wanted 28 rows of 44"),
         *((tmp_path / f"{name}.json", rf"{name}\.json: got {name} \(.*wanted a finished training run") for name in bad),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,7 @@ from runtime.scaling.task import Task
 from runtime.scaling.work import Worker
 from tests.runtime import coded, toy
 
+ROOT = Path(__file__).resolve().parents[3]
 PAGES, RANGE = 7, 3
 
 
@@ -100,10 +103,27 @@ def _pages(archive: Archive, index: str) -> list[Any]:
 def test_a_second_run_does_nothing_and_goes_on_without_being_told_what_was_asked(archive: Archive) -> None:
     archive.run("decode", "--no-symbols")
     before = archive.records()
+    assert {record.worker.rpartition(":")[2] for record in before.values()} == {str(os.getpid())}
     status, figures = archive.run("decode", asked=False)
     assert (status, archive.tasks, figures["this_run"]["pages"], figures["pages_read"]) == (0, [], 0, 14)
     assert archive.records() == before
     assert not list(archive.out.glob("shards/*/*.h5"))
+
+
+def test_a_run_over_finished_work_loads_nothing_that_decodes(archive: Archive) -> None:
+    archive.run("evaluate")
+    script = """
+import sys
+from lightpage.cli.main import run
+from runtime.commands.bulk import bulk
+status = run(bulk, sys.argv[1:])
+assert not (found := {"onnxruntime", "ray", "grpc", "prometheus_client"} & sys.modules.keys()), found
+sys.exit(status)
+"""
+    again = [sys.executable, "-c", script, "evaluate", str(archive.out)]
+    done = subprocess.run(again, capture_output=True, text=True, timeout=60, cwd=ROOT, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "nothing was missing" in done.stdout
 
 
 def test_only_what_is_missing_is_done(archive: Archive) -> None:

@@ -19,6 +19,7 @@ from runtime.scaling.inline import InlineEngine
 from runtime.scaling.job import Choices, Job, of_recordings
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.local import LocalEngine
+from runtime.scaling.metrics import BulkMetrics
 from runtime.scaling.shard import PageRecord, ShardRecord
 from runtime.scaling.task import Operation
 from runtime.scaling.totals import totals
@@ -50,11 +51,15 @@ def test_a_killed_worker_costs_its_range_only_and_nothing_comes_out_differently(
         run(ledger, job, lambda: InlineEngine(Worker(1)))
     for first, kills in ((0, 1), (6, ATTEMPTS)):
         (tmp_path / f"a.{first}{KILLS}").write_text(str(kills))
-    engine = LocalEngine(2, 1, WORKER)
+    engine, metrics = LocalEngine(2, 1, WORKER), BulkMetrics("killed", Operation.DECODE)
     with Ledger(tmp_path / "killed") as ledger:
         job.write(ledger.folder)
-        made = run(ledger, job, lambda: engine)
+        made = run(ledger, job, lambda: engine, metrics)
         found = totals(ledger, job)
+    shown = metrics.registry.get_sample_value
+    assert shown("lightpage_bulk_workers_died_total", {"run": "killed"}) == 1 + ATTEMPTS
+    assert shown("lightpage_bulk_ranges_failed_total", {"run": "killed"}) == 1
+    assert shown("lightpage_bulk_workers", {"run": "killed"}) == 0
     assert (made.restarts, made.failed, made.ranges) == (1 + ATTEMPTS, 1, 3)
     assert "pages 6-8: got the end of its worker by signal 9" in str(made.problems[0])
     assert (found.tally.read, found.tally.missing) == (PAGES - RANGE, RANGE)

@@ -1,0 +1,24 @@
+"""A worker that answers at once and reads nothing: what is left is what its driver takes."""
+
+from __future__ import annotations
+
+from runtime.scaling.local_worker import main
+from runtime.scaling.task import Done, Outcome, Task
+from runtime.scaling.work import Worker
+
+
+def nothing(task: Task, threads: int) -> Outcome:
+    """The task is done."""
+    return Done(task=task, lost={}, seconds=0.0)
+
+
+class Idle(Worker):
+    """Does nothing."""
+
+    def work(self, task: Task) -> Outcome:
+        """The task is done."""
+        return nothing(task, 1)
+
+
+if __name__ == "__main__":
+    main(Idle(1))

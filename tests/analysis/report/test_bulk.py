@@ -1,0 +1,159 @@
+"""`lightpage report` of a bulk run: finished or not, of every operation, and without a change to its folder."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from analysis.report.bulk_figures import rates
+from analysis.report.from_bulk import report_of_bulk, sessions
+from runtime.scaling.task import Task
+from runtime.scaling.totals import Reading
+from tests.analysis.report.pages import check_whole, page_of
+from tests.runtime import coded, toy
+from tests.runtime.scaling.test_bulk import PAGES, Archive, archive, spoil_page
+
+__all__ = ["archive"]
+
+ROOT = Path(__file__).resolve().parents[3]
+SECTIONS = ["figures", "speed", "losses", "devices", "workers"]
+
+
+def told(text: str) -> str:
+    """What a reader sees, in one line."""
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", text)).split())
+
+
+def test_a_run_that_is_not_finished_is_shown_as_far_as_it_is_and_left_alone(archive: Archive, tmp_path: Path) -> None:
+    def interrupt(task: Task) -> None:
+        if len(archive.tasks) == 3:
+            raise KeyboardInterrupt
+
+    spoil_page(archive.folder / "a.h5", 4)
+    archive.before_each = interrupt
+    archive.run("decode")
+    before = {path: path.stat().st_ctime_ns for path in archive.out.rglob("*")}
+    text, seen = page_of(archive.out, tmp_path / "r.html")
+    assert {path: path.stat().st_ctime_ns for path in archive.out.rglob("*")} == before
+    check_whole(text, seen, SECTIONS)
+    assert {name: len(pictures) for name, pictures in seen.pictures.items()} == {"speed": 2, "losses": 1, "devices": 2}
+    assert f"Not finished: {PAGES} of {2 * PAGES} pages have no result yet." in told(text)
+    assert "BlackFrameError 1 7.14% a.h5: page 4: in-phase frame: got black" in told(text).replace("recording ", "")
+    assert str(archive.folder) not in text
+
+
+def test_a_run_that_has_done_nothing_can_be_shown(archive: Archive, tmp_path: Path) -> None:
+    def interrupt(task: Task) -> None:
+        raise KeyboardInterrupt
+
+    archive.before_each = interrupt
+    archive.run("decode")
+    text, seen = page_of(archive.out, tmp_path / "r.html")
+    check_whole(text, seen, SECTIONS)
+    assert "Nothing is done yet." in text
+
+
+def test_pages_that_were_read_again_and_devices_of_a_fleet(archive: Archive, tmp_path: Path) -> None:
+    toy.write_toy_bundle(archive.folder / "newer.zip", version="toy-2")
+    spoil_page(archive.folder / "b.h5", 0)
+    lines = [f'[[device]]\nname = "<{name}>"\nbundle = "toy.zip"\nrecordings = ["{name}.h5"]' for name in "ab"]
+    (archive.folder / "fleet.toml").write_text("\n".join(lines))
+    archive.run("evaluate", "--fleet", str(archive.folder / "fleet.toml"), asked=False)
+    archive.run("evaluate", "--again-with", str(archive.folder / "newer.zip"), asked=False)
+    text, seen = page_of(archive.out, tmp_path / "r.html")
+    check_whole(text, seen, [*SECTIONS[:-1], "rounds", "workers"])
+    assert "toy-2 1 0 0 1 not known not known" in told(text)
+    assert [device.name for device in report_of_bulk(archive.out).devices] == ["<b>", "<a>"]  # the worst first
+    assert "&lt;b&gt;" in text
+    assert "<b>" not in text
+
+
+def test_files_that_came_back_and_files_that_did_not(archive: Archive, tmp_path: Path) -> None:
+    bundle = coded.bundle(archive.folder / "coded.zip")
+    pages = coded.pages(bundle, archive.folder)
+    (archive.folder / "pages.h5").rename(archive.folder / "pages.sent")
+    coded.recording(archive.folder / "a.h5", pages[:8], {2: coded.dark}, code=None)
+    coded.recording(archive.folder / "b.h5", pages[8:])
+    archive.run("recover", "--no-tracking", "--bundle", str(bundle))
+    for _ in range(2):  # a second run takes nothing back of what it says
+        text, seen = page_of(archive.out, tmp_path / "r.html")
+        check_whole(text, seen, [*SECTIONS[:-1], "files", "workers"])
+        assert "1 whole, 0 not" in told(text)
+        assert "9 1,000 whole, 1 data page (2) of it from parity: 9-" in told(text)
+        assert "Margin" in told(text)
+        archive.run("recover", asked=False)
+    (archive.out / "files.json").write_text("[")
+    with pytest.raises(Exception, match=r"files\.json: got .*, wanted what a bulk run has written"):
+        page_of(archive.out, tmp_path / "r.html")
+
+
+def test_a_fleet_that_was_recalibrated_tells_why_a_device_failed(archive: Archive, tmp_path: Path) -> None:
+    for name in ("left", "bad"):
+        toy.write_toy_recording(archive.folder / f"{name}.h5", toy.ToyDevice((148.0, 90.0), seed=4), 16, 3, 6)
+    with h5py.File(archive.folder / "bad.h5", "r+") as file:
+        file["symbols"][:] = toy.symbols_of(16, 999, 3)
+    lines = [f'[[device]]\nname = "{n}"\nbundle = "toy.zip"\nrecordings = ["{n}.h5"]' for n in ("left", "bad")]
+    (archive.folder / "fleet.toml").write_text("\n".join(lines))
+    archive.run("recalibrate", "--fleet", str(archive.folder / "fleet.toml"), asked=False)
+    text, seen = page_of(archive.out, tmp_path / "r.html")
+    check_whole(text, seen, SECTIONS)
+    rows = {device.name: device for device in report_of_bulk(archive.out).devices}
+    assert (rows["left"].result, rows["bad"].result) == ("done", "failed")
+    before, after = rows["left"].air_before, rows["left"].air_after
+    assert before is not None
+    assert after is not None
+    assert f"left done {before:.3f} {after:.3f} toy-1+r1".replace("-", "−", before < 0) in told(text)
+    assert rows["bad"].told
+    assert rows["bad"].told in told(text)
+
+
+def test_a_recording_that_could_not_be_opened_is_named_by_what_tells_it_from_others(
+    archive: Archive, tmp_path: Path
+) -> None:
+    (archive.folder / "c.h5").write_bytes(b"no recording")
+    archive.run("decode")
+    text, _ = page_of(archive.out, tmp_path / "r.html")
+    assert "Finished: none is lost. 1 recording could not be opened." in told(text)
+    assert re.search(r"c\.h5 0 0 0 0 recording c\.h5: got ", told(text))
+    assert str(archive.folder) not in text
+
+
+def test_ranges_whose_time_was_not_noted_have_that_of_their_file(archive: Archive) -> None:
+    archive.run("decode")
+    for path in archive.out.glob("shards/*/*.json"):
+        record = json.loads(path.read_text())
+        path.write_text(
+            json.dumps({k: v for k, v in record.items() if k not in ("finished_s", "worker", "read_bytes")})
+        )
+    data = report_of_bulk(archive.out)
+    times = sorted(reading.finished_s for reading in data.found.readings)
+    assert times == sorted(path.stat().st_mtime for path in archive.out.glob("shards/*/*.json"))
+    assert [(worker.name, worker.pages) for worker in data.workers] == [("not noted", 2 * PAGES)]
+
+
+def test_the_pages_of_a_range_are_spread_over_its_time_and_none_is_lost() -> None:
+    readings = [Reading(10.0, 10.0, 20, "a", 0), Reading(10.0, 5.0, 20, "b", 0), Reading(102.0, 1.0, 4, "a", 0)]
+    assert sessions(readings) == [(0.0, 10.0), (101.0, 102.0)]
+    edges = np.array([0.0, 5.0, 10.0, 200.0])
+    pages, workers = rates(readings, edges)
+    np.testing.assert_allclose(pages, [2.0, 6.0, 4 / 190])
+    np.testing.assert_allclose(workers, [1.0, 2.0, 1 / 190])
+    assert (pages * np.diff(edges)).sum() == pytest.approx(44)
+
+
+def test_it_needs_no_torch(archive: Archive, tmp_path: Path) -> None:
+    archive.run("evaluate")
+    script = "import sys; from analysis.report.command import report; report(sys.argv[1:], standalone_mode=False); "
+    script += "assert not {'torch', 'onnxruntime'} & sys.modules.keys()"
+    words = [sys.executable, "-c", script, str(archive.out), "--out", str(tmp_path / "r.html")]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"{2 * PAGES} of {2 * PAGES} pages done, 0 lost" in done.stdout

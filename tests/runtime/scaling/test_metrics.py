@@ -1,0 +1,116 @@
+"""Metrics of a bulk run: scraped while it works, and in a file after its end, as Prometheus would have them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from urllib.request import urlopen
+
+import h5py
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from runtime.scaling.task import Task
+from tests.runtime.scaling.test_bulk import PAGES, RANGE, Archive, archive, spoil_page
+
+__all__ = ["archive"]
+
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "scaling.md"
+
+
+def values(text: str) -> dict[str, float]:
+    """Every sample by name and labels, without the run's."""
+    found = {}
+    for family in text_string_to_metric_families(text):
+        for sample in family.samples:
+            labels = ",".join(value for name, value in sorted(sample.labels.items()) if name != "run")
+            found[f"{sample.name}{{{labels}}}"] = sample.value
+    return found
+
+
+def test_a_run_is_scraped_while_it_works_and_its_end_is_in_a_file(
+    archive: Archive, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    spoil_page(archive.folder / "a.h5", 1)
+    scraped: list[dict[str, float]] = []
+    address = ""
+
+    def scrape(task: Task) -> None:
+        nonlocal address
+        if found := re.search(r"metrics at (http://\S+)", capsys.readouterr().err):
+            address = found[1]
+        with urlopen(address, timeout=20) as reply:
+            scraped.append(values(reply.read().decode()))
+
+    archive.before_each = scrape
+    file = tmp_path / "bulk.prom"
+    status, _ = archive.run("decode", "--metrics", "127.0.0.1:0", "--metrics-file", str(file))
+    assert (status, len(scraped)) == (2, 6)
+    read = [each["lightpage_bulk_pages_total{read}"] for each in scraped]
+    assert read == [0, RANGE - 1, 2 * RANGE - 1, PAGES - 1, PAGES - 1 + RANGE, PAGES - 1 + 2 * RANGE]
+    assert [each["lightpage_bulk_job_pages_left{}"] for each in scraped[:3]] == [2 * PAGES, 11, 8]
+    for each in scraped:
+        assert each["lightpage_bulk_job_pages{}"] == 2 * PAGES
+        assert (each["lightpage_bulk_ranges_in_flight{}"], each["lightpage_bulk_workers{}"]) == (1, 1)
+        assert "lightpage_bulk_end_timestamp_seconds{}" not in each
+    end = values(file.read_text())
+    assert end["lightpage_bulk_pages_total{lost}"] == end["lightpage_bulk_pages_lost_total{BlackFrameError}"] == 1
+    assert end["lightpage_bulk_job_pages_left{}"] == end["lightpage_bulk_ranges_in_flight{}"] == 0
+    assert end["lightpage_bulk_page_seconds_count{}"] == 2 * PAGES
+    seconds = sum(record.seconds for record in archive.records().values())
+    assert end["lightpage_bulk_page_seconds_sum{}"] == pytest.approx(seconds)
+    with h5py.File(archive.folder / "b.h5") as recording:
+        frames = sum(recording[name].id.get_storage_size() for name in ("in_phase", "quadrature"))
+    assert end["lightpage_bulk_read_bytes_total{}"] == pytest.approx(2 * frames, rel=0.01)
+    finished = [record.finished_s for record in archive.records().values() if record.finished_s is not None]
+    assert len(finished) == 6
+    assert max(finished) <= end["lightpage_bulk_end_timestamp_seconds{}"] < max(finished) + 60
+
+
+def test_promtool_takes_the_file_and_every_metric_is_documented(archive: Archive, tmp_path: Path) -> None:
+    promtool = shutil.which("promtool")
+    if promtool is None:
+        pytest.skip("promtool is not installed")
+    file = tmp_path / "bulk.prom"
+    archive.run("evaluate", "--metrics-file", str(file))
+    done = subprocess.run(
+        [promtool, "check", "metrics"], input=file.read_bytes(), capture_output=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout + done.stderr) == (0, b"")
+    shown = dict(re.findall(r"^# TYPE (lightpage_\S+) (\S+)$", file.read_text(), re.MULTILINE))
+    told = dict(re.findall(r"^\| `(lightpage_bulk_\w+)` \| (\w+) \|", DOCUMENT.read_text(), re.MULTILINE))
+    assert told == {name: kind for name, kind in shown.items() if not name.endswith("_created")}
+
+
+def test_a_file_is_written_however_a_run_ends(archive: Archive, tmp_path: Path) -> None:
+    def interrupt(task: Task) -> None:
+        if len(archive.tasks) == 2:
+            raise KeyboardInterrupt
+
+    archive.before_each = interrupt
+    assert archive.run("decode", "--metrics-file", str(tmp_path / "bulk.prom"))[0] == 130
+    assert values((tmp_path / "bulk.prom").read_text())["lightpage_bulk_job_pages_left{}"] == 2 * PAGES - 2 * RANGE
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--metrics", "0.0.0.0:0"), "--metrics: got 0.0.0.0:0, wanted an address of this machine alone"),
+        (("--metrics", "here"), "--metrics: got 'here'"),
+        (("--metrics", "unix:/tmp/x"), "wanted HOST:PORT"),
+        (("--metrics-file", "bulk.txt"), "wanted *.prom: node_exporter reads no others"),
+    ],
+)
+def test_addresses_that_others_reach_and_files_that_nobody_reads_are_refused(
+    archive: Archive, options: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert archive.run("decode", *options)[0] == 2
+    assert told in capsys.readouterr().err
+    assert not archive.out.exists()
+
+
+def test_an_address_that_others_reach_may_be_asked_for(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
+    assert archive.run("decode", "--metrics", "0.0.0.0:0", "--metrics-insecure")[0] == 0
+    assert "metrics at http://0.0.0.0:" in capsys.readouterr().err
