@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from analysis.comparison.kept_bundle import data_set_of
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.page.symbols import random_symbols
@@ -19,17 +20,18 @@ _NOISE_COUNTS = 2.0
 """Standard deviation of the noise that tells two pages of one field apart, counts."""
 
 
-def archive(folder: Path, pages: int, fields: int, seed: int) -> Path:
-    """A recording of the shipped bundle's device with known symbols; made once.
+def archive(folder: Path, pages: int, fields: int, seed: int, kept: Path | None = None) -> Path:
+    """A recording of a device with known symbols; made once.
 
     Args:
         folder: where it goes.
         pages: that it has.
         fields: how many of them are simulated.
         seed: of symbols and noise.
+        kept: folder of the data set whose device it is; None for the shipped bundle's.
     """
     simulated, out = folder / "fields.h5", folder / "archive.h5"
-    profile, device = load_profile("bench"), Device()
+    profile, device = (load_profile("bench"), Device()) if kept is None else data_set_of(kept)[:2]
     bits = device.sensor.bit_depth
     if not simulated.exists():
         simulator = Simulator(profile, device, LEVELS, seed)
