@@ -1,7 +1,8 @@
-"""Collects the chunks of one frame pair in a buffer of the right size, allocated once, within a budget of memory."""
+"""Collects the chunks of one frame pair in a buffer of the right size, taken once, within a budget of memory."""
 
 from __future__ import annotations
 
+import sys
 import threading
 from typing import Self
 
@@ -11,7 +12,11 @@ from lightpage.errors import FrameError, LimitError
 from lightpage.recording.frame_pair import FramePair
 from runtime.errors import CallerLeft, OverloadedError
 
+Bytes = np.ndarray[tuple[int], np.dtype[np.uint8]]
+
 _RETRY_S = 1.0
+_UNSEEN = 2
+"""References to spare memory that nobody has a view of: the budget's, and the argument of the count itself."""
 
 
 class ReceiveBudget:
@@ -25,6 +30,7 @@ class ReceiveBudget:
 
     def __init__(self, size: int) -> None:
         self._size, self._used, self._taken = size, 0, 0
+        self._spare: Bytes | None = None
         self._lock = threading.Lock()
 
     @property
@@ -62,6 +68,22 @@ class ReceiveBudget:
         with self._lock:
             self._used -= count
 
+    def memory(self, size: int) -> Bytes:
+        """Memory for a pair, uint8 [size]: that of one before, where nobody holds a view of it any more.
+
+        The system would have to fill new memory with zeros first, which takes as long as the pair does.
+        """
+        with self._lock:
+            if self._spare is not None and self._spare.size == size and sys.getrefcount(self._spare) == _UNSEEN:
+                spare, self._spare = self._spare, None
+                return spare
+        return np.empty(size, np.uint8)
+
+    def spare(self, memory: Bytes) -> None:
+        """Leave memory of a pair to a later one; one is kept."""
+        with self._lock:
+            self._spare = memory
+
 
 class PairReceiver:
     """Takes in-phase pixels, then quadrature pixels, in chunks of any size.
@@ -84,7 +106,7 @@ class PairReceiver:
             raise LimitError("frame pair", f"{self.size} bytes", f"at most {max_bytes}")
         self._lock = threading.Lock()
         """Held while bytes are taken in, so that nobody lets go of them meanwhile."""
-        self._buffer: np.ndarray[tuple[int], np.dtype[np.uint8]] | None = None
+        self._buffer: Bytes | None = None
         self._filled, self._closed = 0, False
 
     @property
@@ -114,7 +136,7 @@ class PairReceiver:
             if self._budget is not None:
                 self._budget.take(len(chunk))
             if self._buffer is None:
-                self._buffer = np.empty(self.size, np.uint8)
+                self._buffer = np.empty(self.size, np.uint8) if self._budget is None else self._budget.memory(self.size)
             self._buffer[self._filled : end] = np.frombuffer(chunk, np.uint8)
             self._filled = end
 
@@ -149,4 +171,6 @@ class PairReceiver:
             self._closed = True
             if self._budget is not None:
                 self._budget.give_back(self._filled)
+                if self._buffer is not None:
+                    self._budget.spare(self._buffer)
             self._filled, self._buffer = 0, None
