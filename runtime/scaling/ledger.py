@@ -11,9 +11,9 @@ from types import TracebackType
 from typing import Self
 
 from lightpage.errors import BusyError, InvalidInputError
-from runtime.scaling.job import Job, Source
+from runtime.scaling.job import KNOWN_PAGES, Job, Source
 from runtime.scaling.shard import RECORD, PageRecord, ShardRecord
-from runtime.scaling.task import Operation, Task
+from runtime.scaling.task import Operation, RecordedFile, Task
 
 _LOCK, _SHARDS = "lock", "shards"
 
@@ -113,12 +113,16 @@ class Ledger:
         return list(best.values())
 
     def ranges(self, job: Job, index: int, source: Source) -> Iterator[Task]:
-        """All ranges of a recording, whether they are done or not."""
+        """All ranges of a recording, whether they are done or not; of a device, at the place of its first one."""
+        choices = job.choices
+        if choices.operation is Operation.RECALIBRATE:
+            own = job.devices.get(index, ())
+            if own and all(each.problem is None for each in own):
+                yield self._device(job, index, own)
+            return
         if source.stamp is None:
             return
-        choices = job.choices
-        one_device = choices.operation is Operation.RECALIBRATE
-        count, step = (choices.known_pages,) * 2 if one_device else (source.pages, choices.range_pages)
+        count, step = source.pages, choices.range_pages
         for first in range(0, count, step):
             yield Task(
                 operation=choices.operation,
@@ -131,6 +135,24 @@ class Ledger:
                 tracking=choices.tracking,
                 symbols=choices.symbols,
             )
+
+    def _device(self, job: Job, index: int, own: tuple[Source, ...]) -> Task:
+        """The task of a device."""
+        choices, (first, *others) = job.choices, own
+        count = choices.known_pages or (KNOWN_PAGES if choices.fine_tuning is None else sum(each.pages for each in own))
+        assert first.stamp is not None  # it has no problem
+        return Task(
+            operation=choices.operation,
+            device=first.device,
+            recording=first.path,
+            stamp=first.stamp,
+            pages=tuple(range(count)),
+            bundle=job.bundles[first.bundle],
+            shard=self.shard(index, 0),
+            more=tuple(RecordedFile(path=each.path, stamp=each.stamp) for each in others if each.stamp is not None),
+            run=first.run,
+            fine_tuning=choices.fine_tuning,
+        )
 
     def results(self, source: int) -> frozenset[str]:
         """Names of the shards that a recording has."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
 from lightpage.codec.volume_file import ranges
@@ -12,12 +14,24 @@ from lightpage.metrics.reliability import ConfidenceBin, calibration_error
 from runtime.scaling.job import Job, Source
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.shard import BUNDLE, PageRecord, PageState, ShardRecord, with_end
-from runtime.scaling.task import NamedBundle, Operation, Task
+from runtime.scaling.task import NamedBundle, Operation, Problem, Task
 
 AIR = "air_bits_per_symbol"
 
 TOLD = 5
 """Lost pages that are told with their reasons."""
+
+
+class DeviceState(StrEnum):
+    """What became of a device that was to be recalibrated."""
+
+    RECALIBRATED = "recalibrated"
+    REFUSED = "refused"
+    """It stays as it is: its pages fit no geometry, or the new model would read them worse."""
+    FAILED = "failed"
+    """The next run tries it again."""
+    MISSING = "missing"
+    """It was not come to."""
 
 
 class Mean:
@@ -156,7 +170,8 @@ class Totals:
         figures: means over the pages that were read.
         confidence_bins: of all pages of an evaluation together.
         rounds: what later readings have brought.
-        recordings: a row each.
+        recordings: a row each, unless devices are recalibrated.
+        devices: a row each, where they are.
         lost: the first lost pages, or devices, and why.
     """
 
@@ -165,6 +180,7 @@ class Totals:
     confidence_bins: dict[tuple[float, float], list[float]] = field(default_factory=dict)
     rounds: list[Round] = field(default_factory=list)
     recordings: list[dict[str, Any]] = field(default_factory=list)
+    devices: list[dict[str, Any]] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
 
     @property
@@ -183,31 +199,69 @@ class Totals:
             "models": dict(self.tally.models),
             "figures": {**self.figures.to_json(), **({} if self.ece is None else {"ece": self.ece})},
             "rounds": [each.to_json() for each in self.rounds],
-            "recordings": self.recordings,
+            **({"devices": self.devices} if self.devices else {"recordings": self.recordings}),
         }
 
 
-def totals(ledger: Ledger, job: Job) -> Totals:
+def totals(ledger: Ledger, job: Job, failures: Mapping[tuple[str, Path], Problem] | None = None) -> Totals:
     """Add up what the shards of a job say; a shard is read at a time.
+
+    Args:
+        ledger: of the job.
+        job: what was asked.
+        failures: why devices have no result, see `runtime.scaling.driver.Progressed`.
 
     Raises:
         InvalidInputError: a shard cannot be read.
     """
     found = Totals(rounds=[Round(model) for model in job.rounds])
+    if job.choices.operation is Operation.RECALIBRATE:
+        for index, own in job.devices.items():
+            _add_device(found, ledger, job, index, own, failures or {})
+        return found
     for index, source in enumerate(job.sources):
         _add_recording(found, ledger, job, index, source)
     return found
 
 
+def _add_device(
+    found: Totals,
+    ledger: Ledger,
+    job: Job,
+    index: int,
+    own: tuple[Source, ...],
+    failures: Mapping[tuple[str, Path], Problem],
+) -> None:
+    shard, first = ledger.shard(index, 0), own[0]
+    row: dict[str, Any] = {"device": first.device, "recordings": [str(source.path) for source in own]}
+    problem = next((source.problem for source in own if source.problem is not None), None)
+    if problem is None:
+        found.tally.pages += 1
+        problem = failures.get((first.device, first.path))
+    if shard.name in ledger.results(index):
+        record = ShardRecord.read(shard)
+        page, summary = record.pages[0], record.summary
+        found.tally.add(page)
+        found.tally.models[record.model.version] += 1
+        state = DeviceState.RECALIBRATED if page.state is PageState.READ else DeviceState.REFUSED
+        row |= {"state": state, "air_before": None, "air_after": None, **summary, "reason": page.reason}
+        if state is DeviceState.RECALIBRATED:
+            row["bundle"] = str(with_end(shard, BUNDLE))
+        elif len(found.lost) < TOLD:
+            found.lost.append(f"{_device(first)}recording {first.path}: {page.reason}")
+    else:
+        state = DeviceState.MISSING if problem is None else DeviceState.FAILED
+        row |= {"state": state, "reason": "" if problem is None else str(problem)}
+    found.devices.append(row)
+
+
 def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: Source) -> None:
     own, figures, there = Tally(), Means(), ledger.results(index)
     lost: dict[str, list[int]] = {}
-    summary: dict[str, float | str | None] = {}
     for task in ledger.ranges(job, index, source):
         own.pages += task.weight
         found.tally.pages += task.weight
         for record, page in _pages(found, ledger, job, index, task, there):
-            summary = record.summary
             for tally in (own, found.tally):
                 tally.add(page)
                 tally.models[record.model.version] += 1
@@ -217,14 +271,11 @@ def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: 
             elif page.state is PageState.LOST:
                 lost.setdefault(page.loss or "unknown", []).append(page.page)
                 if len(found.lost) < TOLD:
-                    found.lost.append(f"{_name(source, task, page)}: {page.reason}")
+                    found.lost.append(f"{_device(source)}recording {source.path}: page {page.page}: {page.reason}")
     row = {"device": source.device, "recording": str(source.path), **own.to_json()}
-    if job.choices.operation is not Operation.RECALIBRATE:
-        row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
+    row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
     if source.problem is not None:
         row["problem"] = str(source.problem)
-    if summary:
-        row["recalibration"] = {**summary, "bundle": str(with_end(ledger.shard(index, 0), BUNDLE))}
     found.recordings.append(row)
 
 
@@ -253,10 +304,8 @@ def _pages(
     yield from best.values()
 
 
-def _name(source: Source, task: Task, page: PageRecord) -> str:
-    device = f"device {source.device}: " if source.device else ""
-    number = "" if task.operation is Operation.RECALIBRATE else f": page {page.page}"
-    return f"{device}recording {source.path}{number}"
+def _device(source: Source) -> str:
+    return f"device {source.device}: " if source.device else ""
 
 
 def _air(page: PageRecord) -> float:

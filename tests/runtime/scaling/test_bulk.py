@@ -301,11 +301,11 @@ def test_a_poisoned_device_fails_by_name_and_the_rest_of_the_fleet_is_recalibrat
     fleet = ("--fleet", str(archive.folder / "fleet.toml"))
     status, figures = archive.run("recalibrate", *fleet, asked=False)
     assert (status, figures["pages_read"], figures["pages_lost"]) == (2, 2, 1)
-    rows = {row["device"]: row for row in figures["recordings"]}
-    assert rows["poisoned"]["pages_lost"] == 1
+    rows = {row["device"]: row for row in figures["devices"]}
+    assert rows["poisoned"]["state"] == "refused"
     for name, drifted in offsets.items():
-        assert rows[name]["recalibration"]["air_after"] > rows[name]["recalibration"]["air_before"]
-        made = Bundle.open(rows[name]["recalibration"]["bundle"])
+        assert rows[name]["air_after"] > rows[name]["air_before"]
+        made = Bundle.open(rows[name]["bundle"])
         assert made.version == "toy-1+r1"
         assert made.table["reference_in_phase"].mean() == pytest.approx(drifted[0])
     assert f"device poisoned: recording {archive.folder / 'bad.h5'}: " in capsys.readouterr().err
