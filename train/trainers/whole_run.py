@@ -161,7 +161,7 @@ def make_run(
         return None
     known = [*split.training, *split.validation]
     save_weights(trained.weights, out)
-    own = _own_pilots(recording, profile, mask, known)
+    own = own_pilots(recording, profile, mask, known)
     kept = {"in_phase": references.in_phase, "quadrature": references.quadrature, "pilots": mask}
     save_arrays(out / REFERENCES, kept if own is None else kept | {"pilot_phases": own})
     golden = recording.frames(split.validation[0])
@@ -192,7 +192,7 @@ def _symbols_digest(recording: Recording, pages: list[int]) -> str:
     return digest.hexdigest()
 
 
-def _own_pilots(
+def own_pilots(
     recording: Recording, profile: Profile, mask: NDArray[np.bool_], pages: list[int]
 ) -> NDArray[np.float32] | None:
     """Phases of the device's own fixed pilots, [pilots], radians; None where they are those of the profile.
