@@ -32,6 +32,7 @@ from train.fitting.memory import keep_freed_memory
 from train.models.field import FieldRecovery, TorchFieldSolver
 from train.models.hyperparameters import Hyperparameters
 from train.models.twin import RayTwin, TorchTwin
+from train.processes import ONE
 from train.runs import WEIGHTS, load_run, sole_writer
 from train.trainers.symbols import SymbolTrainer
 from train.trainers.whole_run import Split, make_run, usable_pages
@@ -89,7 +90,7 @@ class TorchRecalibration:
         tuned = replace(before_it, steps=choices.steps, learning_rate=choices.learning_rate, seed=choices.seed)
         trainer = SymbolTrainer(localizer, tuned, choices.synthetic_pages, run)
         with sole_writer(folder / _RUN):
-            make_run(folder / _RUN, recording, bundle.profile, trainer, usable, split, lambda: calibration, devices=1)
+            make_run(folder / _RUN, recording, bundle.profile, trainer, usable, split, lambda: calibration, ONE)
         version, precision = next_version(decoder.version), bundle.manifest.precision
         unproven = out.with_name(f".{out.stem}-tuned{out.suffix}")
         unproven.unlink(missing_ok=True)

@@ -14,11 +14,13 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import RecordingError
 from lightpage.files import write_json
+from lightpage.progress import reporting
 from lightpage.recording.reader import Recording
 from train.commands.calibrate import DEFAULT_PAGES, calibrate_recording
 from train.commands.options import chosen_trainer, given_choices, with_choices
 from train.fitting.memory import keep_freed_memory
 from train.models.decoder import LOCALIZERS
+from train.processes import AUTO, STRATEGIES, Processes, Silence, is_first_process, wait_for_first
 from train.published.localizers import NAMES as PUBLISHED
 from train.runs import Run, sole_writer
 from train.trainers.whole_run import Split, make_run, usable_pages
@@ -48,7 +50,15 @@ from train.trainers.whole_run import Split, make_run, usable_pages
 @click.option(
     "--devices",
     type=click.IntRange(min=1),
-    help="GPUs, or processes without one; all GPUs, or one process, by default.",
+    help="GPUs of each node, or processes without one; all GPUs, or one process, by default.",
+)
+@click.option("--nodes", default=1, show_default=True, type=click.IntRange(min=1), help="Machines that train together.")
+@click.option(
+    "--strategy",
+    type=click.Choice(STRATEGIES),
+    default=AUTO,
+    show_default=True,
+    help="Lightning's, of several processes; auto is ddp where there are several.",
 )
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def train(
@@ -60,14 +70,19 @@ def train(
     validation_share: float,
     test_share: float,
     devices: int | None,
+    nodes: int,
+    strategy: str,
     json_path: Path | None,
     **chosen: Any,
 ) -> None:
     """Train a decoder on known pages; the last pages of the recording stay unseen for `lightpage evaluate`."""
+    processes = Processes(devices or AUTO, nodes, strategy).checked()
     keep_freed_memory()
     given = given_choices(localizer, chosen)
     context = click.get_current_context()
     context.meta["lightpage.resume"] = "run the same command again; it goes on where it was"
+    if not is_first_process():
+        context.with_resource(reporting(Silence()))
     profile = load_profile(profile_name)
     with Recording.open(recording_path) as recording:
         recording.check_against(profile)
@@ -81,7 +96,7 @@ def train(
         def calibration() -> Calibration:
             return _calibration(recording, profile, list(usable)[:DEFAULT_PAGES], calibration_path, out)
 
-        run = make_run(out, recording, profile, trainer, usable, split, calibration, devices or "auto")
+        run = make_run(out, recording, profile, trainer, usable, split, calibration, processes)
         if run is None:
             return
     _tell(run, out, json_path)
@@ -113,11 +128,15 @@ def _calibration(recording: Recording, profile: Profile, pages: list[int], path:
     """The calibration that was named, or was made of these pages for this run before, or is made of them now."""
     if path is not None:
         return load_calibration(path)
-    kept = out / "calibration.toml"
-    if kept.exists():
-        calibration = load_calibration(kept)
-        if calibration.calibrated_pages == tuple(recording.page_hash(page) for page in pages):
-            return calibration
+    kept, hashes = out / "calibration.toml", tuple(recording.page_hash(page) for page in pages)
+
+    def made() -> bool:
+        return kept.exists() and load_calibration(kept).calibrated_pages == hashes
+
+    if not is_first_process():
+        wait_for_first(made, True, f"calibration {kept}")
+    if made():
+        return load_calibration(kept)
     with percent_bar() as progress:
         calibration = calibrate_recording(recording, profile, pages, progress)
     calibration.save(kept)

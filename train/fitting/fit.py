@@ -29,7 +29,7 @@ from train.fitting.precision import lightning_precision
 from train.fitting.provenance import provenance_of
 from train.models.hyperparameters import Hyperparameters
 from train.models.network import Refiner, SymbolUNet
-from train.processes import process_number
+from train.processes import AS_IT_IS, Processes, is_first_process, process_number
 
 _LAST = "last.ckpt"
 
@@ -38,6 +38,9 @@ VALIDATIONS = 60
 
 _SEEDS_APART = 1_000_003
 """Of two processes of one run: further than any run has steps."""
+
+_SEEDS = 2**32
+"""That Lightning takes."""
 
 
 def fit_network(
@@ -50,12 +53,12 @@ def fit_network(
     *,
     kind: type[SymbolUNet] | type[Refiner] = SymbolUNet,
     start: nn.Module | None = None,
-    devices: int | str = "auto",
+    processes: Processes = AS_IT_IS,
 ) -> Fitted[SymbolTraining]:
     """Train, or go on with, the network of a run: see `fit`.
 
     Args:
-        run, validation, devices: as for `fit`.
+        run, validation, processes: as for `fit`.
         training: pages whose phases are NaN where nothing is asked (`train.data.patches.training_pages`).
         hyperparameters: the run's choices.
         pilot_mask: bool [ny, nx].
@@ -80,7 +83,7 @@ def fit_network(
         steps=hyperparameters.steps,
         precision=hyperparameters.precision,
         callbacks=[averaged],
-        devices=devices,
+        processes=processes,
     )
 
 
@@ -88,7 +91,7 @@ def seed_stretch(run: Path, seed: int) -> None:
     """Seed everything for a run: its next stretch, and each of its processes, draw other pages and turns."""
     last = run / CHECKPOINTS / _LAST
     reached = int(_checkpoint(last)["global_step"]) if last.exists() else 0
-    L.seed_everything(seed + reached + _SEEDS_APART * process_number(), verbose=False)
+    L.seed_everything((seed + reached + _SEEDS_APART * process_number()) % _SEEDS, verbose=False)
 
 
 def fit(
@@ -100,7 +103,7 @@ def fit(
     steps: int,
     precision: str,
     callbacks: Sequence[Callback] = (),
-    devices: int | str = "auto",
+    processes: Processes = AS_IT_IS,
 ) -> Fitted[M]:
     """Train, or go on with, the module of a run, judging it by its validation pages after every pass of `training`.
 
@@ -118,11 +121,12 @@ def fit(
         steps: optimiser steps.
         precision: of `PRECISIONS`.
         callbacks: further Lightning callbacks.
-        devices: how many GPUs, or processes where there is none; "auto" takes all GPUs, or one process.
+        processes: that work together; by default all GPUs, or one process.
     """
     if (before := finished(run, module)) is not None:
         return before
-    provenance_of(run)  # notes who begins it
+    if is_first_process():
+        provenance_of(run)  # notes who begins it
     folder = run / CHECKPOINTS
     last = folder / _LAST
     best = ModelCheckpoint(folder, "best", monitor="val_air", mode="max")
@@ -134,7 +138,10 @@ def fit(
             precision=lightning_precision(precision),  # type: ignore[arg-type]
             logger=TensorBoardLogger(str(run), name="", version=TENSORBOARD),
             callbacks=[*callbacks, best, timer, newest, _Steps()],
-            devices=devices,
+            devices=processes.devices,
+            num_nodes=processes.nodes,
+            strategy=processes.strategy,
+            plugins=[processes.environment()],
             enable_progress_bar=False,
             enable_model_summary=False,
             gradient_clip_val=1.0,

@@ -24,7 +24,7 @@ from train.data.training_inputs import TrainingInputs
 from train.fitting.provenance import provenance
 from train.models.decoder import LOCALIZERS
 from train.models.hyperparameters import Hyperparameters
-from train.processes import is_first_process
+from train.processes import AS_IT_IS, Processes, is_first_process
 from train.published.trainer import PublishedTrainer
 from train.runs import (
     DESCRIPTION,
@@ -100,7 +100,7 @@ def make_run(
     usable: dict[int, str],
     split: Split,
     calibrate: Callable[[], Calibration],
-    devices: int | str = "auto",
+    processes: Processes = AS_IT_IS,
 ) -> Run | None:
     """Train, or go on with, a run whose folder belongs to this command; a finished one is told again.
 
@@ -112,7 +112,7 @@ def make_run(
         usable: see `usable_pages`.
         split: of these pages.
         calibrate: gives the device's calibration; it is called once the options are known to be those of before.
-        devices: see `train.fitting.fit.fit`.
+        processes: see `train.fitting.fit.fit`.
 
     Returns:
         The run; None in the processes of further devices.
@@ -138,7 +138,7 @@ def make_run(
     choices = trainer.choices if isinstance(trainer, SymbolTrainer) else Hyperparameters()
     extractor = FeatureExtractor(CalibratedDevice.of(profile, calibration, references), features, choices)
     extractor.check(known_pages(recording, profile, split.training[:1])[0], calibration.coherence_after)
-    begin(out, options)
+    begin(out, options) if is_first_process() else check_begun(out, options)
     if (out / DESCRIPTION).exists():
         return load_run(out) if is_first_process() else None
     mask = recording.pilots()
@@ -154,7 +154,7 @@ def make_run(
             validation=split.validation,
             pilot_mask=mask,
             key=_digest([options[name] for name in ("--profile", _RECORDED, "calibration")]),
-            devices=devices,
+            processes=processes,
         )
     )
     if not is_first_process():
