@@ -6,7 +6,6 @@ import glob
 import hashlib
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -119,7 +118,7 @@ class Job(Plain):
         again = (s if s.problem is None else look_at(s.device, s.path, s.bundle, s.run) for s in self.sources)
         return self.model_copy(update={"sources": tuple(again)})
 
-    @cached_property
+    @property
     def devices(self) -> dict[int, tuple[Source, ...]]:
         """Recordings of each device of a fleet by the place of its first one; without a fleet each by itself."""
         first: dict[str, int] = {}

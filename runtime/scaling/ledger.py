@@ -68,7 +68,13 @@ class Ledger:
         return self.folder / _SHARDS / f"{source:06d}" / f"{first:08d}{again}"
 
     def missing(self, job: Job) -> Iterator[Task]:
-        """Ranges of the first reading that have no result, recording by recording."""
+        """Ranges of the first reading that have no result, recording by recording; or such devices."""
+        if job.choices.operation is Operation.RECALIBRATE:
+            for index, own in job.devices.items():
+                device = self._device(job, index, own)
+                if device is not None and device.shard.name not in self.results(index):
+                    yield device
+            return
         for index, source in enumerate(job.sources):
             there = self.results(index)
             yield from (task for task in self.ranges(job, index, source) if task.shard.name not in there)
@@ -113,13 +119,8 @@ class Ledger:
         return list(best.values())
 
     def ranges(self, job: Job, index: int, source: Source) -> Iterator[Task]:
-        """All ranges of a recording, whether they are done or not; of a device, at the place of its first one."""
+        """All ranges of a recording, whether they are done or not."""
         choices = job.choices
-        if choices.operation is Operation.RECALIBRATE:
-            own = job.devices.get(index, ())
-            if own and all(each.problem is None for each in own):
-                yield self._device(job, index, own)
-            return
         if source.stamp is None:
             return
         count, step = source.pages, choices.range_pages
@@ -136,8 +137,10 @@ class Ledger:
                 symbols=choices.symbols,
             )
 
-    def _device(self, job: Job, index: int, own: tuple[Source, ...]) -> Task:
-        """The task of a device."""
+    def _device(self, job: Job, index: int, own: tuple[Source, ...]) -> Task | None:
+        """The task of a device, whose first recording has this place; None where something of it is lacking."""
+        if any(each.problem is not None for each in own):
+            return None
         choices, (first, *others) = job.choices, own
         count = choices.known_pages or (KNOWN_PAGES if choices.fine_tuning is None else sum(each.pages for each in own))
         assert first.stamp is not None  # it has no problem
