@@ -9,10 +9,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import lightning as L
 import pytest
 import torch
 
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, LightpageError
 from tests.train.node import STEPS, train
 from train import processes
 from train.fitting.curves import curves_of
@@ -79,6 +80,18 @@ def test_the_command_trains_on_two_nodes_and_goes_on_with_one(small_device: list
     again = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS)
     assert again.returncode == 0, again.stderr
     assert again.stdout == told[0]
+
+
+def test_the_end_of_another_process_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("[/gloo/transport/tcp/pair.cc] Read error: Connection reset by peer")
+
+    monkeypatch.setattr(L.Trainer, "fit", broken)
+    with pytest.raises(RuntimeError, match="Read error"):
+        train(tmp_path / "alone", 1)
+    monkeypatch.setattr(L.Trainer, "world_size", 2)
+    with pytest.raises(LightpageError, match=r"got the end of another process, .* go on from the last checkpoint"):
+        train(tmp_path / "two", 1)
 
 
 @pytest.mark.parametrize(

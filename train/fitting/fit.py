@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.utils.data import DataLoader, Dataset, RandomSampler
 
+from lightpage.errors import LightpageError
 from lightpage.progress import track
 from train.data.pages import Page
 from train.fitting.curves import TENSORBOARD, curves_of, thinned
@@ -110,7 +111,8 @@ def fit(
     What a finished training made is kept in the folder and returned when it is asked for again. On several devices
     Lightning runs the program once for each; all of them return the same.
 
-    Raises KeyboardInterrupt after Ctrl-C, with the last checkpoint in place.
+    Raises KeyboardInterrupt after Ctrl-C, with the last checkpoint in place, and LightpageError where another process
+    has ended.
 
     Args:
         run: folder of the run; checkpoints and TensorBoard logs go there, and the last checkpoint is resumed from: the
@@ -161,6 +163,11 @@ def fit(
             )
     except SystemExit:  # Lightning's answer to Ctrl-C, once it has closed its files
         raise KeyboardInterrupt from None
+    except RuntimeError as error:
+        if trainer.world_size > 1 and (isinstance(error, torch.distributed.DistError) or "gloo" in str(error)):
+            expected = "all of them: run the same commands again, they go on from the last checkpoint"
+            raise LightpageError(f"training in {run}", "the end of another process", expected) from error
+        raise
     # the last steps are the quietest, and no validation need have followed them
     rates = {}
     for path in {last, folder / Path(best.best_model_path or last).name}:  # the run may have been moved meanwhile
@@ -200,15 +207,17 @@ class _Steps(Callback):
 @contextmanager
 def _without_hints() -> Iterator[None]:
     """Keep to itself what Lightning would tell a programmer; its errors come through."""
-    log = logging.getLogger("lightning.pytorch")
-    level = log.level
-    log.setLevel(logging.ERROR)
+    logs = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
+    levels = [log.level for log in logs]
+    for log in logs:
+        log.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module=r"lightning\.")
             yield
     finally:
-        log.setLevel(level)
+        for log, level in zip(logs, levels, strict=True):
+            log.setLevel(level)
 
 
 def _checkpoint(path: Path) -> dict[str, Any]:
