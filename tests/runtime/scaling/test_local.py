@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from lightpage.cli.main import run as run_command
+from lightpage.progress import reporting
 from runtime.commands import bulk as command
 from runtime.scaling.driver import run
 from runtime.scaling.engine import ATTEMPTS
@@ -25,7 +26,8 @@ from runtime.scaling.task import Operation
 from runtime.scaling.totals import totals
 from runtime.scaling.work import Worker
 from tests.runtime import toy
-from tests.runtime.scaling.deadly_worker import BEGUN, KILLS
+from tests.runtime.scaling.deadly_worker import BEGUN, KILLS, TALKS
+from tests.told import Told
 
 ROOT = Path(__file__).resolve().parents[3]
 WORKER = "tests.runtime.scaling.deadly_worker"
@@ -101,6 +103,15 @@ def test_two_parts_as_two_processes_do_every_page_once(toy_zip: Path, tmp_path: 
         assert job is not None
         assert list(ledger.missing(job)) == []
         assert totals(ledger, job).tally.read == 3 * PAGES
+
+
+def test_what_a_worker_is_at_is_told_as_it_comes(job: Job, tmp_path: Path) -> None:
+    (tmp_path / f"a{TALKS}").touch()
+    told = Told()
+    with Ledger(tmp_path / "out") as ledger, reporting(told):
+        made = run(ledger, job, lambda: LocalEngine(1, 1, WORKER))
+    assert made.pages == PAGES
+    assert told.notes == [f"device a: {first}, {number}" for first in range(0, PAGES, RANGE) for number in range(3)]
 
 
 DRIVER = """
