@@ -161,9 +161,8 @@ class BulkData:
     def summary(self) -> str:
         """What matters most, in a few words."""
         tally = self.found.tally
-        return (
-            f"{tally.pages - tally.missing:,} of {tally.pages:,} {self.unit} done, {tally.lost.total():,} {self.lost}"
-        )
+        done = f"{tally.pages - tally.missing:,} of {tally.pages:,} {self.unit} done"
+        return f"{done}, {tally.lost.total():,} {self.lost}"
 
 
 def report_of_bulk(folder: Path) -> BulkData:

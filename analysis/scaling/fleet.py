@@ -62,7 +62,7 @@ IMAGE_PX = 4.0
 WANTED = 0.98
 """AIR of a recalibrated device over that of the same network with the true table."""
 
-KEPT = Path("analysis/weights/bench/-0.6deg-32e-4px")
+KEPT = Path(__file__).parents[1] / "weights" / "bench" / "-0.6deg-32e-4px"
 """Data set of the kept network that is trained on."""
 
 LIMIT_S = 24 * 3600.0

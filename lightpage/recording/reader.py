@@ -447,8 +447,8 @@ class Recording:
             )
 
 
-def _stored_bytes(frames: h5py.Dataset) -> int:
-    """What a dataset takes, in its file or in those that it shows."""
+def _stored_bytes(frames: Any) -> int:
+    """What a dataset takes, in its file or in those that it shows. The stubs of h5py know nothing of it."""
     stored = int(frames.id.get_storage_size())
     for source in frames.virtual_sources() if frames.is_virtual else ():
         with open_hdf5(Path(source.file_name), f"recording {source.file_name}") as file:

@@ -139,7 +139,7 @@ class Job(Plain):
         return found
 
     def checked(self, check: Callable[[int, tuple[Source, ...], Path], None]) -> Job:
-        """The same; a device that `check` refuses has a problem. It is given its place, recordings and bundle's path."""
+        """The same; a device that `check` refuses, given its place, recordings and bundle's path, has a problem."""
         sources = list(self.sources)
         for place, own in self.devices.items():
             if any(source.problem is not None for source in own):
