@@ -118,14 +118,17 @@ def test_a_recording_that_is_lost_costs_its_device_alone(fleet: Fleet) -> None:
     assert (status, rows["a"]["state"]) == (0, "recalibrated")
 
 
-def test_a_part_has_whole_devices_and_tells_of_no_others(fleet: Fleet, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("form", [(), ("--deep",)])
+def test_a_part_has_whole_devices_and_tells_of_no_others(
+    form: tuple[str, ...], fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
     for part, name, recordings in (("1/2", "b", 1), ("0/2", "a", 2)):
-        status, rows = fleet.run("--part", part, "--metrics-file", str(fleet.folder / "bulk.prom"))
+        status, rows = fleet.run(*form, "--part", part, "--metrics-file", str(fleet.folder / "bulk.prom"))
         assert (status, list(rows), rows[name]["state"]) == (0, [name], "recalibrated")
         assert len(rows[name]["recordings"]) == recordings
         assert 'lightpage_bulk_job_pages{run="out"} 1.0' in (fleet.folder / "bulk.prom").read_text()
     assert re.search(r"^devices +1$", capsys.readouterr().out, re.MULTILINE)
-    status, rows = fleet.run()
+    status, rows = fleet.run(*form)
     assert (status, sorted(rows)) == (0, ["a", "b"])
     assert not capsys.readouterr().err
     assert [path.parent.name for path in sorted(fleet.out.glob("shards/*/*.zip"))] == ["000000", "000002"]

@@ -105,12 +105,20 @@ def test_two_parts_as_two_processes_do_every_page_once(toy_zip: Path, tmp_path: 
         assert totals(ledger, job).tally.read == 3 * PAGES
 
 
-def test_what_a_worker_is_at_is_told_as_it_comes(job: Job, tmp_path: Path) -> None:
+def test_what_a_worker_is_at_is_told_as_it_comes_and_is_no_outcome(job: Job, tmp_path: Path) -> None:
     (tmp_path / f"a{TALKS}").touch()
-    told = Told()
+    engine, at_work = LocalEngine(1, 1, WORKER), set()
+
+    class Looking(Told):
+        def note(self, what: str) -> None:
+            super().note(what)
+            at_work.add((engine.in_flight, engine.workers_alive))
+
+    told = Looking()
     with Ledger(tmp_path / "out") as ledger, reporting(told):
-        made = run(ledger, job, lambda: LocalEngine(1, 1, WORKER))
-    assert made.pages == PAGES
+        made = run(ledger, job, lambda: engine)
+    assert (made.pages, made.ranges, made.restarts) == (PAGES, PAGES // RANGE, 0)
+    assert (at_work, engine.in_flight, engine.workers_alive) == ({(1, 1)}, 0, 0)
     assert told.notes == [f"device a: {first}, {number}" for first in range(0, PAGES, RANGE) for number in range(3)]
 
 
