@@ -14,6 +14,7 @@ import pytest
 from lightpage.cli.main import run as run_command
 from lightpage.progress import reporting
 from runtime.commands import bulk as command
+from runtime.scaling import local
 from runtime.scaling.driver import run
 from runtime.scaling.engine import ATTEMPTS
 from runtime.scaling.inline import InlineEngine
@@ -25,7 +26,7 @@ from runtime.scaling.task import Operation
 from runtime.scaling.totals import totals
 from runtime.scaling.work import Worker
 from tests.runtime import toy
-from tests.runtime.scaling.deadly_worker import BEGUN, KILLS, TALKS
+from tests.runtime.scaling.deadly_worker import BEGUN, KILLS, SAID, TALKS
 from tests.told import Told
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -67,12 +68,20 @@ def test_a_killed_worker_costs_its_range_only_and_nothing_comes_out_differently(
     assert pages(tmp_path / "killed") == pages(tmp_path / "single")
 
 
-def test_what_a_worker_is_at_is_told_as_it_comes(job: Job, tmp_path: Path) -> None:
+def test_what_a_worker_is_at_is_told_even_where_it_comes_at_once(
+    job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Slow(Told):
+        def note(self, what: str) -> None:
+            super().note(what)
+            wait_for((tmp_path / f"a{SAID}").exists)
+
     (tmp_path / f"a{TALKS}").touch()
-    told = Told()
+    monkeypatch.setattr(local, "longest_s", lambda task: 20.0)
+    told = Slow()
     with Ledger(tmp_path / "out") as ledger, reporting(told):
         made = run(ledger, job, lambda: LocalEngine(1, 1, WORKER))
-    assert made.pages == PAGES
+    assert (made.pages, made.restarts) == (PAGES, 0)
     assert told.notes == [f"device a: {first}, {number}" for first in range(0, PAGES, RANGE) for number in range(3)]
 
 
