@@ -11,7 +11,7 @@ from runtime.scaling.local_worker import main
 from runtime.scaling.task import Outcome, Step, Task
 from runtime.scaling.work import Worker
 
-KILLS, BEGUN, TALKS, SAID = ".kills", ".begun", ".talks", ".said"
+KILLS, BEGUN, TALKS = ".kills", ".begun", ".talks"
 
 
 class Deadly(Worker):
@@ -27,7 +27,6 @@ class Deadly(Worker):
         if task.recording.with_suffix(TALKS).exists():
             for number in range(3):
                 self.tell(Step(device="a", what=f"{task.pages[0]}, {number}"))
-            task.recording.with_suffix(SAID).touch()
         return super().work(task)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -14,19 +15,19 @@ import pytest
 from lightpage.cli.main import run as run_command
 from lightpage.progress import reporting
 from runtime.commands import bulk as command
-from runtime.scaling import local
+from runtime.helper_process import HelperProcess
 from runtime.scaling.driver import run
-from runtime.scaling.engine import ATTEMPTS
+from runtime.scaling.engine import ATTEMPTS, Attempt
 from runtime.scaling.inline import InlineEngine
 from runtime.scaling.job import Choices, Job, of_recordings
 from runtime.scaling.ledger import Ledger
-from runtime.scaling.local import LocalEngine
+from runtime.scaling.local import LocalEngine, _heard
 from runtime.scaling.shard import PageRecord, ShardRecord
 from runtime.scaling.task import Operation
 from runtime.scaling.totals import totals
 from runtime.scaling.work import Worker
 from tests.runtime import toy
-from tests.runtime.scaling.deadly_worker import BEGUN, KILLS, SAID, TALKS
+from tests.runtime.scaling.deadly_worker import BEGUN, KILLS, TALKS
 from tests.told import Told
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -68,21 +69,26 @@ def test_a_killed_worker_costs_its_range_only_and_nothing_comes_out_differently(
     assert pages(tmp_path / "killed") == pages(tmp_path / "single")
 
 
-def test_what_a_worker_is_at_is_told_even_where_it_comes_at_once(
-    job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Slow(Told):
-        def note(self, what: str) -> None:
-            super().note(what)
-            wait_for((tmp_path / f"a{SAID}").exists)
-
+def test_what_a_worker_is_at_is_told_as_it_comes(job: Job, tmp_path: Path) -> None:
     (tmp_path / f"a{TALKS}").touch()
-    monkeypatch.setattr(local, "longest_s", lambda task: 20.0)
-    told = Slow()
+    told = Told()
     with Ledger(tmp_path / "out") as ledger, reporting(told):
         made = run(ledger, job, lambda: LocalEngine(1, 1, WORKER))
-    assert (made.pages, made.restarts) == (PAGES, 0)
+    assert made.pages == PAGES
     assert told.notes == [f"device a: {first}, {number}" for first in range(0, PAGES, RANGE) for number in range(3)]
+
+
+def test_a_worker_whose_lines_came_at_once_is_heard_again_at_once(job: Job, tmp_path: Path) -> None:
+    worker, (own, other) = HelperProcess.__new__(HelperProcess), socket.socketpair()  # without a process
+    worker._link, worker._received = own, b""
+    task = next(Ledger(tmp_path / "out").missing(job))
+    with own, other:
+        other.sendall(b"one\ntwo\n")
+        end = time.monotonic() + 5.0
+        assert worker.line(end) == b"one"
+        assert _heard({worker: Attempt(task, deadline=end)}) == [worker]
+        assert time.monotonic() < end
+        assert worker.line(end) == b"two"
 
 
 DRIVER = """
