@@ -110,6 +110,20 @@ def test_a_second_run_does_nothing_and_goes_on_without_being_told_what_was_asked
     assert not list(archive.out.glob("shards/*/*.h5"))
 
 
+def test_a_run_that_an_earlier_version_began_goes_on(archive: Archive) -> None:
+    archive.run("decode")
+    path = archive.out / "job.json"
+    job = json.loads(path.read_text())
+    for name in ("fine_tuning", "parts"):
+        del job["choices"][name]
+    job["choices"]["known_pages"] = 2
+    for source in job["sources"]:
+        del source["run"]
+    path.write_text(json.dumps(job))
+    status, figures = archive.run("decode")
+    assert (status, archive.tasks, figures["pages_read"]) == (0, [], 14)
+
+
 def test_a_run_over_finished_work_loads_nothing_that_decodes(archive: Archive) -> None:
     archive.run("evaluate")
     script = """
