@@ -78,6 +78,10 @@ class HelperProcess:
         line, _, self._received = self._received.partition(b"\n")
         return line
 
+    def has_line(self) -> bool:
+        """Whether a line has come already, of which the socket says nothing any more."""
+        return b"\n" in self._received
+
     def fileno(self) -> int:
         """Of the socket, for `select`: there is something to read of it once the process has answered or ended."""
         return self._link.fileno()

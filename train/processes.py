@@ -1,15 +1,144 @@
-"""The processes of one command: Lightning starts it once for each device."""
+"""The processes of one training: Lightning's own strategies, and what each process may know before they have met."""
 
 from __future__ import annotations
 
 import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+import torch
+
+from lightpage.errors import InvalidInputError, LightpageError
+from lightpage.progress import State
+
+if TYPE_CHECKING:
+    from lightning.fabric.plugins.environments.cluster_environment import ClusterEnvironment
+
+T = TypeVar("T")
+
+AUTO, DDP = "auto", "ddp"
+STRATEGIES = (AUTO, DDP)
+
+_MOST_ON_A_NODE = 1024
+_MEETING = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK")
+_PATIENCE_S, _LOOK_S = 1800.0, 0.2
+"""How long a process waits for the next piece of another's work, and how often it looks."""
+
+
+@dataclass(frozen=True)
+class Processes:
+    """The processes of one training, a GPU each where there are any.
+
+    Attributes:
+        devices: of each node; "auto" for all GPUs, or one process without one.
+        nodes: machines.
+        strategy: of `STRATEGIES`.
+    """
+
+    devices: int | str = AUTO
+    nodes: int = 1
+    strategy: str = AUTO
+
+    def checked(self) -> Processes:
+        """The same with what `torchrun` says, where that has started this process.
+
+        Raises:
+            InvalidInputError: more devices than there are, nodes that cannot meet, or others than `torchrun` started.
+        """
+        if _by_torchrun():
+            return self._as_started()
+        if self.devices != AUTO:
+            self._check_devices(int(self.devices))
+        given = {name: value for name in _MEETING if (value := os.environ.get(name, ""))}
+        if self.nodes > 1 and len(given) < len(_MEETING):
+            got = f"no {', '.join(name for name in _MEETING if name not in given)}"
+            expected = "in the environment: MASTER_ADDR and MASTER_PORT of the first node, and NODE_RANK of this one"
+            raise InvalidInputError(f"--nodes {self.nodes}", got, expected)
+        for name, most in (("MASTER_PORT", 65535), ("NODE_RANK", self.nodes - 1)):
+            value = given.get(name, "0")
+            if not (value.isdecimal() and int(value) <= most):
+                raise InvalidInputError(f"--nodes {self.nodes}: {name}", value, f"0 to {most}")
+        return self
+
+    def environment(self) -> ClusterEnvironment:
+        """How the processes find each other."""
+        from lightning.fabric.plugins.environments.lightning import LightningEnvironment
+        from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
+
+        return TorchElasticEnvironment() if _by_torchrun() else LightningEnvironment()
+
+    def _as_started(self) -> Processes:
+        there, all_of_them = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
+        nodes = all_of_them // there
+        for flag, asked, started in (("--devices", self.devices, there), ("--nodes", self.nodes, nodes)):
+            if asked not in (AUTO, 1, started):
+                raise InvalidInputError(flag, asked, f"{started}, as torchrun has started, or nothing")
+        self._check_devices(there)
+        return Processes(there, nodes, self.strategy)
+
+    @staticmethod
+    def _check_devices(devices: int) -> None:
+        if torch.cuda.is_available():
+            there, what = torch.cuda.device_count(), "GPUs"
+        else:
+            there, what = len(os.sched_getaffinity(0)), "cores, without a GPU"
+        if devices > there:
+            raise InvalidInputError("--devices", devices, f"at most {there}: this machine's {what}")
+
+
+AS_IT_IS = Processes()
+"""All GPUs of this machine, or one process."""
+
+ONE = Processes(1)
 
 
 def process_number() -> int:
-    """Of this process, 0 for the one that a user started."""
-    return int(os.environ.get("LOCAL_RANK", "0"))
+    """Of this process, 0 for the first one of the first node; each has another."""
+    if _by_torchrun():
+        return int(os.environ["RANK"])
+    return _MOST_ON_A_NODE * int(os.environ.get("NODE_RANK") or 0) + int(os.environ.get("LOCAL_RANK") or 0)
 
 
 def is_first_process() -> bool:
-    """Whether this is the process that a user started, and not one that Lightning started for a further device."""
+    """Whether this is the process that writes, and shows how far it is."""
     return process_number() == 0
+
+
+def wait_for_first(done: Callable[[], int], count: int, what: str) -> None:
+    """Wait for work of the first process, so long as any of it is done.
+
+    Args:
+        done: how much is there.
+        count: that is waited for.
+        what: for the error.
+
+    Raises:
+        LightpageError: no more has come for half an hour.
+    """
+    seen, since = -1, time.monotonic()
+    while (now := done()) < count:
+        if now != seen:
+            seen, since = now, time.monotonic()
+        if time.monotonic() - since > _PATIENCE_S:
+            expected = "the first process at work in the same folder: --out on storage that every node sees"
+            raise LightpageError(what, f"{now} of {count}, and no more for {_PATIENCE_S:.0f} s", expected)
+        time.sleep(_LOOK_S)
+
+
+class Silence:
+    """Shows nothing: what the first process shows is enough; see `lightpage.progress.Reporter`."""
+
+    def track(
+        self, items: Iterable[T], what: str, unit: str, total: int | None, done: int, state: State
+    ) -> Iterable[T]:
+        """See `Reporter`."""
+        return items
+
+    def note(self, what: str) -> None:
+        """See `Reporter`."""
+
+
+def _by_torchrun() -> bool:
+    return "TORCHELASTIC_RUN_ID" in os.environ

@@ -33,6 +33,7 @@ from train.fitting.memory import keep_freed_memory
 from train.models.field import ROUNDS
 from train.models.hyperparameters import Hyperparameters
 from train.models.network import SymbolUNet
+from train.processes import ONE
 from train.runs import sole_writer
 
 NOTHING = "nothing"
@@ -89,7 +90,7 @@ def without(part: str, bench: Bench, choices: Hyperparameters) -> Outcome:
     training = training_pages([FeatureStore(features, range(len(bench.training)))], bench.mask, choices)
     folder = bench.begun(at / f"{choices.steps}", {"without": part, **asdict(choices)})
     kind = Unconditioned if part == POSITIONS else SymbolUNet
-    fitted = fit_network(folder, choices, bench.mask, LEVELS, training, validation, kind=kind, devices=1)
+    fitted = fit_network(folder, choices, bench.mask, LEVELS, training, validation, kind=kind, processes=ONE)
     drawn = choices.drawn(bench.profile.page_shape)
     size = f"{choices.channels}x{choices.blocks}x{choices.depth}"
     return bench.outcome(part, size, choices.steps, folder, fitted, validation, unseen, preparing, drawn)

@@ -43,6 +43,7 @@ from train.models.decoder import LOCALIZERS
 from train.models.hyperparameters import Hyperparameters
 from train.models.prediction import Prediction
 from train.models.presets import FAST, PRESETS
+from train.processes import ONE
 from train.published.localizers import NAMES as PUBLISHED
 from train.published.states import page_states
 from train.published.trainer import train_published
@@ -166,7 +167,7 @@ class Bench:
         counts = len(self.training), len(self.validation)
         inputs = RefinementPages(self.recording, self.pages, *counts, features)
         key = self.key(base)
-        refined = fit_refinements(folder, choices, inputs, extractor, prediction, first, key, devices=1)
+        refined = fit_refinements(folder, choices, inputs, extractor, prediction, first, key, processes=ONE)
         self.kept.keep(folder)
         at = folder / f"refinement-{choices.refinements}"
         held_out = self.held_out(at / "features")
@@ -242,7 +243,7 @@ class Bench:
         return (
             folder,
             features,
-            fit_network(folder, choices, self.mask, LEVELS, patches, validation, devices=1),
+            fit_network(folder, choices, self.mask, LEVELS, patches, validation, processes=ONE),
             preparing,
         )
 
@@ -266,7 +267,7 @@ class Bench:
         folder = self.begun(self.out / name / f"{size.replace('/', '-')}-{choices.steps}", chosen)
         phase = self.fitted.turn_rad
         trained = train_published(
-            folder, name, choices, self.profile, phase, self.mask, training, validation, devices=1
+            folder, name, choices, self.profile, phase, self.mask, training, validation, processes=ONE
         )
         self.kept.keep(folder)
         drawn = choices.steps * choices.batch

@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from analysis.report.drawing import BLUE, GREEN, GREY, ORANGE, Picture, as_picture, new_figure, one_axis
-from analysis.report.from_bulk import LISTED, MEASURES, BulkData, Device, sessions
+from analysis.report.from_bulk import LISTED, MEASURES, PAGES, BulkData, Device, Recalibration, sessions
 from analysis.report.words import number
 from runtime.scaling.totals import Reading
 
@@ -28,14 +28,14 @@ def shown(data: BulkData) -> dict[str, Any]:
     """The pictures, as the template takes them."""
     readings = data.found.readings
     drawn = data.devices[:_DRAWN]
+    known = [each for each in data.recalibrations or () if each.air_before is not None and each.air_after is not None]
     speeds = [speed(readings, data.unit), page_seconds(readings, data.unit)] if readings else []
-    if data.recalibrated:
-        devices = [recalibrations(drawn)] if any(device.air_after is not None for device in drawn) else []
-    else:
-        devices = [by_device(drawn, measure, data.fleet) for measure in data.measures]
+    devices = [by_device(drawn, measure, data.fleet) for measure in data.measures]
+    if known:
+        devices.append(recalibrations(known[:_DRAWN]))
     return {
         "speeds": speeds,
-        "losses": [losses(data.causes, data.unit)] if data.causes else [],
+        "losses": [losses(data.causes, data.unit, data.lost)] if data.causes else [],
         "devices": devices,
         "measure_names": MEASURES,
         "listed": LISTED,
@@ -105,28 +105,30 @@ def page_seconds(readings: Sequence[Reading], unit: str) -> Picture:
     figure, axis = one_axis()
     axis.hist(seconds, bins=min(40, max(5, len(seconds) // 3)), color=BLUE, edgecolor="white")
     axis.axvline(float(median), color=ORANGE, linestyle="dashed", linewidth=1, label=f"median {number(median, 3)} s")
-    axis.set(xlabel=f"s a {unit[:-1]}, mean of a range", ylabel="ranges")
+    ranges = "ranges" if unit == PAGES else unit
+    axis.set(xlabel=f"s a {unit[:-1]}" + (", mean of a range" if unit == PAGES else ""), ylabel=ranges)
     axis.set_xlim(left=0)
     axis.yaxis.set_major_locator(MaxNLocator(integer=True))
     axis.legend(frameon=False)
-    caption = (
-        f"A worker's time for a {unit[:-1]}, range by range: median {number(median, 3)} s, one in a hundred above "
-        f"{number(slow, 3)} s. Short ranges take longer, since the image is looked for on their first page."
-    )
-    return as_picture(figure, f"Times of {len(seconds):,} ranges, median {number(median, 3)} s.", caption)
+    caption = f"A worker's time for a {unit[:-1]}" + (", range by range" if unit == PAGES else "")
+    caption += f": median {number(median, 3)} s, one in a hundred above {number(slow, 3)} s."
+    if unit == PAGES:
+        caption += " Short ranges take longer, since the image is looked for on their first page."
+    return as_picture(figure, f"Times of {len(seconds):,} {ranges}, median {number(median, 3)} s.", caption)
 
 
-def losses(causes: Sequence[tuple[str, int, float, str]], unit: str) -> Picture:
-    """How many were lost by each cause."""
+def losses(causes: Sequence[tuple[str, int, float, str]], unit: str, lost: str) -> Picture:
+    """How many were lost, or refused, by each cause."""
     figure, axis = one_axis()
     names, counts = [cause for cause, *_ in causes][::-1], [count for _, count, *_ in causes][::-1]
     bars = axis.barh(range(len(names)), counts, color=ORANGE, height=0.6)
     axis.bar_label(bars, [f" {count:,}" for count in counts])
     axis.set_yticks(range(len(names)), names)
-    axis.set(xlabel=f"{unit} lost", xlim=(0, 1.15 * max(counts)), ylim=(-1, len(names)))
+    axis.set(xlabel=f"{unit} {lost}", xlim=(0, 1.15 * max(counts)), ylim=(-1, len(names)))
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     told = ", ".join(f"{count:,} {cause}" for cause, count, *_ in causes)
-    return as_picture(figure, f"Losses by cause: {told}.", f"{unit.capitalize()} lost, by cause.")
+    caption = f"{unit.capitalize()} {lost}, by cause"
+    return as_picture(figure, f"{caption}: {told}.", f"{caption}.")
 
 
 def by_device(devices: Sequence[Device], measure: str, fleet: bool) -> Picture:
@@ -150,25 +152,24 @@ def by_device(devices: Sequence[Device], measure: str, fleet: bool) -> Picture:
     return as_picture(figure, f"{caption[:-1]}, {len(known)} of them.", caption)
 
 
-def recalibrations(devices: Sequence[Device]) -> Picture:
+def recalibrations(known: Sequence[Recalibration]) -> Picture:
     """AIR of each device before and after its recalibration."""
-    known = [device for device in devices if device.air_before is not None and device.air_after is not None][::-1]
     figure, axis = one_axis()
-    for row, device in enumerate(known):
+    for row, device in enumerate(known[::-1]):
         before, after = device.air_before, device.air_after
         if before is None or after is None:
             continue
         axis.plot([before, after], [row, row], color=GREY, linewidth=1)
         axis.plot(before, row, "o", color=ORANGE, fillstyle="none", markersize=5, label=None if row else "before")
         axis.plot(after, row, "o", color=BLUE, markersize=5, label=None if row else "after")
-    _name_rows(axis, known)
+    _name_rows(axis, known[::-1])
     axis.set(xlabel="AIR, bit/symbol")
     figure.legend(frameon=False, loc="outside upper center", ncols=2)
     caption = "AIR of the pages that were held back, with the bundle before and with the new one."
     return as_picture(figure, f"AIR of {len(known)} devices before and after.", caption)
 
 
-def _name_rows(axis: Any, devices: Sequence[Device]) -> None:
+def _name_rows(axis: Any, devices: Sequence[Device | Recalibration]) -> None:
     names = [name if len(name) <= 24 else f"…{name[-23:]}" for name in (device.name for device in devices)]
     axis.set_yticks(range(len(names)), names, fontsize=7 if len(names) > 12 else 9)
     axis.set_ylim(-0.8, max(len(names), 3) - 0.2)

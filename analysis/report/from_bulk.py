@@ -17,7 +17,7 @@ from lightpage.words import counted
 from runtime.scaling.job import Job
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.task import Operation
-from runtime.scaling.totals import AIR, CONFIRMED, Group, Reading, Totals, totals
+from runtime.scaling.totals import AIR, CONFIRMED, DeviceState, Group, Reading, Totals, totals
 from runtime.scaling.volumes import known_files
 
 MARGIN = "margin_bits"
@@ -29,6 +29,8 @@ LISTED = 200
 """Devices, workers or files that are listed; the worst, or the first, of more."""
 _NAMED = 20
 """Parts of an enumeration."""
+PAGES, DEVICES = "pages", "devices"
+_LOST = {PAGES: "lost", DEVICES: "refused"}
 
 
 @dataclass(frozen=True)
@@ -56,21 +58,28 @@ class Device:
         """How many pages by cause, for people."""
         return ", ".join(f"{count:,} {cause}" for cause, count in self.group.tally.lost.most_common())
 
-    @property
-    def air_before(self) -> float | None:
-        """Of a recalibration, by the bundle before it."""
-        return _float(self.group.summary.get("air_before"))
 
-    @property
-    def air_after(self) -> float | None:
-        """Of a recalibration, by the new bundle."""
-        return _float(self.group.summary.get("air_after"))
+@dataclass(frozen=True)
+class Recalibration:
+    """What became of a device that was to be recalibrated.
 
-    @property
-    def result(self) -> str:
-        """Of a recalibration, in a word."""
-        tally = self.group.tally
-        return "failed" if tally.lost else "missing" if tally.missing or not tally.pages else "done"
+    Attributes:
+        name: of the device, or its recording where there is no fleet.
+        recordings: that it has.
+        state: in a word.
+        air_before: by the bundle before, bit/symbol; None where it is not known.
+        air_after: by the new bundle.
+        version: of that; empty without one.
+        reason: why there is none, for people.
+    """
+
+    name: str
+    recordings: int
+    state: DeviceState
+    air_before: float | None
+    air_after: float | None
+    version: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -118,9 +127,9 @@ class BulkData:
         unit: what a piece of the work is, in the plural: pages or devices.
         found: what the run has found.
         causes: of losses: cause, how many, their share of all, and the first one.
-        devices: the worst first.
+        devices: the worst first; none where devices are recalibrated.
         fleet: whether these are devices of a fleet.
-        recalibrated: whether they were recalibrated.
+        recalibrations: of devices, the worst first; None of another operation.
         workers: the busiest first.
         files: of a recovery; None where no run has ended yet, or of another operation.
     """
@@ -134,7 +143,7 @@ class BulkData:
     causes: list[tuple[str, int, float, str]]
     devices: list[Device]
     fleet: bool
-    recalibrated: bool
+    recalibrations: list[Recalibration] | None
     workers: list[Worker]
     files: list[File] | None
 
@@ -144,10 +153,16 @@ class BulkData:
         return [name for name in MEASURES if self.found.figures.value(name) is not None]
 
     @property
+    def lost(self) -> str:
+        """What becomes of pages, or of devices, that are not read."""
+        return _LOST[self.unit]
+
+    @property
     def summary(self) -> str:
         """What matters most, in a few words."""
         tally = self.found.tally
-        return f"{tally.pages - tally.missing:,} of {tally.pages:,} {self.unit} done, {tally.lost.total():,} lost"
+        done = f"{tally.pages - tally.missing:,} of {tally.pages:,} {self.unit} done"
+        return f"{done}, {tally.lost.total():,} {self.lost}"
 
 
 def report_of_bulk(folder: Path) -> BulkData:
@@ -163,9 +178,8 @@ def report_of_bulk(folder: Path) -> BulkData:
     found = totals(ledger, job)
     tally = found.tally
     recalibrated = operation is Operation.RECALIBRATE
-    unit = "devices" if recalibrated else "pages"
+    unit = DEVICES if recalibrated else PAGES
     common = _common_folder(job)
-    devices = _devices(found, common)
     return BulkData(
         title=f"Bulk run {folder.absolute().name}: {operation}",
         told=_told(job, found, unit),
@@ -177,9 +191,9 @@ def report_of_bulk(folder: Path) -> BulkData:
             (cause, count, count / tally.pages, _meaning(cause, found.examples.get(cause, "").replace(common, "")))
             for cause, count in tally.lost.most_common()
         ],
-        devices=devices,
+        devices=_devices(found, common),
         fleet=any(source.device for source in job.sources),
-        recalibrated=recalibrated,
+        recalibrations=_recalibrations(found, common) if recalibrated else None,
         workers=_workers(found.readings),
         files=_files(folder) if operation is Operation.RECOVER else None,
     )
@@ -192,22 +206,31 @@ def begun_s(readings: Sequence[Reading]) -> float:
 
 def _told(job: Job, found: Totals, unit: str) -> str:
     tally = found.tally
-    unopened = sum(source.problem is not None for source in job.sources)
+    unopened, failed = sum(source.problem is not None for source in job.sources), _failed(found)
     named = f" {counted(unopened, 'recording')} could not be opened." if unopened else ""
+    if unit == DEVICES:
+        named = f" {counted(failed, 'device')} failed; the next run tries again." if failed else ""
     if tally.missing:
         missing = f"{tally.missing:,} of {tally.pages:,} {unit} have no result yet"
         return f"Not finished: {missing}. The same command goes on with them.{named}"
     lost = tally.lost.total()
-    end = f"{lost:,} of {tally.pages:,} {unit} are lost" if lost else "none is lost"
+    end = f"{lost:,} of {tally.pages:,} {unit} are {_LOST[unit]}" if lost else f"none is {_LOST[unit]}"
     return f"Finished: {end}.{named}"
+
+
+def _failed(found: Totals) -> int:
+    """Devices that lack something, or have a recording that could not be opened."""
+    return sum(row["state"] is DeviceState.FAILED for row in found.devices)
 
 
 def _cards(found: Totals, unit: str) -> list[tuple[str, str, str]]:
     tally, readings = found.tally, found.readings
     cards = [
         ("Done", f"{tally.pages - tally.missing:,}", f"of {tally.pages:,} {unit}"),
-        ("Lost", f"{tally.lost.total():,}", unit),
+        (_LOST[unit].capitalize(), f"{tally.lost.total():,}", unit),
     ]
+    if failed := _failed(found):
+        cards.append(("Failed", f"{failed:,}", f"{unit}, not among those"))
     if tally.left_out:
         cards.append(("Left out", f"{tally.left_out:,}", "pages that a bundle was made from"))
     for measure, name in MEASURES.items():
@@ -224,14 +247,17 @@ def _cards(found: Totals, unit: str) -> list[tuple[str, str, str]]:
 def _facts(job: Job, found: Totals) -> list[tuple[str, str]]:
     choices, readings, tally = job.choices, found.readings, found.tally
     facts = [
-        ("Recordings", f"{len(job.sources):,}, of {counted(len(found.groups), 'device')}")
+        ("Recordings", f"{len(job.sources):,}, of {counted(len(found.groups or found.devices), 'device')}")
         if any(source.device for source in job.sources)
         else ("Recordings", f"{len(job.sources):,}"),
         ("Bundles", _few([f"{each.version} ({each.path.name}, {each.sha256[:12]})" for each in job.bundles])),
         ("Read by", _few([f"{version}: {count:,}" for version, count in tally.models.most_common()])),
     ]
     if choices.operation is Operation.RECALIBRATE:
-        facts.append(("Known pages", f"{choices.known_pages} a device"))
+        pages, tuning = choices.device_pages, choices.fine_tuning
+        facts.append(("Known pages", "all of each device" if pages is None else f"at most {pages} a device"))
+        if tuning is not None:
+            facts.append(("Network", f"trained on for {tuning.steps:,} steps at a rate of {tuning.learning_rate:g}"))
     else:
         followed = "the image is followed" if choices.tracking else "the image is not followed"
         facts.append(("Ranges", f"of {counted(choices.range_pages, 'page')}, {followed} within each"))
@@ -263,10 +289,29 @@ def _devices(found: Totals, common: str) -> list[Device]:
     def rank(device: Device) -> tuple[float, float]:
         tally, figures = device.group.tally, device.group.figures
         known = (figures.value(name) for name in MEASURES)
-        value = next((value for value in known if value is not None), device.air_after)
+        value = next((value for value in known if value is not None), None)
         return -tally.lost.total() / max(1, tally.pages), float("inf") if value is None else value
 
     return sorted(devices, key=rank)
+
+
+def _recalibrations(found: Totals, common: str) -> list[Recalibration]:
+    """The worst first: refused ones, those that failed, those yet to come, and then by AIR."""
+
+    def device(row: dict[str, Any]) -> Recalibration:
+        made = row["state"] is DeviceState.RECALIBRATED
+        return Recalibration(
+            name=row["device"] or row["recordings"][0].removeprefix(common),
+            recordings=len(row["recordings"]),
+            state=row["state"],
+            air_before=row.get("air_before"),
+            air_after=row.get("air_after"),
+            version=row["version"] if made else "",
+            reason=row["reason"].replace(common, ""),
+        )
+
+    worst = (DeviceState.REFUSED, DeviceState.FAILED, DeviceState.MISSING, DeviceState.RECALIBRATED)
+    return sorted(map(device, found.devices), key=lambda each: (worst.index(each.state), each.air_after or 0.0))
 
 
 def _workers(readings: Sequence[Reading]) -> list[Worker]:
@@ -319,7 +364,3 @@ def _few(parts: list[str]) -> str:
     """An enumeration that does not grow without end."""
     more = f" and {len(parts) - _NAMED:,} more" if len(parts) > _NAMED else ""
     return ", ".join(parts[:_NAMED]) + more if parts else "none"
-
-
-def _float(value: float | str | None) -> float | None:
-    return float(value) if isinstance(value, int | float) else None

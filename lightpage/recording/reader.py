@@ -132,8 +132,14 @@ class Recording:
 
     @property
     def stored_page_bytes(self) -> float:
-        """Bytes that the frame pair of a page takes in the file, compressed as it is; mean over the pages."""
-        stored = sum(int(self._file[name].id.get_storage_size()) for name in FRAMES)
+        """Bytes that the frame pair of a page takes in the file, compressed as it is; mean over the pages.
+
+        Of recordings that are shown as one, it is what their own files take.
+
+        Raises:
+            RecordingError: one of these cannot be read.
+        """
+        stored = sum(_stored_bytes(self._file[name]) for name in FRAMES)
         return stored / max(1, self.pages)
 
     @property
@@ -439,6 +445,15 @@ class Recording:
                 f"a count of {frame.max()}",
                 f"at most {full_scale}, since camera_bit_depth = {self._bit_depth}",
             )
+
+
+def _stored_bytes(frames: Any) -> int:
+    """What a dataset takes, in its file or in those that it shows. The stubs of h5py know nothing of it."""
+    stored = int(frames.id.get_storage_size())
+    for source in frames.virtual_sources() if frames.is_virtual else ():
+        with open_hdf5(Path(source.file_name), f"recording {source.file_name}") as file:
+            stored += int(file[source.dset_name].id.get_storage_size())
+    return stored
 
 
 def _size(shape: tuple[int, int] | None) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lightpage.cli.main import RESUME_KEY
+from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import OutputFile, OutputFolder, check_outputs
 from lightpage.codec.volume_file import ranges
 from lightpage.errors import InvalidInputError, LightpageError, LostDataError
@@ -19,12 +20,13 @@ from lightpage.progress import warn
 from runtime.bundle.shipped import DEFAULT
 from runtime.scaling.driver import Progressed, Watch, run
 from runtime.scaling.engine import Engine
-from runtime.scaling.job import KNOWN_PAGES, RANGE_PAGES, Choices, Job, named_bundle, of_fleet, of_recordings
+from runtime.scaling.fine_tuning import DeepRecalibration, deep_recalibration
+from runtime.scaling.job import KNOWN_PAGES, RANGE_PAGES, Choices, Job, Source, named_bundle, of_fleet, of_recordings
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.local import LocalEngine, default_workers
 from runtime.scaling.part import WHOLE, Part
-from runtime.scaling.task import Operation
-from runtime.scaling.totals import AIR, Totals, totals
+from runtime.scaling.task import FineTuning, Operation
+from runtime.scaling.totals import AIR, DeviceState, Totals, totals
 from runtime.scaling.volumes import RecoveredFile, recovered_files
 from runtime.wire.address import check_address, is_local
 
@@ -113,10 +115,34 @@ def evaluate(**asked: Any) -> None:
 
 @bulk.command()
 @_options
-@click.option("--pages", type=click.IntRange(2), help=f"Known pages to use; {KNOWN_PAGES} by default.")
-def recalibrate(pages: int | None, **asked: Any) -> None:
-    """Recalibrate devices, each from a recording of its own; the new bundles are in OUT."""
-    _bulk(Operation.RECALIBRATE, known_pages=pages, **asked)
+@click.option(
+    "--pages", type=click.IntRange(2), help=f"Known pages to use; {KNOWN_PAGES} by default, or all with --deep."
+)
+@click.option("--deep", is_flag=True, help="Train the network on, too, from the run that the fleet names; needs torch.")
+@click.option(
+    "--steps", type=click.IntRange(10), help=f"With --deep: of the optimiser; {FineTuning().steps} by default."
+)
+@click.option(
+    "--learning-rate",
+    type=FiniteRange(0, min_open=True),
+    help=f"With --deep: at its peak; {FineTuning().learning_rate:g} by default.",
+)
+@click.option(
+    "--synthetic-pages",
+    type=click.IntRange(0),
+    help=f"With --deep: of the drifted device, trained on too; {FineTuning().synthetic_pages} by default.",
+)
+@click.option("--seed", type=click.IntRange(0), help=f"With --deep: of the training; {FineTuning().seed} by default.")
+def recalibrate(pages: int | None, deep: bool, fleet: Path | None, **asked: Any) -> None:
+    """Recalibrate devices, each from recordings of its own; the new bundles are in OUT."""
+    given = {name: value for name in FineTuning.model_fields if (value := asked.pop(name)) is not None}
+    if given and not deep:
+        flag = f"--{next(iter(given)).replace('_', '-')}"
+        raise InvalidInputError(flag, "without --deep", "--deep")
+    if deep and asked["recordings"]:
+        raise InvalidInputError("--deep", "with --recordings", "--fleet, whose file names the devices' training runs")
+    tuning = FineTuning(**given) if deep else None
+    _bulk(Operation.RECALIBRATE, known_pages=pages, fine_tuning=tuning, fleet=fleet, **asked)
 
 
 def _bulk(
@@ -135,7 +161,7 @@ def _bulk(
     metrics_insecure: bool,
     metrics_file: Path | None,
     again_with: str | None = None,
-    **chosen: bool | int | None,
+    **chosen: bool | int | FineTuning | None,
 ) -> None:
     """Run an operation; see the options. Choices that are None are as before, or the default."""
     context = click.get_current_context()
@@ -154,12 +180,14 @@ def _bulk(
                 update={"operation": operation, **given}
             )
             job = _job(ledger.folder, before, choices, recordings, fleet, bundle)
+            if choices.fine_tuning is not None:
+                job = job.checked(partial(_check_device, ledger, deep_recalibration(), choices.known_pages))
             if again_with is not None:
                 job = _with_round(job, again_with)
             job.write(ledger.folder)
         with _watched(ledger.folder.name, operation, metrics_address, metrics_file) as watch:
             made = run(ledger, job, partial(_engine, engine, address, workers, threads), watch)
-        found = totals(ledger, job)
+        found = totals(ledger, job, made.failures)
         files = recovered_files(ledger, job) if operation is Operation.RECOVER and own == WHOLE else []
     if json_path is not None:
         write_json(json_path, figures(job, own, made, found, files))
@@ -229,6 +257,20 @@ def _shown(metrics: BulkMetrics, address: str) -> ConsoleServer:
     return server
 
 
+def _check_device(
+    ledger: Ledger, deep: DeepRecalibration, known_pages: int | None, place: int, own: tuple[Source, ...], bundle: Path
+) -> None:
+    """Check that a device can be recalibrated deeply, unless it is.
+
+    Raises:
+        LightpageError: it cannot.
+    """
+    if ledger.recalibrated(place):
+        return
+    pages = sum(source.pages for source in own)
+    deep.check(bundle, own[0].run, pages if known_pages is None else min(known_pages, pages))
+
+
 def _job(
     folder: Path,
     before: Job | None,
@@ -294,16 +336,17 @@ def figures(job: Job, part: Part, made: Progressed, found: Totals, files: list[R
 def table(job: Job, part: Part, made: Progressed, found: Totals, files: list[RecoveredFile]) -> str:
     """The figures for people."""
     tally, air = found.tally, found.figures.value(AIR)
-    unit = "devices" if job.choices.operation is Operation.RECALIBRATE else "pages"
+    recalibrated = job.choices.operation is Operation.RECALIBRATE
+    unit = "devices" if recalibrated else "pages"
     speed = "" if made.pages_per_s is None else f" in {made.seconds:.1f} s, {made.pages_per_s:.2f} a second"
     causes = ", ".join(f"{count} {cause}" for cause, count in tally.lost.most_common())
     rows = [
         ("part", "" if part == WHOLE else f"{part}; without --part, the same command says it of all parts"),
-        (unit, f"{tally.pages} of {len(found.recordings)} recordings"),
+        (unit, f"{len(found.devices)}" if recalibrated else f"{tally.pages} of {len(found.recordings)} recordings"),
         ("this run", f"{made.pages} {unit}{speed}" if made.pages else "nothing was missing"),
-        ("read", f"{tally.read}"),
+        ("recalibrated" if recalibrated else "read", f"{tally.read}"),
         ("left out", f"{tally.left_out} that a bundle was made from" if tally.left_out else ""),
-        ("lost", f"{tally.lost.total()} ({causes})" if causes else "0"),
+        ("refused" if recalibrated else "lost", f"{tally.lost.total()} ({causes})" if causes else "0"),
         ("missing", f"{tally.missing}, the next run tries them again" if tally.missing else ""),
         ("models", ", ".join(f"{version}: {count}" for version, count in tally.models.items())),
         ("device has changed", f"by {tally.recalibration_due} pages" if tally.recalibration_due else ""),
@@ -316,14 +359,29 @@ def table(job: Job, part: Part, made: Progressed, found: Totals, files: list[Rec
             gain = f"; AIR of them {each.air_before.value:.3f} before, {each.air_after.value:.3f} now"
         told = f"{each.pages} pages: {each.won} won, {each.better} better, {each.lost} lost still{gain}"
         rows.append((f"again, {each.model.version}", told))
-    for row in found.recordings if job.choices.operation is Operation.RECALIBRATE else ():
-        if new := row.get("recalibration"):
-            told = f"{new['version']}, AIR {new['air_before']:.3f} before, {new['air_after']:.3f} now"
-            rows.append((row["device"] or Path(row["recording"]).name, told))
     rows += [
         (f"volume {file.volume.id}", file.error or f"{file.path}, {file.volume.file_bytes} bytes") for file in files
     ]
-    return "\n".join(f"{name:<20} {value}" for name, value in rows if value)
+    told = "\n".join(f"{name:<20} {value}" for name, value in rows if value)
+    return f"{told}\n\n{device_table(found.devices)}" if found.devices else told
+
+
+def device_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What became of each device, for people."""
+
+    def air(value: float | None) -> str:
+        return "" if value is None else f"{value:.3f}"
+
+    cells = [("device", "state", "AIR before", "after", "bundle, or why there is none")]
+    for row in rows:
+        name = row["device"] or Path(row["recordings"][0]).name
+        before, after = (air(row.get(f"air_{when}")) for when in ("before", "after"))
+        cells.append((name, str(row["state"]), before, after, row.get("bundle") or row["reason"]))
+    widths = [max(len(cell[column]) for cell in cells) for column in range(2)]
+    return "\n".join(
+        f"{name:<{widths[0]}}  {state:<{widths[1]}}  {before:>10}  {after:>6}  {told}".rstrip()
+        for name, state, before, after, told in cells
+    )
 
 
 def failure(
@@ -345,4 +403,9 @@ def failure(
             then = "every file is whole all the same" if part == WHOLE else "the files come when all parts are done"
             warn(f"{subject}: {got}; {then}")
         return None
+    if job.choices.operation is Operation.RECALIBRATE:
+        failed = sum(row["state"] is DeviceState.FAILED for row in found.devices)
+        got = f"{lost} of {len(found.devices)} devices refused and {failed} failed ({'; '.join(told)})"
+        expected = "known pages of each device, and all that it needs"
+        return InvalidInputError(subject, got, expected) if lost or made.failed else None
     return InvalidInputError(subject, got, "pages that can be read") if lost or made.failed else None

@@ -51,8 +51,14 @@ def judged_pages(
     return judged
 
 
-def judge(before: float, judged: list[JudgedPage], levels: int) -> None:
+def judge(before: float, judged: list[JudgedPage], levels: int, subject: str = "re-fitted geometry") -> None:
     """Each page must show its symbols, whatever the others do, and all together more of them than before.
+
+    Args:
+        before: AIR of the model in service, bits per symbol.
+        judged: pages as the new one reads them.
+        levels: M of their symbols.
+        subject: what is judged.
 
     Raises:
         RecalibrationRefusedError: they do not.
@@ -67,19 +73,19 @@ def judge(before: float, judged: list[JudgedPage], levels: int) -> None:
     )
     if not worst >= least:
         raise RecalibrationRefusedError(
-            "re-fitted geometry",
+            subject,
             f"an AIR of {worst:.3f} bit/symbol on one of the held-back pages",
             f"at least {least:.3f}: the page does not match its symbols",
         )
     if lost := sum(page.lost is not None for page in judged):
         raise RecalibrationRefusedError(
-            "re-fitted geometry",
+            subject,
             f"{lost} of {len(judged)} held-back pages whose pilots do not confirm what is claimed",
             "pages of this device, as its decoder was trained: else calibrate and train anew",
         )
     if after < before - TOLERATED_LOSS_BITS:
         raise RecalibrationRefusedError(
-            "re-fitted geometry",
+            subject,
             f"an AIR of {after:.3f} bit/symbol on held-back pages",
             f"at least the {before:.3f} of the model in service",
         )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.image_search import REACH_PX
-from lightpage.calibration.interfaces import Twin
+from lightpage.calibration.interfaces import FieldSolver, Twin
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.sampling_table import sampling_table
 from lightpage.errors import BundleError, CalibrationError
@@ -50,6 +50,18 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
             bundle holds no calibration to start from.
         BundleError: the bundle's graphs do not show the field, or hold a geometry that cannot be fed instead.
     """
+    return refit_with(bundle, pages, progress, decoder, OnnxTwin(bundle, TWIN_THREADS), decoder.field_solver)
+
+
+def refit_with(
+    bundle: Bundle,
+    pages: KnownPages,
+    progress: Progress,
+    decoder: Decoder,
+    twin: Twin,
+    solve_field: FieldSolver,
+) -> RefitResult:
+    """The same with any twin and field solver of the bundle's profile."""
     profile, earlier = bundle.profile, calibration_of(bundle)
     if not _REFITTED & decoder.graph.ports.keys():
         among = f"{' or '.join(sorted(_REFITTED))} among them"
@@ -58,7 +70,6 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
     references = pages.references or _kept_references(bundle)
     if references is None:
         raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
-    twin = OnnxTwin(bundle, TWIN_THREADS)
     progress("find the image", 0.0)
     image = _find(decoder, twin, pages, references)
     start = moved_cameras(earlier.vector, image)
@@ -69,7 +80,7 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
     try:
         registered = refine(
             twin,
-            decoder.field_solver,
+            solve_field,
             profile,
             references,
             known,

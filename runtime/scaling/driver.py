@@ -28,6 +28,7 @@ class Progressed:
         ranges: that have a result now.
         failed: ranges, or recordings, without one.
         problems: why, of the first of them.
+        failures: why, of each device that is recalibrated, by its name and first recording.
         restarts: workers that died.
         seconds: that it took.
     """
@@ -37,6 +38,7 @@ class Progressed:
     ranges: int = 0
     failed: int = 0
     problems: list[Problem] = field(default_factory=list)
+    failures: dict[tuple[str, Path], Problem] = field(default_factory=dict)
     restarts: int = 0
     seconds: float = 0.0
 
@@ -48,6 +50,8 @@ class Progressed:
     def count(self, outcome: Outcome) -> int:
         """Count an outcome and return how much of the work it was worth."""
         if isinstance(outcome, Failed):
+            if outcome.task.operation is Operation.RECALIBRATE:
+                self.failures[outcome.task.device, outcome.task.recording] = outcome.problem
             self.fail(outcome.problem.about(outcome.task.device))
             return 0
         self.ranges += 1
@@ -162,7 +166,6 @@ def _steps(engine: Engine, tasks: Iterable[Task], made: Progressed, watch: Watch
 
 def _all(ledger: Ledger, job: Job) -> int:
     """Pages of the ledger's part of the job, or devices."""
-    sources = [source for _, source in ledger.sources(job)]
     if job.choices.operation is Operation.RECALIBRATE:
-        return sum(source.stamp is not None for source in sources)
-    return sum(source.pages for source in sources)
+        return sum(all(source.problem is None for source in own) for _, own in ledger.devices(job))
+    return sum(source.pages for _, source in ledger.sources(job))

@@ -15,8 +15,9 @@ THREADS_OF_WORKER = 2
 """Of an inference, where nothing else is asked for and there are as many cores: a second thread is worth nearly one
 core, and a worker takes as much memory as `lightpage evaluate`."""
 
-_START_S, _PAGE_S, _RECALIBRATION_S = 600.0, 60.0, 7200.0
-"""Longest time of a worker's start, of a page, and of a recalibration; one that takes longer is taken for dead."""
+_START_S, _PAGE_S, _RECALIBRATION_S, _FINE_TUNING_S = 600.0, 60.0, 7200.0, 86_400.0
+"""Longest time of a worker's start, of a page, of a recalibration, and of one that trains the network on; a worker that
+takes longer is taken for dead."""
 
 
 class Engine(Protocol):
@@ -66,7 +67,9 @@ def next_attempt(tasks: Iterator[Task]) -> Attempt | None:
 
 def longest_s(task: Task) -> float:
     """Seconds after which a worker that has not done a task is taken for dead."""
-    return _START_S + (_RECALIBRATION_S if task.operation is Operation.RECALIBRATE else _PAGE_S * len(task.pages))
+    if task.operation is not Operation.RECALIBRATE:
+        return _START_S + _PAGE_S * len(task.pages)
+    return _START_S + (_RECALIBRATION_S if task.fine_tuning is None else _FINE_TUNING_S)
 
 
 def given_up(task: Task, got: str) -> Failed:

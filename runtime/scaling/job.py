@@ -5,19 +5,19 @@ from __future__ import annotations
 import glob
 import hashlib
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 from pydantic import ValidationError
 
-from lightpage.errors import BundleError, InvalidInputError, RecordingError
+from lightpage.errors import BundleError, InvalidInputError, LightpageError, RecordingError
 from lightpage.files import replace_text
 from lightpage.recording.reader import Recording
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import MANIFEST
 from runtime.bundle.shipped import bundle_path
-from runtime.scaling.task import NamedBundle, Operation, Plain, Problem, Stamp
+from runtime.scaling.task import FineTuning, NamedBundle, Operation, Plain, Problem, Stamp
 
 FILE = "job.json"
 
@@ -38,7 +38,8 @@ class Source(Plain):
         bundle: place of its bundle among the run's.
         stamp: of the file when the run began; None where it could not be opened.
         pages: that it has.
-        problem: why it could not be opened; None where it could.
+        problem: why it could not be opened, or why its device lacks what it needs; None where all is there.
+        run: folder of the training run that its device's bundle was made from, where the fleet names it.
     """
 
     device: str
@@ -47,6 +48,7 @@ class Source(Plain):
     stamp: Stamp | None
     pages: int
     problem: Problem | None = None
+    run: Path | None = None
 
 
 class Choices(Plain):
@@ -57,7 +59,8 @@ class Choices(Plain):
         range_pages: pages of a range.
         tracking: whether the image is followed within a range.
         symbols: whether decoding keeps symbols and confidences.
-        known_pages: that a device is recalibrated with.
+        known_pages: that a device is recalibrated with; None for `KNOWN_PAGES`, or all of them with `fine_tuning`.
+        fine_tuning: how devices are trained on after the fit of their geometry; None to fit the geometry alone.
         parts: that processes do independently of each other.
     """
 
@@ -65,8 +68,14 @@ class Choices(Plain):
     range_pages: int = RANGE_PAGES
     tracking: bool = True
     symbols: bool = True
-    known_pages: int = KNOWN_PAGES
+    known_pages: int | None = None
+    fine_tuning: FineTuning | None = None
     parts: int = 1
+
+    @property
+    def device_pages(self) -> int | None:
+        """Known pages that a device is recalibrated with; None for all that it has."""
+        return self.known_pages or (KNOWN_PAGES if self.fine_tuning is None else None)
 
 
 class Job(Plain):
@@ -113,8 +122,33 @@ class Job(Plain):
 
     def looked_at_again(self) -> Job:
         """The same; recordings that could not be opened before are tried once more."""
-        again = (s if s.problem is None else look_at(s.device, s.path, s.bundle) for s in self.sources)
+        again = (s if s.problem is None else look_at(s.device, s.path, s.bundle, s.run) for s in self.sources)
         return self.model_copy(update={"sources": tuple(again)})
+
+    @property
+    def devices(self) -> dict[int, tuple[Source, ...]]:
+        """Recordings of each device of a fleet by the place of its first one; without a fleet each by itself.
+
+        Those of a device are next to each other.
+        """
+        first: dict[str, int] = {}
+        found: dict[int, tuple[Source, ...]] = {}
+        for index, source in enumerate(self.sources):
+            place = first.setdefault(source.device, index) if source.device else index
+            found[place] = (*found.get(place, ()), source)
+        return found
+
+    def checked(self, check: Callable[[int, tuple[Source, ...], Path], None]) -> Job:
+        """The same; a device that `check` refuses, given its place, recordings and bundle's path, has a problem."""
+        sources = list(self.sources)
+        for place, own in self.devices.items():
+            if any(source.problem is not None for source in own):
+                continue
+            try:
+                check(place, own, self.bundles[own[0].bundle].path)
+            except LightpageError as error:
+                sources[place] = own[0].model_copy(update={"problem": Problem.of(error)})
+        return self.model_copy(update={"sources": tuple(sources)})
 
     def check(self, folder: Path, asked: Job) -> None:
         """Check that a run asks what was asked before; files that have gone or changed are the workers' to tell.
@@ -127,8 +161,13 @@ class Job(Plain):
             if (now := getattr(asked.choices, name)) != before:
                 raise InvalidInputError(f"{subject}: {name}", f"{now}, and {before} before", expected)
         before_paths = {(s.device, s.path): self.bundles[s.bundle] for s in self.sources}
+        runs = {source.device: source.run for source in self.sources}
         for source in asked.sources:
             bundle = before_paths.pop((source.device, source.path), None)
+            if self.choices.fine_tuning is not None and (run := runs.get(source.device)) != source.run:
+                raise InvalidInputError(
+                    f"{subject}: run of {source.device}", f"{source.run}, and {run} before", expected
+                )
             if bundle is None:
                 raise InvalidInputError(subject, f"recording {source.path}, which was not asked for before", expected)
             now = asked.bundles[source.bundle]
@@ -177,19 +216,25 @@ def found_recordings(patterns: Sequence[str]) -> list[Path]:
     return list(found)
 
 
-def look_at(device: str, path: Path, bundle: int, known: Mapping[tuple[str, Path], Source] | None = None) -> Source:
+def look_at(
+    device: str,
+    path: Path,
+    bundle: int,
+    run: Path | None = None,
+    known: Mapping[tuple[str, Path], Source] | None = None,
+) -> Source:
     """A recording as it is now, or as it is known; one that cannot be opened is kept with its problem."""
     if known and (source := known.get((device, path))) is not None:
-        return source.model_copy(update={"bundle": bundle})
+        return source.model_copy(update={"bundle": bundle, "run": run})
     try:
         stamp = Stamp.of(path)
         with Recording.open(path) as recording:
-            return Source(device=device, path=path, bundle=bundle, stamp=stamp, pages=recording.pages)
+            return Source(device=device, path=path, bundle=bundle, stamp=stamp, pages=recording.pages, run=run)
     except RecordingError as error:
         problem = Problem.of(error)
     except OSError as error:
         problem = Problem.of(RecordingError(f"recording {path}", error, "a recording"))
-    return Source(device=device, path=path, bundle=bundle, stamp=None, pages=0, problem=problem)
+    return Source(device=device, path=path, bundle=bundle, stamp=None, pages=0, problem=problem, run=run)
 
 
 def of_recordings(choices: Choices, patterns: Sequence[str], bundle: str, before: Job | None) -> Job:
@@ -205,7 +250,7 @@ def of_recordings(choices: Choices, patterns: Sequence[str], bundle: str, before
         LightpageError: no such bundle, or no such files.
     """
     known = _known(before)
-    sources = tuple(look_at("", path, 0, known) for path in found_recordings(patterns))
+    sources = tuple(look_at("", path, 0, known=known) for path in found_recordings(patterns))
     return Job(choices=choices, bundles=(named_bundle(bundle),), sources=sources)
 
 
@@ -213,6 +258,7 @@ class _Device(Plain):
     name: str
     bundle: str
     recordings: tuple[str, ...]
+    run: str | None = None
 
 
 class _Fleet(Plain):
@@ -243,7 +289,8 @@ def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
     for device in fleet.device:
         place = bundles.setdefault(_beside(path, device.bundle), len(bundles))
         patterns = [str(path.parent / pattern) for pattern in device.recordings]
-        sources += [look_at(device.name, found, place, known) for found in found_recordings(patterns)]
+        run = None if device.run is None else (path.parent / device.run).absolute()
+        sources += [look_at(device.name, found, place, run, known) for found in found_recordings(patterns)]
     return Job(choices=choices, bundles=tuple(map(named_bundle, bundles)), sources=tuple(sources))
 
 

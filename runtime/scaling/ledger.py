@@ -16,7 +16,7 @@ from lightpage.errors import InvalidInputError, TakenError
 from runtime.scaling.job import Job, Source
 from runtime.scaling.part import WHOLE, Part
 from runtime.scaling.shard import RECORD, PageRecord, ShardRecord
-from runtime.scaling.task import Operation, Task
+from runtime.scaling.task import Operation, RecordedFile, Task
 
 _LOCK, _QUESTION, _SHARDS = "lock", "lock-job", "shards"
 
@@ -100,6 +100,10 @@ class Ledger:
         """Recordings of the part, each with its place among the run's."""
         return self.part.sources(job)
 
+    def devices(self, job: Job) -> Iterator[tuple[int, tuple[Source, ...]]]:
+        """Recordings of each device of the part, with the place of its first one among the run's."""
+        return self.part.devices(job)
+
     def sweep(self, job: Job) -> None:
         """Remove what workers that were killed have left half-written; none of this part may be at work."""
         for index, _ in self.sources(job):
@@ -118,7 +122,14 @@ class Ledger:
         return self.folder / _SHARDS / f"{source:06d}" / f"{first:08d}{again}"
 
     def missing(self, job: Job) -> Iterator[Task]:
-        """Ranges of the first reading that have no result, recording by recording."""
+        """Ranges of the first reading that have no result, recording by recording; or such devices."""
+        if job.choices.operation is Operation.RECALIBRATE:
+            for index, own in self.devices(job):
+                device = self._device(job, index, own)
+                if device is not None and not self.recalibrated(index):
+                    _make(device.shard.parent)
+                    yield device
+            return
         for index, source in self.sources(job):
             there = self.results(index)
             for task in self.ranges(job, index, source):
@@ -167,11 +178,10 @@ class Ledger:
 
     def ranges(self, job: Job, index: int, source: Source) -> Iterator[Task]:
         """All ranges of a recording, whether they are done or not."""
+        choices = job.choices
         if source.stamp is None:
             return
-        choices = job.choices
-        one_device = choices.operation is Operation.RECALIBRATE
-        count, step = (choices.known_pages,) * 2 if one_device else (source.pages, choices.range_pages)
+        count, step = source.pages, choices.range_pages
         for first in range(0, count, step):
             yield Task(
                 operation=choices.operation,
@@ -184,6 +194,30 @@ class Ledger:
                 tracking=choices.tracking,
                 symbols=choices.symbols,
             )
+
+    def _device(self, job: Job, index: int, own: tuple[Source, ...]) -> Task | None:
+        """The task of a device, whose first recording has this place; None where something of it is lacking."""
+        if any(each.problem is not None for each in own):
+            return None
+        choices, (first, *others) = job.choices, own
+        count = choices.device_pages or sum(each.pages for each in own)
+        assert first.stamp is not None  # it has no problem
+        return Task(
+            operation=choices.operation,
+            device=first.device,
+            recording=first.path,
+            stamp=first.stamp,
+            pages=tuple(range(count)),
+            bundle=job.bundles[first.bundle],
+            shard=self.shard(index, 0),
+            more=tuple(RecordedFile(path=each.path, stamp=each.stamp) for each in others if each.stamp is not None),
+            run=first.run,
+            fine_tuning=choices.fine_tuning,
+        )
+
+    def recalibrated(self, place: int) -> bool:
+        """Whether a device has a result, by the place of its first recording."""
+        return self.shard(place, 0).name in self.results(place)
 
     def results(self, source: int) -> frozenset[str]:
         """Names of the shards that a recording has."""

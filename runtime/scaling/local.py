@@ -9,15 +9,16 @@ from collections.abc import Generator, Iterable, Sized
 
 from pydantic import TypeAdapter
 
+from lightpage.progress import note
 from runtime.errors import WorkerError
 from runtime.execution.cpus import available_cpus
 from runtime.helper_process import HelperProcess, same_packages
 from runtime.scaling.engine import ATTEMPTS, THREADS_OF_WORKER, Attempt, given_up, longest_s, next_attempt
-from runtime.scaling.task import Outcome, Task
+from runtime.scaling.task import Outcome, Step, Task
 
 WORKER = "runtime.scaling.local_worker"
 
-_OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
+_ANSWER: TypeAdapter[Outcome | Step] = TypeAdapter(Outcome | Step)
 
 _SEND_S = 60.0
 """A task is a few kilobytes, and the worker waits for it."""
@@ -75,9 +76,14 @@ class LocalEngine:
                         else:
                             yield given_up(attempt.task, _told(worker, error))
                         continue
+                    answer = _ANSWER.validate_json(line)
+                    if isinstance(answer, Step):
+                        note(f"device {answer.device}: {answer.what}")
+                        busy[worker] = attempt
+                        continue
                     free.append(worker)
                     self._count(busy, free)
-                    yield _OUTCOME.validate_json(line)
+                    yield answer
         finally:
             for worker in (*busy, *free):
                 worker.end()
@@ -106,9 +112,9 @@ class LocalEngine:
 
 def _heard(busy: dict[HelperProcess, Attempt]) -> list[HelperProcess]:
     """Workers that have answered or ended, at least one; those whose time is up among them."""
-    ended = [worker for worker in busy if worker.fileno() < 0]
-    if ended:
-        return ended
+    heard = [worker for worker in busy if worker.fileno() < 0 or worker.has_line()]
+    if heard:
+        return heard
     left = min(attempt.deadline for attempt in busy.values()) - time.monotonic()
     ready, _, _ = select.select(list(busy), [], [], max(0.0, left))
     now = time.monotonic()

@@ -30,6 +30,7 @@ def main(worker: Worker) -> None:
             os._exit(_DRIVER_GONE)
 
     threading.Thread(target=listen, name="lightpage-driver", daemon=True).start()
+    worker.tell = lambda step: link.sendall(step.model_dump_json().encode() + b"\n")
     while True:
         outcome = worker.work(Task.model_validate_json(tasks.get()))
         link.sendall(outcome.model_dump_json().encode() + b"\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import islice
 
 from lightpage.errors import InvalidInputError
 from runtime.scaling.job import Job, Source
@@ -35,10 +36,12 @@ class Part(Plain):
 
     def sources(self, job: Job) -> Iterator[tuple[int, Source]]:
         """Its recordings, each with its place among the run's."""
-        places: dict[str | int, int] = {}
-        for index, source in enumerate(job.sources):
-            if places.setdefault(source.device or index, len(places)) % self.count == self.index:
-                yield index, source
+        for place, own in self.devices(job):
+            yield from enumerate(own, place)
+
+    def devices(self, job: Job) -> Iterator[tuple[int, tuple[Source, ...]]]:
+        """Recordings of each of its devices; see `runtime.scaling.job.Job.devices`."""
+        return islice(job.devices.items(), self.index, None, self.count)
 
     def __str__(self) -> str:
         return f"{self.index}/{self.count}"

@@ -18,7 +18,7 @@ from lightpage.files import replace_file, replace_text
 from lightpage.metrics.reliability import ConfidenceBin
 from runtime.scaling.task import NamedBundle, Plain
 
-RECORD, SYMBOLS, USER_BYTES, BUNDLE = ".json", ".h5", ".npz", ".zip"
+RECORD, SYMBOLS, USER_BYTES, BUNDLE, TRAINING, LOG = ".json", ".h5", ".npz", ".zip", ".run", ".log"
 """Ends of the names of a shard's files. The record is written last: without one, there is no result."""
 
 

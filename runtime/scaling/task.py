@@ -77,6 +77,29 @@ class Stamp(Plain):
         return cls(size=found.st_size, modified_ns=found.st_mtime_ns)
 
 
+class RecordedFile(Plain):
+    """A recording, and how to know it again."""
+
+    path: Path
+    stamp: Stamp
+
+
+class FineTuning(Plain):
+    """How the network of a device is trained on, once its geometry is found.
+
+    Attributes:
+        steps: of the optimiser.
+        learning_rate: at its peak.
+        synthetic_pages: trained on beside the known ones.
+        seed: of batches and rotations.
+    """
+
+    steps: int = 600
+    learning_rate: float = 1e-3
+    synthetic_pages: int = 0
+    seed: int = 0
+
+
 class Task(Plain):
     """A range of pages of one recording, or one device to recalibrate.
 
@@ -90,6 +113,9 @@ class Task(Plain):
         shard: path of the result, without the end of its name.
         tracking: whether the image is followed within the range.
         symbols: whether decoding keeps symbols and confidences.
+        more: further recordings of a device that is recalibrated, whose pages follow those of the first.
+        run: of a device that is recalibrated deeply: folder of the training run that its bundle was made from.
+        fine_tuning: how it is trained then; None for a re-fit of the geometry alone.
     """
 
     operation: Operation
@@ -101,6 +127,14 @@ class Task(Plain):
     shard: Path
     tracking: bool = True
     symbols: bool = True
+    more: tuple[RecordedFile, ...] = ()
+    run: Path | None = None
+    fine_tuning: FineTuning | None = None
+
+    @property
+    def files(self) -> tuple[RecordedFile, ...]:
+        """All recordings, in order."""
+        return (RecordedFile(path=self.recording, stamp=self.stamp), *self.more)
 
     @property
     def weight(self) -> int:
@@ -110,8 +144,22 @@ class Task(Plain):
     @property
     def name(self) -> str:
         """Of the range, for people."""
-        whole = self.operation is Operation.RECALIBRATE
-        return f"recording {self.recording}" + ("" if whole else f": pages {self.pages[0]}-{self.pages[-1]}")
+        if self.operation is Operation.RECALIBRATE:
+            return f"recording {self.recording}" + (f" and {len(self.more)} more" if self.more else "")
+        return f"recording {self.recording}: pages {self.pages[0]}-{self.pages[-1]}"
+
+
+class Step(Plain):
+    """What a worker does with a device at the moment.
+
+    Attributes:
+        device: its name.
+        what: for people.
+    """
+
+    kind: Literal["step"] = "step"
+    device: str
+    what: str
 
 
 class Done(Plain):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,27 @@ from lightpage.metrics.reliability import ConfidenceBin, calibration_error
 from runtime.scaling.job import Job, Source
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.shard import BUNDLE, PageRecord, PageState, ShardRecord, record_of, with_end
-from runtime.scaling.task import NamedBundle, Operation, Task
+from runtime.scaling.task import NamedBundle, Operation, Problem, Task
 
 AIR, CONFIRMED = "air_bits_per_symbol", "confirmed_bits"
 
+UNKNOWN = "unknown"
+"""Cause of a loss that has none."""
+
 TOLD = 5
 """Lost pages that are told with their reasons."""
+
+
+class DeviceState(StrEnum):
+    """What became of a device that was to be recalibrated."""
+
+    RECALIBRATED = "recalibrated"
+    REFUSED = "refused"
+    """It stays as it is: its pages fit no geometry, or the new model would read them worse."""
+    FAILED = "failed"
+    """The next run tries it again."""
+    MISSING = "missing"
+    """It was not come to."""
 
 
 class Mean:
@@ -94,7 +110,7 @@ class Tally:
         self.left_out += page.state is PageState.LEFT_OUT
         self.recalibration_due += page.recalibration_due and page.state is PageState.READ
         if page.state is PageState.LOST:
-            self.lost[page.loss or "unknown"] += 1
+            self.lost[page.loss or UNKNOWN] += 1
 
     def to_json(self) -> dict[str, Any]:
         """The counts under the names that other programs read."""
@@ -188,14 +204,12 @@ class Group:
         tally: of their pages.
         figures: of those that were read.
         told: the first problem that anything of it had, for people; empty without one.
-        summary: of its recalibration, see `runtime.scaling.shard.ShardRecord`.
     """
 
     recordings: int = 0
     tally: Tally = field(default_factory=Tally)
     figures: Means = field(default_factory=Means)
     told: str = ""
-    summary: dict[str, float | str | None] = field(default_factory=dict)
 
 
 @dataclass
@@ -207,10 +221,11 @@ class Totals:
         figures: means over the pages that were read.
         confidence_bins: of all pages of an evaluation together.
         rounds: what later readings have brought.
-        recordings: a row each.
+        recordings: a row each, unless devices are recalibrated.
+        devices: a row each, where they are.
         lost: the first lost pages, or devices, and why.
         examples: the first one of each cause.
-        groups: by device; by recording where there is no fleet.
+        groups: by device, unless devices are recalibrated; by recording where there is no fleet.
         readings: all ranges that were done, a few numbers each.
     """
 
@@ -219,6 +234,7 @@ class Totals:
     confidence_bins: dict[tuple[float, float], list[float]] = field(default_factory=dict)
     rounds: list[Round] = field(default_factory=list)
     recordings: list[dict[str, Any]] = field(default_factory=list)
+    devices: list[dict[str, Any]] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     examples: dict[str, str] = field(default_factory=dict)
     groups: dict[str, Group] = field(default_factory=dict)
@@ -240,26 +256,65 @@ class Totals:
             "models": dict(self.tally.models),
             "figures": {**self.figures.to_json(), **({} if self.ece is None else {"ece": self.ece})},
             "rounds": [each.to_json() for each in self.rounds],
-            "recordings": self.recordings,
+            **({"devices": self.devices} if self.devices else {"recordings": self.recordings}),
         }
 
 
-def totals(ledger: Ledger, job: Job) -> Totals:
+def totals(ledger: Ledger, job: Job, failures: Mapping[tuple[str, Path], Problem] | None = None) -> Totals:
     """Add up what the shards of a job say, or of the ledger's part of it; a shard is read at a time.
+
+    Args:
+        ledger: of the job.
+        job: what was asked.
+        failures: why devices have no result, see `runtime.scaling.driver.Progressed`.
 
     Raises:
         InvalidInputError: a shard cannot be read.
     """
     found = Totals(rounds=[Round(model) for model in job.rounds])
+    if job.choices.operation is Operation.RECALIBRATE:
+        for index, own in ledger.devices(job):
+            _add_device(found, ledger, index, own, failures or {})
+        return found
     for index, source in ledger.sources(job):
         _add_recording(found, ledger, job, index, source)
     return found
 
 
+def _add_device(
+    found: Totals,
+    ledger: Ledger,
+    index: int,
+    own: tuple[Source, ...],
+    failures: Mapping[tuple[str, Path], Problem],
+) -> None:
+    shard, first = ledger.shard(index, 0), own[0]
+    row: dict[str, Any] = {"device": first.device, "recordings": [str(source.path) for source in own]}
+    problem = next((source.problem for source in own if source.problem is not None), None)
+    if problem is None:
+        found.tally.pages += 1
+        problem = failures.get((first.device, first.path))
+    if ledger.recalibrated(index):
+        record = ShardRecord.read(shard)
+        page = record.pages[0]
+        found.tally.add(page)
+        found.tally.models[record.model.version] += 1
+        found.readings.append(Reading.of(shard, record, 1))
+        state = DeviceState.RECALIBRATED if page.state is PageState.READ else DeviceState.REFUSED
+        row |= {"state": state, "air_before": None, "air_after": None, **record.summary, "reason": page.reason}
+        if state is DeviceState.RECALIBRATED:
+            row["bundle"] = str(with_end(shard, BUNDLE))
+        else:
+            _tell_lost(found, page, f"{_recording(first)}: {page.reason}")
+    else:
+        state = DeviceState.MISSING if problem is None else DeviceState.FAILED
+        row |= {"state": state, "reason": "" if problem is None else str(problem)}
+    found.devices.append(row)
+
+
 def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: Source) -> None:
     own, figures, there = Tally(), Means(), ledger.results(index)
     lost: dict[str, list[int]] = {}
-    summary: dict[str, float | str | None] = {}
     group = found.groups.setdefault(source.device or str(source.path), Group())
     group.recordings += 1
     if source.problem is not None:
@@ -268,7 +323,6 @@ def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: 
         for tally in (own, group.tally, found.tally):
             tally.pages += task.weight
         for record, page in _pages(found, ledger, job, index, task, there):
-            summary = group.summary = record.summary
             for tally in (own, group.tally, found.tally):
                 tally.add(page)
                 tally.models[record.model.version] += 1
@@ -278,19 +332,13 @@ def _add_recording(found: Totals, ledger: Ledger, job: Job, index: int, source: 
                     if page.confirmed_bits is not None:
                         means.add({CONFIRMED: page.confirmed_bits})
             elif page.state is PageState.LOST:
-                told, cause = f"{_name(source, task, page)}: {page.reason}", page.loss or "unknown"
-                lost.setdefault(cause, []).append(page.page)
-                found.examples.setdefault(cause, told)
+                lost.setdefault(page.loss or UNKNOWN, []).append(page.page)
                 group.told = group.told or page.reason
-                if len(found.lost) < TOLD:
-                    found.lost.append(told)
+                _tell_lost(found, page, f"{_recording(source)}: page {page.page}: {page.reason}")
     row = {"device": source.device, "recording": str(source.path), **own.to_json()}
-    if job.choices.operation is not Operation.RECALIBRATE:
-        row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
+    row |= {"lost_pages": {cause: ranges(pages) for cause, pages in lost.items()}, "figures": figures.to_json()}
     if source.problem is not None:
         row["problem"] = str(source.problem)
-    if summary:
-        row["recalibration"] = {**summary, "bundle": str(with_end(ledger.shard(index, 0), BUNDLE))}
     found.recordings.append(row)
 
 
@@ -321,10 +369,15 @@ def _pages(
     yield from best.values()
 
 
-def _name(source: Source, task: Task, page: PageRecord) -> str:
+def _tell_lost(found: Totals, page: PageRecord, told: str) -> None:
+    found.examples.setdefault(page.loss or UNKNOWN, told)
+    if len(found.lost) < TOLD:
+        found.lost.append(told)
+
+
+def _recording(source: Source) -> str:
     device = f"device {source.device}: " if source.device else ""
-    number = "" if task.operation is Operation.RECALIBRATE else f": page {page.page}"
-    return f"{device}recording {source.path}{number}"
+    return f"{device}recording {source.path}"
 
 
 def _air(page: PageRecord) -> float:

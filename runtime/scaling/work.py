@@ -7,6 +7,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -20,6 +21,7 @@ from lightpage.codec.volume import Volume
 from lightpage.errors import (
     BundleError,
     CalibrationError,
+    FrameError,
     InvalidInputError,
     LightpageError,
     RecalibrationRefusedError,
@@ -28,8 +30,9 @@ from lightpage.errors import (
 from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.measures import PageMeasures, measure
 from lightpage.page.pilots import Pilots
-from lightpage.progress import warn
+from lightpage.progress import reporting, warn
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.joined import join
 from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import check_recording, decode_unseen, pilots_of
 from runtime.bulk.read_ahead import read_ahead
@@ -45,11 +48,27 @@ from runtime.recalibration.known_pages import read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
 from runtime.recalibration.recalibration import next_version, recalibrate
 from runtime.recalibration.refit import refit
+from runtime.scaling.fine_tuning import DeepRecalibration, deep_recalibration
 from runtime.scaling.job import bundle_sha256
-from runtime.scaling.shard import BUNDLE, SYMBOLS, PageRecord, PageState, ShardRecord, with_end, write_user_bytes
-from runtime.scaling.task import Done, Failed, NamedBundle, Operation, Outcome, Problem, Stamp, Task
+from runtime.scaling.shard import (
+    BUNDLE,
+    LOG,
+    SYMBOLS,
+    TRAINING,
+    PageRecord,
+    PageState,
+    ShardRecord,
+    with_end,
+    write_user_bytes,
+)
+from runtime.scaling.steps import StepLog
+from runtime.scaling.task import Done, Failed, NamedBundle, Operation, Outcome, Problem, Stamp, Step, Task
 
 T = TypeVar("T")
+
+
+_OF_THE_DEVICE = (RecalibrationRefusedError, CalibrationError, FrameError)
+"""What a deep recalibration finds of a device; anything else is tried again by the next run."""
 
 
 class Changed(RecordingError):
@@ -62,10 +81,17 @@ class Worker:
     Args:
         threads: of an inference.
         fit: how a device is re-fitted.
+        deep: gives what recalibrates deeply.
+
+    Attributes:
+        tell: called with the step that a deep recalibration is at.
     """
 
-    def __init__(self, threads: int, fit: Refit = refit) -> None:
-        self._threads, self._fit = threads, fit
+    def __init__(
+        self, threads: int, fit: Refit = refit, deep: Callable[[], DeepRecalibration] = deep_recalibration
+    ) -> None:
+        self._threads, self._fit, self._deep = threads, fit, deep
+        self.tell: Callable[[Step], None] = lambda step: None
         self._warm: tuple[NamedBundle, _Warm] | None = None
 
     def work(self, task: Task) -> Outcome:
@@ -78,10 +104,10 @@ class Worker:
         try:
             _check_stamp(task)
             warm = self._opened(task.bundle)
-            with Recording.open(task.recording) as recording:
+            with _recording_of(task) as recording:
                 check_recording(warm.decoder, recording)
                 record = self._record(task, recording, warm)
-                read_bytes = round(recording.stored_page_bytes * len(task.pages))
+                read_bytes = round(recording.stored_page_bytes * min(len(task.pages), recording.pages))
             whole = False
             _check_stamp(task)
             record = record.model_copy(update=self._told(start, read_bytes))
@@ -137,13 +163,38 @@ class Worker:
         out = with_end(task.shard, BUNDLE)
         out.unlink(missing_ok=True)  # of a worker that was killed before it wrote the record
         try:
-            known = read_recorded(recording, first_lit_pages(recording, len(task.pages), warn))
-            outcome = recalibrate(decoder, known, out, next_version(decoder.version), self._fit, lambda *_: None)
+            if task.fine_tuning is not None:
+                outcome = self._fine_tuned(task, recording, decoder)
+            else:
+                known = read_recorded(recording, first_lit_pages(recording, len(task.pages), warn))
+                outcome = recalibrate(decoder, known, out, next_version(decoder.version), self._fit, lambda *_: None)
         except (RecalibrationRefusedError, CalibrationError, InvalidInputError) as error:
+            if task.fine_tuning is not None and not isinstance(error, _OF_THE_DEVICE):
+                raise
             lost = PageRecord(page=0, state=PageState.LOST, loss=type(error).__name__, reason=str(error))
             return ShardRecord(model=task.bundle, pages=(lost,), seconds=0.0)
         read = PageRecord(page=0, state=PageState.READ)
         return ShardRecord(model=task.bundle, pages=(read,), seconds=0.0, summary=_summary(outcome))
+
+    def _fine_tuned(self, task: Task, recording: Recording, decoder: Decoder) -> RecalibrationOutcome:
+        """Recalibrate a device deeply, or go on where an earlier run was ended."""
+        assert task.fine_tuning is not None  # or it would be re-fitted
+        if task.run is None:
+            raise InvalidInputError(f"device {task.device}", "no run", "the training run that its bundle was made from")
+        log = StepLog(
+            with_end(task.shard, LOG), lambda what: self.tell(Step(device=task.device or task.name, what=what))
+        )
+        with reporting(log):
+            return self._deep().recalibrate(
+                decoder,
+                recording,
+                task.run,
+                with_end(task.shard, TRAINING),
+                with_end(task.shard, BUNDLE),
+                task.fine_tuning,
+                len(task.pages),
+                log.progress,
+            )
 
 
 class _Warm:
@@ -266,20 +317,41 @@ def lost_page(page: int, error: LightpageError) -> PageRecord:
     return PageRecord(page=page, state=PageState.LOST, loss=loss, reason=str(error), recalibration_due=due)
 
 
-def _check_stamp(task: Task) -> None:
-    """Check that a recording is the one that the run began with.
+@contextmanager
+def _recording_of(task: Task) -> Iterator[Recording]:
+    """The recording of a task, or its recordings as one.
 
     Raises:
-        RecordingError: it has gone or has changed.
+        RecordingError: see `Recording.open` and `join`.
     """
-    subject = f"recording {task.recording}"
+    if not task.more:
+        with Recording.open(task.recording) as recording:
+            yield recording
+        return
+    joined = task.shard.with_name(f".{task.shard.name}-joined.h5")  # swept where the worker is killed
     try:
-        found = Stamp.of(task.recording)
-    except OSError as error:
-        raise RecordingError(subject, error, "the file that the run began with") from None
-    if found != task.stamp:
-        expected = f"{task.stamp.size} bytes, changed when the run began: begin another run with the new file"
-        raise Changed(subject, f"{found.size} bytes, changed since", expected)
+        join([file.path for file in task.files], joined)
+        with Recording.open(joined) as recording:
+            yield recording
+    finally:
+        joined.unlink(missing_ok=True)
+
+
+def _check_stamp(task: Task) -> None:
+    """Check that recordings are those that the run began with.
+
+    Raises:
+        RecordingError: one has gone or has changed.
+    """
+    for file in task.files:
+        subject = f"recording {file.path}"
+        try:
+            found = Stamp.of(file.path)
+        except OSError as error:
+            raise RecordingError(subject, error, "the file that the run began with") from None
+        if found != file.stamp:
+            expected = f"{file.stamp.size} bytes, changed when the run began: begin another run with the new file"
+            raise Changed(subject, f"{found.size} bytes, changed since", expected)
 
 
 def _read_record(page: int, found: DecodedPage, measures: PageMeasures | None) -> PageRecord:

@@ -17,7 +17,7 @@ from lightpage.files import replace_text
 from lightpage.progress import track
 from train.data.features import PageFeatures, PageState
 from train.data.pages import Page
-from train.processes import is_first_process
+from train.processes import is_first_process, wait_for_first
 
 _STATE = "state.json"
 _FILES = {"light": "light", "positions": "positions", "estimate": "belief", "phases": "phases"}
@@ -25,8 +25,6 @@ _FILES = {"light": "light", "positions": "positions", "estimate": "belief", "pha
 
 The file of estimates keeps its earlier name, so that what an earlier version has made is gone on with."""
 _PAGE_STATE = "page_states"
-_PATIENCE_S, _LOOK_S = 1800.0, 0.2
-"""How long a process waits for the next page of another, and how often it looks."""
 
 Maker = Callable[[int, tuple[float, float]], Iterator[PageFeatures]]
 """Makes the features from a page number on; told of the shift of the page before it."""
@@ -85,12 +83,12 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
         what: for the progress bar.
 
     Raises:
-        TimeoutError: the first process has made no page for half an hour.
+        LightpageError: the first process has made no page for half an hour.
     """
     folder.mkdir(parents=True, exist_ok=True)
     key = f"{count} pages {key}"
     if not is_first_process():
-        _wait(folder, key, count)
+        wait_for_first(lambda: _kept(folder, key)[0], count, f"features in {folder}")
     done, shift, before = _kept(folder, key)
     if done >= count:
         return before
@@ -121,17 +119,6 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
             state = {"key": key, "done": number + 1, "shift_px": page.state.shift_px, "seconds": seconds}
             replace_text(folder / _STATE, json.dumps(state), "state of the features")
     return seconds
-
-
-def _wait(folder: Path, key: str, count: int) -> None:
-    """Until another process has made all pages, so long as it makes any."""
-    seen, since = -1, time.monotonic()
-    while (done := _kept(folder, key)[0]) < count:
-        if done != seen:
-            seen, since = done, time.monotonic()
-        if time.monotonic() - since > _PATIENCE_S:
-            raise TimeoutError(f"features in {folder}: {done} of {count} pages, and no more for {_PATIENCE_S:.0f} s")
-        time.sleep(_LOOK_S)
 
 
 def _kept(folder: Path, key: str) -> tuple[int, tuple[float, float], float]:

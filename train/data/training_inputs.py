@@ -13,6 +13,7 @@ from lightpage.calibration.document import Calibration
 from lightpage.device.profile import Profile
 from lightpage.recording.reader import Recording
 from train.data.features import FeatureExtractor
+from train.processes import Processes
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class TrainingInputs:
         training, validation: page numbers.
         pilot_mask: bool [ny, nx].
         key: digest of profile, recording and calibration.
-        devices: GPUs or processes, "auto" for what is there.
+        processes: of the training.
     """
 
     out: Path
@@ -40,7 +41,7 @@ class TrainingInputs:
     validation: list[int]
     pilot_mask: NDArray[np.bool_]
     key: str
-    devices: int | str
+    processes: Processes
 
 
 @dataclass(frozen=True)

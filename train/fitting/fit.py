@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.utils.data import DataLoader, Dataset, RandomSampler
 
+from lightpage.errors import LightpageError
 from lightpage.progress import track
 from train.data.pages import Page
 from train.fitting.curves import TENSORBOARD, curves_of, thinned
@@ -29,7 +30,7 @@ from train.fitting.precision import lightning_precision
 from train.fitting.provenance import provenance_of
 from train.models.hyperparameters import Hyperparameters
 from train.models.network import Refiner, SymbolUNet
-from train.processes import process_number
+from train.processes import AS_IT_IS, Processes, is_first_process, process_number
 
 _LAST = "last.ckpt"
 
@@ -38,6 +39,9 @@ VALIDATIONS = 60
 
 _SEEDS_APART = 1_000_003
 """Of two processes of one run: further than any run has steps."""
+
+_SEEDS = 2**32
+"""That Lightning takes."""
 
 
 def fit_network(
@@ -50,12 +54,12 @@ def fit_network(
     *,
     kind: type[SymbolUNet] | type[Refiner] = SymbolUNet,
     start: nn.Module | None = None,
-    devices: int | str = "auto",
+    processes: Processes = AS_IT_IS,
 ) -> Fitted[SymbolTraining]:
     """Train, or go on with, the network of a run: see `fit`.
 
     Args:
-        run, validation, devices: as for `fit`.
+        run, validation, processes: as for `fit`.
         training: pages whose phases are NaN where nothing is asked (`train.data.patches.training_pages`).
         hyperparameters: the run's choices.
         pilot_mask: bool [ny, nx].
@@ -80,7 +84,7 @@ def fit_network(
         steps=hyperparameters.steps,
         precision=hyperparameters.precision,
         callbacks=[averaged],
-        devices=devices,
+        processes=processes,
     )
 
 
@@ -88,7 +92,7 @@ def seed_stretch(run: Path, seed: int) -> None:
     """Seed everything for a run: its next stretch, and each of its processes, draw other pages and turns."""
     last = run / CHECKPOINTS / _LAST
     reached = int(_checkpoint(last)["global_step"]) if last.exists() else 0
-    L.seed_everything(seed + reached + _SEEDS_APART * process_number(), verbose=False)
+    L.seed_everything((seed + reached + _SEEDS_APART * process_number()) % _SEEDS, verbose=False)
 
 
 def fit(
@@ -100,14 +104,15 @@ def fit(
     steps: int,
     precision: str,
     callbacks: Sequence[Callback] = (),
-    devices: int | str = "auto",
+    processes: Processes = AS_IT_IS,
 ) -> Fitted[M]:
     """Train, or go on with, the module of a run, judging it by its validation pages after every pass of `training`.
 
     What a finished training made is kept in the folder and returned when it is asked for again. On several devices
     Lightning runs the program once for each; all of them return the same.
 
-    Raises KeyboardInterrupt after Ctrl-C, with the last checkpoint in place.
+    Raises KeyboardInterrupt after Ctrl-C, with the last checkpoint in place, and LightpageError where another process
+    has ended.
 
     Args:
         run: folder of the run; checkpoints and TensorBoard logs go there, and the last checkpoint is resumed from: the
@@ -118,11 +123,12 @@ def fit(
         steps: optimiser steps.
         precision: of `PRECISIONS`.
         callbacks: further Lightning callbacks.
-        devices: how many GPUs, or processes where there is none; "auto" takes all GPUs, or one process.
+        processes: that work together; by default all GPUs, or one process.
     """
     if (before := finished(run, module)) is not None:
         return before
-    provenance_of(run)  # notes who begins it
+    if is_first_process():
+        provenance_of(run)  # notes who begins it
     folder = run / CHECKPOINTS
     last = folder / _LAST
     best = ModelCheckpoint(folder, "best", monitor="val_air", mode="max")
@@ -134,7 +140,10 @@ def fit(
             precision=lightning_precision(precision),  # type: ignore[arg-type]
             logger=TensorBoardLogger(str(run), name="", version=TENSORBOARD),
             callbacks=[*callbacks, best, timer, newest, _Steps()],
-            devices=devices,
+            devices=processes.devices,
+            num_nodes=processes.nodes,
+            strategy=processes.strategy,
+            plugins=[processes.environment()],
             enable_progress_bar=False,
             enable_model_summary=False,
             gradient_clip_val=1.0,
@@ -154,6 +163,11 @@ def fit(
             )
     except SystemExit:  # Lightning's answer to Ctrl-C, once it has closed its files
         raise KeyboardInterrupt from None
+    except RuntimeError as error:
+        if trainer.world_size > 1 and (isinstance(error, torch.distributed.DistError) or "gloo" in str(error)):
+            expected = "all of them: run the same commands again, they go on from the last checkpoint"
+            raise LightpageError(f"training in {run}", "the end of another process", expected) from error
+        raise
     # the last steps are the quietest, and no validation need have followed them
     rates = {}
     for path in {last, folder / Path(best.best_model_path or last).name}:  # the run may have been moved meanwhile
@@ -193,15 +207,17 @@ class _Steps(Callback):
 @contextmanager
 def _without_hints() -> Iterator[None]:
     """Keep to itself what Lightning would tell a programmer; its errors come through."""
-    log = logging.getLogger("lightning.pytorch")
-    level = log.level
-    log.setLevel(logging.ERROR)
+    logs = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
+    levels = [log.level for log in logs]
+    for log in logs:
+        log.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module=r"lightning\.")
             yield
     finally:
-        log.setLevel(level)
+        for log, level in zip(logs, levels, strict=True):
+            log.setLevel(level)
 
 
 def _checkpoint(path: Path) -> dict[str, Any]:

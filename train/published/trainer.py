@@ -18,6 +18,7 @@ from train.data.training_inputs import Trained, TrainingInputs
 from train.fitting.concentration_scale import best_kappa_scale
 from train.fitting.fit import fit, seed_stretch
 from train.fitting.fitted import Fitted
+from train.processes import AS_IT_IS, Processes
 from train.published.decoder import PARAXIAL, PublishedDecoder, make_localizer
 from train.published.states import page_states
 from train.published.training import DataPages, FramePages, PublishedChoices, PublishedTraining
@@ -78,7 +79,7 @@ class PublishedTrainer:
             inputs.pilot_mask,
             training,
             validation,
-            devices=inputs.devices,
+            processes=inputs.processes,
         )
         return Trained(
             weights=fitted.module.network.state_dict(),
@@ -99,7 +100,7 @@ def train_published(
     validation: FramePages,
     *,
     callbacks: Sequence[Callback] = (),
-    devices: int | str = "auto",
+    processes: Processes = AS_IT_IS,
 ) -> Fitted[PublishedTraining]:
     """Train a published decoder from its first weights, or go on with it.
 
@@ -108,7 +109,7 @@ def train_published(
         localizer, choices, profile, quadrature_phase: as for `published_decoder`.
         mask: pilots, bool [ny, nx], which are not learnt from.
         training, validation: pages of one recording.
-        callbacks, devices: as for `train.fitting.fit.fit`.
+        callbacks, processes: as for `train.fitting.fit.fit`.
     """
     seed_stretch(run, choices.seed)
     recording = training.recording
@@ -122,7 +123,7 @@ def train_published(
         steps=choices.steps,
         precision=choices.precision,
         callbacks=callbacks,
-        devices=devices,
+        processes=processes,
     )
 
 

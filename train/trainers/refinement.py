@@ -29,6 +29,7 @@ from train.models.hyperparameters import Hyperparameters
 from train.models.network import Refiner
 from train.models.parts import stacked, turned
 from train.models.prediction import Prediction
+from train.processes import AS_IT_IS, Processes
 
 _FLOORS = (0.05, 20.0)
 """Least and largest `Measured.pull` floor that is accepted."""
@@ -104,7 +105,7 @@ def fit_refinements(
     first: Fitted[SymbolTraining],
     key: str,
     starts: Iterable[nn.Module] = (),
-    devices: int | str = "auto",
+    processes: Processes = AS_IT_IS,
 ) -> Refined:
     """Train, or go on with, the refinements of a run, one behind the other.
 
@@ -116,7 +117,7 @@ def fit_refinements(
         first: the first pass's training.
         key: everything that the first pass's features depend on.
         starts: networks whose weights the first of them begin with.
-        devices: see `fit_network`.
+        processes: see `fit_network`.
     """
     passes, features, seconds = [first], inputs.features, 0.0
     count, seen = len(inputs.pages), inputs.training + inputs.validation
@@ -134,7 +135,7 @@ def fit_refinements(
         mask, levels = first.module.pilot_mask, first.module.levels
         patches = training_pages([training], mask, chosen)
         passes.append(
-            fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, start=start, devices=devices)
+            fit_network(at, chosen, mask, levels, patches, validation, kind=Refiner, start=start, processes=processes)
         )
         seconds += passes[-1].seconds
     return Refined(passes[1:], validation, seconds)

@@ -95,7 +95,7 @@ class SymbolTrainer:
             training,
             validation,
             start=None if before is None else before.network,
-            devices=inputs.devices,
+            processes=inputs.processes,
         )
         weights = {f"network.{name}": value for name, value in fitted.module.network.state_dict().items()}
         seconds, last = preparing + fitted.seconds, fitted
@@ -137,7 +137,7 @@ class SymbolTrainer:
             first,
             f"{inputs.key} {self.localizer} {self.choices.first_pass}",
             starts,
-            inputs.devices,
+            inputs.processes,
         )
         for name, module in {
             "prediction": prediction,

@@ -96,23 +96,50 @@ def test_files_that_came_back_and_files_that_did_not(archive: Archive, tmp_path:
 
 
 def test_a_fleet_that_was_recalibrated_tells_why_a_device_failed(archive: Archive, tmp_path: Path) -> None:
-    for name in ("left", "bad"):
+    for name in ("left-1", "left-2", "bad", "lost"):
         toy.write_toy_recording(archive.folder / f"{name}.h5", toy.ToyDevice((148.0, 90.0), seed=4), 16, 3, 6)
     with h5py.File(archive.folder / "bad.h5", "r+") as file:
         file["symbols"][:] = toy.symbols_of(16, 999, 3)
-    lines = [f'[[device]]\nname = "{n}"\nbundle = "toy.zip"\nrecordings = ["{n}.h5"]' for n in ("left", "bad")]
+    (archive.folder / "lost.h5").write_bytes(b"no recording")
+    names = ("left", "bad", "lost")
+    lines = [f'[[device]]\nname = "{name}"\nbundle = "toy.zip"\nrecordings = ["{name}*.h5"]' for name in names]
     (archive.folder / "fleet.toml").write_text("\n".join(lines))
     archive.run("recalibrate", "--fleet", str(archive.folder / "fleet.toml"), asked=False)
     text, seen = page_of(archive.out, tmp_path / "r.html")
     check_whole(text, seen, SECTIONS)
-    rows = {device.name: device for device in report_of_bulk(archive.out).devices}
-    assert (rows["left"].result, rows["bad"].result) == ("done", "failed")
+    assert {name: len(pictures) for name, pictures in seen.pictures.items()} == {"speed": 2, "losses": 1, "devices": 1}
+    data = report_of_bulk(archive.out)
+    assert data.recalibrations is not None
+    assert [(each.name, each.state) for each in data.recalibrations] == [
+        ("bad", "refused"),
+        ("lost", "failed"),
+        ("left", "recalibrated"),
+    ]
+    rows = {each.name: each for each in data.recalibrations}
     before, after = rows["left"].air_before, rows["left"].air_after
     assert before is not None
     assert after is not None
-    assert f"left done {before:.3f} {after:.3f} toy-1+r1".replace("-", "−", before < 0) in told(text)
-    assert rows["bad"].told
-    assert rows["bad"].told in told(text)
+    assert f"left 2 recalibrated {before:.3f} {after:.3f} toy-1+r1".replace("-", "−", before < 0) in told(text)
+    assert rows["bad"].reason
+    assert f"bad 1 refused {rows['bad'].reason}" in told(text)
+    assert "lost 1 failed recording lost.h5: got " in told(text)
+    assert "Finished: 1 of 2 devices are refused. 1 device failed; the next run tries again." in told(text)
+    assert "Recordings 4, of 3 devices" in told(text)
+    assert "Known pages at most 2 a device" in told(text)
+    assert str(archive.folder) not in text
+
+
+def test_devices_that_were_not_come_to_are_missing(archive: Archive, tmp_path: Path) -> None:
+    def interrupt(task: Task) -> None:
+        raise KeyboardInterrupt
+
+    archive.before_each = interrupt
+    archive.run("recalibrate")
+    text, seen = page_of(archive.out, tmp_path / "r.html")
+    check_whole(text, seen, SECTIONS)
+    assert "Not finished: 2 of 2 devices have no result yet." in told(text)
+    assert "a.h5 1 missing" in told(text)
+    assert "None is refused." in told(text)
 
 
 def test_a_recording_that_could_not_be_opened_is_named_by_what_tells_it_from_others(

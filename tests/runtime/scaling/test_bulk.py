@@ -110,6 +110,20 @@ def test_a_second_run_does_nothing_and_goes_on_without_being_told_what_was_asked
     assert not list(archive.out.glob("shards/*/*.h5"))
 
 
+def test_a_run_that_an_earlier_version_began_goes_on(archive: Archive) -> None:
+    archive.run("decode")
+    path = archive.out / "job.json"
+    job = json.loads(path.read_text())
+    for name in ("fine_tuning", "parts"):
+        del job["choices"][name]
+    job["choices"]["known_pages"] = 2
+    for source in job["sources"]:
+        del source["run"]
+    path.write_text(json.dumps(job))
+    status, figures = archive.run("decode")
+    assert (status, archive.tasks, figures["pages_read"]) == (0, [], 14)
+
+
 def test_a_run_over_finished_work_loads_nothing_that_decodes(archive: Archive) -> None:
     archive.run("evaluate")
     script = """
@@ -375,15 +389,15 @@ def test_a_poisoned_device_fails_by_name_and_the_rest_of_the_fleet_is_recalibrat
     fleet = ("--fleet", str(archive.folder / "fleet.toml"))
     for index, name in enumerate(offsets):  # one part, one device
         status, figures = archive.run("recalibrate", *fleet, "--part", f"{index}/3", asked=False)
-        assert (status, [row["device"] for row in figures["recordings"]]) == (0, [name])
+        assert (status, [row["device"] for row in figures["devices"]]) == (0, [name])
     status, figures = archive.run("recalibrate", *fleet, asked=False)
     assert [task.device for task in archive.tasks] == ["poisoned"]
     assert (status, figures["pages_read"], figures["pages_lost"]) == (2, 2, 1)
-    rows = {row["device"]: row for row in figures["recordings"]}
-    assert rows["poisoned"]["pages_lost"] == 1
+    rows = {row["device"]: row for row in figures["devices"]}
+    assert rows["poisoned"]["state"] == "refused"
     for name, drifted in offsets.items():
-        assert rows[name]["recalibration"]["air_after"] > rows[name]["recalibration"]["air_before"]
-        made = Bundle.open(rows[name]["recalibration"]["bundle"])
+        assert rows[name]["air_after"] > rows[name]["air_before"]
+        made = Bundle.open(rows[name]["bundle"])
         assert made.version == "toy-1+r1"
         assert made.table["reference_in_phase"].mean() == pytest.approx(drifted[0])
     assert f"device poisoned: recording {archive.folder / 'bad.h5'}: " in capsys.readouterr().err

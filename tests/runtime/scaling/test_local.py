@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -12,20 +13,23 @@ from pathlib import Path
 import pytest
 
 from lightpage.cli.main import run as run_command
+from lightpage.progress import reporting
 from runtime.commands import bulk as command
+from runtime.helper_process import HelperProcess
 from runtime.scaling.driver import run
-from runtime.scaling.engine import ATTEMPTS
+from runtime.scaling.engine import ATTEMPTS, Attempt
 from runtime.scaling.inline import InlineEngine
 from runtime.scaling.job import Choices, Job, of_recordings
 from runtime.scaling.ledger import Ledger
-from runtime.scaling.local import LocalEngine
+from runtime.scaling.local import LocalEngine, _heard
 from runtime.scaling.metrics import BulkMetrics
 from runtime.scaling.shard import PageRecord, ShardRecord
 from runtime.scaling.task import Operation
 from runtime.scaling.totals import totals
 from runtime.scaling.work import Worker
 from tests.runtime import toy
-from tests.runtime.scaling.deadly_worker import BEGUN, KILLS
+from tests.runtime.scaling.deadly_worker import BEGUN, KILLS, TALKS
+from tests.told import Told
 
 ROOT = Path(__file__).resolve().parents[3]
 WORKER = "tests.runtime.scaling.deadly_worker"
@@ -101,6 +105,36 @@ def test_two_parts_as_two_processes_do_every_page_once(toy_zip: Path, tmp_path: 
         assert job is not None
         assert list(ledger.missing(job)) == []
         assert totals(ledger, job).tally.read == 3 * PAGES
+
+
+def test_what_a_worker_is_at_is_told_as_it_comes_and_is_no_outcome(job: Job, tmp_path: Path) -> None:
+    (tmp_path / f"a{TALKS}").touch()
+    engine, at_work = LocalEngine(1, 1, WORKER), set()
+
+    class Looking(Told):
+        def note(self, what: str) -> None:
+            super().note(what)
+            at_work.add((engine.in_flight, engine.workers_alive))
+
+    told = Looking()
+    with Ledger(tmp_path / "out") as ledger, reporting(told):
+        made = run(ledger, job, lambda: engine)
+    assert (made.pages, made.ranges, made.restarts) == (PAGES, PAGES // RANGE, 0)
+    assert (at_work, engine.in_flight, engine.workers_alive) == ({(1, 1)}, 0, 0)
+    assert told.notes == [f"device a: {first}, {number}" for first in range(0, PAGES, RANGE) for number in range(3)]
+
+
+def test_a_worker_whose_lines_came_at_once_is_heard_again_at_once(job: Job, tmp_path: Path) -> None:
+    worker, (own, other) = HelperProcess.__new__(HelperProcess), socket.socketpair()  # without a process
+    worker._link, worker._received = own, b""
+    task = next(Ledger(tmp_path / "out").missing(job))
+    with own, other:
+        other.sendall(b"one\ntwo\n")
+        end = time.monotonic() + 5.0
+        assert worker.line(end) == b"one"
+        assert _heard({worker: Attempt(task, deadline=end)}) == [worker]
+        assert time.monotonic() < end
+        assert worker.line(end) == b"two"
 
 
 DRIVER = """

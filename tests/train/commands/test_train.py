@@ -31,7 +31,7 @@ from tests.lightpage.small import small_profile
 from tests.told import Told
 from train.commands import train as cli_train
 from train.commands.options import chosen_localizer, chosen_trainer
-from train.commands.train import _own_pilots, train
+from train.commands.train import train
 from train.data.feature_store import FeatureStore
 from train.fitting import provenance as origin
 from train.fitting.curves import curves_of
@@ -40,6 +40,7 @@ from train.models.hyperparameters import Hyperparameters
 from train.models.presets import PRESETS
 from train.runs import FORMAT, begin, check_begun, sole_writer
 from train.trainers.symbols import SymbolTrainer
+from train.trainers.whole_run import own_pilots
 
 SECONDS = 120
 
@@ -207,29 +208,28 @@ def test_two_processes_train_one_run_and_its_refinement(small_device: list[str],
     assert all(bool(light.any()) for light, *_ in (kept[index] for index in range(len(kept))))
 
 
-def test_pilots_of_the_devices_own_are_found(
-    device: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pilots_of_the_devices_own_are_found(device: list[str], tmp_path: Path) -> None:
     profile = small_profile()
     mask = pilot_mask(profile)
     path = tmp_path / "R.h5"
     shutil.copy(device[3], path)
-    with Recording.open(path) as recording:
-        assert _own_pilots(recording, profile, mask, [0, 1, 2]) is None
-        assert not capsys.readouterr().err
+    told = Told()
+    with Recording.open(path) as recording, reporting(told):
+        assert own_pilots(recording, profile, mask, [0, 1, 2]) is None
+        assert not told.notes
     with h5py.File(path, "r+") as file:
         symbols = file["symbols"][:]
         symbols[:, mask] = 64
         file["symbols"][:] = symbols
     with Recording.open(path) as recording:
-        own = _own_pilots(recording, profile, mask, [0, 1, 2])
+        own = own_pilots(recording, profile, mask, [0, 1, 2])
     np.testing.assert_allclose(own, np.full(mask.sum(), np.pi / 2), rtol=1e-6)
     with h5py.File(path, "r+") as file:
         symbols[1][mask] = 65
         file["symbols"][:] = symbols
-    with Recording.open(path) as recording:
-        assert _own_pilots(recording, profile, mask, [0, 1, 2]) is None
-    assert "no piston" in capsys.readouterr().err
+    with Recording.open(path) as recording, reporting(told):
+        assert own_pilots(recording, profile, mask, [0, 1, 2]) is None
+    assert "no piston" in told.notes[0]
 
 
 def test_a_calibration_of_another_device_is_refused(device: list[str], tmp_path: Path) -> None:
@@ -260,7 +260,7 @@ def test_other_options_are_refused_before_a_calibration_is_made(
 
     arguments = [*device[:4], *device[6:], "--out", str(tmp_path)]
     with monkeypatch.context() as patch:
-        patch.setattr("train.commands.train.check_begun", begin)
+        patch.setattr("train.trainers.whole_run.check_begun", begin)
         patch.setattr("train.commands.train._calibration", interrupt)
         with pytest.raises(click.Abort):
             run([*arguments, "--steps", "60"])

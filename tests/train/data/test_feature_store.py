@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from train.data import feature_store
+from lightpage.errors import LightpageError
+from train import processes
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import PageFeatures, PageState
 
@@ -71,10 +72,10 @@ def test_what_is_complete_is_not_made_again(tmp_path: Path) -> None:
 
 
 def test_further_processes_wait_for_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feature_store, "_PATIENCE_S", 0.5)
+    monkeypatch.setattr(processes, "_PATIENCE_S", 0.5)
     monkeypatch.setenv("LOCAL_RANK", "1")
     other = Pages()
-    with pytest.raises(TimeoutError, match="0 of 3 pages, and no more"):
+    with pytest.raises(LightpageError, match="got 0 of 3, and no more"):
         fill(tmp_path, "device", 3, other, "pages")
     monkeypatch.delenv("LOCAL_RANK")
     fill(tmp_path, "device", 3, Pages(), "pages")

@@ -1,0 +1,91 @@
+"""Deep recalibration: what it needs, and that a drifted device reads better after it than after a re-fit alone."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from export.deep import DEEP
+from lightpage.cli.main import run as run_command
+from lightpage.cli.simulate import simulate
+from lightpage.errors import InvalidInputError
+from runtime.bundle.bundle import Bundle
+from runtime.commands.bulk import bulk
+from runtime.scaling.fine_tuning import GROUP, deep_recalibration
+from tests.lightpage.small import small_profile
+from tests.runtime import toy
+from train.commands.train import train
+from train.models.hyperparameters import Hyperparameters
+from train.runs import WEIGHTS, Run
+
+TRAINED = ("1" * 64,)
+
+
+def made_run(folder: Path, profile_toml: str) -> Path:
+    folder.mkdir()
+    Run("coherent", profile_toml, "", Hyperparameters(), 8, TRAINED, 0.0, 1.0, 0.0).save(folder)
+    (folder / WEIGHTS).touch()
+    return folder
+
+
+def test_the_entry_point_names_it() -> None:
+    packaging = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))
+    ((name, value),) = packaging["project"]["entry-points"][GROUP].items()
+    assert deep_recalibration([EntryPoint(name, value, GROUP)]) is DEEP
+
+
+def test_a_device_without_what_it_needs_is_told(tmp_path: Path) -> None:
+    bundle = toy.write_toy_bundle(tmp_path / "toy.zip", trained_pages=TRAINED)
+    own = Bundle.open(bundle).manifest.profile
+    good, other = made_run(tmp_path / "good", own), made_run(tmp_path / "other", small_profile().to_toml())
+    DEEP.check(bundle, good, 8)
+    (made_run(tmp_path / "bare", own) / WEIGHTS).unlink()
+    stranger = toy.write_toy_bundle(tmp_path / "stranger.zip")
+    for model, run, pages, told in (
+        (bundle, None, 40, "run: got none, wanted the folder of the training run"),
+        (bundle, good, 7, "known pages: got 7, wanted at least 8"),
+        (bundle, tmp_path / "none", 40, "none: got .*No such file.*wanted a finished training run"),
+        (bundle, tmp_path / "bare", 40, f"bare: got no {WEIGHTS}"),
+        (bundle, other, 40, "other: got devices of profile small"),
+        (stranger, good, 40, r"good: got pages that .*stranger\.zip was not trained on"),
+    ):
+        with pytest.raises(InvalidInputError, match=told):
+            DEEP.check(model, run, pages)
+
+
+@pytest.mark.long
+def test_a_drifted_device_is_found_trained_on_and_judged_by_pages_of_its_own(
+    small_device: list[str], tmp_path: Path
+) -> None:
+    from export.command import export_run
+
+    run = tmp_path / "run"
+    small = [*small_device, "--channels", "8", "--blocks", "1", "--refinements", "0", "--synthetic-pages", "0"]
+    CliRunner().invoke(
+        train, [*small, "--steps", "240", "--out", str(run)], standalone_mode=False, catch_exceptions=False
+    )
+    export_run(run, tmp_path / "bundle.zip", version="small-1")
+    profile = small_device[1]
+    drifted = ["--set", "geometry.pipe_angle_deg=-0.58", "--set", "in_phase_camera.shift_x_px=5"]
+    for name, pages, seed in (("a", 6, 31), ("b", 6, 32)):
+        words = ["--profile", profile, "--pages", str(pages), "--seed", str(seed), *drifted, "--no-truth"]
+        out = ["--out", str(tmp_path / f"{name}.h5")]
+        CliRunner().invoke(simulate, [*words, *out], standalone_mode=False, catch_exceptions=False)
+    lines = ["[[device]]", 'name = "a"', 'bundle = "bundle.zip"', 'recordings = ["a.h5", "b.h5"]', 'run = "run"']
+    (tmp_path / "fleet.toml").write_text("\n".join(lines))
+    words = ["recalibrate", str(tmp_path / "out"), "--fleet", str(tmp_path / "fleet.toml"), "--workers", "1"]
+    deep = ["--deep", "--steps", "120", "--json", str(tmp_path / "J.json")]
+    assert run_command(bulk, [*words, *deep]) == 0
+    (row,) = json.loads((tmp_path / "J.json").read_text())["devices"]
+    assert row["air_after"] > row["air_before"] + 0.1
+    assert (row["pages_used"], row["pages_held_back"]) == (12, 2)
+    made, before = Bundle.open(row["bundle"]), Bundle.open(tmp_path / "bundle.zip")
+    assert made.version == "small-1+r1"
+    assert set(before.manifest.trained_pages) < set(made.manifest.trained_pages)
+    assert len(set(made.manifest.trained_pages) - set(before.manifest.trained_pages)) == 10
+    assert made.manifest.provenance.command == "recalibrate --deep from small-1"

@@ -1,0 +1,248 @@
+"""A fleet: one device is one task, what one lacks is its own affair, and what was trained is not trained again."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lightpage.cli.main import run as run_command
+from lightpage.errors import InvalidInputError, LightpageError, RecalibrationRefusedError
+from lightpage.progress import Progress, note, track
+from lightpage.recording.reader import Recording
+from runtime.bundle.bundle import Bundle
+from runtime.commands import bulk as command
+from runtime.decoding.decoder import Decoder
+from runtime.recalibration.known_pages import read_recorded
+from runtime.recalibration.outcome import RecalibrationOutcome
+from runtime.recalibration.recalibration import next_version, recalibrate
+from runtime.scaling.fine_tuning import deep_recalibration
+from runtime.scaling.inline import InlineEngine
+from runtime.scaling.task import FineTuning
+from runtime.scaling.work import Worker
+from tests.runtime import toy
+
+PAGES = 3
+
+
+@dataclass
+class Deep:
+    """A deep recalibration that fits as the toy does, and keeps what it was asked."""
+
+    error: Exception | None = None
+    asked: list[tuple[str, int, int, FineTuning, list[str]]] = field(default_factory=list)
+
+    def check(self, bundle: Path, run: Path | None, pages: int) -> None:
+        if run is None:
+            raise InvalidInputError("run", "none", "a run")
+
+    def recalibrate(
+        self,
+        decoder: Decoder,
+        recording: Recording,
+        run: Path,
+        folder: Path,
+        out: Path,
+        choices: FineTuning,
+        pages: int,
+        progress: Progress,
+    ) -> RecalibrationOutcome:
+        folder.mkdir(exist_ok=True)
+        self.asked.append((run.name, recording.pages, pages, choices, [path.name for path in folder.iterdir()]))
+        (folder / "begun").touch()
+        progress("fit", 0.0)
+        for _ in track(range(2), "training", unit="step", total=2):
+            note("so far")
+        if self.error is not None:
+            raise self.error
+        version = next_version(decoder.version)
+        return recalibrate(decoder, read_recorded(recording, range(2)), out, version, toy.fit_references, progress)
+
+
+class Fleet:
+    """Devices `a` and `b` of toy recordings, and `lightpage bulk recalibrate` on them within this process."""
+
+    def __init__(self, folder: Path, bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder, self.out, self.deep = folder, folder / "out", Deep()
+        self.bundle = bundle
+        for number, name in enumerate(("a-1", "a-2", "b")):
+            device = toy.ToyDevice((148.0, 90.0), seed=number)
+            toy.write_toy_recording(folder / f"{name}.h5", device, 16, PAGES, number)
+        engine = InlineEngine(Worker(1, toy.fit_references, lambda: self.deep))
+        monkeypatch.setattr(command, "_engine", lambda *_: engine)
+        monkeypatch.setattr(command, "deep_recalibration", lambda: self.deep)
+
+    def run(self, *options: str, runs: tuple[str, ...] = ("a", "b")) -> tuple[int, dict[str, dict[str, Any]]]:
+        """Exit status, and a row for each device."""
+        tables = []
+        for name, pattern in (("a", "a-*.h5"), ("b", "b.h5")):
+            lines = ["[[device]]", f'name = "{name}"', f'bundle = "{self.bundle}"', f'recordings = ["{pattern}"]']
+            tables += [*lines, *([f'run = "run-{name}"'] if name in runs else [])]
+        (self.folder / "fleet.toml").write_text("\n".join(tables))
+        told = self.folder / "told.json"
+        told.unlink(missing_ok=True)
+        words = ["recalibrate", str(self.out), "--fleet", str(self.folder / "fleet.toml"), "--json", str(told)]
+        status = run_command(command.bulk, [*words, *options])
+        return status, {row["device"]: row for row in json.loads(told.read_text())["devices"]} if told.exists() else {}
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, toy_zip: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
+    return Fleet(tmp_path, toy_zip, monkeypatch)
+
+
+def test_a_device_of_several_recordings_is_one_task_with_one_bundle(
+    fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, rows = fleet.run("--pages", "5")
+    assert (status, [len(rows[name]["recordings"]) for name in "ab"]) == (2, [2, 1])
+    assert (rows["a"]["state"], rows["a"]["pages_used"]) == ("recalibrated", 5)  # more than one of them has
+    assert (rows["b"]["state"], "at least 5 that show light" in rows["b"]["reason"]) == ("refused", True)
+    assert len(list(fleet.out.glob("shards/*/*.zip"))) == 1
+    assert not list(fleet.out.glob("shards/*/.*"))
+    assert re.search(r"^a +recalibrated +\d\.\d{3} +4\.000 +/.*\.zip$", capsys.readouterr().out, re.MULTILINE)
+
+
+def test_a_recording_that_is_lost_costs_its_device_alone(fleet: Fleet) -> None:
+    whole = (fleet.folder / "a-2.h5").read_bytes()
+    (fleet.folder / "a-2.h5").write_bytes(whole[:1000])
+    status, rows = fleet.run()
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "failed", "recalibrated")
+    assert "a-2.h5" in rows["a"]["reason"]
+    (fleet.folder / "a-2.h5").write_bytes(whole)
+    status, rows = fleet.run()
+    assert (status, rows["a"]["state"]) == (0, "recalibrated")
+
+
+@pytest.mark.parametrize("form", [(), ("--deep",)])
+def test_a_part_has_whole_devices_and_tells_of_no_others(
+    form: tuple[str, ...], fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for part, name, recordings in (("1/2", "b", 1), ("0/2", "a", 2)):
+        status, rows = fleet.run(*form, "--part", part, "--metrics-file", str(fleet.folder / "bulk.prom"))
+        assert (status, list(rows), rows[name]["state"]) == (0, [name], "recalibrated")
+        assert len(rows[name]["recordings"]) == recordings
+        assert 'lightpage_bulk_job_pages{run="out"} 1.0' in (fleet.folder / "bulk.prom").read_text()
+    assert re.search(r"^devices +1$", capsys.readouterr().out, re.MULTILINE)
+    status, rows = fleet.run(*form)
+    assert (status, sorted(rows)) == (0, ["a", "b"])
+    assert not capsys.readouterr().err
+    assert [path.parent.name for path in sorted(fleet.out.glob("shards/*/*.zip"))] == ["000000", "000002"]
+
+
+def test_frames_of_all_recordings_of_a_device_are_counted_as_read(fleet: Fleet) -> None:
+    fleet.run("--deep")
+    stored = []
+    for name in ("a-1", "a-2"):
+        with Recording.open(fleet.folder / f"{name}.h5") as recording:
+            stored.append(recording.stored_page_bytes * PAGES)
+    assert json.loads((fleet.out / "shards/000000/00000000.json").read_text())["read_bytes"] == sum(stored)
+
+
+def test_a_device_that_is_done_stays_so_when_its_run_has_gone(fleet: Fleet) -> None:
+    def gone(bundle: Path, run: Path | None, pages: int) -> None:
+        raise InvalidInputError("run", "none", "a run")
+
+    assert fleet.run("--deep")[0] == 0
+    fleet.deep.check = gone  # type: ignore[method-assign]
+    status, rows = fleet.run("--deep")
+    assert (status, {row["state"] for row in rows.values()}) == (0, {"recalibrated"})
+
+
+def test_a_device_of_two_unreadable_recordings_has_failed_once(
+    fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a-1", "a-2"):
+        (fleet.folder / f"{name}.h5").write_bytes(b"no recording")
+    assert fleet.run()[0] == 2
+    assert "0 of 2 devices refused and 1 failed" in capsys.readouterr().err
+
+
+def test_the_deep_form_is_given_all_pages_and_the_run_of_each_device(fleet: Fleet) -> None:
+    status, rows = fleet.run("--deep", "--steps", "20", "--seed", "7")
+    tuning = FineTuning(steps=20, seed=7)
+    assert fleet.deep.asked == [("run-a", 2 * PAGES, 2 * PAGES, tuning, []), ("run-b", PAGES, PAGES, tuning, [])]
+    assert (status, {row["state"] for row in rows.values()}) == (0, {"recalibrated"})
+    assert Bundle.open(rows["a"]["bundle"]).version == "toy-1+r1"
+    log = (fleet.out / "shards/000000/00000000.log").read_text()
+    assert [line.partition(" ")[2] for line in log.splitlines()][:5] == [
+        "fit: 0%",
+        "so far",
+        "training: step 1 of 2",
+        "so far",
+        "training: 2 steps",
+    ]
+
+
+def test_a_device_without_its_run_is_told_before_anything_is_done(
+    fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, rows = fleet.run("--deep", runs=("b",))
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "failed", "recalibrated")
+    assert rows["a"]["reason"] == "run: got none, wanted a run"
+    assert "device a: run: got none" in capsys.readouterr().err.partition("device b")[0]
+    assert [asked[0] for asked in fleet.deep.asked] == ["run-b"]
+
+
+def test_an_interrupted_fleet_goes_on_in_the_same_folder(fleet: Fleet) -> None:
+    fleet.deep.error = KeyboardInterrupt()
+    assert fleet.run("--deep")[0] == 130
+    fleet.deep.error = None
+    assert fleet.run("--deep")[0] == 0
+    assert [(run, there) for run, *_, there in fleet.deep.asked] == [("run-a", []), ("run-a", ["begun"]), ("run-b", [])]
+    assert fleet.run("--deep")[0] == 0
+    assert len(fleet.deep.asked) == 3
+
+
+@pytest.mark.parametrize(
+    ("error", "state", "again"),
+    [
+        (RecalibrationRefusedError("fine-tuned model", "less", "more"), "refused", 2),
+        (InvalidInputError("run", "another", "this one"), "failed", 4),
+    ],
+)
+def test_what_a_device_is_refused_for_stays_and_all_else_is_tried_again(
+    error: LightpageError, state: str, again: int, fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet.deep.error = error
+    for _ in range(2):
+        status, rows = fleet.run("--deep")
+        assert (status, [row["state"] for row in rows.values()]) == (2, [state, state])
+        assert rows["a"]["reason"] == str(error)
+        assert f"device a: {error.subject}" in capsys.readouterr().err.replace(f"recording {fleet.folder}/a-1.h5: ", "")
+    assert len(fleet.deep.asked) == again
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--steps", "20"), "--steps: got without --deep"),
+        (("--deep", "--recordings", "b.h5"), "--deep: got with --recordings"),
+    ],
+)
+def test_options_that_do_nothing_are_refused(
+    options: tuple[str, ...], told: str, fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert fleet.run(*options)[0] == 2
+    assert told in capsys.readouterr().err
+
+
+def test_another_run_or_training_in_the_same_folder_is_refused(
+    fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert fleet.run("--deep")[0] == 0
+    for options, runs, told in (
+        (("--deep", "--steps", "20"), ("a", "b"), "fine_tuning: got steps=20"),
+        (("--deep",), ("a",), "run of b: got None"),
+    ):
+        assert fleet.run(*options, runs=runs)[0] == 2
+        assert told in capsys.readouterr().err
+
+
+def test_without_the_other_package_there_is_no_deep_form() -> None:
+    with pytest.raises(LightpageError, match="no entry point deep"):
+        deep_recalibration([])
