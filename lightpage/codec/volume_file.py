@@ -242,6 +242,22 @@ class VolumeFiles:
         raise InvalidInputError("volume", f"pages of {found}", "one of them: --volume ID or --volume ID:CHECKSUM")
 
 
+def parse_volume(volume: str | None) -> tuple[int | None, int | None]:
+    """Number and checksum of a volume that is asked for.
+
+    Raises:
+        InvalidInputError: neither ID nor ID:CHECKSUM.
+    """
+    if volume is None:
+        return None, None
+    number, _, checksum = volume.partition(":")
+    try:
+        return int(number), int(checksum, 16) if checksum else None
+    except ValueError:
+        expected = "ID, or ID:CHECKSUM in hexadecimal digits"
+        raise InvalidInputError("--volume", repr(volume), expected) from None
+
+
 def ranges(numbers: Sequence[int]) -> str:
     """Numbers for people, neighbours together: 1-3, 7."""
     parts: list[list[int]] = []

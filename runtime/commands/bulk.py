@@ -13,11 +13,14 @@ import click
 from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import OutputFile, OutputFolder, check_outputs
-from lightpage.codec.volume_file import ranges
+from lightpage.codec.code import Code, load_code
+from lightpage.codec.volume_file import parse_volume, ranges
 from lightpage.errors import InvalidInputError, LightpageError, LostDataError
 from lightpage.files import write_json
 from lightpage.progress import warn
 from runtime.bundle.shipped import DEFAULT
+from runtime.commands.provider_option import PROVIDER
+from runtime.execution.providers import CPU, Provider
 from runtime.scaling.driver import Progressed, Watch, run
 from runtime.scaling.engine import Engine
 from runtime.scaling.fine_tuning import DeepRecalibration, deep_recalibration
@@ -27,7 +30,7 @@ from runtime.scaling.local import LocalEngine, default_workers
 from runtime.scaling.part import WHOLE, Part
 from runtime.scaling.task import FineTuning, Operation
 from runtime.scaling.totals import AIR, DeviceState, Totals, totals
-from runtime.scaling.volumes import RecoveredFile, recovered_files
+from runtime.scaling.volumes import ALL_FILES, RecoveredFile, Wanted, recovered_files
 from runtime.wire.address import check_address, is_local
 
 if TYPE_CHECKING:
@@ -61,6 +64,7 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--threads", type=click.IntRange(1), help="Threads of a worker; by default its share of the cores."
         ),
+        PROVIDER,
         click.option("--workers", type=click.IntRange(1), help="How many; by default one for every two cores."),
         click.option("--address", help="With --engine ray: of the cluster, `auto` for the one that runs here."),
         click.option("--engine", type=click.Choice([LOCAL, RAY]), default=LOCAL, show_default=True, help="Who works."),
@@ -100,9 +104,13 @@ def decode(**asked: Any) -> None:
 @bulk.command()
 @_options
 @_pages_options
-def recover(**asked: Any) -> None:
+@click.option("--code", "code_path", type=click.Path(path_type=Path), help="Code; the recordings' or the bundles'.")
+@click.option("--volume", metavar="ID[:CHECKSUM]", help="Write the file of this volume alone.")
+@click.option("--holes", is_flag=True, help="Where data are lost, write FILE.holes with zeros in their place.")
+def recover(code_path: Path | None, volume: str | None, holes: bool, **asked: Any) -> None:
     """Read the files back whose pages recordings show; the pages of a file may be in several recordings."""
-    _bulk(Operation.RECOVER, **asked)
+    code = None if code_path is None else load_code(code_path)
+    _bulk(Operation.RECOVER, code=code, wanted=Wanted(*parse_volume(volume), holes), **asked)
 
 
 @bulk.command()
@@ -161,7 +169,8 @@ def _bulk(
     metrics_insecure: bool,
     metrics_file: Path | None,
     again_with: str | None = None,
-    **chosen: bool | int | FineTuning | None,
+    wanted: Wanted = ALL_FILES,
+    **chosen: bool | int | str | Code | FineTuning | None,
 ) -> None:
     """Run an operation; see the options. Choices that are None are as before, or the default."""
     context = click.get_current_context()
@@ -179,6 +188,7 @@ def _bulk(
             choices = (Choices(operation=operation) if before is None else before.choices).model_copy(
                 update={"operation": operation, **given}
             )
+            provider = Provider.parse(choices.provider)
             job = _job(ledger.folder, before, choices, recordings, fleet, bundle)
             if choices.fine_tuning is not None:
                 job = job.checked(partial(_check_device, ledger, deep_recalibration(), choices.known_pages))
@@ -186,9 +196,9 @@ def _bulk(
                 job = _with_round(job, again_with)
             job.write(ledger.folder)
         with _watched(ledger.folder.name, operation, metrics_address, metrics_file) as watch:
-            made = run(ledger, job, partial(_engine, engine, address, workers, threads), watch)
+            made = run(ledger, job, partial(_engine, engine, address, workers, threads, provider), watch)
         found = totals(ledger, job, made.failures)
-        files = recovered_files(ledger, job) if operation is Operation.RECOVER and own == WHOLE else []
+        files = recovered_files(ledger, job, wanted) if operation is Operation.RECOVER and own == WHOLE else []
     if json_path is not None:
         write_json(json_path, figures(job, own, made, found, files))
     click.echo(table(job, own, made, found, files))
@@ -196,12 +206,17 @@ def _bulk(
         raise error
 
 
-def _engine(name: str, address: str | None, workers: int | None, threads: int | None) -> Engine:
+def _engine(name: str, address: str | None, workers: int | None, threads: int | None, provider: Provider) -> Engine:
+    on_gpu = provider.name != CPU
     if name == RAY:
         from runtime.scaling.ray_engine import RayEngine
 
-        return RayEngine(address, workers, threads)
-    return LocalEngine(workers or default_workers(), threads)
+        return RayEngine(address, workers, threads, gpus=int(on_gpu))
+    if on_gpu:
+        from runtime.execution.session import check_provider  # loads onnxruntime, which takes a while
+
+        check_provider(provider)
+    return LocalEngine(workers or (1 if on_gpu else default_workers()), threads)
 
 
 def _check_metrics(address: str | None, insecure: bool, file: Path | None) -> None:

@@ -10,19 +10,13 @@ from typing import Any
 import click
 
 from runtime.bundle.shipped import DEFAULT, bundle_path
+from runtime.commands.provider_option import PROVIDER
 from runtime.decoding.decoder import Decoder
-from runtime.execution.providers import CPU, WANTED, Provider
+from runtime.execution.providers import CPU, Provider
 
 Load = Callable[[], Decoder]
 """Opens the decoder that the options name; raises as `Decoder.load` does."""
 THREADS = click.option("--threads", type=click.IntRange(1), help="Threads of an inference; by default all cores.")
-PROVIDER = click.option(
-    "--provider",
-    envvar="LIGHTPAGE_SERVICE__PROVIDER",
-    show_envvar=True,
-    show_default=CPU,
-    help=f"What computes pages: {WANTED}.",
-)
 ENGINE_CACHE = click.option(
     "--engine-cache",
     type=click.Path(file_okay=False, path_type=Path),

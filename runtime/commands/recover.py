@@ -8,8 +8,7 @@ import click
 
 from lightpage.cli.paths import OutputFile
 from lightpage.codec.code import load_code
-from lightpage.codec.volume_file import ranges
-from lightpage.errors import InvalidInputError
+from lightpage.codec.volume_file import parse_volume, ranges
 from lightpage.files import write_json
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording
@@ -48,7 +47,7 @@ def recover(
     with Recording.open(recording) as pages:
         code = code_of(pages, decoder.bundle) if code_path is None else load_code(code_path)
         tracker = tracker_for(decoder) if tracking else NoTracker(decoder)
-        result = recover_file(decoder, pages, tracker, code, out, *which(volume), holes=holes)
+        result = recover_file(decoder, pages, tracker, code, out, *parse_volume(volume), holes=holes)
     if json_path is not None:
         write_json(json_path, result.to_json())
     click.echo(describe(result))
@@ -56,22 +55,6 @@ def recover(
         warn(f"no bytes: {line}")
     if (error := lost_data(result, out, holes)) is not None:
         raise error
-
-
-def which(volume: str | None) -> tuple[int | None, int | None]:
-    """Number and checksum of a volume that is asked for.
-
-    Raises:
-        InvalidInputError: neither ID nor ID:CHECKSUM.
-    """
-    if volume is None:
-        return None, None
-    number, _, checksum = volume.partition(":")
-    try:
-        return int(number), int(checksum, 16) if checksum else None
-    except ValueError:
-        expected = "ID, or ID:CHECKSUM in hexadecimal digits"
-        raise InvalidInputError("--volume", repr(volume), expected) from None
 
 
 def describe(result: Recovery) -> str:

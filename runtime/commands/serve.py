@@ -28,7 +28,8 @@ from runtime.acquisition.sources import open_source
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.shipped import DEFAULT, bundle_path
 from runtime.bundle.signature import BundleKey
-from runtime.commands.execution import ENGINE_CACHE, PROVIDER, THREADS
+from runtime.commands.execution import ENGINE_CACHE, THREADS
+from runtime.commands.provider_option import PROVIDER
 from runtime.console.actions import Actions
 from runtime.console.history import History
 from runtime.console.server import Console, ConsoleServer

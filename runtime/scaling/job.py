@@ -11,12 +11,14 @@ from typing import Literal
 
 from pydantic import ValidationError
 
+from lightpage.codec.code import Code
 from lightpage.errors import BundleError, InvalidInputError, LightpageError, RecordingError
 from lightpage.files import replace_text
 from lightpage.recording.reader import Recording
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import MANIFEST
 from runtime.bundle.shipped import bundle_path
+from runtime.execution.providers import CPU
 from runtime.scaling.task import FineTuning, NamedBundle, Operation, Plain, Problem, Stamp
 
 FILE = "job.json"
@@ -59,6 +61,8 @@ class Choices(Plain):
         range_pages: pages of a range.
         tracking: whether the image is followed within a range.
         symbols: whether decoding keeps symbols and confidences.
+        code: of the pages whose user bytes are read; None for each recording's, or else its bundle's.
+        provider: what pages are computed with.
         known_pages: that a device is recalibrated with; None for `KNOWN_PAGES`, or all of them with `fine_tuning`.
         fine_tuning: how devices are trained on after the fit of their geometry; None to fit the geometry alone.
         parts: that processes do independently of each other.
@@ -68,6 +72,8 @@ class Choices(Plain):
     range_pages: int = RANGE_PAGES
     tracking: bool = True
     symbols: bool = True
+    code: Code | None = None
+    provider: str = CPU
     known_pages: int | None = None
     fine_tuning: FineTuning | None = None
     parts: int = 1

@@ -193,6 +193,8 @@ class Ledger:
                 shard=self.shard(index, first),
                 tracking=choices.tracking,
                 symbols=choices.symbols,
+                code=choices.code,
+                provider=choices.provider,
             )
 
     def _device(self, job: Job, index: int, own: tuple[Source, ...]) -> Task | None:
@@ -212,6 +214,7 @@ class Ledger:
             shard=self.shard(index, 0),
             more=tuple(RecordedFile(path=each.path, stamp=each.stamp) for each in others if each.stamp is not None),
             run=first.run,
+            provider=choices.provider,
             fine_tuning=choices.fine_tuning,
         )
 

@@ -41,6 +41,7 @@ class RayEngine:
         workers: most ranges at once; by default as many as the cluster's CPUs allow at any time.
         threads: CPUs of a worker, and threads of its inferences; by default `THREADS_OF_WORKER`, or what a node has.
         work: what a worker does with a task and so many threads.
+        gpus: of a worker, 0 or 1: Ray shows it that one alone.
     """
 
     def __init__(
@@ -49,9 +50,10 @@ class RayEngine:
         workers: int | None = None,
         threads: int | None = None,
         work: Callable[[Task, int], Outcome] | None = None,
+        gpus: int = 0,
     ) -> None:
         self._address, self._workers, self._work = address, workers, work or _work
-        self._threads = threads
+        self._threads, self._gpus = threads, gpus
         self.restarts, self.in_flight, self.workers_alive = 0, 0, 0
 
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
@@ -59,7 +61,7 @@ class RayEngine:
 
         Raises:
             WorkerError: no cluster, or one that does not answer.
-            InvalidInputError: no node has as many CPUs as a worker takes.
+            InvalidInputError: no node has as many CPUs as a worker takes, or a GPU if it takes one.
             ModuleNotFoundError: Ray is not installed: the extra cluster brings it.
         """
         with connected(self._address) as ray:
@@ -67,7 +69,7 @@ class RayEngine:
 
     def _run(self, ray: Any, following: Iterator[Task]) -> Generator[Outcome, None, None]:
         threads = self._threads_of(ray)
-        work = ray.remote(self._work).options(num_cpus=threads, max_retries=0)
+        work = ray.remote(self._work).options(num_cpus=threads, num_gpus=self._gpus, max_retries=0)
         again = deque[Attempt]()
         busy: dict[Any, Attempt] = {}
         try:
@@ -107,6 +109,8 @@ class RayEngine:
             InvalidInputError: more are asked for.
         """
         largest = max((int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]), default=0)
+        if self._gpus and not ray.cluster_resources().get("GPU"):
+            raise InvalidInputError("the Ray cluster", "no GPU", "a node with one, or provider cpu")
         if self._threads is not None and self._threads > largest:
             raise InvalidInputError(
                 "--threads", f"{self._threads}, and nodes of {largest} CPUs", "a node that has them"
@@ -115,7 +119,10 @@ class RayEngine:
 
     def _most(self, ray: Any, threads: int) -> int:
         """Tasks that may be on their way, as the cluster is now."""
-        room = int(ray.cluster_resources().get("CPU", 0)) // threads
+        there = ray.cluster_resources()
+        room = int(there.get("CPU", 0)) // threads
+        if self._gpus:
+            room = min(room, int(there.get("GPU", 0)) // self._gpus)
         self.workers_alive = room if self._workers is None else min(room, self._workers)
         return self._workers or max(1, room) * AHEAD
 

@@ -8,7 +8,9 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from lightpage.codec.code import Code
 from lightpage.errors import LightpageError
+from runtime.execution.providers import CPU
 
 
 class Operation(StrEnum):
@@ -113,6 +115,8 @@ class Task(Plain):
         shard: path of the result, without the end of its name.
         tracking: whether the image is followed within the range.
         symbols: whether decoding keeps symbols and confidences.
+        code: of the pages whose user bytes are read; None for the recording's, or else the bundle's.
+        provider: what pages are computed with, as `runtime.execution.providers.Provider.parse` takes it.
         more: further recordings of a device that is recalibrated, whose pages follow those of the first.
         run: of a device that is recalibrated deeply: folder of the training run that its bundle was made from.
         fine_tuning: how it is trained then; None for a re-fit of the geometry alone.
@@ -127,6 +131,8 @@ class Task(Plain):
     shard: Path
     tracking: bool = True
     symbols: bool = True
+    code: Code | None = None
+    provider: str = CPU
     more: tuple[RecordedFile, ...] = ()
     run: Path | None = None
     fine_tuning: FineTuning | None = None

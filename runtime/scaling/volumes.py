@@ -8,15 +8,39 @@ from pathlib import Path
 from typing import Any
 
 from lightpage.codec.volume import Volume
-from lightpage.codec.volume_file import VolumeFile, ranges
+from lightpage.codec.volume_file import Restored, VolumeFile, ranges
 from lightpage.errors import InvalidInputError, LostDataError
 from lightpage.files import write_json
 from runtime.scaling.job import Job
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.shard import read_user_bytes
 
-FOLDER, TOLD = "files", "files.json"
-"""Of a run's folder: the files that are whole, and what became of each at the end of the last run."""
+FOLDER, TOLD, HOLES = "files", "files.json", ".holes"
+"""Of a run's folder: the files, what became of each at the end of the last run, and the end of a name with holes."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which files are made.
+
+    Attributes:
+        volume_id, checksum: of one volume alone; None for any.
+        holes: whether a file is made too where data are lost, with zeros in their place and `HOLES` behind its name.
+    """
+
+    volume_id: int | None = None
+    checksum: int | None = None
+    holes: bool = False
+
+    def takes(self, volume: Volume) -> bool:
+        """Whether a volume's file is made."""
+        return self.volume_id in (None, volume.id) and self.checksum in (None, volume.checksum)
+
+    def __str__(self) -> str:
+        return f"{self.volume_id}" + ("" if self.checksum is None else f":{self.checksum:08x}")
+
+
+ALL_FILES = Wanted()
 
 
 @dataclass(frozen=True)
@@ -25,10 +49,11 @@ class RecoveredFile:
 
     Attributes:
         volume: how it lies on its pages.
-        path: where the file is, if it is whole.
+        path: where the file is, if it is whole, or would be.
         read: pages that gave bytes, parity pages included.
         restored, lost: see `lightpage.codec.volume_file.Restored`.
-        error: why there is no file; None where there is.
+        error: why there is no whole file; None where there is.
+        holes: the file with zeros where data are lost; None where none was made.
     """
 
     volume: Volume
@@ -37,6 +62,7 @@ class RecoveredFile:
     restored: tuple[int, ...] = ()
     lost: tuple[int, ...] = ()
     error: str | None = None
+    holes: Path | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The figures under the names that other programs read."""
@@ -47,25 +73,33 @@ class RecoveredFile:
             "restored": list(self.restored),
             "lost": list(self.lost),
             "error": self.error,
+            "file_with_holes": None if self.holes is None else str(self.holes),
         }
 
 
-def recovered_files(ledger: Ledger, job: Job) -> list[RecoveredFile]:
-    """Make the file of every volume whose pages suffice, and note what became of each; one that is there stays.
+def recovered_files(ledger: Ledger, job: Job, wanted: Wanted = ALL_FILES) -> list[RecoveredFile]:
+    """Make the files of volumes whose pages suffice, and note what became of each; one that is there stays.
 
     Of the shards one is held at a time, and of the volumes their names.
 
     Raises:
-        InvalidInputError: a shard cannot be read, or a file cannot be written.
+        InvalidInputError: a shard cannot be read, a file cannot be written, or no page is of the volume that is wanted.
     """
     shards: dict[Volume, dict[Path, int]] = {}
+    seen: set[Volume] = set()
     for shard in _shards(ledger, job):
         for _, page in read_user_bytes(shard):
             if (volume := Volume.of_page(page)) is not None:
+                seen.add(volume)
+                if not wanted.takes(volume):
+                    continue
                 there = shards.setdefault(volume, {})
                 there[shard] = there.get(shard, 0) + 1
     before = {file["file"]: tuple(file["restored"]) for file in known_files(ledger.folder) or ()}
-    files = [_file(ledger.folder / FOLDER, volume, there, before) for volume, there in shards.items()]
+    if seen and not shards:
+        shown = ", ".join(f"{volume.id}:{volume.checksum:08x}" for volume in seen)
+        raise InvalidInputError("--volume", str(wanted), f"a volume of the recordings: {shown}")
+    files = [_file(ledger.folder / FOLDER, volume, there, before, wanted.holes) for volume, there in shards.items()]
     write_json(ledger.folder / TOLD, [file.to_json() for file in files])
     return files
 
@@ -96,7 +130,9 @@ def _shards(ledger: Ledger, job: Job) -> list[Path]:
     return found
 
 
-def _file(folder: Path, volume: Volume, shards: dict[Path, int], before: dict[str, tuple[int, ...]]) -> RecoveredFile:
+def _file(
+    folder: Path, volume: Volume, shards: dict[Path, int], before: dict[str, tuple[int, ...]], holes: bool
+) -> RecoveredFile:
     path, read = folder / f"{volume.id}-{volume.checksum:08x}", sum(shards.values())
     if path.exists():
         return RecoveredFile(volume, path, read, before.get(str(path), ()))
@@ -104,6 +140,24 @@ def _file(folder: Path, volume: Volume, shards: dict[Path, int], before: dict[st
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise InvalidInputError(f"folder {folder}", error, "a folder that can be written") from None
+    try:
+        done = _written(path, volume, shards, despite_losses=False)
+        if not done.lost:
+            return RecoveredFile(volume, path, read, done.restored)
+        told = f"data pages {ranges(done.lost)} lost, no file; at most {volume.parity_pages} lost pages a group"
+        if not holes:
+            return RecoveredFile(volume, path, read, done.restored, done.lost, told)
+        # under a name of its own: whoever finds the other one may take it for whole
+        beside = path.with_name(path.name + HOLES)
+        _written(beside, volume, shards, despite_losses=True)
+        told = told.replace("no file", f"zeros in {beside}")
+        return RecoveredFile(volume, path, read, done.restored, done.lost, told, beside)
+    except (LostDataError, InvalidInputError) as error:
+        return RecoveredFile(volume, path, read, error=str(error))
+
+
+def _written(path: Path, volume: Volume, shards: dict[Path, int], *, despite_losses: bool) -> Restored:
+    """Put a file together, and give it its name unless data are lost; raises as `VolumeFile` does."""
     file = VolumeFile(path, volume)
     try:
         for shard in shards:
@@ -111,12 +165,8 @@ def _file(folder: Path, volume: Volume, shards: dict[Path, int], before: dict[st
                 if Volume.of_page(page) == volume and page.header is not None and page.data is not None:
                     file.add(page.header.page, page.data)
         done = file.restore()
-        if done.lost:
-            told = f"data pages {ranges(done.lost)} lost, no file; at most {volume.parity_pages} lost pages a group"
-            return RecoveredFile(volume, path, read, done.restored, done.lost, told)
-        file.complete()
-        return RecoveredFile(volume, path, read, done.restored)
-    except (LostDataError, InvalidInputError) as error:
-        return RecoveredFile(volume, path, read, error=str(error))
+        if despite_losses or not done.lost:
+            file.complete(done.lost)
+        return done
     finally:
         file.close()

@@ -44,6 +44,7 @@ from runtime.decoding.image_tracker import tracker_for
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import NoTracker, Tracker
 from runtime.errors import LostPageError
+from runtime.execution.providers import Provider
 from runtime.recalibration.known_pages import read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
 from runtime.recalibration.recalibration import next_version, recalibrate
@@ -92,7 +93,7 @@ class Worker:
     ) -> None:
         self._threads, self._fit, self._deep = threads, fit, deep
         self.tell: Callable[[Step], None] = lambda step: None
-        self._warm: tuple[NamedBundle, _Warm] | None = None
+        self._warm: tuple[NamedBundle, str, _Warm] | None = None
 
     def work(self, task: Task) -> Outcome:
         """Read a range and write its shard, or say why there is none.
@@ -103,7 +104,7 @@ class Worker:
         whole = True
         try:
             _check_stamp(task)
-            warm = self._opened(task.bundle)
+            warm = self._opened(task.bundle, task.provider)
             with _recording_of(task) as recording:
                 check_recording(warm.decoder, recording)
                 record = self._record(task, recording, warm)
@@ -143,20 +144,21 @@ class Worker:
             Operation.RECOVER: reading.recovered,
         }[task.operation]()
 
-    def _opened(self, bundle: NamedBundle) -> _Warm:
+    def _opened(self, bundle: NamedBundle, provider: str) -> _Warm:
         """The decoder of a bundle; the one before it is let go first, so that there is one at a time.
 
         Raises:
             BundleError: another bundle than was named.
+            ProviderError: there is no such provider here.
         """
-        if self._warm is None or self._warm[0] != bundle:
+        if self._warm is None or self._warm[:2] != (bundle, provider):
             self._warm = None
             if (found := bundle_sha256(bundle.path)) != bundle.sha256:
                 raise BundleError(
                     f"bundle {bundle.path}", f"SHA-256 {found}", f"{bundle.sha256}, as the run began with"
                 )
-            self._warm = bundle, _Warm(Decoder.load(bundle.path, self._threads))
-        return self._warm[1]
+            self._warm = bundle, provider, _Warm(Decoder.load(bundle.path, self._threads, Provider.parse(provider)))
+        return self._warm[2]
 
     def _recalibrated(self, task: Task, recording: Recording, decoder: Decoder) -> ShardRecord:
         """Recalibrate a device; that its pages fit no geometry is a result too."""
@@ -275,7 +277,8 @@ class _Range:
 
     def recovered(self) -> ShardRecord:
         """User bytes."""
-        reader = page_reader(self.decoder, self.recording, self.tracker, code_of(self.recording, self.decoder.bundle))
+        code = self.task.code or code_of(self.recording, self.decoder.bundle)
+        reader = page_reader(self.decoder, self.recording, self.tracker, code)
         kept: list[tuple[int, PageBytes]] = []
         records: list[PageRecord] = []
         for page, frames in self._read(self.recording.frames):

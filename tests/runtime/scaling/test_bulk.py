@@ -362,6 +362,58 @@ def test_a_file_whose_pages_do_not_suffice_is_not_written(archive: Archive, caps
     assert "volumes 9 without a file" in capsys.readouterr().err
 
 
+def test_a_file_of_one_volume_is_written_with_holes_under_a_name_of_its_own(
+    archive: Archive, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bundle = coded.bundle(archive.folder / "coded.zip")
+    pages = coded.pages(bundle, archive.folder)
+    (archive.folder / "pages.h5").rename(archive.folder / "pages.sent")
+    coded.recording(archive.folder / "a.h5", pages[:8], {0: coded.dark, 1: coded.dark, 2: coded.dark})
+    coded.recording(archive.folder / "b.h5", pages[8:])
+    asked = ("recover", "--no-tracking", "--bundle", str(bundle))
+    for _ in range(2):  # the second time it is made again
+        status, figures = archive.run(*asked, "--holes")
+        (told,) = figures["files"]
+        holes = Path(told["file_with_holes"])
+        assert (status, told["file"], told["lost"]) == (3, None, [0, 1, 2])
+        found, lost = holes.read_bytes(), 3 * len(coded.CONTENT) // (len(pages) - 1)
+        assert len(found) == len(coded.CONTENT)
+        assert not any(found[: lost // 2])
+        assert found[-100:] == coded.CONTENT[-100:]
+        assert [path.name for path in (archive.out / "files").iterdir()] == [holes.name]
+    assert f"zeros in {holes}" in capsys.readouterr().out
+    assert archive.run(*asked, "--volume", "9")[1]["files"][0]["file_with_holes"] is None
+    assert archive.run(*asked, "--volume", "8:12")[0] == 2
+    assert "--volume: got 8:00000012, wanted a volume of the recordings: 9:" in capsys.readouterr().err
+
+
+def test_a_code_of_its_own_reads_pages_whose_recording_and_bundle_have_none(archive: Archive) -> None:
+    bundle = coded.bundle(archive.folder / "coded.zip")
+    pages = coded.pages(bundle, archive.folder)
+    (archive.folder / "pages.h5").rename(archive.folder / "pages.sent")
+    for name, some in (("a", pages[:8]), ("b", pages[8:])):
+        coded.recording(archive.folder / f"{name}.h5", some, code=None)
+    asked = ("recover", "--no-tracking", "--bundle", str(archive.folder / "toy.zip"))
+    assert archive.run(*asked)[0] == 2
+    shutil.rmtree(archive.out)
+    coded.CODE.save(archive.folder / "code.toml")
+    status, figures = archive.run(*asked, "--code", str(archive.folder / "code.toml"))
+    assert status == 0
+    assert Path(figures["files"][0]["file"]).read_bytes() == coded.CONTENT
+    assert archive.run("recover", asked=False)[0] == 0  # the code is part of what was asked
+    assert archive.tasks == []
+
+
+def test_pages_are_computed_with_the_provider_that_is_asked_for(
+    archive: Archive, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert archive.run("decode", "--provider", "cuda")[0] == 2
+    assert {task.provider for task in archive.tasks} == {"cuda"}
+    assert "provider cuda: got an onnxruntime with" in capsys.readouterr().err
+    assert archive.run("decode", "--provider", "gpu")[0] == 2
+    assert "provider: got 'gpu', wanted cpu, cuda or tensorrt" in capsys.readouterr().err
+
+
 def test_pages_without_any_bytes_are_lost_data(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
     bundle = coded.bundle(archive.folder / "coded.zip")
     status, figures = archive.run("recover", "--no-tracking", "--bundle", str(bundle))

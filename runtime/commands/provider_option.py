@@ -1,0 +1,15 @@
+"""The option that says what computes pages, for commands that decode, and for those that have others decode."""
+
+from __future__ import annotations
+
+import click
+
+from runtime.execution.providers import CPU, WANTED
+
+PROVIDER = click.option(
+    "--provider",
+    envvar="LIGHTPAGE_SERVICE__PROVIDER",
+    show_envvar=True,
+    show_default=CPU,
+    help=f"What computes pages: {WANTED}.",
+)
