@@ -303,6 +303,8 @@ def main(
         made: Callable[[str], BulkRun] = partial(_run, job, out, options, mark)
         figures |= killed(made("killed"), job, kills, nodes, cluster, seed)
         figures |= compared(job, out / "killed", out / "single")
+        if json_path is not None:  # the rest takes as long again
+            write_json(json_path, figures)
         figures |= in_peace(made("peace"), job, warm_pages)
     click.echo(json.dumps(figures, indent=2))
     if json_path is not None:
