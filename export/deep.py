@@ -25,7 +25,7 @@ from runtime.recalibration.judgement import JudgedPage, judge, judged_pages
 from runtime.recalibration.known_pages import KnownPages, read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome, RefitReport
 from runtime.recalibration.recalibration import next_version
-from runtime.recalibration.refit import refit_with
+from runtime.recalibration.refit import refit
 from runtime.scaling.fine_tuning import DeepRecalibration
 from runtime.scaling.task import FineTuning
 from train.fitting.memory import keep_freed_memory
@@ -168,7 +168,7 @@ def _calibration(
     profile = decoder.bundle.profile
     twin, solve_field = TorchTwin(RayTwin(profile)), TorchFieldSolver(FieldRecovery(profile))
     try:
-        near = refit_with(decoder.bundle, read_recorded(recording, pages), progress, decoder, twin, solve_field)
+        near = refit(decoder.bundle, read_recorded(recording, pages), progress, decoder, twin, solve_field)
         found = parse_calibration(near.calibration_toml)
     except CalibrationError as error:
         note(f"{error}; calibrating from nominal")

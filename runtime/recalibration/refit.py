@@ -34,7 +34,14 @@ _SEARCHED_SYMBOLS = 300
 """Known symbols by which the image is looked for: enough in any light that can be calibrated in, and soon done."""
 
 
-def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:
+def refit(
+    bundle: Bundle,
+    pages: KnownPages,
+    progress: Progress,
+    decoder: Decoder,
+    twin: Twin | None = None,
+    solve_field: FieldSolver | None = None,
+) -> RefitResult:
     """Fit on `pages`, starting from the bundle's calibration, moved to where their image is found.
 
     The table holds the re-traced geometry and the reference frames that it was fitted with.
@@ -44,24 +51,14 @@ def refit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decode
         pages: known pages; the first finds the geometry, the coherences are the mean of all.
         progress: told of every stage.
         decoder: the bundle's, whose graph recovers the field.
+        twin: of the bundle's profile; the bundle's own if left out.
+        solve_field: recovers fields; the decoder's graph if left out.
 
     Raises:
         CalibrationError: the pages fit no geometry near the earlier calibration, there are no reference frames, or the
             bundle holds no calibration to start from.
         BundleError: the bundle's graphs do not show the field, or hold a geometry that cannot be fed instead.
     """
-    return refit_with(bundle, pages, progress, decoder, OnnxTwin(bundle, TWIN_THREADS), decoder.field_solver)
-
-
-def refit_with(
-    bundle: Bundle,
-    pages: KnownPages,
-    progress: Progress,
-    decoder: Decoder,
-    twin: Twin,
-    solve_field: FieldSolver,
-) -> RefitResult:
-    """The same with any twin and field solver of the bundle's profile."""
     profile, earlier = bundle.profile, calibration_of(bundle)
     if not _REFITTED & decoder.graph.ports.keys():
         among = f"{' or '.join(sorted(_REFITTED))} among them"
@@ -70,6 +67,7 @@ def refit_with(
     references = pages.references or _kept_references(bundle)
     if references is None:
         raise CalibrationError("re-fit", "no reference frames", "reference-only frames taken with the known pages")
+    twin = OnnxTwin(bundle, TWIN_THREADS) if twin is None else twin
     progress("find the image", 0.0)
     image = _find(decoder, twin, pages, references)
     start = moved_cameras(earlier.vector, image)
@@ -80,7 +78,7 @@ def refit_with(
     try:
         registered = refine(
             twin,
-            solve_field,
+            decoder.field_solver if solve_field is None else solve_field,
             profile,
             references,
             known,
