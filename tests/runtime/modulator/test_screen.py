@@ -98,6 +98,7 @@ def runs(process: int) -> bool:
 
 
 def own_window() -> int:
+    until(lambda: bool(windows_of(os.getpid())))  # its process goes by its own name once it has begun
     (found,) = windows_of(os.getpid())
     return found
 

@@ -18,6 +18,7 @@ from runtime.trigger.scpi_line import ScpiLine
 from runtime.trigger.scpi_port import REFUSALS, LineTimes
 from runtime.virtual_device.pulse_generator import IDENTITY, PulseGeneratorEmulator
 from runtime.virtual_device.serial_port import Fault, Pty, TcpPort, VirtualSerialPort
+from tests.runtime.cameras.scene import until
 
 TIMES = LineTimes(answer_s=0.15, quiet_s=0.03, late_s=0.4, synchronise_s=1.5)
 NUMBER = re.compile(r"\d+\.\d+")
@@ -152,6 +153,9 @@ def test_what_comes_unasked_is_no_answer(tmp_path: Path) -> None:
         line = ScpiLine(port.address, times=TIMES)
         line.send(":PULSE1:STATE ON")
         port._write(b"ok\r\n")
+        serial = line._port._port
+        assert serial is not None
+        until(lambda: serial.in_waiting == len(b"ok\r\n"))  # the system hands bytes on in its own time
         port.fault = lambda message: Fault.SILENCE if message == ":PULSE2:STATE ON" else None
         with pytest.raises(LostShotError, match="no answer"):
             line.send(":PULSE2:STATE ON")
