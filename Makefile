@@ -118,9 +118,10 @@ soak: $(STAMP)  ## 40 minutes at 80% of the service's load: does its memory grow
 	$(BIN)/python -m analysis.service.soak --json $(BENCH_SERVICE)/soak.json
 
 BENCH_SCALING := runs/bench-scaling
+QUICK := --kept analysis/weights/bench/-0.6deg-32e-4px --out $(BENCH_SCALING)/quick
 bench-scaling: $(STAMP)  ## bulk runs whose workers and Ray nodes are killed, speed, memory, a second run, a fleet, how far it goes: in hours
-	$(ONE_THREAD) $(BIN)/python -m analysis.scaling.faults --out $(BENCH_SCALING) --json $(BENCH_SCALING)/local.json
-	$(ONE_THREAD) $(BIN)/python -m analysis.scaling.faults --engine ray --out $(BENCH_SCALING) --json $(BENCH_SCALING)/ray.json
+	$(ONE_THREAD) $(BIN)/python -m analysis.scaling.faults $(QUICK) --json $(BENCH_SCALING)/local.json
+	$(ONE_THREAD) $(BIN)/python -m analysis.scaling.faults --engine ray $(QUICK) --json $(BENCH_SCALING)/ray.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.scaling.second_run --out $(BENCH_SCALING) --json $(BENCH_SCALING)/second-run.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.scaling.cost --out $(BENCH_SCALING) --json $(BENCH_SCALING)/cost.json
 	$(ONE_THREAD) $(BIN)/python -m analysis.scaling.fleet --deep 2 --out $(BENCH_SCALING)/fleet --json $(BENCH_SCALING)/fleet.json

@@ -95,12 +95,16 @@ def recovered_files(ledger: Ledger, job: Job, wanted: Wanted = ALL_FILES) -> lis
                     continue
                 there = shards.setdefault(volume, {})
                 there[shard] = there.get(shard, 0) + 1
-    before = {file["file"]: tuple(file["restored"]) for file in known_files(ledger.folder) or ()}
+    known = known_files(ledger.folder) or []
+    before = {file["file"]: tuple(file["restored"]) for file in known}
     if seen and not shards:
         shown = ", ".join(f"{volume.id}:{volume.checksum:08x}" for volume in seen)
         raise InvalidInputError("--volume", str(wanted), f"a volume of the recordings: {shown}")
     files = [_file(ledger.folder / FOLDER, volume, there, before, wanted.holes) for volume, there in shards.items()]
-    write_json(ledger.folder / TOLD, [file.to_json() for file in files])
+    told = [file.to_json() for file in files]
+    asked = {(volume.id, volume.checksum) for volume in shards}
+    others = [file for file in known if (file["volume"], file["checksum"]) not in asked]
+    write_json(ledger.folder / TOLD, [*others, *told])
     return files
 
 
@@ -142,16 +146,16 @@ def _file(
         raise InvalidInputError(f"folder {folder}", error, "a folder that can be written") from None
     try:
         done = _written(path, volume, shards, despite_losses=False)
-        if not done.lost:
-            return RecoveredFile(volume, path, read, done.restored)
-        told = f"data pages {ranges(done.lost)} lost, no file; at most {volume.parity_pages} lost pages a group"
-        if not holes:
-            return RecoveredFile(volume, path, read, done.restored, done.lost, told)
         # under a name of its own: whoever finds the other one may take it for whole
-        beside = path.with_name(path.name + HOLES)
-        _written(beside, volume, shards, despite_losses=True)
-        told = told.replace("no file", f"zeros in {beside}")
-        return RecoveredFile(volume, path, read, done.restored, done.lost, told, beside)
+        beside, made = path.with_name(path.name + HOLES), "no file"
+        if not done.lost:
+            beside.unlink(missing_ok=True)
+            return RecoveredFile(volume, path, read, done.restored)
+        if holes:
+            _written(beside, volume, shards, despite_losses=True)
+            made = f"zeros in {beside}"
+        told = f"data pages {ranges(done.lost)} lost, {made}; at most {volume.parity_pages} lost pages a group"
+        return RecoveredFile(volume, path, read, done.restored, done.lost, told, beside if beside.exists() else None)
     except (LostDataError, InvalidInputError) as error:
         return RecoveredFile(volume, path, read, error=str(error))
 

@@ -382,9 +382,28 @@ def test_a_file_of_one_volume_is_written_with_holes_under_a_name_of_its_own(
         assert found[-100:] == coded.CONTENT[-100:]
         assert [path.name for path in (archive.out / "files").iterdir()] == [holes.name]
     assert f"zeros in {holes}" in capsys.readouterr().out
-    assert archive.run(*asked, "--volume", "9")[1]["files"][0]["file_with_holes"] is None
+    assert archive.run(*asked, "--volume", "9")[1]["files"][0]["file_with_holes"] == str(holes)  # it is there still
     assert archive.run(*asked, "--volume", "8:12")[0] == 2
     assert "--volume: got 8:00000012, wanted a volume of the recordings: 9:" in capsys.readouterr().err
+
+
+def test_one_volume_alone_leaves_what_is_known_of_the_others_and_a_whole_file_needs_no_holes(archive: Archive) -> None:
+    bundle = coded.bundle(archive.folder / "coded.zip")
+    pages = coded.pages(bundle, archive.folder)
+    (archive.folder / "pages.h5").rename(archive.folder / "pages.sent")
+    coded.recording(archive.folder / "a.h5", pages[:8])
+    coded.recording(archive.folder / "b.h5", pages[8:])
+    asked = ("recover", "--no-tracking", "--bundle", str(bundle))
+    (told,) = archive.run(*asked)[1]["files"]
+    note, file = archive.out / "files.json", Path(told["file"])
+    note.write_text(json.dumps([{**told, "volume": 3}, told]))
+    file.unlink()
+    holes = file.with_name(file.name + ".holes")
+    holes.write_bytes(b"from before the last page came")
+    assert archive.run(*asked, "--volume", "9")[0] == 0
+    assert [each["volume"] for each in json.loads(note.read_text())] == [3, 9]
+    assert file.read_bytes() == coded.CONTENT
+    assert not holes.exists()
 
 
 def test_a_code_of_its_own_reads_pages_whose_recording_and_bundle_have_none(archive: Archive) -> None:
