@@ -12,3 +12,9 @@ Floats = NDArray[np.float64]
 def mean_resultant(kappa: Floats) -> Floats:
     """I1(kappa) / I0(kappa): the mean cosine of the error that a concentration promises."""
     return np.asarray(i1e(kappa) / i0e(kappa), np.float64)
+
+
+def information(kappa: Floats) -> Floats:
+    """What a concentration claims to tell of an angle, nats: log of the density over the uniform one, its own mean."""
+    scaled = i0e(kappa)
+    return np.asarray(kappa * (i1e(kappa) / scaled - 1) - np.log(scaled), np.float64)

@@ -27,6 +27,9 @@ _ALIASING = 60.0
 
 _CHUNK = 8192
 
+_LEAST_WEIGHT = 1e-200
+"""Of all levels with the right bit together, beside the most probable one: a smaller sum of floats has lost digits."""
+
 
 def own_information(mu: NDArray[np.floating], kappa: NDArray[np.floating], levels: int) -> Floats:
     """Bits that an estimate claims to know of a symbol: log2 M less the entropy of its posterior; shape as `mu`.
@@ -112,14 +115,22 @@ def gray_rate(
         raise PageError("levels of a Gray-labelled page", m, "a power of two")
     bits = m.bit_length() - 1
     labels = np.arange(m) ^ (np.arange(m) >> 1)
+    ones = labels[:, None] >> np.arange(bits) & 1
     total = np.full(phase.size, float(bits))
     for rows in _chunks(phase.size):
         logits = _logits(phase.ravel()[rows], k.ravel()[rows], m)
-        everything = logsumexp(logits, axis=1)
-        sent = labels[s.ravel()[rows]]
-        for bit in range(bits):
-            alike = (labels[None, :] >> bit & 1) == (sent[:, None] >> bit & 1)
-            total[rows] += (logsumexp(np.where(alike, logits, -np.inf), axis=1) - everything) / np.log(2)
+        sent = ones[s.ravel()[rows]]
+        weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+        one, zero = weights @ ones, weights @ (1 - ones)
+        alike = np.where(sent, one, zero)
+        vanished = alike < _LEAST_WEIGHT
+        log_share = np.log(np.where(vanished, 1.0, alike) / (one + zero))
+        if vanished.any():  # too improbable for a plain sum
+            symbol, bit = np.nonzero(vanished)
+            same = sent[symbol, bit, None] == ones[:, bit].T
+            of_same = logsumexp(np.where(same, logits[symbol], -np.inf), axis=1)
+            log_share[vanished] = of_same - logsumexp(logits[symbol], axis=1)
+        total[rows] += log_share.sum(axis=1) / np.log(2)
     return total
 
 

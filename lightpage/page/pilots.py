@@ -11,7 +11,7 @@ from scipy.special import i0e
 from lightpage.device.profile import Profile
 from lightpage.errors import PageError
 from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
-from lightpage.von_mises import mean_resultant
+from lightpage.von_mises import information, mean_resultant
 
 _CREDIT = 20.0
 """Pilots that count for the decoder before any is seen: noise of 54 pilots then costs under 0.01 bit a symbol."""
@@ -208,7 +208,7 @@ def check_claims(
     errors = _errors(p, pilots)
     kappa, count = np.abs(errors), len(errors)
     mean = mean_resultant(kappa)
-    claimed = kappa * (mean - 1) - np.log(i0e(kappa))
+    claimed = information(kappa)
     confirmed = -trust * _missed(errors, angle_rad) / 2 - np.log(i0e(trust * kappa))
     # of kappa cos(error): kappa^2 (E cos^2 - (E cos)^2), with E cos^2 = 1 - I1 / (kappa I0)
     variance = kappa * np.maximum(kappa * (1 - mean**2) - mean, 0)

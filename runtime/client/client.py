@@ -89,6 +89,9 @@ class LightpageClient:
         self._decode_frames = self._channel.stream_unary(
             f"{method}DecodeFrames", serialized_part, pb.DecodeReply.FromString
         )
+        self._decode_shared = self._channel.unary_unary(  # one message, for which no thread has to send a stream
+            f"{method}DecodeFrames", pb.DecodeFramesRequest.SerializeToString, pb.DecodeReply.FromString
+        )
         self._decode_pages = self._channel.stream_stream(
             f"{method}DecodePages", serialized_part, pb.DecodePagesReply.FromString
         )
@@ -171,7 +174,7 @@ class LightpageClient:
             header.shared.offset = memory.write(pair)
             header.shared.region = memory.handle
             request = pb.DecodeFramesRequest(header=header)
-            return remote_page(self._unary(self._decode_frames, iter([request])))
+            return remote_page(self._unary(self._decode_shared, request))
         reply: pb.DecodeReply = self._unary(self._decode_frames, _parts(header, _sent_frames(pair)))
         return remote_page(reply)
 

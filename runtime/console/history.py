@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.recording.frame_pair import FramePair
-from runtime.service.monitor import claimed_bits
 from runtime.service.observation import Observation
 
 PAGES = 5000
@@ -135,13 +134,13 @@ def _row(observation: Observation) -> PageRow:
         lost=None if observation.lost is None else observation.lost.value,
         unread=unread,
         margin_bits=observation.margin_bits,
-        air_bits=None if page is None else claimed_bits(page),
+        air_bits=observation.claimed_bits,
         trust=None if page is None else page.pilot_trust,
         share=None if page is None else page.check.share,
         shift_x_px=None if image is None else image.shift_x_px,
         shift_y_px=None if image is None else image.shift_y_px,
         piston_rad=None if page is None else page.piston_rad,
-        residual_rad=observation.residual_rad(),
+        residual_rad=observation.residual_rad,
         recalibration_due=page is not None and bool(page.check.recalibration_due),
     )
 

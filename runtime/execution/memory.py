@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from lightpage.allocator import set_options
 
 _ARENA_MAX = -8
 """Number of glibc's option, from its malloc.h."""
 _ARENAS = 2
+
+SHARED: Mapping[str, str] = {"MALLOC_ARENA_MAX": str(_ARENAS)}
+"""Environment of a process that others start, by which glibc does from the first thread on what `share_freed_memory`
+asks for."""
 
 
 def share_freed_memory() -> bool:

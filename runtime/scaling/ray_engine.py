@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lightpage.errors import InvalidInputError
 from runtime.errors import WorkerError
 from runtime.execution.cpus import available_cpus
+from runtime.execution.memory import SHARED
 from runtime.helper_process import same_packages
 from runtime.scaling.engine import ATTEMPTS, THREADS_OF_WORKER, Attempt, given_up, longest_s, next_attempt
 from runtime.scaling.task import Outcome, Task
@@ -135,10 +136,8 @@ def _work(task: Task, threads: int) -> Outcome:
     """In a process of Ray: do a task."""
     global _worker
     if _worker is None:
-        from runtime.execution.memory import share_freed_memory
         from runtime.scaling.work import Worker
 
-        share_freed_memory()
         _worker = Worker(threads)
     return _worker.work(task)
 
@@ -163,7 +162,8 @@ def connected(address: str | None) -> Iterator[Any]:
             "_temp_dir": folder,
             "_node_ip_address": _LOOPBACK,
         }
-    packages = {"env_vars": {"PYTHONPATH": same_packages(1)["PYTHONPATH"]}}
+    # Ray's process has many threads before a task comes: then it is too late to tell the C library of memory.
+    packages = {"env_vars": {"PYTHONPATH": same_packages(1)["PYTHONPATH"], **SHARED}}
     try:
         try:
             ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=packages, **settings)

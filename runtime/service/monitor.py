@@ -11,12 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import i0e
 
 from lightpage.codec.page_bytes import Loss
-from lightpage.von_mises import mean_resultant
-from runtime.decoding.page import DecodedPage
 from runtime.errors import Reason
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.observation import Observation
@@ -31,9 +27,6 @@ _MAD_DEVIATIONS = 1.4826
 
 _MEDIAN_ERROR = 1.25
 """Standard error of a median of many normal values over that of their mean."""
-
-_SYMBOLS = 4096
-"""Symbols by which a page's information is estimated: their mean is exact to a thousandth, and soon taken."""
 
 _OPTICAL = (Reason.PILOTS_DISAGREE, Reason.IMAGE_NOT_FOUND, Reason.TOO_FEW_PILOTS, Reason.UNSPECIFIED)
 """Losses that say something of the device's calibration, frames that contradict each other among them; a lost shot does
@@ -258,10 +251,10 @@ class PageFigures:
         if page is None or observation.lost is not None:
             return figures
         figures |= {
-            AIR.name: claimed_bits(page),
+            AIR.name: observation.claimed_bits or 0.0,
             TRUST.name: page.pilot_trust,
             SHARE.name: page.check.share,
-            RESIDUAL.name: observation.residual_rad() or 0.0,
+            RESIDUAL.name: observation.residual_rad or 0.0,
         }
         if observation.tells:
             figures[CHANGED.name] = float(page.check.recalibration_due)
@@ -357,14 +350,3 @@ class Monitor:
         for sign in state.signs:
             self._metrics.monitor_signs.labels(sign.name).set(math.nan if sign.value is None else sign.value)
             self._metrics.monitor_raised.labels(sign.name).set(sign.raised)
-
-
-def claimed_bits(page: DecodedPage) -> float:
-    """Information that a symbol's phase carries by its concentration, however many its levels are, bits; mean of many.
-
-    log2 of the von Mises density over that of no knowledge, averaged over the density itself.
-    """
-    concentration = page.concentration.ravel()
-    kappa: NDArray[np.float64] = concentration[:: max(1, concentration.size // _SYMBOLS)].astype(np.float64)
-    nats = kappa * (mean_resultant(kappa) - 1) - np.log(i0e(kappa))
-    return float(nats.mean() / np.log(2))

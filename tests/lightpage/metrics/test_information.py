@@ -106,6 +106,14 @@ def test_gray_rate_is_a_brute_force_bit_posterior_and_never_above_air() -> None:
     assert got.mean() <= information.achievable_rate(mu, kappa, symbols, 8).mean()
 
 
+def test_gray_rate_of_a_bit_that_is_all_but_impossible_is_a_number() -> None:
+    """A symbol opposite the decided one: of its first bit, levels a quarter of a turn away are the least improbable."""
+    kappa, symbols = np.array([3e4]), np.array([2])
+    got = information.gray_rate(np.zeros(1), kappa, symbols, 4)
+    # 0 is labelled 00 and 2 is 11: each bit's best level with the right value is a quarter of a turn away
+    assert got[0] == pytest.approx(2 - 2 * kappa[0] / np.log(2), rel=1e-12)
+
+
 def test_gray_labels_need_a_power_of_two_and_the_page_measure_says_none_without() -> None:
     kappa = np.full(100, 12.0)
     symbols, mu = drawn_page(6, kappa, 5)

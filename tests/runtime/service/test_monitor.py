@@ -18,7 +18,7 @@ from runtime.errors import Reason, UnconfirmedPageError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.metrics import ServiceMetrics
-from runtime.service.monitor import Monitor, MonitorSettings, PageFigures, claimed_bits
+from runtime.service.monitor import Monitor, MonitorSettings, PageFigures
 from runtime.service.observation import Observation
 from runtime.service.registry import ModelRegistry
 from tests.runtime import toy
@@ -153,7 +153,7 @@ def test_what_a_page_says_of_the_device(page: DecodedPage) -> None:
     poor = replace(page, check=replace(page.check, confirmed_bits=0.3 * page.check.claimed_bits))
     assert PageFigures().of(observation(poor))["page_due"] == poor.check.recalibration_due == 1
     assert "page_due" not in PageFigures().of(observation(poor, tells=False))
-    assert told["air_bits"] == claimed_bits(page)
+    assert told["air_bits"] == observation(page).claimed_bits
     assert not {"margin_bits", "piston_walk_rad"} & told.keys()
     told = figures.of(observation(replace(page, piston_rad=-3.0), user_data=found(None, 0.1)))
     assert told["piston_walk_rad"] == pytest.approx(2 * math.pi - 6)
@@ -167,19 +167,6 @@ def test_what_a_page_says_of_the_device(page: DecodedPage) -> None:
     assert figures.of(lost) == {"unread": 1}
     assert figures.of(replace(lost, tells=False)) == {}
     assert figures.of(observation(None, lost=Reason.MISSING_FRAME)) == {}
-
-
-def test_claimed_information_is_that_of_the_density() -> None:
-    """log2(kappa / 2 pi e) / 2 + log2 2 pi for a narrow one, 0 for none."""
-
-    class Claims:
-        concentration = np.full((10, 1000), 5000.0, np.float32)
-
-    narrow = Claims()
-    expected = np.log2(2 * np.pi) - np.log2(2 * np.pi * np.e / 5000) / 2
-    assert claimed_bits(narrow) == pytest.approx(expected, abs=1e-3)  # type: ignore[arg-type]
-    narrow.concentration = np.zeros((2, 2), np.float32)
-    assert claimed_bits(narrow) == 0  # type: ignore[arg-type]
 
 
 def test_answers_and_lost_pages_carry_it(toy_zip: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from lightpage.errors import FrameError
 from lightpage.page.pilots import Pilots
+from lightpage.von_mises import information
 from runtime.acquisition.source import SHOT_S, Shot
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
@@ -54,7 +55,9 @@ def test_pages_given_out_and_lost_are_observed(toy_zip: Path) -> None:
     assert (given.page_index, given.lost, given.tells) == (0, None, True)
     assert given.page is not None
     assert given.pair is not None
-    air, residual = given.estimated_air_bits(), given.residual_rad()
+    kappa = given.page.concentration.astype(np.float64)
+    assert given.claimed_bits == pytest.approx(information(kappa).mean() / np.log(2))
+    air, residual = given.claimed_bits, given.residual_rad
     assert air is not None
     assert 0 < air <= 8
     assert residual is not None
