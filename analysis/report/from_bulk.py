@@ -16,7 +16,7 @@ from lightpage.errors import InvalidInputError
 from lightpage.words import counted
 from runtime.scaling.job import Job
 from runtime.scaling.ledger import Ledger
-from runtime.scaling.task import Operation
+from runtime.scaling.task import NamedBundle, Operation
 from runtime.scaling.totals import AIR, CONFIRMED, DeviceState, Group, Reading, Totals, totals
 from runtime.scaling.volumes import known_files
 
@@ -244,13 +244,18 @@ def _cards(found: Totals, unit: str) -> list[tuple[str, str, str]]:
     return cards
 
 
+def _bundle(bundle: NamedBundle) -> str:
+    told = f"{bundle.path.name}, {bundle.sha256[:12] or 'could not be read'}"
+    return f"{bundle.version} ({told})" if bundle.version else told
+
+
 def _facts(job: Job, found: Totals) -> list[tuple[str, str]]:
     choices, readings, tally = job.choices, found.readings, found.tally
     facts = [
         ("Recordings", f"{len(job.sources):,}, of {counted(len(found.groups or found.devices), 'device')}")
         if any(source.device for source in job.sources)
         else ("Recordings", f"{len(job.sources):,}"),
-        ("Bundles", _few([f"{each.version} ({each.path.name}, {each.sha256[:12]})" for each in job.bundles])),
+        ("Bundles", _few([_bundle(each) for each in job.bundles])),
         ("Read by", _few([f"{version}: {count:,}" for version, count in tally.models.most_common()])),
     ]
     if choices.operation is Operation.RECALIBRATE:

@@ -191,7 +191,8 @@ def _bulk(
             provider = Provider.parse(choices.provider)
             job = _job(ledger.folder, before, choices, recordings, fleet, bundle)
             if choices.fine_tuning is not None:
-                job = job.checked(partial(_check_device, ledger, deep_recalibration(), choices.known_pages))
+                check = partial(_check_device, ledger, deep_recalibration(), choices.known_pages)
+                job = job.checked(ledger.devices(job), check)
             if again_with is not None:
                 job = _with_round(job, again_with)
             job.write(ledger.folder)

@@ -109,9 +109,9 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine], watch: Watch = _
     start = time.perf_counter()
     made = Progressed()
     ledger.sweep(job)
-    for _, source in ledger.sources(job):
-        if source.problem is not None:
-            made.fail(source.problem.about(source.device))
+    problems = (source.problem.about(source.device) for _, source in ledger.sources(job) if source.problem is not None)
+    for problem in dict.fromkeys(problems):  # a bundle is lacking to all recordings of its device
+        made.fail(problem)
     unit = "device" if job.choices.operation is Operation.RECALIBRATE else "page"
     try:
         for number in range(1 + len(job.rounds)):

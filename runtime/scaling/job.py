@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import hashlib
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -127,9 +127,16 @@ class Job(Plain):
             raise InvalidInputError(f"job {path}", error, expected) from None
 
     def looked_at_again(self) -> Job:
-        """The same; recordings that could not be opened before are tried once more."""
-        again = (s if s.problem is None else look_at(s.device, s.path, s.bundle, s.run) for s in self.sources)
-        return self.model_copy(update={"sources": tuple(again)})
+        """The same; recordings and bundles that could not be opened before are tried once more."""
+        bundles, lacking = list(self.bundles), dict[int, Problem | None]()
+        for place, bundle in enumerate(bundles):
+            if not bundle.sha256:
+                bundles[place], lacking[place] = bundle_as_it_is(str(bundle.path))
+        again = (
+            s if s.problem is None else look_at(s.device, s.path, s.bundle, s.run, lacking=lacking.get(s.bundle))
+            for s in self.sources
+        )
+        return self.model_copy(update={"bundles": tuple(bundles), "sources": tuple(again)})
 
     @property
     def devices(self) -> dict[int, tuple[Source, ...]]:
@@ -144,10 +151,19 @@ class Job(Plain):
             found[place] = (*found.get(place, ()), source)
         return found
 
-    def checked(self, check: Callable[[int, tuple[Source, ...], Path], None]) -> Job:
-        """The same; a device that `check` refuses, given its place, recordings and bundle's path, has a problem."""
+    def checked(
+        self,
+        devices: Iterable[tuple[int, tuple[Source, ...]]],
+        check: Callable[[int, tuple[Source, ...], Path], None],
+    ) -> Job:
+        """The same; of these devices, one that `check` refuses has a problem.
+
+        Args:
+            devices: of `devices`, places and recordings.
+            check: is given the place, recordings and bundle's path of each that has none yet.
+        """
         sources = list(self.sources)
-        for place, own in self.devices.items():
+        for place, own in devices:
             if any(source.problem is not None for source in own):
                 continue
             try:
@@ -177,7 +193,7 @@ class Job(Plain):
             if bundle is None:
                 raise InvalidInputError(subject, f"recording {source.path}, which was not asked for before", expected)
             now = asked.bundles[source.bundle]
-            if now.sha256 != bundle.sha256:
+            if bundle.sha256 and now.sha256 and now.sha256 != bundle.sha256:
                 got = f"{now.version} ({now.sha256[:12]}), and {bundle.version} ({bundle.sha256[:12]}) before"
                 raise InvalidInputError(f"{subject}: bundle", got, f"{expected}; --again-with reads anew what was lost")
         if left_out := [str(path) for _, path in before_paths if path.exists()]:
@@ -207,6 +223,14 @@ def named_bundle(name_or_path: str) -> NamedBundle:
     return NamedBundle(path=path, sha256=bundle_sha256(path), version=Bundle.open(path).version)
 
 
+def bundle_as_it_is(name_or_path: str) -> tuple[NamedBundle, Problem | None]:
+    """A bundle as a fleet names it, without SHA-256 and version where it cannot be read, and why."""
+    try:
+        return named_bundle(name_or_path), None
+    except LightpageError as error:
+        return NamedBundle(path=bundle_path(name_or_path).absolute(), sha256="", version=""), Problem.of(error)
+
+
 def found_recordings(patterns: Sequence[str]) -> list[Path]:
     """Files that the patterns name, each once, sorted within a pattern.
 
@@ -228,8 +252,14 @@ def look_at(
     bundle: int,
     run: Path | None = None,
     known: Mapping[tuple[str, Path], Source] | None = None,
+    lacking: Problem | None = None,
 ) -> Source:
-    """A recording as it is now, or as it is known; one that cannot be opened is kept with its problem."""
+    """A recording as it is now, or as it is known.
+
+    One that cannot be opened is kept with its problem, or with what its bundle is `lacking`.
+    """
+    if lacking is not None:
+        return Source(device=device, path=path, bundle=bundle, stamp=None, pages=0, problem=lacking, run=run)
     if known and (source := known.get((device, path))) is not None:
         return source.model_copy(update={"bundle": bundle, "run": run})
     try:
@@ -274,13 +304,14 @@ class _Fleet(Plain):
 def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
     """A run over the devices that a file names, each with its bundle and recordings; paths are relative to the file.
 
+    A bundle that cannot be read is a problem of the devices that name it.
+
     Args:
         choices, before: see `of_recordings`.
         path: of the file.
 
     Raises:
-        InvalidInputError: the file cannot be read, or two devices have one name.
-        LightpageError: no such bundle, or no such files.
+        InvalidInputError: the file cannot be read, two devices have one name, or a pattern names no file.
     """
     subject = f"fleet {path}"
     try:
@@ -290,14 +321,17 @@ def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
     names = [device.name for device in fleet.device]
     if not names or len(set(names)) < len(names):
         raise InvalidInputError(subject, f"devices {', '.join(names) or 'none'}", "devices of different names")
-    bundles: dict[str, int] = {}
+    named = dict.fromkeys(_beside(path, device.bundle) for device in fleet.device)
+    places = {name: place for place, name in enumerate(named)}
+    bundles = [bundle_as_it_is(name) for name in named]
     sources, known = [], _known(before)
     for device in fleet.device:
-        place = bundles.setdefault(_beside(path, device.bundle), len(bundles))
+        place = places[_beside(path, device.bundle)]
+        _, lacking = bundles[place]
         patterns = [str(path.parent / pattern) for pattern in device.recordings]
         run = None if device.run is None else (path.parent / device.run).absolute()
-        sources += [look_at(device.name, found, place, run, known) for found in found_recordings(patterns)]
-    return Job(choices=choices, bundles=tuple(map(named_bundle, bundles)), sources=tuple(sources))
+        sources += [look_at(device.name, found, place, run, known, lacking) for found in found_recordings(patterns)]
+    return Job(choices=choices, bundles=tuple(bundle for bundle, _ in bundles), sources=tuple(sources))
 
 
 def _known(job: Job | None) -> dict[tuple[str, Path], Source]:

@@ -17,7 +17,7 @@ from runtime.scaling.engine import Engine
 from runtime.scaling.shard import PageState
 from runtime.scaling.task import Failed, Operation, Outcome
 
-_SECONDS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 60.0, 300.0, 1800.0)
+_SECONDS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 60.0, 300.0, 1800.0, 7200.0)
 """From a page of the fast preset to the recalibration of a large device."""
 
 _UNCONFIRMED = (Reason.PILOTS_DISAGREE, Reason.IMAGE_NOT_FOUND, Reason.TOO_FEW_PILOTS)

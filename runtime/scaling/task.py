@@ -53,8 +53,8 @@ class NamedBundle(Plain):
 
     Attributes:
         path: where it lies.
-        sha256: see `runtime.scaling.job.bundle_sha256`.
-        version: of its manifest.
+        sha256: see `runtime.scaling.job.bundle_sha256`; empty of one that could not be read when the run began.
+        version: of its manifest; likewise.
     """
 
     path: Path

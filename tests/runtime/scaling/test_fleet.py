@@ -68,7 +68,7 @@ class Fleet:
 
     def __init__(self, folder: Path, bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.out, self.deep = folder, folder / "out", Deep()
-        self.bundle = bundle
+        self.bundle, self.bundles = bundle, {"a": bundle, "b": bundle}
         for number, name in enumerate(("a-1", "a-2", "b")):
             device = toy.ToyDevice((148.0, 90.0), seed=number)
             toy.write_toy_recording(folder / f"{name}.h5", device, 16, PAGES, number)
@@ -80,8 +80,8 @@ class Fleet:
         """Exit status, and a row for each device."""
         tables = []
         for name, pattern in (("a", "a-*.h5"), ("b", "b.h5")):
-            lines = ["[[device]]", f'name = "{name}"', f'bundle = "{self.bundle}"', f'recordings = ["{pattern}"]']
-            tables += [*lines, *([f'run = "run-{name}"'] if name in runs else [])]
+            named = [f'name = "{name}"', f'bundle = "{self.bundles[name]}"', f'recordings = ["{pattern}"]']
+            tables += ["[[device]]", *named, *([f'run = "run-{name}"'] if name in runs else [])]
         (self.folder / "fleet.toml").write_text("\n".join(tables))
         told = self.folder / "told.json"
         told.unlink(missing_ok=True)
@@ -114,6 +114,27 @@ def test_a_recording_that_is_lost_costs_its_device_alone(fleet: Fleet) -> None:
     assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "failed", "recalibrated")
     assert "a-2.h5" in rows["a"]["reason"]
     (fleet.folder / "a-2.h5").write_bytes(whole)
+    status, rows = fleet.run()
+    assert (status, rows["a"]["state"]) == (0, "recalibrated")
+
+
+@pytest.mark.parametrize("left", [None, b"no zip"])
+def test_a_bundle_that_is_lost_costs_its_device_alone(
+    left: bytes | None, fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = fleet.folder / "own.zip"
+    own.write_bytes(whole := fleet.bundle.read_bytes())
+    fleet.bundles["a"] = own
+    own.unlink() if left is None else own.write_bytes(left)
+    status, rows = fleet.run()
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "failed", "recalibrated")
+    assert str(own) in rows["a"]["reason"]
+    assert f"device a: bundle {own}" in capsys.readouterr().err
+    assert fleet.run()[0] == 2  # it is no other question
+    own.write_bytes(whole)
+    status, rows = fleet.run()
+    assert (status, rows["a"]["state"]) == (0, "recalibrated")
+    own.unlink()
     status, rows = fleet.run()
     assert (status, rows["a"]["state"]) == (0, "recalibrated")
 
