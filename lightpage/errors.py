@@ -31,6 +31,10 @@ class RecordingError(InvalidInputError):
     """A recording that is truncated, foreign or inconsistent."""
 
 
+class UnreadableError(RecordingError):
+    """Data of a recording that the file system did not give, or gave damaged: another try may go well."""
+
+
 class FrameError(InvalidInputError):
     """A camera frame of the wrong size, type or bit depth, or without usable light."""
 

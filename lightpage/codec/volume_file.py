@@ -22,6 +22,10 @@ MOST_VOLUMES = 16
 _COPIED = 1 << 20
 
 
+PARTIAL = ".partial"
+"""End of the name of a file whose pages are still coming."""
+
+
 @dataclass(frozen=True)
 class Restored:
     """What became of a file's pages.
@@ -49,7 +53,7 @@ class VolumeFile:
 
     def __init__(self, path: Path, volume: Volume, number: int = 0) -> None:
         self.path, self.volume = path, volume
-        self._partial = path.with_name(f"{path.name}.{number}.partial")
+        self._partial = path.with_name(f"{path.name}.{number}{PARTIAL}")
         self._there: set[int] = set()
         self.repeated = 0
         """Pages that came again, with the same bytes."""

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile, parse_profile
-from lightpage.errors import ProfileError, RecordingError
+from lightpage.errors import ProfileError, RecordingError, UnreadableError
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.black_level import without_black
 from lightpage.recording.frame_pair import FramePair
@@ -427,7 +427,7 @@ class Recording:
         try:
             data: NDArray[Any] = np.asarray(self._file[name][where])
         except OSError as error:
-            raise RecordingError(self._subject(f"dataset '{name}'"), error, "data that can be read") from None
+            raise UnreadableError(self._subject(f"dataset '{name}'"), error, "data that can be read") from None
         data = data.astype(data.dtype.newbyteorder("="), copy=False)  # torch takes no other byte order
         if name in REFERENCES:
             self._check_counts(name, data, "")

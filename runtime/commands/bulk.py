@@ -23,7 +23,7 @@ from runtime.commands.provider_option import PROVIDER
 from runtime.execution.providers import CPU, Provider
 from runtime.scaling.driver import Progressed, Watch, run
 from runtime.scaling.engine import Engine
-from runtime.scaling.fine_tuning import DeepRecalibration, deep_recalibration
+from runtime.scaling.fine_tuning import deep_recalibration
 from runtime.scaling.job import KNOWN_PAGES, RANGE_PAGES, Choices, Job, Source, named_bundle, of_fleet, of_recordings
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.local import LocalEngine, default_workers
@@ -191,7 +191,7 @@ def _bulk(
             provider = Provider.parse(choices.provider)
             job = _job(ledger.folder, before, choices, recordings, fleet, bundle)
             if choices.fine_tuning is not None:
-                check = partial(_check_device, ledger, deep_recalibration(), choices.known_pages)
+                check = partial(_check_device, ledger, choices.known_pages)
                 job = job.checked(ledger.devices(job), check)
             if again_with is not None:
                 job = _with_round(job, again_with)
@@ -273,9 +273,7 @@ def _shown(metrics: BulkMetrics, address: str) -> ConsoleServer:
     return server
 
 
-def _check_device(
-    ledger: Ledger, deep: DeepRecalibration, known_pages: int | None, place: int, own: tuple[Source, ...], bundle: Path
-) -> None:
+def _check_device(ledger: Ledger, known_pages: int | None, place: int, own: tuple[Source, ...], bundle: Path) -> None:
     """Check that a device can be recalibrated deeply, unless it is.
 
     Raises:
@@ -284,7 +282,7 @@ def _check_device(
     if ledger.recalibrated(place):
         return
     pages = sum(source.pages for source in own)
-    deep.check(bundle, own[0].run, pages if known_pages is None else min(known_pages, pages))
+    deep_recalibration().check(bundle, own[0].run, pages if known_pages is None else min(known_pages, pages))
 
 
 def _job(
@@ -319,14 +317,14 @@ def _job(
     if before is None:
         return asked
     before.check(folder, asked)
-    return before.looked_at_again()
+    return before.with_bundles_of(asked).looked_at_again()
 
 
 def _with_round(job: Job, bundle: str) -> Job:
     """A job with one more round, if it does not have it."""
     model = named_bundle(bundle)
-    known = any(model.sha256 == other.sha256 for other in job.rounds)
-    return job if known else job.model_copy(update={"rounds": (*job.rounds, model)})
+    known = tuple(model if other.sha256 == model.sha256 else other for other in job.rounds)
+    return job.model_copy(update={"rounds": known if model in known else (*known, model)})
 
 
 def figures(job: Job, part: Part, made: Progressed, found: Totals, files: list[RecoveredFile]) -> dict[str, Any]:

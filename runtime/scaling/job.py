@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from lightpage.codec.code import Code
 from lightpage.errors import BundleError, InvalidInputError, LightpageError, RecordingError
@@ -126,12 +126,25 @@ class Job(Plain):
             expected = "what `lightpage bulk` of this version has written"
             raise InvalidInputError(f"job {path}", error, expected) from None
 
+    def with_bundles_of(self, asked: Job) -> Job:
+        """The same; bundles that could not be read before, or lie elsewhere now, are taken from the same question."""
+        now = {(source.device, source.path): asked.bundles[source.bundle] for source in asked.sources}
+        places: dict[NamedBundle, int] = {}
+        sources = []
+        for source in self.sources:
+            before = self.bundles[source.bundle]
+            bundle = now.get((source.device, source.path), before)
+            if before.sha256 and not bundle.sha256:  # it has gone since
+                bundle = before
+            sources.append(source.model_copy(update={"bundle": places.setdefault(bundle, len(places))}))
+        return self.model_copy(update={"bundles": tuple(places), "sources": tuple(sources)})
+
     def looked_at_again(self) -> Job:
         """The same; recordings and bundles that could not be opened before are tried once more."""
         bundles, lacking = list(self.bundles), dict[int, Problem | None]()
         for place, bundle in enumerate(bundles):
             if not bundle.sha256:
-                bundles[place], lacking[place] = bundle_as_it_is(str(bundle.path))
+                bundles[place], lacking[place] = bundle_as_it_is(bundle.path)
         again = (
             s if s.problem is None else look_at(s.device, s.path, s.bundle, s.run, lacking=lacking.get(s.bundle))
             for s in self.sources
@@ -207,7 +220,7 @@ def bundle_sha256(path: Path) -> str:
         BundleError: it cannot be read.
     """
     try:
-        with (path / MANIFEST if path.is_dir() else path).open("rb") as file:
+        with _told_by(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise BundleError(f"bundle {path}", error, "a bundle that can be read") from None
@@ -219,16 +232,40 @@ def named_bundle(name_or_path: str) -> NamedBundle:
     Raises:
         BundleError: it is none.
     """
-    path = bundle_path(name_or_path).absolute()
-    return NamedBundle(path=path, sha256=bundle_sha256(path), version=Bundle.open(path).version)
+    return _named(bundle_path(name_or_path).absolute())
 
 
-def bundle_as_it_is(name_or_path: str) -> tuple[NamedBundle, Problem | None]:
-    """A bundle as a fleet names it, without SHA-256 and version where it cannot be read, and why."""
+def bundle_as_it_is(path: Path, known: Mapping[Path, NamedBundle] | None = None) -> tuple[NamedBundle, Problem | None]:
+    """A bundle of a fleet, without SHA-256 and version where it cannot be read, and why.
+
+    Args:
+        path: of it, absolute.
+        known: bundles as they were before; one whose file is as it was is not read again.
+    """
+    before = known.get(path) if known else None
+    if before is not None and before.stamp is not None and before.stamp == _stamp(path):
+        return before, None
     try:
-        return named_bundle(name_or_path), None
+        return _named(path), None
     except LightpageError as error:
-        return NamedBundle(path=bundle_path(name_or_path).absolute(), sha256="", version=""), Problem.of(error)
+        return NamedBundle(path=path, sha256="", version=""), Problem.of(error)
+
+
+def _named(path: Path) -> NamedBundle:
+    stamp, sha256 = _stamp(path), bundle_sha256(path)
+    return NamedBundle(path=path, sha256=sha256, version=Bundle.open(path).version, stamp=stamp)
+
+
+def _stamp(bundle: Path) -> Stamp | None:
+    try:
+        return Stamp.of(_told_by(bundle))
+    except OSError:
+        return None
+
+
+def _told_by(bundle: Path) -> Path:
+    """The file whose contents say what a bundle is."""
+    return bundle / MANIFEST if bundle.is_dir() else bundle
 
 
 def found_recordings(patterns: Sequence[str]) -> list[Path]:
@@ -268,6 +305,11 @@ def look_at(
             return Source(device=device, path=path, bundle=bundle, stamp=stamp, pages=recording.pages, run=run)
     except RecordingError as error:
         problem = Problem.of(error)
+    except FileNotFoundError as error:
+        pattern = glob.has_magic(str(path))
+        got = "no file when the run began" if pattern else error
+        expected = "files that are there; begin another run for this device" if pattern else "a recording"
+        problem = Problem.of(RecordingError(f"recording {path}", got, expected))
     except OSError as error:
         problem = Problem.of(RecordingError(f"recording {path}", error, "a recording"))
     return Source(device=device, path=path, bundle=bundle, stamp=None, pages=0, problem=problem, run=run)
@@ -291,9 +333,9 @@ def of_recordings(choices: Choices, patterns: Sequence[str], bundle: str, before
 
 
 class _Device(Plain):
-    name: str
-    bundle: str
-    recordings: tuple[str, ...]
+    name: str = Field(min_length=1)
+    bundle: str = Field(min_length=1)
+    recordings: tuple[str, ...] = Field(min_length=1)
     run: str | None = None
 
 
@@ -304,14 +346,14 @@ class _Fleet(Plain):
 def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
     """A run over the devices that a file names, each with its bundle and recordings; paths are relative to the file.
 
-    A bundle that cannot be read is a problem of the devices that name it.
+    A bundle that cannot be read, or a pattern that names no file, is a problem of the devices that name it.
 
     Args:
         choices, before: see `of_recordings`.
         path: of the file.
 
     Raises:
-        InvalidInputError: the file cannot be read, two devices have one name, or a pattern names no file.
+        InvalidInputError: the file cannot be read, or two devices have one name.
     """
     subject = f"fleet {path}"
     try:
@@ -321,23 +363,44 @@ def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
     names = [device.name for device in fleet.device]
     if not names or len(set(names)) < len(names):
         raise InvalidInputError(subject, f"devices {', '.join(names) or 'none'}", "devices of different names")
+    there = {} if before is None else {bundle.path: bundle for bundle in before.bundles}
     named = dict.fromkeys(_beside(path, device.bundle) for device in fleet.device)
     places = {name: place for place, name in enumerate(named)}
-    bundles = [bundle_as_it_is(name) for name in named]
+    bundles = [bundle_as_it_is(name, there) for name in named]
     sources, known = [], _known(before)
     for device in fleet.device:
         place = places[_beside(path, device.bundle)]
         _, lacking = bundles[place]
-        patterns = [str(path.parent / pattern) for pattern in device.recordings]
         run = None if device.run is None else (path.parent / device.run).absolute()
-        sources += [look_at(device.name, found, place, run, known, lacking) for found in found_recordings(patterns)]
+        recordings = _recordings_of(device, path.parent, known)
+        sources += [look_at(device.name, found, place, run, known, lacking) for found in recordings]
     return Job(choices=choices, bundles=tuple(bundle for bundle, _ in bundles), sources=tuple(sources))
+
+
+def _recordings_of(device: _Device, folder: Path, known: Mapping[tuple[str, Path], Source]) -> list[Path]:
+    """Files of a device; of a pattern that names none, or named none when the run began, the pattern itself.
+
+    Of files that have gone since, nothing: the run knows them.
+    """
+    found: dict[Path, None] = {}
+    begun = any(name == device.name for name, _ in known)
+    for pattern in (str(folder / each) for each in device.recordings):
+        itself = Path(pattern).absolute()
+        if (device.name, itself) in known:
+            found[itself] = None
+            continue
+        try:
+            found |= dict.fromkeys(found_recordings([pattern]))
+        except InvalidInputError:
+            found |= {} if begun else {itself: None}
+    return list(found)
 
 
 def _known(job: Job | None) -> dict[tuple[str, Path], Source]:
     return {} if job is None else {(source.device, source.path): source for source in job.sources}
 
 
-def _beside(fleet: Path, bundle: str) -> str:
-    """The name of a shipped bundle, or a path relative to the fleet's file."""
-    return bundle if bundle_path(bundle) != Path(bundle) else str(fleet.parent / bundle)
+def _beside(fleet: Path, bundle: str) -> Path:
+    """Path of a bundle: of a shipped one by its name, else relative to the fleet's file."""
+    shipped = bundle_path(bundle)
+    return (shipped if shipped != Path(bundle) else fleet.parent / bundle).absolute()

@@ -88,9 +88,13 @@ class Ledger:
             raise self._not_writable(error) from None
         try:
             fcntl.flock(lock, kind | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             os.close(lock)
             raise TakenError(self._subject, "another run at work there", "its end, or another folder") from None
+        except OSError as error:
+            os.close(lock)
+            expected = "storage that has locks, without which two runs could be at work there"
+            raise InvalidInputError(f"lock {self.folder / name}", error, expected) from None
         return lock
 
     def _not_writable(self, error: OSError) -> InvalidInputError:

@@ -48,20 +48,6 @@ class Problem(Plain):
         return f"{self.subject}: got {self.got}, wanted {self.expected}"
 
 
-class NamedBundle(Plain):
-    """A bundle, and how to know it again.
-
-    Attributes:
-        path: where it lies.
-        sha256: see `runtime.scaling.job.bundle_sha256`; empty of one that could not be read when the run began.
-        version: of its manifest; likewise.
-    """
-
-    path: Path
-    sha256: str
-    version: str
-
-
 class Stamp(Plain):
     """A file's size in bytes and time of change in nanoseconds, by which it is known again."""
 
@@ -77,6 +63,22 @@ class Stamp(Plain):
         """
         found = path.stat()
         return cls(size=found.st_size, modified_ns=found.st_mtime_ns)
+
+
+class NamedBundle(Plain):
+    """A bundle, and how to know it again.
+
+    Attributes:
+        path: where it lies.
+        sha256: see `runtime.scaling.job.bundle_sha256`; empty of one that could not be read when the run began.
+        version: of its manifest; likewise.
+        stamp: of the file that was read; None in records of earlier versions.
+    """
+
+    path: Path
+    sha256: str
+    version: str
+    stamp: Stamp | None = None
 
 
 class RecordedFile(Plain):

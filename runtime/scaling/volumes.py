@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lightpage.codec.volume import Volume
-from lightpage.codec.volume_file import Restored, VolumeFile, ranges
+from lightpage.codec.volume_file import PARTIAL, Restored, VolumeFile, ranges
 from lightpage.errors import InvalidInputError, LostDataError
 from lightpage.files import write_json
 from runtime.scaling.job import Job
@@ -80,11 +80,13 @@ class RecoveredFile:
 def recovered_files(ledger: Ledger, job: Job, wanted: Wanted = ALL_FILES) -> list[RecoveredFile]:
     """Make the files of volumes whose pages suffice, and note what became of each; one that is there stays.
 
-    Of the shards one is held at a time, and of the volumes their names.
+    Of the shards one is held at a time, and of the volumes their names. No other process may make them meanwhile.
 
     Raises:
         InvalidInputError: a shard cannot be read, a file cannot be written, or no page is of the volume that is wanted.
     """
+    for left in (ledger.folder / FOLDER).glob(f"*{PARTIAL}"):  # of a run that was killed
+        left.unlink(missing_ok=True)
     shards: dict[Volume, dict[Path, int]] = {}
     seen: set[Volume] = set()
     for shard in _shards(ledger, job):

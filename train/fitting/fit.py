@@ -6,7 +6,6 @@ import logging
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -24,13 +23,13 @@ from lightpage.errors import LightpageError
 from lightpage.progress import track
 from train.data.pages import Page
 from train.fitting.curves import TENSORBOARD, curves_of, thinned
-from train.fitting.fitted import CHECKPOINTS, KEPT_POINTS, Fitted, M, finished
+from train.fitting.fitted import CHECKPOINTS, KEPT_POINTS, Fitted, M, finished, is_finished
 from train.fitting.modules import AVERAGED_SHARE, SymbolTraining
 from train.fitting.precision import lightning_precision
 from train.fitting.provenance import provenance_of
 from train.models.hyperparameters import Hyperparameters
 from train.models.network import Refiner, SymbolUNet
-from train.processes import AS_IT_IS, Processes, is_first_process, process_number
+from train.processes import AS_IT_IS, Processes, is_first_process, process_number, wait_for_first
 
 _LAST = "last.ckpt"
 
@@ -168,6 +167,11 @@ def fit(
             expected = "all of them: run the same commands again, they go on from the last checkpoint"
             raise LightpageError(f"training in {run}", "the end of another process", expected) from error
         raise
+    if not is_first_process():  # on another machine the same pages may give another digit
+        wait_for_first(lambda: int(is_finished(run)), 1, f"training in {run}")
+        found = finished(run, module)
+        assert found is not None  # it was waited for
+        return found
     # the last steps are the quietest, and no validation need have followed them
     rates = {}
     for path in {last, folder / Path(best.best_model_path or last).name}:  # the run may have been moved meanwhile
@@ -177,10 +181,9 @@ def fit(
             rates[path] = fmean(module.rate(page) for page in DataLoader(validation, batch_size=1))
     chosen = max(rates, key=lambda path: rates[path])
     module.load_state_dict(_checkpoint(chosen)["state_dict"])
-    fitted = Fitted(module, rates[chosen], timer.time_elapsed(), {})
-    if trainer.is_global_zero:
-        fitted = replace(fitted, curves={name: thinned(curve, KEPT_POINTS) for name, curve in curves_of(run).items()})
-        fitted.save(run)
+    curves = {name: thinned(curve, KEPT_POINTS) for name, curve in curves_of(run).items()}
+    fitted = Fitted(module, rates[chosen], timer.time_elapsed(), curves)
+    fitted.save(run)
     return fitted
 
 

@@ -39,7 +39,7 @@ class Fitted(Generic[M]):
         module: the best one, in float32.
         validation_air: its AIR on the validation pages, bits per data symbol.
         seconds: of training, all stretches of an interrupted run together.
-        curves: of `train.fitting.curves.CURVES`, thinned; none in the processes of further devices.
+        curves: of `train.fitting.curves.CURVES`, thinned.
     """
 
     module: M
@@ -55,13 +55,18 @@ class Fitted(Generic[M]):
         replace_text(run / FITTED, json.dumps(kept, indent=1) + "\n", "result of a training")
 
 
+def is_finished(run: Path) -> bool:
+    """Whether the training of a run has ended, and what it made is there."""
+    return (run / FITTED).exists()
+
+
 def finished(run: Path, module: M) -> Fitted[M] | None:
     """What an earlier call of `fit` made of the module of a run, None if it is not there.
 
     Raises:
         InvalidInputError: it is damaged, or of another module.
     """
-    if not (run / FITTED).exists():
+    if not is_finished(run):
         return None
     kept = _kept(run)
     try:
@@ -77,7 +82,7 @@ def fitted_curves(run: Path) -> dict[str, Curve]:
     Raises:
         InvalidInputError: what it kept is damaged.
     """
-    return _kept(run)["curves"] if (run / FITTED).exists() else {}
+    return _kept(run)["curves"] if is_finished(run) else {}
 
 
 def _kept(run: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -241,6 +242,17 @@ def test_a_part_waits_for_another_one_that_writes_down_what_is_asked(
     assert archive.run("decode", "--part", "1/2")[0] == 0
 
 
+def test_storage_without_locks_is_named(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(ledger_module.fcntl, "flock", no_locks)
+    assert archive.run("decode")[0] == 2
+    assert "No locks available, wanted storage that has locks" in capsys.readouterr().err
+
+
 def test_recordings_that_vanish_or_change_are_named_and_the_others_go_on(
     archive: Archive, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -340,8 +352,10 @@ def test_files_come_back_from_pages_in_several_recordings(archive: Archive) -> N
     assert file.read_bytes() == coded.CONTENT
     assert figures["files"][0]["restored"] == [2]
     made = file.stat().st_mtime_ns
+    left = file.with_name(f"{file.name}.0.partial")  # of a run that was killed
+    left.touch()
     assert archive.run("recover", asked=False)[0] == 0
-    assert file.stat().st_mtime_ns == made
+    assert (file.stat().st_mtime_ns, left.exists()) == (made, False)
     shutil.rmtree(archive.out)
     for part, lost in (("0/2", 1), ("1/2", 0)):
         status, figures = archive.run("recover", "--no-tracking", "--bundle", str(bundle), "--part", part)
@@ -481,7 +495,8 @@ def test_a_poisoned_device_fails_by_name_and_the_rest_of_the_fleet_is_recalibrat
     [
         ("device = 3", "[[device]] tables"),
         ("[[device]]\nname='a'\nbundle='toy.zip'\nrecordings=['a.h5']\n" * 2, "devices a, a"),
-        ("[[device]]\nname='a'\nbundle='toy.zip'\nrecordings=['none*.h5']", "no file"),
+        ("[[device]]\nname='a'\nbundle='toy.zip'\nrecordings=[]", "at least 1 item"),
+        ("[[device]]\nname=''\nbundle='toy.zip'\nrecordings=['a.h5']", "at least 1 character"),
     ],
 )
 def test_a_fleet_that_makes_no_sense_is_refused(

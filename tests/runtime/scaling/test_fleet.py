@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from lightpage.cli.main import run as run_command
-from lightpage.errors import InvalidInputError, LightpageError, RecalibrationRefusedError
+from lightpage.errors import InvalidInputError, LightpageError, RecalibrationRefusedError, UnreadableError
 from lightpage.progress import Progress, note, track
+from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from runtime.bundle.bundle import Bundle
 from runtime.commands import bulk as command
@@ -20,6 +21,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.recalibration.known_pages import read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.recalibration.recalibration import next_version, recalibrate
+from runtime.scaling import job as job_module
 from runtime.scaling.fine_tuning import deep_recalibration
 from runtime.scaling.inline import InlineEngine
 from runtime.scaling.task import FineTuning
@@ -69,17 +71,19 @@ class Fleet:
     def __init__(self, folder: Path, bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.out, self.deep = folder, folder / "out", Deep()
         self.bundle, self.bundles = bundle, {"a": bundle, "b": bundle}
+        self.patterns = {"a": "a-*.h5", "b": "b.h5"}
         for number, name in enumerate(("a-1", "a-2", "b")):
             device = toy.ToyDevice((148.0, 90.0), seed=number)
             toy.write_toy_recording(folder / f"{name}.h5", device, 16, PAGES, number)
-        engine = InlineEngine(Worker(1, toy.fit_references, lambda: self.deep))
-        monkeypatch.setattr(command, "_engine", lambda *_: engine)
+        monkeypatch.setattr(
+            command, "_engine", lambda *_: InlineEngine(Worker(1, toy.fit_references, lambda: self.deep))
+        )
         monkeypatch.setattr(command, "deep_recalibration", lambda: self.deep)
 
     def run(self, *options: str, runs: tuple[str, ...] = ("a", "b")) -> tuple[int, dict[str, dict[str, Any]]]:
         """Exit status, and a row for each device."""
         tables = []
-        for name, pattern in (("a", "a-*.h5"), ("b", "b.h5")):
+        for name, pattern in self.patterns.items():
             named = [f'name = "{name}"', f'bundle = "{self.bundles[name]}"', f'recordings = ["{pattern}"]']
             tables += ["[[device]]", *named, *([f'run = "run-{name}"'] if name in runs else [])]
         (self.folder / "fleet.toml").write_text("\n".join(tables))
@@ -137,6 +141,85 @@ def test_a_bundle_that_is_lost_costs_its_device_alone(
     own.unlink()
     status, rows = fleet.run()
     assert (status, rows["a"]["state"]) == (0, "recalibrated")
+
+
+def test_a_bundle_with_another_name_is_taken_once_the_fleet_says_so(
+    fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet.bundles["a"] = fleet.folder / "mistyped.zip"
+    status, rows = fleet.run()
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "failed", "recalibrated")
+    assert "mistyped.zip" in capsys.readouterr().err
+    right = fleet.folder / "right.zip"
+    right.write_bytes(fleet.bundle.read_bytes())
+    fleet.bundles["a"] = right
+    status, rows = fleet.run()
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (0, "recalibrated", "recalibrated")
+
+
+def test_a_bundle_may_be_moved_before_its_device_is_done(fleet: Fleet) -> None:
+    whole = (fleet.folder / "b.h5").read_bytes()
+    (fleet.folder / "b.h5").write_bytes(b"no recording")
+    before = fleet.folder / "before.zip"
+    before.write_bytes(fleet.bundle.read_bytes())
+    fleet.bundles = dict.fromkeys(fleet.bundles, before)
+    assert fleet.run()[0] == 2
+    (fleet.folder / "b.h5").write_bytes(whole)
+    fleet.bundles = dict.fromkeys(fleet.bundles, before.rename(fleet.folder / "after.zip"))
+    status, rows = fleet.run()
+    assert (status, rows["b"]["state"]) == (0, "recalibrated")
+
+
+def test_a_pattern_that_names_no_file_costs_its_device_alone(fleet: Fleet, capsys: pytest.CaptureFixture[str]) -> None:
+    (fleet.folder / "b.h5").rename(fleet.folder / "elsewhere.h5")
+    fleet.patterns["b"] = "b*.h5"
+    status, rows = fleet.run()
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "recalibrated", "failed")
+    told = f"device b: recording {fleet.folder / 'b*.h5'}: got no file when the run began"
+    assert told in capsys.readouterr().err
+    (fleet.folder / "elsewhere.h5").rename(fleet.folder / "b.h5")
+    assert fleet.run()[0] == 2
+    assert told in capsys.readouterr().err
+
+
+def test_recordings_of_a_finished_device_may_go(fleet: Fleet) -> None:
+    assert fleet.run()[0] == 0
+    for name in ("a-1", "a-2"):
+        (fleet.folder / f"{name}.h5").unlink()
+    status, rows = fleet.run()
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (0, "recalibrated", "recalibrated")
+
+
+def test_bundles_that_are_as_they_were_are_not_read_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert fleet.run()[0] == 0
+    monkeypatch.setattr(job_module, "bundle_sha256", lambda path: pytest.fail(f"{path} is read"))
+    assert fleet.run()[0] == 0
+
+
+def test_frames_that_could_not_be_read_say_nothing_of_the_device(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(recording: Recording, page: int) -> FramePair:
+        raise UnreadableError(f"recording {recording.path}", "Input/output error", "data that can be read")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Recording, "frames", broken)
+        status, rows = fleet.run()
+        assert (status, {row["state"] for row in rows.values()}) == (2, {"failed"})
+    assert "Input/output error" in capsys.readouterr().err
+    status, rows = fleet.run()
+    assert (status, {row["state"] for row in rows.values()}) == (0, {"recalibrated"})
+
+
+def test_finished_devices_are_counted_where_nothing_can_train(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert fleet.run("--deep")[0] == 0
+
+    def missing() -> Deep:
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+    monkeypatch.setattr(command, "deep_recalibration", missing)
+    status, rows = fleet.run("--deep")
+    assert (status, {row["state"] for row in rows.values()}) == (0, {"recalibrated"})
 
 
 @pytest.mark.parametrize("form", [(), ("--deep",)])

@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import lightning as L
 import numpy as np
 import pytest
 import torch
@@ -72,6 +73,24 @@ def test_it_learns_and_is_not_trained_twice(tmp_path: Path, mask: np.ndarray) ->
     without = fit_network(run, CHOICES, mask, LEVELS, training, validation)
     assert without.validation_air == again.validation_air
     assert not (run / CHECKPOINTS).exists()
+
+
+def test_further_processes_take_what_the_first_one_has_made(
+    tmp_path: Path, mask: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each would judge the pages by itself, and on another machine find another last digit."""
+    choices, fitting = replace(CHOICES, steps=10), L.Trainer.fit
+    first = fit_network(tmp_path / "first", choices, mask, LEVELS, pages(2, 0), pages(1, 1))
+
+    def then_the_first_ends(*args: object, **kwargs: object) -> None:
+        fitting(*args, **kwargs)  # type: ignore[arg-type]
+        replace(first, validation_air=1.25).save(tmp_path / "other")
+
+    monkeypatch.setattr(L.Trainer, "fit", then_the_first_ends)
+    monkeypatch.setattr("train.fitting.fit.is_first_process", lambda: False)
+    other = fit_network(tmp_path / "other", choices, mask, LEVELS, pages(2, 0), pages(1, 1))
+    assert (other.validation_air, other.curves) == (1.25, first.curves)
+    torch.testing.assert_close(other.module.network.state_dict(), first.module.network.state_dict())
 
 
 @pytest.mark.parametrize("damaged", [FITTED, FITTED_WEIGHTS])
