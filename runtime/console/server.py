@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import logging
-import os
 import socket
 import ssl
 import threading
@@ -268,15 +267,20 @@ class _Server(ThreadingWSGIServer):
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer a connection, for a limited time."""
-        ending = threading.Timer(LONGEST_S, _cut_off, [socket.socket(fileno=os.dup(request.fileno()))])
-        ending.daemon = True
-        ending.start()
+        """Answer a connection, for a limited time; give its room back however that ends."""
         try:
-            super().process_request_thread(request, client_address)
+            with request.dup() as same:
+                ending = threading.Timer(LONGEST_S, _cut_off, [same])
+                ending.daemon = True
+                ending.start()
+                try:
+                    super().process_request_thread(request, client_address)
+                finally:
+                    ending.cancel()
+        except (OSError, RuntimeError):  # there are no descriptors or threads left
+            self.handle_error(request, client_address)
+            self.shutdown_request(request)
         finally:
-            ending.cancel()
-            ending.args[0].close()  # type: ignore[index]  # it was given
             self._room.release()
 
     def finish_request(self, request: Any, client_address: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import json
 import socket
@@ -56,6 +57,18 @@ def state(running: Stage, tls: TlsFiles) -> dict[str, object]:
     status, text = asked(running, tls, "/state.json", None)
     assert status == 200
     return dict(json.loads(text))
+
+
+def until_answered(running: Stage) -> bool:
+    """Whether somebody is answered again, once the threads of others have ended."""
+    until = time.monotonic() + 10
+    while time.monotonic() < until:
+        try:
+            with urllib.request.urlopen(f"{running.url}/metrics", timeout=10) as reply:
+                return bool(reply.status == 200)
+        except OSError:
+            time.sleep(0.01)
+    return False
 
 
 def test_an_administrator_rolls_back(secured: Stage, authority: Authority) -> None:
@@ -171,16 +184,30 @@ def test_connections_are_bounded_in_number_and_in_time(toy_zip: Path, monkeypatc
             connection.settimeout(10)
             assert connection.recv(1) == b"", "it was held for long enough"
             connection.close()
-        until = time.monotonic() + 10
-        while time.monotonic() < until:
-            try:
-                with urllib.request.urlopen(f"{running.url}/metrics", timeout=10) as reply:
-                    assert reply.status == 200
-                    break
-            except OSError:  # the threads of the others have not all ended yet
-                time.sleep(0.01)
-        else:
-            pytest.fail("nobody is answered any more")
+        assert until_answered(running)
+
+
+@pytest.mark.parametrize(
+    ("lacking", "error"),
+    [
+        ("threading.Timer.start", RuntimeError("can't start new thread")),
+        ("socket.socket.dup", OSError(errno.EMFILE, "Too many open files")),
+    ],
+)
+def test_a_connection_that_cannot_be_answered_gives_its_room_back(
+    toy_zip: Path, monkeypatch: pytest.MonkeyPatch, lacking: str, error: Exception
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("runtime.console.server.MOST_CONNECTIONS", 1)
+    with stage(toy_zip) as running:
+        with monkeypatch.context() as patch:
+            patch.setattr(lacking, fail)
+            with socket.create_connection(("localhost", running.server.port)) as connection:
+                connection.settimeout(10)
+                assert connection.recv(1) == b""
+        assert until_answered(running)
 
 
 def test_a_caller_that_hangs_up_is_no_fault(
