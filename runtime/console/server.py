@@ -106,8 +106,11 @@ class Console:
         identity: Identity | None = environ.get(IDENTITY)
         if method == "POST" and path == "/actions":
             return self._act(environ, start_response, identity)
-        if identity is not None and not identity.may(Role.READ):
-            return _answer(start_response, "403 Forbidden", "text/plain", b"a certificate without a role\n", method)
+        try:
+            if identity is not None:  # whose certificate was checked when its TLS session began, and not since
+                identity.check(Role.READ, "a page of the console", time.time())
+        except NotAllowedError as error:
+            return _refused(start_response, "403 Forbidden", str(error), method)
         if method not in ("GET", "HEAD"):
             return _answer(start_response, "405 Method Not Allowed", "text/plain", b"GET and HEAD only\n", method)
         if path == "/metrics":
@@ -354,8 +357,8 @@ def _cut_off(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-def _refused(start: StartResponse, status: str, why: str) -> Iterable[bytes]:
-    return _answer(start, status, "text/plain; charset=utf-8", _encoded(why), "POST")
+def _refused(start: StartResponse, status: str, why: str, method: str = "POST") -> Iterable[bytes]:
+    return _answer(start, status, "text/plain; charset=utf-8", _encoded(why), method)
 
 
 def _encoded(text: str) -> bytes:

@@ -179,4 +179,4 @@ def test_a_service_with_tls_is_scraped_with_a_certificate(
         nobody = authority.caller("nobody")
         files = [word for name, path in vars(nobody).items() for word in (f"--{name}", str(path))]
         assert cli_main.run(top, [*place, *files]) == EXIT_ERROR
-        assert "403 Forbidden: a certificate without a role" in capsys.readouterr().err
+        assert "403 Forbidden: a page of the console: got nobody with no role" in capsys.readouterr().err

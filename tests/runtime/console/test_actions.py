@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from runtime.identity.roles import Identity, Role
 from runtime.wire.tls import TlsFiles
 from tests.runtime import toy
 from tests.runtime.console.stage import Stage, stage
@@ -148,6 +149,17 @@ def test_callers_without_a_certificate_get_no_answer(secured: Stage, authority: 
     wrong = TlsFiles(authority.folder / "ca.pem", foreign.certificate, foreign.key)
     with pytest.raises((ssl.SSLError, ConnectionError, http.client.HTTPException)):
         asked(secured, wrong)
+    assert secured.plane.registry.current.version == "toy-2"
+
+
+def test_a_certificate_that_has_ended_since_its_tls_session_began_opens_nothing(
+    secured: Stage, authority: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tls, ended = authority.caller("operator 7", ["admin"]), Identity("operator 7", frozenset(Role), until=1.0)
+    monkeypatch.setattr("runtime.console.server.identity_of", lambda _: ended)
+    for path, content in (("/", None), ("/state.json", None), ("/metrics", None), ("/actions", ROLL_BACK)):
+        status, text = asked(secured, tls, path, content)
+        assert (status, "operator 7 that has expired" in text) == (403, True), path
     assert secured.plane.registry.current.version == "toy-2"
 
 
