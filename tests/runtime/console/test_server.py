@@ -20,6 +20,7 @@ from runtime.console.pictures import SIDE_PX, confidence_png, frame_png
 from runtime.console.server import POINTS, RECENT, ConsoleServer
 from runtime.service.observation import Observation
 from tests.runtime.console.stage import stage
+from tests.runtime.identity.authority import Authority
 
 
 def fetched(url: str, method: str = "GET") -> tuple[int, bytes, dict[str, str]]:
@@ -117,3 +118,21 @@ def test_the_command_finds_a_console_or_says_how_to_start_one(
         assert capsys.readouterr().out.strip() == f"{running.url}/"
     assert cli_main.run(lightpage, ["console", "--address", address, "--no-browser"]) == EXIT_ERROR
     assert "--metrics-port" in capsys.readouterr().err
+
+
+def test_the_command_finds_a_console_with_tls(
+    toy_zip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    authority = Authority(tmp_path)
+    with stage(toy_zip, authority.service()) as running:
+        command = ["console", "--address", running.url.removeprefix("https://"), "--no-browser"]
+        own = vars(authority.caller("watcher", ["read"]))
+        files = [word for name, path in own.items() for word in (f"--{name}", str(path))]
+        assert cli_main.run(lightpage, [*command, *files]) == 0
+        assert capsys.readouterr().out.strip() == f"{running.url}/"
+        assert cli_main.run(lightpage, command) == EXIT_ERROR
+        assert "--ca, --certificate and --key" in capsys.readouterr().err
+        for name, path in own.items():
+            monkeypatch.setenv(f"LIGHTPAGE_CLIENT_{name.upper()}", str(path))
+        assert cli_main.run(lightpage, command) == 0
+        assert capsys.readouterr().out.strip() == f"{running.url}/"
