@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import socket
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -69,9 +70,27 @@ def test_metrics_are_beside_it_and_nothing_takes_orders(toy_zip: Path) -> None:
             assert fetched(f"{running.url}/state.json", method)[0] == 405
         for path in ("/nothing", "/static/console.js", "/../server.py", "//etc/passwd", "/frames/other.png"):
             assert fetched(running.url + path)[0] == 404
-        status, content, headers = fetched(f"{running.url}/", "HEAD")
-        assert (status, content) == (200, b"")
-        assert int(headers["Content-Length"]) > 500
+        for path in ("/", "/metrics", "/nothing"):
+            status, content, headers = fetched(running.url + path)
+            found, nothing, told = fetched(running.url + path, "HEAD")
+            assert (found, nothing, told["Content-Type"]) == (status, b"", headers["Content-Type"])
+            assert int(told["Content-Length"]) > 0
+        assert int(headers["Content-Length"]) == int(told["Content-Length"]) == len(content)
+
+
+def test_answers_tell_no_versions_of_what_runs_them(toy_zip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with stage(toy_zip) as running:
+        for path in ("/", "/metrics", "/nothing"):
+            assert fetched(running.url + path)[2]["Server"] == "lightpage"
+        monkeypatch.setattr(running.console, "_content", lambda *_: 1 // 0)
+        status, content, headers = fetched(f"{running.url}/state.json")
+        assert (status, content, headers["Server"]) == (500, b"see the log\n", "lightpage")
+        with socket.create_connection(("localhost", running.server.port)) as connection:
+            connection.settimeout(10)
+            connection.sendall(b"GET / HTTP/1.1\r\n" + 200 * b"A: b\r\n" + b"\r\n")
+            told = connection.recv(1000)
+        assert told.startswith(b"HTTP/1.0 431 ")
+        assert b"\r\nServer: lightpage\r\n" in told
 
 
 def test_what_is_no_number_is_none_and_series_are_thinned(toy_zip: Path) -> None:
