@@ -34,8 +34,7 @@ if [[ "$base" == *@* ]]; then
     exit 2
   fi
 fi
-revision="$(git rev-parse HEAD 2>/dev/null || echo unknown)"
-[ "$revision" = unknown ] || [ -z "$(git status --porcelain)" ] || revision="$revision-changed"
+revision="$(packaging/revision.sh)"
 case "${LIGHTPAGE_RELEASE:-}" in
   "" | 0) ;;
   1)

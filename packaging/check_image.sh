@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Starts an image that buildah built, as it is meant to run, and sees whether it keeps its promises: not root, root file
 # system read-only, no torch (unless deep), what its SBOM says and nothing else, healthy only while it serves, gone soon
-# after SIGTERM.
+# after SIGTERM. An image of another revision than the work tree's is refused.
 #
 #   packaging/check_image.sh [TAG [BUNDLE]]
 #
@@ -9,6 +9,8 @@
 # image serves by itself. Needs root, since it makes a mount namespace of its own.
 #
 # Environment:
+#   LIGHTPAGE_BUILDER        buildah, if anything
+#   LIGHTPAGE_STORAGE        where buildah keeps images (default build/containers)
 #   LIGHTPAGE_SBOM           the SBOM (default what write_sbom.sh wrote, build/sbom/TAG.cdx.json)
 #   LIGHTPAGE_CHECK_DEVICE   folder of a running `lightpage virtual-device`, in whose network this is: the image then does
 #                            the main job over its cameras, serial line and modulator
@@ -23,6 +25,10 @@ bundle="${2:-}"
 port="${LIGHTPAGE_CHECK_PORT:-$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')}"
 storage="$(realpath -m "${LIGHTPAGE_STORAGE:-build/containers}")"
 
+if [ "${LIGHTPAGE_BUILDER:-buildah}" != buildah ]; then
+  echo "check_image: LIGHTPAGE_BUILDER is '$LIGHTPAGE_BUILDER'; buildah wanted: no other image can be checked" >&2
+  exit 2
+fi
 if [ "${1:-}" != --inside ]; then
   exec unshare --mount --pid --fork --kill-child --propagation private "$0" --inside "$tag" "$bundle"
 fi
@@ -32,14 +38,30 @@ tag="$2"
 bundle="$3"
 scratch="$(mktemp -d)"
 store=(buildah --storage-driver vfs --root "$storage" --runroot "$scratch/run")
-container="$("${store[@]}" from --pull-never "$tag")"
 clean_up() {
   [ -z "${service:-}" ] || kill -KILL "$service" 2>/dev/null || true
   umount --recursive "$scratch/root" 2>/dev/null || umount --recursive --lazy "$scratch/root" 2>/dev/null || true
-  "${store[@]}" rm "$container" >/dev/null || true
+  [ -z "${container:-}" ] || "${store[@]}" rm "$container" >/dev/null || true
   rm -rf --one-file-system "$scratch"
 }
 trap clean_up EXIT
+
+field() {
+  "${store[@]}" inspect --type image --format "$1" "$tag"
+}
+label() { field "{{index .Docker.Config.Labels \"org.opencontainers.image.$1\"}}"; }
+wanted="$(packaging/revision.sh)"
+if ! made="$(label revision 2>"$scratch/said")"; then
+  echo "check_image: no image $tag in $storage ($(tail -1 "$scratch/said")); wanted what" \
+    "make image LIGHTPAGE_BUILDER=buildah builds" >&2
+  exit 2
+fi
+if [ "$made" != "$wanted" ]; then
+  echo "check_image: image $tag in $storage is of revision '$made', wanted that of the work tree, '$wanted':" \
+    "make image LIGHTPAGE_BUILDER=buildah builds it anew" >&2
+  exit 2
+fi
+container="$("${store[@]}" from --pull-never "$tag")"
 tree="$("${store[@]}" mount "$container")"
 
 root="$scratch/root"
@@ -64,15 +86,11 @@ if [ -n "$hardware" ]; then # what `--device`, `--group-add` and `--network host
 fi
 mount -o remount,bind,ro "$root"
 
-field() {
-  "${store[@]}" inspect --type image --format "$1" "$tag"
-}
 mapfile -t environment < <(field '{{range .Docker.Config.Env}}{{println .}}{{end}}' | sed '/^$/d')
 mapfile -t entrypoint < <(field '{{range .Docker.Config.Entrypoint}}{{println .}}{{end}}' | sed '/^$/d')
 mapfile -t arguments < <(field '{{range .Docker.Config.Cmd}}{{println .}}{{end}}' | sed '/^$/d')
 mapfile -t health < <(field '{{range .Docker.Config.Healthcheck.Test}}{{println .}}{{end}}' | sed '/^$/d;1d')
 user="$(field '{{.Docker.Config.User}}')"
-label() { field "{{index .Docker.Config.Labels \"org.opencontainers.image.$1\"}}"; }
 sbom="${LIGHTPAGE_SBOM:-build/sbom/${tag//[:\/]/-}.cdx.json}"
 
 become_image() { # in place of the calling shell, so that a signal reaches the command itself

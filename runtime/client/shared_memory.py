@@ -77,7 +77,9 @@ class SharedMemory:
         return FramePair(in_phase, quadrature)
 
     def write(self, pair: FramePair) -> int:
-        """Write a pair to the region's begin, unless it lies in the region; returns its offset.
+        """Write a pair to the region's begin, unless it lies in the region one frame behind the other.
+
+        Returns its offset. What lay in its place is overwritten, frames of the pair itself too.
 
         Raises:
             InvalidInputError: the region is too small.
@@ -89,6 +91,8 @@ class SharedMemory:
         if whole and follows and 0 <= offset <= self.size - 2 * in_phase.nbytes:
             return offset
         frames = self.frames((in_phase.shape[0], in_phase.shape[1]), in_phase.dtype)
+        if np.may_share_memory(frames.in_phase, quadrature):  # which goes second
+            quadrature = quadrature.copy()
         frames.in_phase[...], frames.quadrature[...] = in_phase, quadrature
         return 0
 

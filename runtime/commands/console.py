@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import webbrowser
-from urllib.error import URLError
-from urllib.request import ProxyHandler, build_opener
 
 import click
 
-from lightpage.errors import LightpageError
-
-_ANSWER_S = 5.0
+from runtime.commands.connection import with_tls
+from runtime.console.fetch import fetch, url_of
+from runtime.wire.tls import TlsFiles
 
 
 @click.command()
 @click.option("--address", default="127.0.0.1:9100", show_default=True, help="HOST:PORT of its --metrics-port.")
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open it, or print its address alone.")
-def console(address: str, browser: bool) -> None:
-    """Open the console of a service that runs with --metrics-port."""
-    url = f"http://{address}/"
-    try:
-        with build_opener(ProxyHandler({})).open(f"{url}state.json", timeout=_ANSWER_S) as reply:
-            reply.read()
-    except (URLError, OSError, ValueError) as error:
-        reason = getattr(error, "reason", error)
-        expected = "a service that runs with --metrics-port: `lightpage serve --metrics-port 9100`"
-        raise LightpageError(f"console at {address}", reason, expected) from None
+@with_tls
+def console(address: str, browser: bool, tls: TlsFiles | None) -> None:
+    """Open the console of a service that runs with --metrics-port.
+
+    Where the service has TLS, the browser needs a certificate of its own.
+    """
+    fetch(f"console at {address}", address, "state.json", tls)
+    url = url_of(address, tls=tls)
     click.echo(url)
     if browser:
         webbrowser.open(url)

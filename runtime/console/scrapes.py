@@ -7,20 +7,15 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from urllib.error import HTTPError, URLError
-from urllib.request import HTTPSHandler, ProxyHandler, build_opener
 
 from prometheus_client.parser import text_string_to_metric_families
 
 from lightpage.errors import LightpageError
+from runtime.console.fetch import fetch, wanted
 from runtime.wire.tls import TlsFiles
 
 WINDOW_S = 60.0
 """Rates and times are those of so many seconds, once it has been scraped for so long."""
-_ANSWER_S = 5.0
-_MOST_BYTES = 16 << 20
-_SAID_BYTES = 200
-"""Of a refusal's text."""
 _SERVES = "lightpage_calls_in_flight"
 """A metric that every service has from its start."""
 
@@ -68,27 +63,18 @@ def scrape(address: str, tls: TlsFiles | None = None) -> Scrape:
         InvalidInputError: certificates that are no good.
         LightpageError: nobody answers there, or something else than a Lightpage service.
     """
-    expected = "a service that runs with --metrics-port: `lightpage serve --metrics-port 9100`"
-    subject, url = f"metrics at {address}", f"http{'s' if tls else ''}://{address}/metrics"
-    secure = [HTTPSHandler(context=tls.client_context())] if tls else []
+    subject = f"metrics at {address}"
+    content = fetch(subject, address, "metrics", tls)
     try:
-        with build_opener(ProxyHandler({}), *secure).open(url, timeout=_ANSWER_S) as reply:
-            text = reply.read(_MOST_BYTES).decode("utf-8")
         samples = {
             (sample.name, frozenset(sample.labels.items())): float(sample.value)
-            for family in text_string_to_metric_families(text)
+            for family in text_string_to_metric_families(content.decode("utf-8"))
             for sample in family.samples
         }
-    except HTTPError as error:
-        with error:
-            said = error.read(_SAID_BYTES).decode("utf-8", "replace").strip()
-        raise LightpageError(subject, f"{error.code} {error.reason}: {said}", expected) from None
-    except (URLError, OSError) as error:
-        raise LightpageError(subject, getattr(error, "reason", error), expected) from None
     except ValueError:
-        raise LightpageError(subject, "no metrics", expected) from None
+        raise LightpageError(subject, "no metrics", wanted(tls)) from None
     if (_SERVES, frozenset()) not in samples:
-        raise LightpageError(subject, "metrics of something else", expected)
+        raise LightpageError(subject, "metrics of something else", wanted(tls))
     return Scrape(time.monotonic(), samples)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import logging
-import os
 import socket
 import ssl
 import threading
@@ -14,6 +13,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Self
+from wsgiref.headers import Headers
 from wsgiref.simple_server import WSGIRequestHandler, make_server
 
 from prometheus_client import make_wsgi_app
@@ -39,6 +39,8 @@ _log = logging.getLogger(__name__)
 
 IDENTITY = "lightpage.identity"
 """Key of a request's caller, an `Identity`, in its environment; it is not there without TLS."""
+_NAME = "lightpage"
+"""As which the server names itself to callers."""
 _ACTION_BYTES = 1000
 _DRAINED_BYTES = 1 << 16
 MOST_CONNECTIONS = 64
@@ -107,21 +109,20 @@ class Console:
         identity: Identity | None = environ.get(IDENTITY)
         if method == "POST" and path == "/actions":
             return self._act(environ, start_response, identity)
-        if identity is not None and not identity.may(Role.READ):
-            return _answer(start_response, "403 Forbidden", "text/plain", b"a certificate without a role\n", method)
-        if method not in ("GET", "HEAD"):
-            return _answer(start_response, "405 Method Not Allowed", "text/plain", b"GET and HEAD only\n", method)
+        try:
+            if identity is not None:  # whose certificate was checked when its TLS session began, and not since
+                identity.check(Role.READ, "a page of the console", time.time())
+        except NotAllowedError as error:
+            return _refused(start_response, "403 Forbidden", str(error))
+        if method != "GET":
+            return _refused(start_response, "405 Method Not Allowed", "GET and HEAD only")
         if path == "/metrics":
             answer: Iterable[bytes] = self._metrics(environ, start_response)
             return answer
-        try:
-            found = self._content(path, identity)
-        except Exception:
-            _log.exception("console: %s", path)
-            return _answer(start_response, "500 Internal Server Error", "text/plain", b"see the log\n", method)
+        found = self._content(path, identity)
         if found is None:
-            return _answer(start_response, "404 Not Found", "text/plain", b"not found\n", method)
-        return _answer(start_response, "200 OK", found[1], found[0], method)
+            return _refused(start_response, "404 Not Found", "not found")
+        return _answer(start_response, "200 OK", found[1], found[0])
 
     def _act(
         self, environ: WSGIEnvironment, start_response: StartResponse, identity: Identity | None
@@ -158,7 +159,7 @@ class Console:
         except Exception:
             _log.exception("console: action of %s", name)
             return _refused(start_response, "500 Internal Server Error", "see the log")
-        return _answer(start_response, "200 OK", "text/plain; charset=utf-8", _encoded(outcome), "POST")
+        return _answer(start_response, "200 OK", "text/plain; charset=utf-8", _encoded(outcome))
 
     def _content(self, path: str, identity: Identity | None) -> tuple[bytes, str] | None:
         if path in _STATIC:
@@ -220,7 +221,7 @@ class ConsoleServer:
     def __init__(
         self, console: WSGIApplication, port: int, host: str = "127.0.0.1", certificates: Certificates | None = None
     ) -> None:
-        self._server = make_server(host, port, console, _Server, handler_class=_Handler)
+        self._server = make_server(host, port, _served(console), _Server, handler_class=_Handler)
         self._server.certificates = certificates
         self._thread = threading.Thread(target=self._server.serve_forever, name="lightpage-console", daemon=True)
         self._thread.start()
@@ -268,15 +269,20 @@ class _Server(ThreadingWSGIServer):
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer a connection, for a limited time."""
-        ending = threading.Timer(LONGEST_S, _cut_off, [socket.socket(fileno=os.dup(request.fileno()))])
-        ending.daemon = True
-        ending.start()
+        """Answer a connection, for a limited time; give its room back however that ends."""
         try:
-            super().process_request_thread(request, client_address)
+            with request.dup() as same:
+                ending = threading.Timer(LONGEST_S, _cut_off, [same])
+                ending.daemon = True
+                ending.start()
+                try:
+                    super().process_request_thread(request, client_address)
+                finally:
+                    ending.cancel()
+        except (OSError, RuntimeError):  # there are no descriptors or threads left
+            self.handle_error(request, client_address)
+            self.shutdown_request(request)
         finally:
-            ending.cancel()
-            ending.args[0].close()  # type: ignore[index]  # it was given
             self._room.release()
 
     def finish_request(self, request: Any, client_address: Any) -> None:
@@ -307,6 +313,10 @@ class _Handler(WSGIRequestHandler):
     def get_stderr(self) -> Any:
         """Nowhere: a caller that hangs up is no fault, and what the console does not foresee it logs itself."""
         return io.StringIO()
+
+    def version_string(self) -> str:
+        """What its own refusals say that it is."""
+        return _NAME
 
     def get_environ(self) -> WSGIEnvironment:
         """See `WSGIRequestHandler`."""
@@ -350,8 +360,37 @@ def _cut_off(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
+def _served(application: WSGIApplication) -> WSGIApplication:
+    """An application as it is served: HEAD is GET without the content, failures are logged, nothing names versions."""
+
+    def answer(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
+        begun: list[tuple[str, list[tuple[str, str]]]] = []
+
+        def begin(status: str, headers: list[tuple[str, str]], error: Any = None, /) -> Callable[[bytes], object]:
+            begun.append((status, headers))
+            return _no_write
+
+        is_head = environ["REQUEST_METHOD"] == "HEAD"
+        try:
+            content = b"".join(application(environ | {"REQUEST_METHOD": "GET"} if is_head else environ, begin))
+        except Exception:
+            _log.exception("console: %s", environ.get("PATH_INFO"))
+            content = b"".join(_refused(begin, "500 Internal Server Error", "see the log"))
+        status, told = begun[-1][0], Headers(begun[-1][1])
+        told["Content-Length"], told["Server"] = str(len(content)), _NAME
+        start_response(status, told.items())
+        return [] if is_head else [content]
+
+    return answer
+
+
+def _no_write(content: bytes) -> object:
+    """What PEP 3333 has for applications of old; none here uses it."""
+    raise NotImplementedError
+
+
 def _refused(start: StartResponse, status: str, why: str) -> Iterable[bytes]:
-    return _answer(start, status, "text/plain; charset=utf-8", _encoded(why), "POST")
+    return _answer(start, status, "text/plain; charset=utf-8", _encoded(why))
 
 
 def _encoded(text: str) -> bytes:
@@ -359,6 +398,6 @@ def _encoded(text: str) -> bytes:
     return f"{text}\n".encode("utf-8", "backslashreplace")
 
 
-def _answer(start: StartResponse, status: str, kind: str, content: bytes, method: str) -> Iterable[bytes]:
-    start(status, [("Content-Type", kind), ("Content-Length", str(len(content))), *_HEADERS])
-    return [] if method == "HEAD" else [content]
+def _answer(start: StartResponse, status: str, kind: str, content: bytes) -> Iterable[bytes]:
+    start(status, [("Content-Type", kind), *_HEADERS])
+    return [content]

@@ -37,6 +37,7 @@ from runtime.service.shared_memory import SharedMemory
 from runtime.service.slots import Slots
 from runtime.service.stages import Stage, Stages
 from runtime.service.store import ModelStore
+from runtime.service.store_health import StoreHealth
 
 
 @dataclass(frozen=True)
@@ -116,10 +117,12 @@ class DataPlane:
         self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s)
         self.uploads = Slots(1, "uploads of models", self.limits.deadline_s)
         self.models = Models(registry, store, self.limits.model_bytes, self._in_service, self.audit)
+        self.store_health = StoreHealth(self.models.trouble)
+        """Tells of the store without waiting for its disk."""
         self._in_service(registry.current)
         self.metrics.watch_load(self.decodes, self.received)
         if store is not None:
-            self.metrics.watch_store(self.models.trouble)
+            self.metrics.watch_store(self.store_health, store.known_trouble)
         if source is not None:
             self.metrics.watch(source)
             if source.pages is not None:

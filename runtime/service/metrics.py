@@ -27,6 +27,7 @@ from runtime.errors import LostPageError, UnconfirmedPageError
 from runtime.errors import Reason as PageLoss
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.service.store import Reason, Trouble
+from runtime.service.store_health import StoreHealth
 
 if TYPE_CHECKING:
     from runtime.service.receiver import ReceiveBudget
@@ -38,6 +39,8 @@ _FINE_SECONDS = tuple(sorted({*_SECONDS, 0.001, 0.002, 0.03, 0.07, 0.15, 0.3, 0.
 """From handing over a small reply to the longest wait for a slot; no bucket is much wider than the time in it."""
 _READ = "none"
 """Loss of a page whose bytes were read."""
+_LOOK_S = 2.0
+"""A scrape waits so long for the store's disk: less than Prometheus waits for a scrape."""
 VERSIONS = 32
 """Models whose pages are told apart, the newest: each recalibration makes another one."""
 
@@ -172,9 +175,9 @@ class ServiceMetrics:
         """Show what the source counts, whenever somebody looks."""
         self.registry.register(_SourceFigures(source))
 
-    def watch_store(self, trouble: Callable[[], Trouble | None]) -> None:
-        """Show what is wrong with the store, whenever somebody looks."""
-        self.registry.register(_StoreFigures(trouble))
+    def watch_store(self, health: StoreHealth, trouble: Callable[[], Trouble | None]) -> None:
+        """Show whether the store is well, and else its `trouble`, as far as it is known; whenever somebody looks."""
+        self.registry.register(_StoreFigures(health, trouble))
 
     def in_service(self, version: str) -> None:
         """Say which model decodes now."""
@@ -226,14 +229,21 @@ class _SourceFigures(Collector):
 class _StoreFigures(Collector):
     """How the store is."""
 
-    def __init__(self, trouble: Callable[[], Trouble | None]) -> None:
-        self._trouble = trouble
+    def __init__(self, health: StoreHealth, trouble: Callable[[], Trouble | None]) -> None:
+        self._health, self._trouble = health, trouble
 
     def collect(self) -> Iterator[Metric]:
-        """The figures as they are now."""
-        trouble = self._trouble()
-        yield GaugeMetricFamily("lightpage_store_ok", "1 where the model store is well.", value=float(trouble is None))
+        """The figures as they are now; a disk that hangs is waited for no longer than `_LOOK_S`."""
+        is_well = self._health.is_well(_LOOK_S)
+        found = None if is_well else self._reason()
+        yield GaugeMetricFamily("lightpage_store_ok", "1 where the model store is well.", value=float(is_well))
         reasons = GaugeMetricFamily("lightpage_store_trouble", "1 for what is wrong with it.", labels=["reason"])
         for reason in Reason:
-            reasons.add_metric([reason.value], float(trouble is not None and trouble.reason is reason))
+            reasons.add_metric([reason.value], float(reason is found))
         yield reasons
+
+    def _reason(self) -> Reason | None:
+        if self._health.hangs:
+            return Reason.HUNG
+        trouble = self._trouble()
+        return None if trouble is None else trouble.reason

@@ -68,6 +68,8 @@ class Reason(StrEnum):
     FULL = "full"
     READ_ONLY = "read_only"
     GONE = "gone"
+    HUNG = "hung"
+    """The disk does not answer."""
     FAILED = "failed"
     """The disk fails in another way."""
 
@@ -342,6 +344,10 @@ class ModelStore:
         if time.monotonic() - self._probed >= PROBE_S:
             with suppress(StoreError):
                 self.check(needed_bytes)
+        return self.known_trouble()
+
+    def known_trouble(self) -> Trouble | None:
+        """What was wrong with the store when it was tried last; its disk is left alone."""
         with self._guard:
             return self._failure or self._damage
 

@@ -6,6 +6,7 @@ import math
 import os
 import pty
 import select
+import socket
 import subprocess
 import sys
 import time
@@ -17,7 +18,7 @@ from wsgiref.simple_server import make_server
 import pytest
 
 from lightpage.cli import main as cli_main
-from lightpage.cli.main import EXIT_ERROR
+from lightpage.cli.main import EXIT_ERROR, lightpage
 from lightpage.errors import LightpageError
 from runtime.commands.top import top
 from runtime.console.scrapes import Change, Scrape, Scrapes, scrape
@@ -84,6 +85,26 @@ def test_a_wrong_address_is_named_with_what_to_do(toy_zip: Path, capsys: pytest.
             Thread(target=server.handle_request, daemon=True).start()
             with pytest.raises(LightpageError, match=told):
                 scrape(f"127.0.0.1:{server.server_port}")
+
+
+@pytest.mark.parametrize("arguments", [["top", "--once"], ["console", "--no-browser"]])
+def test_what_is_no_http_and_no_port_is_named_in_a_line(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def answer(listener: socket.socket) -> None:
+        connection, _ = listener.accept()
+        with connection:
+            connection.recv(1000)
+            connection.sendall(b"\x00\x00\x06\x04\x00\x00\x00\x00\x00\x00\x05\x00\x00\x40\x00")  # as a gRPC server
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.settimeout(10)
+        Thread(target=answer, args=(listener,), daemon=True).start()
+        other = f"127.0.0.1:{listener.getsockname()[1]}"
+        for place, got in ((other, "an answer that is not HTTP"), ("127.0.0.1:x", "nonnumeric port: 'x'")):
+            assert cli_main.run(lightpage, [*arguments, "--address", place]) == EXIT_ERROR
+            (told,) = capsys.readouterr().err.splitlines()
+            assert f"at {place}: got {got}" in told
 
 
 def test_quantiles_are_those_of_what_came_between() -> None:
@@ -175,8 +196,10 @@ def test_a_service_with_tls_is_scraped_with_a_certificate(
         assert cli_main.run(top, [*place, *files]) == 0
         assert "model toy-1" in capsys.readouterr().out
         assert cli_main.run(top, place) == EXIT_ERROR
-        assert "metrics at localhost" in capsys.readouterr().err
+        told = capsys.readouterr().err
+        assert "metrics at localhost" in told
+        assert "--ca, --certificate and --key" in told
         nobody = authority.caller("nobody")
         files = [word for name, path in vars(nobody).items() for word in (f"--{name}", str(path))]
         assert cli_main.run(top, [*place, *files]) == EXIT_ERROR
-        assert "403 Forbidden: a certificate without a role" in capsys.readouterr().err
+        assert "403 Forbidden: a page of the console: got nobody with no role" in capsys.readouterr().err

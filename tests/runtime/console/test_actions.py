@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import json
 import socket
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from runtime.identity.roles import Identity, Role
 from runtime.wire.tls import TlsFiles
 from tests.runtime import toy
 from tests.runtime.console.stage import Stage, stage
@@ -56,6 +58,18 @@ def state(running: Stage, tls: TlsFiles) -> dict[str, object]:
     status, text = asked(running, tls, "/state.json", None)
     assert status == 200
     return dict(json.loads(text))
+
+
+def until_answered(running: Stage) -> bool:
+    """Whether somebody is answered again, once the threads of others have ended."""
+    until = time.monotonic() + 10
+    while time.monotonic() < until:
+        try:
+            with urllib.request.urlopen(f"{running.url}/metrics", timeout=10) as reply:
+                return bool(reply.status == 200)
+        except OSError:
+            time.sleep(0.01)
+    return False
 
 
 def test_an_administrator_rolls_back(secured: Stage, authority: Authority) -> None:
@@ -138,6 +152,17 @@ def test_callers_without_a_certificate_get_no_answer(secured: Stage, authority: 
     assert secured.plane.registry.current.version == "toy-2"
 
 
+def test_a_certificate_that_has_ended_since_its_tls_session_began_opens_nothing(
+    secured: Stage, authority: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tls, ended = authority.caller("operator 7", ["admin"]), Identity("operator 7", frozenset(Role), until=1.0)
+    monkeypatch.setattr("runtime.console.server.identity_of", lambda _: ended)
+    for path, content in (("/", None), ("/state.json", None), ("/metrics", None), ("/actions", ROLL_BACK)):
+        status, text = asked(secured, tls, path, content)
+        assert (status, "operator 7 that has expired" in text) == (403, True), path
+    assert secured.plane.registry.current.version == "toy-2"
+
+
 def test_a_body_that_does_not_come_is_refused_and_nothing_else_is_said(
     toy_zip: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -171,16 +196,30 @@ def test_connections_are_bounded_in_number_and_in_time(toy_zip: Path, monkeypatc
             connection.settimeout(10)
             assert connection.recv(1) == b"", "it was held for long enough"
             connection.close()
-        until = time.monotonic() + 10
-        while time.monotonic() < until:
-            try:
-                with urllib.request.urlopen(f"{running.url}/metrics", timeout=10) as reply:
-                    assert reply.status == 200
-                    break
-            except OSError:  # the threads of the others have not all ended yet
-                time.sleep(0.01)
-        else:
-            pytest.fail("nobody is answered any more")
+        assert until_answered(running)
+
+
+@pytest.mark.parametrize(
+    ("lacking", "error"),
+    [
+        ("threading.Timer.start", RuntimeError("can't start new thread")),
+        ("socket.socket.dup", OSError(errno.EMFILE, "Too many open files")),
+    ],
+)
+def test_a_connection_that_cannot_be_answered_gives_its_room_back(
+    toy_zip: Path, monkeypatch: pytest.MonkeyPatch, lacking: str, error: Exception
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("runtime.console.server.MOST_CONNECTIONS", 1)
+    with stage(toy_zip) as running:
+        with monkeypatch.context() as patch:
+            patch.setattr(lacking, fail)
+            with socket.create_connection(("localhost", running.server.port)) as connection:
+                connection.settimeout(10)
+                assert connection.recv(1) == b""
+        assert until_answered(running)
 
 
 def test_a_caller_that_hangs_up_is_no_fault(

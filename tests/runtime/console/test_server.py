@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import socket
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -20,6 +21,7 @@ from runtime.console.pictures import SIDE_PX, confidence_png, frame_png
 from runtime.console.server import POINTS, RECENT, ConsoleServer
 from runtime.service.observation import Observation
 from tests.runtime.console.stage import stage
+from tests.runtime.identity.authority import Authority
 
 
 def fetched(url: str, method: str = "GET") -> tuple[int, bytes, dict[str, str]]:
@@ -68,9 +70,27 @@ def test_metrics_are_beside_it_and_nothing_takes_orders(toy_zip: Path) -> None:
             assert fetched(f"{running.url}/state.json", method)[0] == 405
         for path in ("/nothing", "/static/console.js", "/../server.py", "//etc/passwd", "/frames/other.png"):
             assert fetched(running.url + path)[0] == 404
-        status, content, headers = fetched(f"{running.url}/", "HEAD")
-        assert (status, content) == (200, b"")
-        assert int(headers["Content-Length"]) > 500
+        for path in ("/", "/metrics", "/nothing"):
+            status, content, headers = fetched(running.url + path)
+            found, nothing, told = fetched(running.url + path, "HEAD")
+            assert (found, nothing, told["Content-Type"]) == (status, b"", headers["Content-Type"])
+            assert int(told["Content-Length"]) > 0
+        assert int(headers["Content-Length"]) == int(told["Content-Length"]) == len(content)
+
+
+def test_answers_tell_no_versions_of_what_runs_them(toy_zip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with stage(toy_zip) as running:
+        for path in ("/", "/metrics", "/nothing"):
+            assert fetched(running.url + path)[2]["Server"] == "lightpage"
+        monkeypatch.setattr(running.console, "_content", lambda *_: 1 // 0)
+        status, content, headers = fetched(f"{running.url}/state.json")
+        assert (status, content, headers["Server"]) == (500, b"see the log\n", "lightpage")
+        with socket.create_connection(("localhost", running.server.port)) as connection:
+            connection.settimeout(10)
+            connection.sendall(b"GET / HTTP/1.1\r\n" + 200 * b"A: b\r\n" + b"\r\n")
+            told = connection.recv(1000)
+        assert told.startswith(b"HTTP/1.0 431 ")
+        assert b"\r\nServer: lightpage\r\n" in told
 
 
 def test_what_is_no_number_is_none_and_series_are_thinned(toy_zip: Path) -> None:
@@ -117,3 +137,21 @@ def test_the_command_finds_a_console_or_says_how_to_start_one(
         assert capsys.readouterr().out.strip() == f"{running.url}/"
     assert cli_main.run(lightpage, ["console", "--address", address, "--no-browser"]) == EXIT_ERROR
     assert "--metrics-port" in capsys.readouterr().err
+
+
+def test_the_command_finds_a_console_with_tls(
+    toy_zip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    authority = Authority(tmp_path)
+    with stage(toy_zip, authority.service()) as running:
+        command = ["console", "--address", running.url.removeprefix("https://"), "--no-browser"]
+        own = vars(authority.caller("watcher", ["read"]))
+        files = [word for name, path in own.items() for word in (f"--{name}", str(path))]
+        assert cli_main.run(lightpage, [*command, *files]) == 0
+        assert capsys.readouterr().out.strip() == f"{running.url}/"
+        assert cli_main.run(lightpage, command) == EXIT_ERROR
+        assert "--ca, --certificate and --key" in capsys.readouterr().err
+        for name, path in own.items():
+            monkeypatch.setenv(f"LIGHTPAGE_CLIENT_{name.upper()}", str(path))
+        assert cli_main.run(lightpage, command) == 0
+        assert capsys.readouterr().out.strip() == f"{running.url}/"

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from lightpage.errors import FrameError, InvalidInputError, LightpageError
+from lightpage.recording.frame_pair import FramePair
 from runtime.client.client import LightpageClient
 from runtime.client.shared_memory import SharedMemory as ClientMemory
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -93,6 +94,17 @@ def test_a_pair_may_lie_anywhere_in_its_region(service: Running) -> None:
         for offset in (8, PAIR, 1 << 40, (1 << 64) - 1):
             with pytest.raises(grpc.RpcError, match=r"header\.shared\.offset"):
                 decode(service.server.target, pb.DecodeFramesRequest(header=header(memory.handle, offset)))
+
+
+def test_a_pair_that_lies_there_the_other_way_round_is_turned(service: Running) -> None:
+    symbols, pair = a_page()
+    with service.client.share_memory() as memory:
+        inside = memory.frames(toy.SHAPE, "uint8")
+        inside.in_phase[...], inside.quadrature[...] = pair.quadrature, pair.in_phase
+        page = service.client.decode(FramePair(inside.quadrature, inside.in_phase), 16, memory=memory)
+        np.testing.assert_array_equal(inside.in_phase, pair.in_phase)
+        np.testing.assert_array_equal(inside.quadrature, pair.quadrature)
+    assert (page.symbols == symbols).all()
 
 
 def test_many_pages_of_one_call_may_lie_there(service: Running) -> None:

@@ -9,6 +9,8 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
+import threading
 import time
 from collections import namedtuple
 from pathlib import Path
@@ -19,6 +21,7 @@ from lightpage.errors import BundleError
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.errors import StoreError
+from runtime.service import metrics as metrics_module
 from runtime.service import store as store_module
 from runtime.service.dataplane import DataPlane
 from runtime.service.registry import ModelRegistry
@@ -343,6 +346,29 @@ def test_the_store_is_tried_now_and_then_and_not_whenever_somebody_asks(
     now += 2
     assert "Read-only" in plane.store_trouble()
     assert plane.models.trouble().reason is Reason.READ_ONLY  # type: ignore[union-attr]
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_disk_that_hangs_is_shown_and_holds_no_scrape_up(
+    decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plane, answers, made = a_plane(decoder, store), threading.Event(), tempfile.mkstemp
+
+    def hung(prefix: str, dir: Path) -> tuple[int, str]:
+        answers.wait(10)
+        return made(prefix=prefix, dir=dir)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("tempfile.mkstemp", hung)
+        patch.setattr(metrics_module, "_LOOK_S", 0.01)
+        patch.setattr(plane.store_health, "_longest_s", 0.0)
+        for _ in range(3):
+            assert figure(plane, "lightpage_store_ok") == 0
+            assert figure(plane, "lightpage_store_trouble", reason="hung") == 1
+        answers.set()
+    plane.store_health.is_well(10)  # the end of the look that hung
+    assert figure(plane, "lightpage_store_ok") == 1
+    assert figure(plane, "lightpage_store_trouble", reason="hung") == 0
 
 
 def test_a_service_without_a_store_has_no_trouble_and_shows_none(decoder: Decoder) -> None:
