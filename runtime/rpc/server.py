@@ -24,7 +24,6 @@ from runtime.rpc.message_gate import MessageGate
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits
 from runtime.service.recalibrator import Recalibrator
-from runtime.service.store_health import StoreHealth
 from runtime.service.traces import Traces
 from runtime.wire.address import check_free
 from runtime.wire.channel import add_port
@@ -82,7 +81,7 @@ class LightpageServer:
         self._thread = threading.Thread(target=self._run, name="lightpage-rpc", daemon=True)
         self._pool = ThreadPoolExecutor(plane.limits.concurrent_calls, thread_name_prefix="lightpage-call")
         self._names = ("", *(service.descriptor.full_name for service in self._services))
-        self._store = StoreHealth(plane.store_trouble)
+        self._store = plane.store_health
         self._serving = self._stopping = self._started = False
         self.port = 0
 
