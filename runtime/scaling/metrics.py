@@ -45,7 +45,7 @@ class BulkMetrics(Watch):
         one = ["run", "part"]
         self.pages = Counter("lightpage_bulk_pages", "Pages, by what became of them.", [*one, "state"], registry=own)
         self.lost = Counter("lightpage_bulk_pages_lost", "Lost pages, by cause.", [*one, "reason"], registry=own)
-        self.failed = Counter("lightpage_bulk_ranges_failed", "Ranges, or what could not be opened.", one, registry=own)
+        self.failed = Counter("lightpage_bulk_ranges_failed", "Ranges or files without a result.", one, registry=own)
         self.died = Counter("lightpage_bulk_workers_died", "Workers that died.", one, registry=own)
         self.read_bytes = Counter("lightpage_bulk_read_bytes", "Frames, as they lie in recordings.", one, registry=own)
         self.job_pages = Gauge("lightpage_bulk_job_pages", "Pages of the whole job, or devices.", one, registry=own)
