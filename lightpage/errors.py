@@ -93,5 +93,9 @@ class TakenError(BusyError):
     """Another process has the resource; once that has ended, the same command may go well."""
 
 
+class MissingResultsError(LightpageError):
+    """Some of the work has no result; the same command tries that again, and repeats nothing else."""
+
+
 class LimitError(LightpageError):
     """A request is larger than the service accepts."""

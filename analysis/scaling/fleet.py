@@ -28,6 +28,7 @@ import numpy as np
 from analysis.comparison.kept_bundle import data_set_of, export_kept
 from analysis.hardware.drifting import TrueTable, Truth, direction, moved
 from analysis.hardware.rows import append_row, kept_rows
+from lightpage.cli.main import EXIT_AGAIN, EXIT_ERROR
 from lightpage.cli.main import run as run_command
 from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.device.profile import Profile, load_profile
@@ -184,7 +185,7 @@ def recalibrated(folder: Path, fleet: Path, options: Sequence[str], threads: int
         timeout=LIMIT_S,
         check=False,
     )
-    if done.returncode not in (0, 2):
+    if done.returncode not in (0, EXIT_ERROR, EXIT_AGAIN):  # devices are refused, or have failed
         raise RuntimeError(f"lightpage bulk recalibrate ended with status {done.returncode}")
     devices: list[dict[str, Any]] = json.loads(told.read_text())["devices"]
     return devices

@@ -16,7 +16,7 @@ import click
 
 from lightpage.cli.paths import check_outputs
 from lightpage.cli.progress_bar import Bars
-from lightpage.errors import LightpageError, LostDataError, TakenError
+from lightpage.errors import LightpageError, LostDataError, MissingResultsError, TakenError
 from lightpage.progress import reporting
 
 GROUP = "lightpage.commands"
@@ -29,8 +29,8 @@ RESUME = "run the same command again; nothing half-written was left under a fina
 EXIT_ERROR = 2
 EXIT_LOST = 3
 """Data are lost."""
-EXIT_TAKEN = 75
-"""Another process has to end first; then the same command may go well: EX_TEMPFAIL of sysexits.h."""
+EXIT_AGAIN = 75
+"""The same command may go well later: EX_TEMPFAIL of sysexits.h."""
 EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
 """128 + SIGINT, 128 + SIGTERM, as shells have it."""
 
@@ -143,7 +143,7 @@ def lightpage() -> None:
 def run(command: click.Command, arguments: Sequence[str] | None = None, name: str = "lightpage") -> int:
     """Run a command line and return its exit status.
 
-    That is 0, 2 for a foreseen error, 3 where data are lost, 75 where another process has to end first, 130 after
+    That is 0, 2 for a foreseen error, 3 where data are lost, 75 where the same command may go well later, 130 after
     Ctrl-C, 143 after SIGTERM.
 
     SIGTERM ends a command as Ctrl-C does, so that it clears up behind itself.
@@ -206,7 +206,7 @@ def _fail(error: LightpageError) -> int:
     click.echo("lightpage: error: " + " ".join(str(error).split()), err=True)
     if isinstance(error, LostDataError):
         return EXIT_LOST
-    return EXIT_TAKEN if isinstance(error, TakenError) else EXIT_ERROR
+    return EXIT_AGAIN if isinstance(error, (MissingResultsError, TakenError)) else EXIT_ERROR
 
 
 def main() -> NoReturn:

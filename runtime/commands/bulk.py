@@ -15,7 +15,7 @@ from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import OutputFile, OutputFolder, check_outputs
 from lightpage.codec.code import Code, load_code
 from lightpage.codec.volume_file import parse_volume, ranges
-from lightpage.errors import InvalidInputError, LightpageError, LostDataError
+from lightpage.errors import InvalidInputError, LightpageError, LostDataError, MissingResultsError
 from lightpage.files import write_json
 from lightpage.progress import warn
 from runtime.bundle.shipped import DEFAULT
@@ -46,8 +46,9 @@ def bulk() -> None:
     """Read archives of recordings, or recalibrate a fleet, with many workers.
 
     Results and a ledger of every page go into the folder OUT. The same command again does only what is missing; without
-    --recordings and --fleet it goes on with what was asked before. Exit status 2 says that pages or recordings are
-    lost, 3 that a file is, 75 that another run is at work on the same.
+    --recordings and --fleet it goes on with what was asked before. Exit status 2 says that pages are lost, or devices
+    refused, 3 that a file is lost, and 75 that the same command may do more: something is missing, or another run is at
+    work.
     """
 
 
@@ -196,7 +197,7 @@ def _bulk(
             if again_with is not None:
                 job = _with_round(job, again_with)
             job.write(ledger.folder)
-        with _watched(ledger.folder.name, operation, metrics_address, metrics_file) as watch:
+        with _watched(ledger, operation, metrics_address, metrics_file) as watch:
             made = run(ledger, job, partial(_engine, engine, address, workers, threads, provider), watch)
         found = totals(ledger, job, made.failures)
         files = recovered_files(ledger, job, wanted) if operation is Operation.RECOVER and own == WHOLE else []
@@ -234,14 +235,14 @@ def _check_metrics(address: str | None, insecure: bool, file: Path | None) -> No
 
 
 @contextmanager
-def _watched(run_name: str, operation: Operation, address: str | None, file: Path | None) -> Iterator[Watch]:
+def _watched(ledger: Ledger, operation: Operation, address: str | None, file: Path | None) -> Iterator[Watch]:
     """What keeps the metrics that were asked for; the file is written however the run ends."""
     if address is None and file is None:
         yield Watch()
         return
     from runtime.scaling.metrics import BulkMetrics  # prometheus_client, for who asks for it
 
-    metrics = BulkMetrics(run_name, operation)
+    metrics = BulkMetrics(ledger.folder.name, operation, ledger.part)
     try:
         with ExitStack() as stack:
             if address is not None:
@@ -357,7 +358,7 @@ def table(job: Job, part: Part, made: Progressed, found: Totals, files: list[Rec
     rows = [
         ("part", "" if part == WHOLE else f"{part}; without --part, the same command says it of all parts"),
         (unit, f"{len(found.devices)}" if recalibrated else f"{tally.pages} of {len(found.recordings)} recordings"),
-        ("this run", f"{made.pages} {unit}{speed}" if made.pages else "nothing was missing"),
+        ("this run", f"{made.pages} {unit}{speed}" if made.pages or made.failed else "nothing was missing"),
         ("recalibrated" if recalibrated else "read", f"{tally.read}"),
         ("left out", f"{tally.left_out} that a bundle was made from" if tally.left_out else ""),
         ("refused" if recalibrated else "lost", f"{tally.lost.total()} ({causes})" if causes else "0"),
@@ -401,14 +402,21 @@ def device_table(rows: Sequence[Mapping[str, Any]]) -> str:
 def failure(
     out: Path, job: Job, part: Part, made: Progressed, found: Totals, files: list[RecoveredFile]
 ) -> LightpageError | None:
-    """The error that a run ends with where something is lost; None where nothing is."""
+    """The error that a run ends with where something is missing or lost; None where nothing is."""
     subject, tally = f"bulk run {out}", found.tally
     lost = tally.lost.total()
     told = [*map(str, made.problems), *found.lost]
     if (more := made.failed + lost - len(told)) > 0:
         told.append(f"and {more} more")
-    got = f"{lost} of {tally.pages} lost and {tally.missing} missing ({'; '.join(told)})"
-    if job.choices.operation is Operation.RECOVER and not made.failed:
+    got, expected = f"{lost} of {tally.pages} lost and {tally.missing} missing", "pages that can be read"
+    if job.choices.operation is Operation.RECALIBRATE:
+        failed = sum(row["state"] is DeviceState.FAILED for row in found.devices)
+        got = f"{lost} of {len(found.devices)} devices refused and {failed} failed"
+        expected = "known pages of each device, and all that it needs"
+    got = f"{got} ({'; '.join(told)})"
+    if made.failed:
+        return MissingResultsError(subject, got, f"{expected}; the same command tries again what is missing")
+    if job.choices.operation is Operation.RECOVER:
         broken = ranges([file.volume.id for file in files if file.error is not None])
         if broken or (lost and not files and part == WHOLE):
             what = f"volumes {broken} without a file" if broken else "no file"
@@ -417,9 +425,4 @@ def failure(
             then = "every file is whole all the same" if part == WHOLE else "the files come when all parts are done"
             warn(f"{subject}: {got}; {then}")
         return None
-    if job.choices.operation is Operation.RECALIBRATE:
-        failed = sum(row["state"] is DeviceState.FAILED for row in found.devices)
-        got = f"{lost} of {len(found.devices)} devices refused and {failed} failed ({'; '.join(told)})"
-        expected = "known pages of each device, and all that it needs"
-        return InvalidInputError(subject, got, expected) if lost or made.failed else None
-    return InvalidInputError(subject, got, "pages that can be read") if lost or made.failed else None
+    return InvalidInputError(subject, got, expected) if lost else None

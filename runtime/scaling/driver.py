@@ -84,6 +84,9 @@ class Watch:
     def count(self, outcome: Outcome) -> None:
         """This has become of a range."""
 
+    def fail(self) -> None:
+        """A recording or bundle cannot be opened, or a device lacks something: no range of it is handed out."""
+
     def deaths(self, count: int) -> None:
         """So many workers have died."""
 
@@ -112,6 +115,7 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine], watch: Watch = _
     problems = (source.problem.about(source.device) for _, source in ledger.sources(job) if source.problem is not None)
     for problem in dict.fromkeys(problems):  # a bundle is lacking to all recordings of its device
         made.fail(problem)
+        watch.fail()
     unit = "device" if job.choices.operation is Operation.RECALIBRATE else "page"
     try:
         for number in range(1 + len(job.rounds)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
@@ -51,12 +52,12 @@ class Attempt:
     Attributes:
         task: what is asked.
         number: how many workers have died at it.
-        deadline: until when it must be done, `time.monotonic` seconds.
+        deadline: until when it must be done, `time.monotonic` seconds; infinite until a worker has it.
     """
 
     task: Task
     number: int = 0
-    deadline: float = 0.0
+    deadline: float = math.inf
 
 
 def next_attempt(tasks: Iterator[Task]) -> Attempt | None:

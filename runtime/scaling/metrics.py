@@ -14,6 +14,7 @@ from lightpage.files import replace_text
 from runtime.errors import Reason
 from runtime.scaling.driver import Watch
 from runtime.scaling.engine import Engine
+from runtime.scaling.part import WHOLE, Part
 from runtime.scaling.shard import PageState
 from runtime.scaling.task import Failed, Operation, Outcome
 
@@ -30,20 +31,21 @@ _CAUSES: dict[Operation, Iterable[str]] = {
 
 
 class BulkMetrics(Watch):
-    """The figures of one run. All have the label `run`, so that files of several runs may lie in one folder.
+    """The figures of one run. All have the labels `run` and `part`, so that files of many may lie in one folder.
 
     Args:
         run: name of the run's folder.
         operation: what it does.
+        part: what this process does of it.
     """
 
-    def __init__(self, run: str, operation: Operation) -> None:
+    def __init__(self, run: str, operation: Operation, part: Part = WHOLE) -> None:
         self.registry = own = CollectorRegistry()
-        self._run = run
-        one = ["run"]
-        self.pages = Counter("lightpage_bulk_pages", "Pages, by what became of them.", ["run", "state"], registry=own)
-        self.lost = Counter("lightpage_bulk_pages_lost", "Lost pages, by cause.", ["run", "reason"], registry=own)
-        self.failed = Counter("lightpage_bulk_ranges_failed", "Page ranges without a result.", one, registry=own)
+        self._own = run, str(part)
+        one = ["run", "part"]
+        self.pages = Counter("lightpage_bulk_pages", "Pages, by what became of them.", [*one, "state"], registry=own)
+        self.lost = Counter("lightpage_bulk_pages_lost", "Lost pages, by cause.", [*one, "reason"], registry=own)
+        self.failed = Counter("lightpage_bulk_ranges_failed", "Ranges or files without a result.", one, registry=own)
         self.died = Counter("lightpage_bulk_workers_died", "Workers that died.", one, registry=own)
         self.read_bytes = Counter("lightpage_bulk_read_bytes", "Frames, as they lie in recordings.", one, registry=own)
         self.job_pages = Gauge("lightpage_bulk_job_pages", "Pages of the whole job, or devices.", one, registry=own)
@@ -51,7 +53,7 @@ class BulkMetrics(Watch):
         self.in_flight = Gauge("lightpage_bulk_ranges_in_flight", "Page ranges handed out.", one, registry=own)
         self.workers = Gauge("lightpage_bulk_workers", "Workers alive.", one, registry=own)
         self.ended = Gauge("lightpage_bulk_end_timestamp_seconds", "When the run ended.", one, registry=own)
-        self.info = Gauge("lightpage_bulk_info", "1 for what the run does.", ["run", "operation"], registry=own)
+        self.info = Gauge("lightpage_bulk_info", "1 for what the run does.", [*one, "operation"], registry=own)
         self.page_seconds = Histogram(
             "lightpage_bulk_page_seconds",
             "A worker's time for a page, mean of its range.",
@@ -59,7 +61,7 @@ class BulkMetrics(Watch):
             buckets=_SECONDS,
             registry=own,
         )
-        self.info.labels(run, operation).set(1)
+        self.info.labels(*self._own, operation).set(1)
         self._begin_at_zero(operation)
 
     def _begin_at_zero(self, operation: Operation) -> None:
@@ -72,41 +74,45 @@ class BulkMetrics(Watch):
         )
         for metric, values in known:
             for value in values:
-                metric.labels(self._run, *value)
+                metric.labels(*self._own, *value)
 
     def wanted(self, total: int, left: int) -> None:
         """Note how many pages the job has, or devices, and how many have no result."""
-        self.job_pages.labels(self._run).set(total)
-        self.left.labels(self._run).set(left)
+        self.job_pages.labels(*self._own).set(total)
+        self.left.labels(*self._own).set(left)
 
     def begin(self, engine: Engine) -> None:
         """Show how many workers there are and what they have, whenever somebody looks."""
-        self.in_flight.labels(self._run).set_function(lambda: engine.in_flight)
-        self.workers.labels(self._run).set_function(lambda: engine.workers_alive)
+        self.in_flight.labels(*self._own).set_function(lambda: engine.in_flight)
+        self.workers.labels(*self._own).set_function(lambda: engine.workers_alive)
+
+    def fail(self) -> None:
+        """Count what has no result."""
+        self.failed.labels(*self._own).inc()
 
     def deaths(self, count: int) -> None:
         """Count workers that died."""
-        self.died.labels(self._run).inc(count)
+        self.died.labels(*self._own).inc(count)
 
     def count(self, outcome: Outcome) -> None:
         """Count what became of a range."""
         if isinstance(outcome, Failed):
-            self.failed.labels(self._run).inc()
+            self.fail()
             return
         pages, lost = outcome.task.weight, sum(outcome.lost.values())
         read = pages - lost - outcome.left_out
         for state, count in ((PageState.READ, read), (PageState.LOST, lost), (PageState.LEFT_OUT, outcome.left_out)):
-            self.pages.labels(self._run, state).inc(count)
+            self.pages.labels(*self._own, state).inc(count)
         for reason, count in outcome.lost.items():
-            self.lost.labels(self._run, reason).inc(count)
-        self.read_bytes.labels(self._run).inc(outcome.read_bytes)
-        self.left.labels(self._run).dec(pages)
+            self.lost.labels(*self._own, reason).inc(count)
+        self.read_bytes.labels(*self._own).inc(outcome.read_bytes)
+        self.left.labels(*self._own).dec(pages)
         for _ in range(pages):
-            self.page_seconds.labels(self._run).observe(outcome.seconds / pages)
+            self.page_seconds.labels(*self._own).observe(outcome.seconds / pages)
 
     def end(self) -> None:
         """Note when the run ended."""
-        self.ended.labels(self._run).set(time.time())
+        self.ended.labels(*self._own).set(time.time())
 
     def write(self, path: Path) -> None:
         """Write all of it in the format of Prometheus, whole or not at all.

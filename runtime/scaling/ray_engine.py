@@ -6,9 +6,11 @@ import logging
 import os
 import shutil
 import tempfile
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from lightpage.errors import InvalidInputError
@@ -35,7 +37,9 @@ class RayEngine:
     """Has Ray tasks do tasks; see `runtime.scaling.engine.Engine`.
 
     A process of Ray keeps its decoder from one task to the next. Ray's own retries are off: a task of a worker or node
-    that dies is given out again by this engine. Recordings, bundles and the run's folder must be there on every node.
+    that dies is given out again by this engine, and so is one whose worker does not answer in time; that one is killed.
+    Time that a task waits for a worker is not counted. Recordings, bundles and the run's folder must be there on every
+    node.
 
     Args:
         address: of a cluster, `auto` for one that runs on this machine; None to start one here, for this run.
@@ -61,7 +65,7 @@ class RayEngine:
         """See `Engine`.
 
         Raises:
-            WorkerError: no cluster, or one that does not answer.
+            WorkerError: no cluster, one that does not answer, or one that has lost all its workers.
             InvalidInputError: no node has as many CPUs as a worker takes, or a GPU if it takes one.
             ModuleNotFoundError: Ray is not installed: the extra cluster brings it.
         """
@@ -75,26 +79,29 @@ class RayEngine:
         busy: dict[Any, Attempt] = {}
         try:
             while True:
-                most = self._most(ray, threads)
+                self._count(ray, threads)
+                most = self._workers or max(1, self.workers_alive) * AHEAD
                 while len(busy) < most and (attempt := again.popleft() if again else next_attempt(following)):
                     busy[work.remote(attempt.task, threads)] = attempt
                 self.in_flight = len(busy)
                 if not busy:
                     return
-                limit_s = max(longest_s(attempt.task) for attempt in busy.values())
-                ready, _ = ray.wait(list(busy), num_returns=1, timeout=limit_s)
-                if not ready:
-                    raise WorkerError("the Ray cluster", f"no answer within {limit_s:.0f} s", "nodes that work")
-                for ref in ready:
+                for attempt in islice(busy.values(), max(1, self.workers_alive)):  # Ray begins them in this order
+                    attempt.deadline = min(attempt.deadline, time.monotonic() + longest_s(attempt.task))
+                left_s = min(attempt.deadline for attempt in busy.values()) - time.monotonic()
+                ready, _ = ray.wait(list(busy), num_returns=1, timeout=max(0.0, left_s))
+                for ref in ready or self._overdue(ray, threads, busy):
                     attempt = busy.pop(ref)
                     self.in_flight = len(busy)
                     try:
+                        if not ready:
+                            ray.cancel(ref, force=True)  # nobody hears what it may answer still
+                            raise TimeoutError("no answer in time")
                         outcome: Outcome = ray.get(ref)
-                    except ray.exceptions.RayError as error:
+                    except (ray.exceptions.RayError, TimeoutError) as error:
                         self.restarts += 1
-                        attempt.number += 1
-                        if attempt.number < ATTEMPTS:
-                            again.append(attempt)
+                        if attempt.number + 1 < ATTEMPTS:
+                            again.append(Attempt(attempt.task, attempt.number + 1))
                             continue
                         outcome = given_up(attempt.task, _told(error))
                     yield outcome
@@ -118,14 +125,25 @@ class RayEngine:
             )
         return self._threads or max(1, min(THREADS_OF_WORKER, largest))
 
-    def _most(self, ray: Any, threads: int) -> int:
-        """Tasks that may be on their way, as the cluster is now."""
+    def _overdue(self, ray: Any, threads: int, busy: dict[Any, Attempt]) -> list[Any]:
+        """Tasks whose time is up.
+
+        Raises:
+            WorkerError: there is no worker that could have done one.
+        """
+        self._count(ray, threads)
+        if not self.workers_alive:
+            raise WorkerError("the Ray cluster", "no workers any more", "nodes that have what a worker takes")
+        now = time.monotonic()
+        return [ref for ref, attempt in busy.items() if attempt.deadline <= now]
+
+    def _count(self, ray: Any, threads: int) -> None:
+        """Look for how many workers the cluster suffices now."""
         there = ray.cluster_resources()
         room = int(there.get("CPU", 0)) // threads
         if self._gpus:
             room = min(room, int(there.get("GPU", 0)) // self._gpus)
         self.workers_alive = room if self._workers is None else min(room, self._workers)
-        return self._workers or max(1, room) * AHEAD
 
 
 _worker: Worker | None = None

@@ -16,7 +16,7 @@ import click
 import pytest
 import yaml
 
-from lightpage.cli.main import EXIT_ERROR, EXIT_LOST, EXIT_TAKEN
+from lightpage.cli.main import EXIT_AGAIN, EXIT_ERROR, EXIT_LOST
 from runtime.commands import serve as serving
 from runtime.rpc import server as rpc
 from runtime.scaling.part import Part
@@ -296,7 +296,7 @@ def test_what_another_try_would_not_change_is_not_tried_again(name: str) -> None
     assert (ignored["action"], ignored["onPodConditions"][0]["type"]) == ("Ignore", "DisruptionTarget")
     assert (final["action"], final["onExitCodes"]["operator"]) == ("FailIndex", "In")
     assert final["onExitCodes"]["values"] == [EXIT_ERROR, EXIT_LOST]
-    assert EXIT_TAKEN not in final["onExitCodes"]["values"]
+    assert EXIT_AGAIN not in final["onExitCodes"]["values"]
     assert spec["template"]["spec"]["restartPolicy"] == "Never"  # what a policy on failures needs
     assert spec["backoffLimitPerIndex"] > 0
 
@@ -307,6 +307,7 @@ def test_the_ray_job_is_understood_and_tells_nobody_of_itself() -> None:
     assert not re.search(r"[*?\[$'\"]", job["entrypoint"])  # it passes through shells
     options = parsed(words)
     assert (options["engine"], options["address"]) == ("ray", "auto")
+    assert job["backoffLimit"] == 0  # whatever the exit status is, which may say that nothing is left to do
     cluster = job["rayClusterSpec"]
     for pod in manifests.templates(job):
         for container in pod["spec"]["containers"]:

@@ -115,7 +115,7 @@ def test_a_recording_that_is_lost_costs_its_device_alone(fleet: Fleet) -> None:
     whole = (fleet.folder / "a-2.h5").read_bytes()
     (fleet.folder / "a-2.h5").write_bytes(whole[:1000])
     status, rows = fleet.run()
-    assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "failed", "recalibrated")
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (75, "failed", "recalibrated")
     assert "a-2.h5" in rows["a"]["reason"]
     (fleet.folder / "a-2.h5").write_bytes(whole)
     status, rows = fleet.run()
@@ -131,10 +131,10 @@ def test_a_bundle_that_is_lost_costs_its_device_alone(
     fleet.bundles["a"] = own
     own.unlink() if left is None else own.write_bytes(left)
     status, rows = fleet.run()
-    assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "failed", "recalibrated")
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (75, "failed", "recalibrated")
     assert str(own) in rows["a"]["reason"]
     assert f"device a: bundle {own}" in capsys.readouterr().err
-    assert fleet.run()[0] == 2  # it is no other question
+    assert fleet.run()[0] == 75  # it is no other question
     own.write_bytes(whole)
     status, rows = fleet.run()
     assert (status, rows["a"]["state"]) == (0, "recalibrated")
@@ -230,7 +230,7 @@ def test_a_part_has_whole_devices_and_tells_of_no_others(
         status, rows = fleet.run(*form, "--part", part, "--metrics-file", str(fleet.folder / "bulk.prom"))
         assert (status, list(rows), rows[name]["state"]) == (0, [name], "recalibrated")
         assert len(rows[name]["recordings"]) == recordings
-        assert 'lightpage_bulk_job_pages{run="out"} 1.0' in (fleet.folder / "bulk.prom").read_text()
+        assert f'lightpage_bulk_job_pages{{part="{part}",run="out"}} 1.0' in (fleet.folder / "bulk.prom").read_text()
     assert re.search(r"^devices +1$", capsys.readouterr().out, re.MULTILINE)
     status, rows = fleet.run(*form)
     assert (status, sorted(rows)) == (0, ["a", "b"])
@@ -262,7 +262,7 @@ def test_a_device_of_two_unreadable_recordings_has_failed_once(
 ) -> None:
     for name in ("a-1", "a-2"):
         (fleet.folder / f"{name}.h5").write_bytes(b"no recording")
-    assert fleet.run()[0] == 2
+    assert fleet.run()[0] == 75
     assert "0 of 2 devices refused and 1 failed" in capsys.readouterr().err
 
 
@@ -286,7 +286,7 @@ def test_a_device_without_its_run_is_told_before_anything_is_done(
     fleet: Fleet, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, rows = fleet.run("--deep", runs=("b",))
-    assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "failed", "recalibrated")
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (75, "failed", "recalibrated")
     assert rows["a"]["reason"] == "run: got none, wanted a run"
     assert "device a: run: got none" in capsys.readouterr().err.partition("device b")[0]
     assert [asked[0] for asked in fleet.deep.asked] == ["run-b"]
@@ -303,19 +303,19 @@ def test_an_interrupted_fleet_goes_on_in_the_same_folder(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "state", "again"),
+    ("error", "state", "again", "ends"),
     [
-        (RecalibrationRefusedError("fine-tuned model", "less", "more"), "refused", 2),
-        (InvalidInputError("run", "another", "this one"), "failed", 4),
+        (RecalibrationRefusedError("fine-tuned model", "less", "more"), "refused", 2, 2),
+        (InvalidInputError("run", "another", "this one"), "failed", 4, 75),
     ],
 )
 def test_what_a_device_is_refused_for_stays_and_all_else_is_tried_again(
-    error: LightpageError, state: str, again: int, fleet: Fleet, capsys: pytest.CaptureFixture[str]
+    error: LightpageError, state: str, again: int, ends: int, fleet: Fleet, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fleet.deep.error = error
     for _ in range(2):
         status, rows = fleet.run("--deep")
-        assert (status, [row["state"] for row in rows.values()]) == (2, [state, state])
+        assert (status, [row["state"] for row in rows.values()]) == (ends, [state, state])
         assert rows["a"]["reason"] == str(error)
         assert f"device a: {error.subject}" in capsys.readouterr().err.replace(f"recording {fleet.folder}/a-1.h5: ", "")
     assert len(fleet.deep.asked) == again

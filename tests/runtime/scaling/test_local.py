@@ -60,10 +60,10 @@ def test_a_killed_worker_costs_its_range_only_and_nothing_comes_out_differently(
         job.write(ledger.folder)
         made = run(ledger, job, lambda: engine, metrics)
         found = totals(ledger, job)
-    shown = metrics.registry.get_sample_value
-    assert shown("lightpage_bulk_workers_died_total", {"run": "killed"}) == 1 + ATTEMPTS
-    assert shown("lightpage_bulk_ranges_failed_total", {"run": "killed"}) == 1
-    assert shown("lightpage_bulk_workers", {"run": "killed"}) == 0
+    shown, labels = metrics.registry.get_sample_value, {"run": "killed", "part": "0/1"}
+    assert shown("lightpage_bulk_workers_died_total", labels) == 1 + ATTEMPTS
+    assert shown("lightpage_bulk_ranges_failed_total", labels) == 1
+    assert shown("lightpage_bulk_workers", labels) == 0
     assert (made.restarts, made.failed, made.ranges) == (1 + ATTEMPTS, 1, 3)
     assert "pages 6-8: got the end of its worker by signal 9" in str(made.problems[0])
     assert (found.tally.read, found.tally.missing) == (PAGES - RANGE, RANGE)
