@@ -148,7 +148,7 @@ def test_a_bundle_with_another_name_is_taken_once_the_fleet_says_so(
 ) -> None:
     fleet.bundles["a"] = fleet.folder / "mistyped.zip"
     status, rows = fleet.run()
-    assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "failed", "recalibrated")
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (75, "failed", "recalibrated")
     assert "mistyped.zip" in capsys.readouterr().err
     right = fleet.folder / "right.zip"
     right.write_bytes(fleet.bundle.read_bytes())
@@ -163,7 +163,7 @@ def test_a_bundle_may_be_moved_before_its_device_is_done(fleet: Fleet) -> None:
     before = fleet.folder / "before.zip"
     before.write_bytes(fleet.bundle.read_bytes())
     fleet.bundles = dict.fromkeys(fleet.bundles, before)
-    assert fleet.run()[0] == 2
+    assert fleet.run()[0] == 75
     (fleet.folder / "b.h5").write_bytes(whole)
     fleet.bundles = dict.fromkeys(fleet.bundles, before.rename(fleet.folder / "after.zip"))
     status, rows = fleet.run()
@@ -174,11 +174,11 @@ def test_a_pattern_that_names_no_file_costs_its_device_alone(fleet: Fleet, capsy
     (fleet.folder / "b.h5").rename(fleet.folder / "elsewhere.h5")
     fleet.patterns["b"] = "b*.h5"
     status, rows = fleet.run()
-    assert (status, rows["a"]["state"], rows["b"]["state"]) == (2, "recalibrated", "failed")
+    assert (status, rows["a"]["state"], rows["b"]["state"]) == (75, "recalibrated", "failed")
     told = f"device b: recording {fleet.folder / 'b*.h5'}: got no file when the run began"
     assert told in capsys.readouterr().err
     (fleet.folder / "elsewhere.h5").rename(fleet.folder / "b.h5")
-    assert fleet.run()[0] == 2
+    assert fleet.run()[0] == 75
     assert told in capsys.readouterr().err
 
 
@@ -205,7 +205,7 @@ def test_frames_that_could_not_be_read_say_nothing_of_the_device(
     with monkeypatch.context() as patch:
         patch.setattr(Recording, "frames", broken)
         status, rows = fleet.run()
-        assert (status, {row["state"] for row in rows.values()}) == (2, {"failed"})
+        assert (status, {row["state"] for row in rows.values()}) == (75, {"failed"})
     assert "Input/output error" in capsys.readouterr().err
     status, rows = fleet.run()
     assert (status, {row["state"] for row in rows.values()}) == (0, {"recalibrated"})
