@@ -41,7 +41,9 @@ class Certificates:
     def __init__(self, files: TlsFiles) -> None:
         self._files = files
         self._lock = threading.Lock()
-        self._stamp = self._refused = self._stamp_now()
+        self._stamp = self._stamp_now()
+        self._refused: _Stamp | None = None
+        """Of files that were no good, as long as those of `_stamp` count."""
         self._pem, self._context = files.read(), self._loaded()
         _warn_of(self._pem)
 
@@ -52,6 +54,7 @@ class Certificates:
             if stamp not in (self._stamp, self._refused):
                 try:
                     self._pem, self._context, self._stamp = self._files.read(), self._loaded(), stamp
+                    self._refused = None
                     _log.info("certificates: read anew from %s", self._files.certificate)
                     _warn_of(self._pem)
                 except InvalidInputError as error:

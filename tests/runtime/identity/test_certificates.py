@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import ssl
 import subprocess
 from datetime import timedelta
 from pathlib import Path
@@ -100,6 +101,24 @@ def test_new_files_of_a_mounted_secret_count(authority: Authority, tmp_path: Pat
     assert _mounted(tmp_path / "mount", newer, "2026_02_01") == mounted
     assert certificates.pem().certificate == newer.certificate.read_bytes() != before.certificate
     assert certificates.context() is not context
+
+
+def test_earlier_files_that_are_put_back_count(tmp_path: Path) -> None:
+    folders = [tmp_path / "earlier", tmp_path / "wider"]
+    for folder in folders:
+        Authority(folder).service()
+    link = tmp_path / "tls"
+    link.symlink_to(folders[0])
+    certificates = Certificates(TlsFiles(link / "ca.pem", link / "service.pem", link / "service.key"))
+    for folder in (*folders, *folders):  # each time with the same number, size and time of change
+        link.unlink()
+        link.symlink_to(folder)
+        assert certificates.pem().ca == (folder / "ca.pem").read_bytes()
+        assert certificates.context().get_ca_certs(binary_form=True) == [_der(folder / "ca.pem")]
+
+
+def _der(path: Path) -> bytes:
+    return ssl.PEM_cert_to_DER_cert(path.read_text())
 
 
 def test_half_replaced_files_leave_the_earlier_ones(authority: Authority, caplog: pytest.LogCaptureFixture) -> None:
