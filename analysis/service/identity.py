@@ -71,14 +71,20 @@ CALLERS: Mapping[str, Sequence[str]] = {
 """Certificates by name, and their roles; `none` connects without one."""
 
 
+def commands_of(section: str) -> str:
+    """The first commands of a section of the documentation, for bash."""
+    found = re.search(rf"### {section}\n.*?```\n(.*?)```", OPERATIONS.read_text("utf-8"), re.DOTALL)
+    if found is None:
+        raise RuntimeError(f"{OPERATIONS.name}: no commands in {section}")
+    return found[1]
+
+
 def documented() -> tuple[str, dict[str, str]]:
     """The commands that make certificates, and the role that each call needs, as the documentation has them."""
     text = OPERATIONS.read_text("utf-8")
-    commands = re.search(r"### Certificates from nothing.*?```\n(.*?)```", text, re.DOTALL)
-    if commands is None:
-        raise RuntimeError(f"{OPERATIONS.name}: no commands that make certificates")
     rows = re.findall(r"^\| `(read|decode|recalibrate|admin)` \| (.+) \|$", text, re.MULTILINE)
-    return commands[1], {call: role for role, calls in rows for call in re.findall(r"`([\w/]+)`", calls)}
+    needed = {call: role for role, calls in rows for call in re.findall(r"`([\w/]+)`", calls)}
+    return commands_of("Certificates from nothing"), needed
 
 
 def expected(caller: str, role: str) -> str:

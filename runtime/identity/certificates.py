@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import ssl
 import threading
@@ -80,6 +81,20 @@ class Certificates:
         """What an HTTP server meets the next caller with, who must have a certificate."""
         self.pem()
         return self._context
+
+    def ends_s(self) -> float:
+        """When the first ends of the service's own certificates and its callers' authorities, seconds since 1970.
+
+        One that only OpenSSL can read is left out; where there is no other, this is infinite.
+        """
+        pem = self.pem()
+        try:
+            own = x509.load_pem_x509_certificates(pem.certificate)
+        except ValueError:  # it was warned of
+            own = []
+        ends = [each.not_valid_after_utc.timestamp() for each in own]
+        ends += [ssl.cert_time_to_seconds(str(each["notAfter"])) for each in self._context.get_ca_certs()]
+        return min(ends, default=math.inf)
 
     def _loaded(self) -> ssl.SSLContext:
         """The context of the files as they are.

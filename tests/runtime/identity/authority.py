@@ -25,12 +25,13 @@ class Authority:
 
     folder: Path
     name: str = "authority"
+    valid_for: timedelta = _DAY
 
     def __post_init__(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._key = ec.generate_private_key(ec.SECP256R1())
         subject = _named(self.name)
-        builder = _begun(subject, subject, self._key.public_key(), _DAY)
+        builder = _begun(subject, subject, self._key.public_key(), self.valid_for)
         builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         (self.folder / "ca.pem").write_bytes(_pem(builder.sign(self._key, hashes.SHA256())))
 

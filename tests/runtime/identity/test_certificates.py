@@ -6,12 +6,13 @@ import os
 import shutil
 import ssl
 import subprocess
+import time
 from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
-from analysis.service.identity import documented
+from analysis.service.identity import commands_of, documented
 from lightpage.errors import InvalidInputError
 from runtime.identity.certificates import Certificates
 from runtime.identity.roles import identity_of
@@ -155,13 +156,33 @@ def test_the_console_keeps_the_earlier_certificates_too(authority: Authority) ->
 
 def test_the_commands_for_operators_make_good_certificates(tmp_path: Path) -> None:
     commands, _ = documented()
-    subprocess.run(["bash", "-c", f"set -e\n{commands}"], cwd=tmp_path, check=True, capture_output=True, timeout=60)
+    bash(commands, tmp_path)
     roles = {"watcher": {"read"}, "controller": {"decode"}, "keeper": {"decode", "recalibrate"}, "operator": {"admin"}}
     for name in ("service", *roles):
         TlsFiles(*(tmp_path / "tls" / file for file in ("ca.pem", f"{name}.pem", f"{name}.key"))).read()
     for name, expected in roles.items():
         identity = identity_of((tmp_path / "tls" / f"{name}.pem").read_bytes())
         assert (identity.name, identity.roles) == (name, expected)
+
+
+def test_the_commands_that_renew_certificates_keep_the_authority_the_keys_and_the_roles(tmp_path: Path) -> None:
+    bash(commands_of("Certificates from nothing"), tmp_path)
+    tls = tmp_path / "tls"
+    before = {path.name: path.read_bytes() for path in tls.iterdir()}
+    bash(commands_of("New certificates"), tmp_path)
+    changed = {path.name for path in tls.iterdir() if path.read_bytes() != before.get(path.name)}
+    names = ("service", "watcher", "controller", "keeper", "operator")
+    assert changed == {*(f"{name}.pem" for name in names), "ca.srl"}
+    for name in names:
+        now, earlier = identity_of((tls / f"{name}.pem").read_bytes()), identity_of(before[f"{name}.pem"])
+        assert (now.name, now.roles) == (earlier.name, earlier.roles)
+        assert now.until >= earlier.until
+        TlsFiles(tls / "ca.pem", tls / f"{name}.pem", tls / f"{name}.key").read()
+        bash(f"openssl verify -CAfile ca.pem {name}.pem", tls)
+
+
+def bash(commands: str, folder: Path) -> None:
+    subprocess.run(["bash", "-ec", commands], cwd=folder, check=True, capture_output=True, timeout=60)
 
 
 def _replace(files: TlsFiles, newer: TlsFiles) -> None:
@@ -175,6 +196,23 @@ def test_a_certificate_that_ends_is_warned_of(
 ) -> None:
     Certificates(authority.service(valid_for=timedelta(days=days)))
     assert (told in caplog.text) if told else not caplog.records
+
+
+def test_the_first_end_is_told(authority: Authority, tmp_path: Path) -> None:
+    files = authority.service(valid_for=timedelta(days=90))
+    certificates, day_s = Certificates(files), 86_400
+    now = time.time()
+    assert certificates.ends_s() - now == pytest.approx(day_s, abs=60), "the authority's comes first"
+    longer = Authority(tmp_path / "longer", valid_for=timedelta(days=400))
+    for days in (30, 90):
+        newer = longer.service(valid_for=timedelta(days=days))
+        for source, target in zip(vars(newer).values(), vars(files).values(), strict=True):
+            shutil.copy(source, target)
+        assert certificates.ends_s() - now == pytest.approx(days * day_s, abs=60), "nobody has connected meanwhile"
+    between = longer.service("between", valid_for=timedelta(days=7))
+    with files.certificate.open("ab") as chain:
+        chain.write(between.certificate.read_bytes())
+    assert certificates.ends_s() - now == pytest.approx(7 * day_s, abs=60), "of a chain"
 
 
 def test_a_certificate_for_callers_is_warned_of(authority: Authority, caplog: pytest.LogCaptureFixture) -> None:

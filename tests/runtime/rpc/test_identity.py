@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
@@ -187,6 +188,11 @@ def test_new_certificates_count_without_a_restart(start: Start, authority: Autho
         assert ended(server.target, before) is grpc.StatusCode.UNAVAILABLE
     finally:
         server.stop(0.5)
+
+
+def test_metrics_say_when_the_first_certificate_ends(start: Start, secured: Running) -> None:
+    assert secured.count("lightpage_certificate_ends_seconds") == pytest.approx(time.time() + 86_400, abs=60)
+    assert start().plane.metrics.registry.get_sample_value("lightpage_certificate_ends_seconds") is None
 
 
 def test_health_checks_with_tls_need_no_certificate(authority: Authority) -> None:
