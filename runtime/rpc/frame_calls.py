@@ -266,9 +266,9 @@ def _header(first: FramePart | None, call: Call) -> pb.DecodeHeader:
 
 
 def _caller(header: pb.DecodeHeader, call: Call) -> Caller:
-    """The caller, whose pages without a session of their own are those of its connection."""
-    session = call.own(header.options.session) or f"connection {call.peer}"
-    return call.caller.in_session(session, header.options.tracking == pb.TRACKING_STATELESS)
+    """The caller, whose pages without a session of their own are those of its connection, or of none."""
+    session = call.session(header.options.session) or call.connection_session
+    return call.caller.in_session(session, not session or header.options.tracking == pb.TRACKING_STATELESS)
 
 
 def check_black(header: pb.DecodeHeader | pb.RecalibrateFramesHeader) -> None:

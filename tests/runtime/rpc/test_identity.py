@@ -138,7 +138,7 @@ def test_callers_of_other_names_share_no_session_and_no_request_id(secured: Runn
             answers.append(client.read_page(request_id="shot"))
     assert [answer.replayed for answer in answers] == [False, False, True]
     assert answers[0].page == answers[2].page != answers[1].page
-    assert set(secured.plane.registry.current.sessions._trackers) == {"3:one/a", "3:two/a"}
+    assert set(secured.plane.registry.current.sessions._trackers) == {"session 3:one/a", "session 3:two/a"}
 
 
 def test_names_and_ids_that_look_alike_are_told_apart(secured: Running) -> None:
@@ -149,6 +149,19 @@ def test_names_and_ids_that_look_alike_are_told_apart(secured: Running) -> None:
     assert own("line", "7/job") != own("line/7", "job")
     assert own("", "job") == "job"
     assert own("line", "") == ""
+
+
+def test_no_name_of_a_session_is_that_of_a_connection(secured: Running, authority: Authority) -> None:
+    pair, sessions = a_page()[1], secured.plane.registry.current.sessions
+    with LightpageClient(secured.server.target, tls=authority.caller("one", ["decode"])) as client:
+        client.decode(pair, 16)
+        (connection,) = sessions._trackers
+        assert connection.startswith("connection 3:one/ipv4:127.0.0.1:")
+        client.decode(pair, 16, session=connection)
+    secured.client.decode(pair, 16)
+    (plain,) = (key for key in sessions._trackers if key.startswith("connection ipv4:"))
+    secured.client.decode(pair, 16, session=plain)
+    assert len(sessions._trackers) == 4
 
 
 def test_without_a_certificate_a_secured_service_lets_nobody_do_anything(secured: Running) -> None:
