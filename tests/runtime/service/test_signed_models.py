@@ -120,6 +120,18 @@ def test_a_bundle_that_somebody_puts_into_the_store_needs_one(service: Signed, t
             service.plane.models.activate(version)
 
 
+def test_a_signature_may_be_put_beside_a_bundle_that_was_taken_in_without_one(tmp_path: Path) -> None:
+    signer, new = Signer(tmp_path), toy.write_toy_bundle(tmp_path / "new.zip", version="toy-2")
+    signature = signer.signature(new)
+    begin(tmp_path, None).models.take_in(new)
+    plane = begin(tmp_path, signer)
+    with pytest.raises(BundleError, match=r"signature: got none, wanted .*\.sig behind the bundle's name"):
+        plane.models.activate("toy-2")
+    signature_path(tmp_path / "store" / "toy-2.zip").write_bytes(signature)
+    assert plane.models.activate("toy-2")[0].version == "toy-2"
+    assert begin(tmp_path, signer).registry.current.version == "toy-2"
+
+
 def test_without_a_key_no_signature_is_kept(toy_zip: Path, tmp_path: Path) -> None:
     registry = ModelRegistry(Decoder.load(toy_zip, threads=1))
     plane = DataPlane(registry, store=ModelStore(tmp_path / "store", registry.current.decoder.bundle))
