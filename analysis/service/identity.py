@@ -45,14 +45,14 @@ role=urn:lightpage:role
 issue recalibrator extendedKeyUsage=clientAuth "subjectAltName=URI:$role:recalibrate"
 issue nobody extendedKeyUsage=clientAuth
 issue expired extendedKeyUsage=clientAuth "subjectAltName=URI:$role:admin"
-openssl x509 -req -in expired.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days -1 -out expired.pem \
-    -extfile <(printf "%s\n" extendedKeyUsage=clientAuth "subjectAltName=URI:$role:admin")
+openssl x509 -req -in expired.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days -1 \
+    -extfile expired.ext -out expired.pem
 openssl ecparam -name prime256v1 -genkey -noout -out other.key
-openssl req -x509 -new -key other.key -days 10 -subj "/CN=Another authority" -out other.pem
-openssl ecparam -name prime256v1 -genkey -noout -out wrong.key
-openssl req -new -key wrong.key -subj "/CN=wrong" -out wrong.csr
-openssl x509 -req -in wrong.csr -CA other.pem -CAkey other.key -CAcreateserial -days 10 -out wrong.pem \
-    -extfile <(printf "%s\n" extendedKeyUsage=clientAuth "subjectAltName=URI:$role:admin")
+openssl req -x509 -new -key other.key -days 10 -subj "/CN=Another authority" \
+    -addext keyUsage=critical,keyCertSign,cRLSign -out other.pem
+issue wrong extendedKeyUsage=clientAuth "subjectAltName=URI:$role:admin"
+openssl x509 -req -in wrong.csr -CA other.pem -CAkey other.key -CAcreateserial -days 10 \
+    -extfile wrong.ext -out wrong.pem
 """
 """Certificates beside those of the documentation: one with a role of its own, and some that must not help anybody."""
 
