@@ -51,6 +51,9 @@ def test_sessions_and_pages_without_one(start: Start) -> None:
     assert [client.decode(pair, session="mine").piston_rad for _ in range(2)] == [1, 2]
     assert [client.decode(pair, stateless=True).piston_rad for _ in range(2)] == [1, 1]
     assert [client.read_page(1, session="mine").piston_rad, client.read_page(1).piston_rad] == [3, 1]
+    assert client.decode(pair, session="x" * 1024).piston_rad == 1
+    with pytest.raises(InvalidInputError, match="session: got 1025 characters, wanted at most 1024"):
+        client.decode(pair, session="x" * 1025)
 
 
 def test_clients_at_one_unix_socket_are_followed_apart(start: Start, tmp_path: Path) -> None:
