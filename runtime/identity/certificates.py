@@ -22,8 +22,8 @@ _log = logging.getLogger(__name__)
 SOON = timedelta(days=14)
 """A certificate that ends within this time is warned of."""
 
-_Stamp = tuple[tuple[int, int, int], ...]
-"""Number, size and time of change of each file."""
+_Stamp = tuple[tuple[int, ...], ...]
+"""Number, size and times of change of each file: of its contents, and of what the system knows of it, as its owner."""
 
 
 class Certificates:
@@ -114,14 +114,14 @@ class Certificates:
         return context
 
     def _stamp_now(self) -> _Stamp:
-        found = []
+        found: list[tuple[int, ...]] = []
         for path in vars(self._files).values():
             try:
                 status = os.stat(path)
             except OSError:
-                found.append((0, 0, 0))
+                found.append(())
             else:
-                found.append((status.st_ino, status.st_size, status.st_mtime_ns))
+                found.append((status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
         return tuple(found)
 
 
