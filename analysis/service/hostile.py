@@ -29,6 +29,7 @@ from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.files import write_json
 from lightpage.progress import track
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import ENDLESS, SERVICE
 from runtime.rpc.inference_calls import INFERENCE
 
@@ -68,6 +69,14 @@ def filled(message: Message, chance: random.Random, depth: int = 0) -> Message:
                 getattr(message, field.name).append(value)
             else:
                 setattr(message, field.name, value)
+    return message
+
+
+def edged(message: pb.DecodeHeader, chance: random.Random) -> pb.DecodeHeader:
+    """The header with some of its own integers at the edges of their types."""
+    for field in message.DESCRIPTOR.fields:
+        if field.cpp_type in _BEYOND and not field.is_repeated and chance.random() < 0.3:
+            setattr(message, field.name, scalar(field, chance))
     return message
 
 
@@ -117,6 +126,9 @@ def requests_of(method: Any, chance: random.Random, pages: PagesToSend) -> list[
         data: bytes = filled(kind(), chance).SerializePartialToString()
         return [mutated(data, chance) if chance.random() < 0.4 else data]
     if method.name.startswith("Decode") and chance.random() < 0.5:
+        if chance.random() < 0.5:  # DecodePages takes many where some are of no pixels
+            headers = [edged(pages.header(), chance) for _ in range(8)]
+            return [pb.DecodeFramesRequest(header=header).SerializeToString() for header in headers]
         begun = [each.SerializeToString() for each in pages.requests()[:2]]
         return [mutated(begun[0], chance), *([begun[1]] if chance.random() < 0.3 else [])]
     count = chance.choice((0, 1, 2, 3))

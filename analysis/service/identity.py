@@ -45,14 +45,14 @@ role=urn:lightpage:role
 issue recalibrator extendedKeyUsage=clientAuth "subjectAltName=URI:$role:recalibrate"
 issue nobody extendedKeyUsage=clientAuth
 issue expired extendedKeyUsage=clientAuth "subjectAltName=URI:$role:admin"
-openssl x509 -req -in expired.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days -1 -out expired.pem \
-    -extfile <(printf "%s\n" extendedKeyUsage=clientAuth "subjectAltName=URI:$role:admin")
+openssl x509 -req -in expired.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days -1 \
+    -extfile expired.ext -out expired.pem
 openssl ecparam -name prime256v1 -genkey -noout -out other.key
-openssl req -x509 -new -key other.key -days 10 -subj "/CN=Another authority" -out other.pem
-openssl ecparam -name prime256v1 -genkey -noout -out wrong.key
-openssl req -new -key wrong.key -subj "/CN=wrong" -out wrong.csr
-openssl x509 -req -in wrong.csr -CA other.pem -CAkey other.key -CAcreateserial -days 10 -out wrong.pem \
-    -extfile <(printf "%s\n" extendedKeyUsage=clientAuth "subjectAltName=URI:$role:admin")
+openssl req -x509 -new -key other.key -days 10 -subj "/CN=Another authority" \
+    -addext keyUsage=critical,keyCertSign,cRLSign -out other.pem
+issue wrong extendedKeyUsage=clientAuth "subjectAltName=URI:$role:admin"
+openssl x509 -req -in wrong.csr -CA other.pem -CAkey other.key -CAcreateserial -days 10 \
+    -extfile wrong.ext -out wrong.pem
 """
 """Certificates beside those of the documentation: one with a role of its own, and some that must not help anybody."""
 
@@ -71,14 +71,20 @@ CALLERS: Mapping[str, Sequence[str]] = {
 """Certificates by name, and their roles; `none` connects without one."""
 
 
+def commands_of(section: str) -> str:
+    """The first commands of a section of the documentation, for bash."""
+    found = re.search(rf"### {section}\n.*?```\n(.*?)```", OPERATIONS.read_text("utf-8"), re.DOTALL)
+    if found is None:
+        raise RuntimeError(f"{OPERATIONS.name}: no commands in {section}")
+    return found[1]
+
+
 def documented() -> tuple[str, dict[str, str]]:
     """The commands that make certificates, and the role that each call needs, as the documentation has them."""
     text = OPERATIONS.read_text("utf-8")
-    commands = re.search(r"### Certificates from nothing.*?```\n(.*?)```", text, re.DOTALL)
-    if commands is None:
-        raise RuntimeError(f"{OPERATIONS.name}: no commands that make certificates")
     rows = re.findall(r"^\| `(read|decode|recalibrate|admin)` \| (.+) \|$", text, re.MULTILINE)
-    return commands[1], {call: role for role, calls in rows for call in re.findall(r"`([\w/]+)`", calls)}
+    needed = {call: role for role, calls in rows for call in re.findall(r"`([\w/]+)`", calls)}
+    return commands_of("Certificates from nothing"), needed
 
 
 def expected(caller: str, role: str) -> str:

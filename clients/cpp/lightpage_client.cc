@@ -1,6 +1,8 @@
 #include "lightpage_client.h"
 
 #include <algorithm>
+#include <random>
+#include <sstream>
 #include <thread>
 
 #include "error_details.pb.h"
@@ -84,6 +86,16 @@ Reply ask(v1::Lightpage::Stub& stub,
   return reply;
 }
 
+// A name that no other client has, for one at a Unix socket; empty for others, whose connections have sessions.
+std::string session_at(const std::string& target) {
+  if (target.rfind("unix:", 0) != 0) return "";
+  std::random_device random;
+  std::ostringstream name;
+  name << "client " << std::hex;
+  for (int i = 0; i < 4; ++i) name << random() << '-';
+  return name.str();
+}
+
 bool has_ended(const v1::Job& job) {
   return job.state() != v1::JOB_STATE_RUNNING && job.state() != v1::JOB_STATE_UNSPECIFIED;
 }
@@ -115,11 +127,13 @@ Error::Error(grpc::StatusCode status_code, const std::string& message, const std
 }
 
 Client::Client(const std::string& target)
-    : stub_(v1::Lightpage::NewStub(open_channel(target, grpc::InsecureChannelCredentials()))) {}
+    : stub_(v1::Lightpage::NewStub(open_channel(target, grpc::InsecureChannelCredentials()))),
+      session_(session_at(target)) {}
 
 Client::Client(const std::string& target, const Certificates& own)
     : stub_(v1::Lightpage::NewStub(
-          open_channel(target, grpc::SslCredentials({own.ca, own.key, own.certificate})))) {}
+          open_channel(target, grpc::SslCredentials({own.ca, own.key, own.certificate})))),
+      session_(session_at(target)) {}
 
 v1::DescribeReply Client::describe(Deadline deadline) {
   return retried(deadline, unavailable, [&] {
@@ -138,6 +152,8 @@ v1::DecodeReply Client::decode(const v1::DecodeHeader& header, const void* pixel
     const auto writer = stub_->DecodeFrames(&context, &reply);
     v1::DecodeFramesRequest part;
     *part.mutable_header() = header;
+    v1::DecodeOptions& options = *part.mutable_header()->mutable_options();
+    if (options.session().empty() && options.tracking() != v1::TRACKING_STATELESS) options.set_session(session_);
     bool sent = writer->Write(part);
     for (std::size_t start = 0; sent && start < bytes; start += step) {
       part.set_chunk(data + start, std::min(step, bytes - start));

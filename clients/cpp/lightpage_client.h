@@ -65,7 +65,7 @@ struct Certificates {
 
 class Client {
  public:
-  // `target` is HOST:PORT. It connects at the first call, and again whenever the connection was lost.
+  // `target` is HOST:PORT or unix:PATH. It connects at the first call, and again whenever the connection was lost.
   explicit Client(const std::string& target);
 
   // The same with TLS.
@@ -76,6 +76,7 @@ class Client {
 
   // Decode a frame pair. `pixels` are the in-phase frame and, behind it, the quadrature frame: rows first, one byte a
   // pixel, or two, little-endian. They are sent in chunks of at most `chunk_bytes` (DescribeReply.limits; 0 for 1 MiB).
+  // At a Unix socket, a header without a session gets that of this client: the service tells no connections apart there.
   v1::DecodeReply decode(const v1::DecodeHeader& header, const void* pixels, std::size_t bytes, Deadline deadline,
                          std::size_t chunk_bytes = 0);
 
@@ -96,6 +97,7 @@ class Client {
 
  private:
   std::unique_ptr<v1::Lightpage::Stub> stub_;
+  std::string session_;  // its own at a Unix socket, else empty
 };
 
 }  // namespace lightpage

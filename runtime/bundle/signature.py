@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -33,6 +34,12 @@ class BundleKey:
         if not isinstance(key, ec.EllipticCurvePublicKey):
             raise InvalidInputError(subject, "a key of another kind", expected)
         self._key = key
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the key as DER (SubjectPublicKeyInfo), hexadecimal."""
+        kind = serialization.PublicFormat.SubjectPublicKeyInfo
+        return hashlib.sha256(self._key.public_bytes(serialization.Encoding.DER, kind)).hexdigest()
 
     def check(self, content: bytes, signature: bytes, subject: str) -> None:
         """Check that a bundle is signed.

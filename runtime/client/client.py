@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -70,6 +71,9 @@ class LightpageClient:
 
     Every method raises the `LightpageError` that the service raised, or one that says why there was no answer.
 
+    At a Unix socket (``unix:PATH``) the service cannot tell connections apart. There, each client names a session of
+    its own for the frames that it sends, unless the caller names one.
+
     Args:
         target: where the service is.
         timeout_s: deadline of a call.
@@ -82,6 +86,7 @@ class LightpageClient:
     def __init__(self, target: str, timeout_s: float = CALL_S, tls: TlsFiles | None = None) -> None:
         check_address("target", target)
         self.target, self._timeout = target, timeout_s
+        self._session = f"client {secrets.token_hex(16)}" if target.startswith("unix:") else ""
         self._channel = open_channel(target, tls)
         self._stub = pb_grpc.LightpageStub(self._channel)  # type: ignore[no-untyped-call]
         # Not the stub's: their chunks are no messages.
@@ -707,7 +712,9 @@ class LightpageClient:
         options: PageOptions,
     ) -> pb.DecodeHeader:
         """What is sent before a pair; raises `FrameError` where that cannot be sent."""
-        frame = _sent_frames(pair)[0]
+        frame, asked = _sent_frames(pair)[0], options_message(levels, options)
+        if asked.tracking != pb.TRACKING_STATELESS:
+            asked.session = asked.session or self._session
         return message_of(
             pb.DecodeHeader,
             rows_px=frame.shape[0],
@@ -715,7 +722,7 @@ class LightpageClient:
             pixel_type=PIXEL_CODES[frame.dtype.name],
             bit_depth=self._bit_depth() if bit_depth is None else bit_depth,
             black_level=black_level,
-            options=options_message(levels, options),
+            options=asked,
             pilots=pilots_message(pilots) if pilots is not None else None,
             correlation_id=correlation_id,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import ssl
 import threading
@@ -21,8 +22,8 @@ _log = logging.getLogger(__name__)
 SOON = timedelta(days=14)
 """A certificate that ends within this time is warned of."""
 
-_Stamp = tuple[tuple[int, int, int], ...]
-"""Number, size and time of change of each file."""
+_Stamp = tuple[tuple[int, ...], ...]
+"""Number, size and times of change of each file: of its contents, and of what the system knows of it, as its owner."""
 
 
 class Certificates:
@@ -41,7 +42,9 @@ class Certificates:
     def __init__(self, files: TlsFiles) -> None:
         self._files = files
         self._lock = threading.Lock()
-        self._stamp = self._refused = self._stamp_now()
+        self._stamp = self._stamp_now()
+        self._refused: _Stamp | None = None
+        """Of files that were no good, as long as those of `_stamp` count."""
         self._pem, self._context = files.read(), self._loaded()
         _warn_of(self._pem)
 
@@ -52,6 +55,7 @@ class Certificates:
             if stamp not in (self._stamp, self._refused):
                 try:
                     self._pem, self._context, self._stamp = self._files.read(), self._loaded(), stamp
+                    self._refused = None
                     _log.info("certificates: read anew from %s", self._files.certificate)
                     _warn_of(self._pem)
                 except InvalidInputError as error:
@@ -78,6 +82,20 @@ class Certificates:
         self.pem()
         return self._context
 
+    def ends_s(self) -> float:
+        """When the first ends of the service's own certificates and its callers' authorities, seconds since 1970.
+
+        One that only OpenSSL can read is left out; where there is no other, this is infinite.
+        """
+        pem = self.pem()
+        try:
+            own = x509.load_pem_x509_certificates(pem.certificate)
+        except ValueError:  # it was warned of
+            own = []
+        ends = [each.not_valid_after_utc.timestamp() for each in own]
+        ends += [ssl.cert_time_to_seconds(str(each["notAfter"])) for each in self._context.get_ca_certs()]
+        return min(ends, default=math.inf)
+
     def _loaded(self) -> ssl.SSLContext:
         """The context of the files as they are.
 
@@ -96,14 +114,14 @@ class Certificates:
         return context
 
     def _stamp_now(self) -> _Stamp:
-        found = []
+        found: list[tuple[int, ...]] = []
         for path in vars(self._files).values():
             try:
                 status = os.stat(path)
             except OSError:
-                found.append((0, 0, 0))
+                found.append(())
             else:
-                found.append((status.st_ino, status.st_size, status.st_mtime_ns))
+                found.append((status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
         return tuple(found)
 
 

@@ -91,6 +91,15 @@ class Call:
         own = self.identity.name
         return f"{len(own)}:{own}/{name}" if name and own else name
 
+    def session(self, name: str) -> str:
+        """Where the pages of a session that the caller named are followed; empty for none."""
+        return f"session {self.own(name)}" if name else ""
+
+    @property
+    def connection_session(self) -> str:
+        """Where the pages of its connection are followed; empty where gRPC has one name for all connections."""
+        return "" if self.peer.startswith("unix:") else f"connection {self.own(self.peer)}"
+
     @property
     def is_watch(self) -> bool:
         """Whether it lasts as long as its caller likes."""

@@ -193,11 +193,14 @@ class FrameCalls:
             return self._refusal(error, received.header, received.stages)
 
     def check(self, header: pb.DecodeHeader) -> None:
-        """Check what a header asks for.
+        """Check what a header says of its frames, and what it asks for.
 
         Raises:
+            LimitError, FrameError: see `DataPlane.check_format`.
             InvalidInputError: what is not to be had of any page.
         """
+        shape, dtype = (header.rows_px, header.columns_px), pixel_type(header.pixel_type)
+        self._plane.check_format(shape, dtype, header.bit_depth)
         check_options(header.options)
         check_black(header)
         self._pilots(header)
@@ -263,13 +266,13 @@ def _header(first: FramePart | None, call: Call) -> pb.DecodeHeader:
 
 
 def _caller(header: pb.DecodeHeader, call: Call) -> Caller:
-    """The caller, whose pages without a session of their own are those of its connection."""
-    session = call.own(header.options.session) or f"connection {call.peer}"
-    return call.caller.in_session(session, header.options.tracking == pb.TRACKING_STATELESS)
+    """The caller, whose pages without a session of their own are those of its connection, or of none."""
+    session = call.session(header.options.session) or call.connection_session
+    return call.caller.in_session(session, not session or header.options.tracking == pb.TRACKING_STATELESS)
 
 
 def check_black(header: pb.DecodeHeader | pb.RecalibrateFramesHeader) -> None:
-    """Check the black level of a header.
+    """Check the black level of a header whose bit depth was checked before: full scale has as many bits.
 
     Raises:
         InvalidInputError: no count would be left above it.

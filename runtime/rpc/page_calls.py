@@ -113,4 +113,4 @@ class PageCalls:
 
 def _caller(options: pb.DecodeOptions, call: Call) -> Caller:
     """The caller with its session; without one, the pages are those of the device."""
-    return call.caller.in_session(call.own(options.session), options.tracking == pb.TRACKING_STATELESS)
+    return call.caller.in_session(call.session(options.session), options.tracking == pb.TRACKING_STATELESS)

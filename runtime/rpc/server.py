@@ -73,6 +73,8 @@ class LightpageServer:
         self._traces = traces
         self._plane, self._recalibrator, self._address = plane, recalibrator, address
         self._credentials = None if certificates is None else certificates.server_credentials()
+        if certificates is not None:
+            plane.metrics.watch_certificates(certificates.ends_s)
         self._services = [Served(SERVICE, (*more, *handlers(plane, recalibrator)))]
         if inference:
             self._services.append(Served(INFERENCE, (InferenceCalls(plane),), PREFIX))

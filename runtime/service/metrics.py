@@ -179,6 +179,11 @@ class ServiceMetrics:
         """Show whether the store is well, and else its `trouble`, as far as it is known; whenever somebody looks."""
         self.registry.register(_StoreFigures(health, trouble))
 
+    def watch_certificates(self, ends_s: Callable[[], float]) -> None:
+        """Show when the first certificate ends, whenever somebody looks."""
+        name, about = "lightpage_certificate_ends_seconds", "First end of its own and its authorities', since 1970."
+        Gauge(name, about, registry=self.registry).set_function(ends_s)
+
     def in_service(self, version: str) -> None:
         """Say which model decodes now."""
         self.model.clear()

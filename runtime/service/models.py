@@ -70,7 +70,7 @@ class Models:
         self.registry, self.store = registry, store
         self._most_bytes, self._in_service = most_bytes, in_service
         self._own_note = Note()
-        registry.made_here = lambda version: self._noted.origins.get(version) is Origin.RECALIBRATED
+        registry.made_under = self._made_under
         self._noting = threading.RLock()
         """Held while the note is changed; taken after the registry's lock and before the store's."""
         self._uploading = threading.Lock()
@@ -86,7 +86,7 @@ class Models:
 
         def note(model: Model, history: History) -> None:
             with self._noting:
-                self._remember(**self._history(history), origins=self._origins(model.version, Origin.RECALIBRATED))
+                self._remember(**self._history(history), **self._made(model.version, Origin.RECALIBRATED))
             self._begin(model)
 
         with self._audited("recalibrate", actor, decoder.version):
@@ -300,7 +300,7 @@ class Models:
                 raise store.failed(error) from None
         try:
             with self._noting:
-                self._remember(origins=self._origins(version, Origin.UPLOADED))
+                self._remember(**self._made(version, Origin.UPLOADED))
         except BaseException:
             final.unlink(missing_ok=True)
             signature_path(final).unlink(missing_ok=True)
@@ -356,10 +356,19 @@ class Models:
         names = tuple(place.path.name if place.path.parent == folder else None for place in history.places)
         return {"history": names, "cursor": history.cursor}
 
-    def _origins(self, version: str, origin: Origin) -> dict[str, Origin]:
-        """Origins with one more, without those of bundles that are gone."""
-        known = {*self.versions(), version}
-        return {name: value for name, value in self._noted.origins.items() if name in known} | {version: origin}
+    def _made(self, version: str, origin: Origin) -> dict[str, Any]:
+        """Fields of the note that say where bundles come from, with one more, and without those that are gone."""
+        others, note = {*self.versions()} - {version}, self._noted
+        origins = {name: value for name, value in note.origins.items() if name in others} | {version: origin}
+        keys = {name: value for name, value in note.keys.items() if name in others}
+        if origin is Origin.RECALIBRATED and (key := self.registry.key_fingerprint):
+            keys[version] = key
+        return {"origins": origins, "keys": keys}
+
+    def _made_under(self, version: str) -> str | None:
+        """As `ModelRegistry.made_under`."""
+        note = self._noted
+        return note.keys.get(version, "") if note.origins.get(version) is Origin.RECALIBRATED else None
 
     def _place(self, version: str) -> Place:
         """Where a model is that is loaded, was in service, or is in the store."""

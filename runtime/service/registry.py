@@ -12,6 +12,7 @@ from lightpage.errors import BundleError, CalibrationError, RecalibrationRefused
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import Manifest
 from runtime.bundle.signature import BundleKey
+from runtime.bundle.signature_file import read_signature, signature_path
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker, Tracker
 from runtime.errors import ModelExistsError, OtherModelError
@@ -131,7 +132,8 @@ class ModelRegistry:
         key: that bundles must be signed with which come from elsewhere; None for none.
 
     Attributes:
-        made_here: says of a version whether this service has made it: then it needs no signature.
+        made_under: says of a version which fingerprint the bundle key had when this service recalibrated it, empty for
+            no key, and None where it did not. Under the present key it needs no signature.
     """
 
     def __init__(
@@ -142,7 +144,7 @@ class ModelRegistry:
         key: BundleKey | None = None,
     ) -> None:
         self._make_tracker, self._kept, self._key = make_tracker, kept, key
-        self.made_here: Callable[[str], bool] = lambda version: False
+        self.made_under: Callable[[str], str | None] = lambda version: None
         self._changing = threading.Lock()
         """Held from the checks of a change to its end, its note included; taken before the lock below."""
         self._lock = threading.Lock()
@@ -282,6 +284,11 @@ class ModelRegistry:
         """Whether bundles that come from elsewhere must be signed."""
         return self._key is not None
 
+    @property
+    def key_fingerprint(self) -> str:
+        """Of the key that they must be signed with; empty for none."""
+        return "" if self._key is None else self._key.fingerprint
+
     def opened(self, path: Path, signature: bytes = b"") -> Decoder:
         """The decoder of a bundle that comes from elsewhere.
 
@@ -308,8 +315,13 @@ class ModelRegistry:
             held = self._loaded.get(place.version)
         if held is not None:
             return held
-        if place != self.base and self.made_here(place.version):
+        made_under = None if place == self.base else self.made_under(place.version)
+        if made_under == self.key_fingerprint:
             decoder = self.current.decoder.of_another(Bundle.open(place.path))
+        elif made_under is not None and self.wants_signatures and not read_signature(place.path):
+            got = f"none, and it was recalibrated under {'another bundle key' if made_under else 'no bundle key'}"
+            expected = f"the file {signature_path(place.path).name} beside it, or a recalibration of a signed bundle"
+            raise BundleError(f"bundle {place.path}: signature", got, expected)
         else:
             decoder = self.opened(place.path)
         if decoder.version != place.version:

@@ -23,13 +23,17 @@ class _Entry:
     error: Exception | None = None
     ended_at: float = float("inf")
 
+    def size(self, request_id: str) -> int:
+        """Bytes that are kept of it: a request may be as long as a message, and an error has no answer."""
+        return len(request_id) + len(self.request) + len(self.answer)
+
 
 class Replays:
     """Remembers answers by request id, for a limited time and a limited number of bytes.
 
     Args:
         keep_s: how long, seconds.
-        keep_bytes: how much of all answers; the oldest go first.
+        keep_bytes: how much of all answers, with their requests; the oldest go first.
         clock: seconds that never go back.
     """
 
@@ -107,11 +111,11 @@ class Replays:
     def _forget(self) -> None:
         """Drop answers that are too old, then the oldest where there are too many bytes of them."""
         now = self._clock()
-        held = sum(len(entry.answer) for entry in self._entries.values())
+        held = sum(entry.size(request_id) for request_id, entry in self._entries.items())
         for request_id, entry in list(self._entries.items()):
             if not entry.done:
                 continue
             if now - entry.ended_at <= self._keep_s and held <= self._keep_bytes:
                 break
-            held -= len(entry.answer)
+            held -= entry.size(request_id)
             del self._entries[request_id]

@@ -91,12 +91,14 @@ class Note:
         cursor: index of the one in service.
         pinned: versions that are never deleted.
         origins: of bundles by version, where they are known.
+        keys: fingerprints by version of the bundle keys that recalibrations were made under.
     """
 
     history: tuple[str | None, ...] = (None,)
     cursor: int = 0
     pinned: frozenset[str] = frozenset()
     origins: Mapping[str, Origin] = field(default_factory=dict)
+    keys: Mapping[str, str] = field(default_factory=dict)
 
 
 class ModelStore:
@@ -208,7 +210,7 @@ class ModelStore:
         """
         with self._writing:
             note = replace(self.note, **changes)
-            data = {
+            data: dict[str, Any] = {
                 "base": self._base,
                 "bundle": note.history[note.cursor],  # with the base all that earlier programs read
                 "history": note.history,
@@ -216,6 +218,8 @@ class ModelStore:
                 "pinned": sorted(note.pinned),
                 "origins": dict(sorted(note.origins.items())),
             }
+            if note.keys:
+                data["keys"] = dict(sorted(note.keys.items()))
             try:
                 self._check_folder()
                 self._keep_damaged()
@@ -263,6 +267,7 @@ class ModelStore:
             name, base = data["bundle"], data["base"]
             pinned = frozenset(map(str, data.get("pinned", ())))
             origins = {version: Origin(origin) for version, origin in data.get("origins", {}).items()}
+            keys = {version: str(key) for version, key in data.get("keys", {}).items()}
             # A note of an earlier program names the bundle in service alone.
             history = tuple(data.get("history", (None,) if name is None else (None, name)))
             cursor = int(data.get("cursor", len(history) - 1))
@@ -274,13 +279,13 @@ class ModelStore:
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise BundleError(subject, repr(error), "a note that can be read") from None
         if base != self._base:
-            return Note(pinned=pinned, origins=origins)
+            return Note(pinned=pinned, origins=origins, keys=keys)
         if in_service != name or cursor < 0:
             raise BundleError(subject, f"{name!r} and {in_service!r}", "one bundle in service")
         for each in history:
             if each is not None and not (isinstance(each, str) and Path(each).name == each and each.endswith(".zip")):
                 raise BundleError(subject, repr(each), "the name of a bundle")
-        return Note(history, cursor, pinned, origins)
+        return Note(history, cursor, pinned, origins, keys)
 
     def last(self) -> Path | None:
         """The bundle that was in service when the program ended, None standing for the base.

@@ -16,8 +16,8 @@ class PageOptions(TypedDict, total=False):
         want_phase: also get the phase.
         quantised: get the confidence in one byte a symbol.
         user_data: also get the page's bytes; the level count must then be that of the model's code, or 0.
-        session: of the pages that this one is followed with; by default those of the connection, or of the device where
-            the service reads the page.
+        session: of the pages that this one is followed with; by default those of the connection, at a Unix socket those
+            of the client, or of the device where the service reads the page.
         stateless: decode the page as if it were the first, so that the same frames give the same answer.
     """
 

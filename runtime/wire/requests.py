@@ -11,6 +11,9 @@ from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 
 _CONFIDENCE_FORMATS = (pb.CONFIDENCE_FORMAT_UNSPECIFIED, pb.CONFIDENCE_FORMAT_FLOAT32, pb.CONFIDENCE_FORMAT_UINT8)
 
+SESSION_CHARACTERS = 1024
+"""Of the name of a session, at most: the service remembers it."""
+
 
 def pilots_of(message: pb.Pilots, page_shape: tuple[int, int], levels: int) -> Pilots:
     """Pilots that a caller sent.
@@ -38,7 +41,7 @@ def check_options(options: pb.DecodeOptions) -> None:
 
     Raises:
         PageError: an impossible level count; 0 stands for the default.
-        InvalidInputError: an unknown format of confidences, or way of tracking.
+        InvalidInputError: an unknown format of confidences, or way of tracking, or too long a name of a session.
     """
     if options.levels:
         check_levels(options.levels)
@@ -47,3 +50,5 @@ def check_options(options: pb.DecodeOptions) -> None:
         raise InvalidInputError("confidence_format", options.confidence_format, expected)
     if options.tracking not in pb.Tracking.values():
         raise InvalidInputError("tracking", options.tracking, "TRACKING_SESSION or TRACKING_STATELESS")
+    if (length := len(options.session)) > SESSION_CHARACTERS:
+        raise InvalidInputError("session", f"{length} characters", f"at most {SESSION_CHARACTERS}")

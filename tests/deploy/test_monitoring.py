@@ -52,6 +52,7 @@ def shown(toy_zip: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     monitor, registry = Monitor(metrics=metrics), ModelRegistry(Decoder(bundle, threads=1))
     store = ModelStore(tmp_path_factory.mktemp("store"), bundle)
     plane = DataPlane(registry, source, store, metrics=metrics, observers=[history], monitor=monitor)
+    metrics.watch_certificates(lambda: 2e9)
     for _ in range(3):
         stages = Stages()
         plane.read_page(None, None, Caller(), stages=stages)

@@ -102,6 +102,19 @@ def test_it_decodes_a_pair_that_it_sends(program: Path, target: str, tmp_path: P
     assert out.read_bytes() == symbols.tobytes()
 
 
+def test_each_client_at_a_unix_socket_has_a_session_of_its_own(program: Path, toy_zip: Path, tmp_path: Path) -> None:
+    plane = DataPlane(ModelRegistry(Decoder.load(toy_zip, threads=1), no_tracker))
+    pair = toy.ToyDevice(seed=3).page(toy.symbols_of(16, 3)[0], 16, 0.7)
+    frames = raw(tmp_path / "frames.raw", pair.in_phase, pair.quadrature)
+    with LightpageServer(plane, Recalibrator(plane), f"unix:{tmp_path}/s") as server:
+        for _ in range(2):
+            done = run(program, server.target, "decode", frames, "--out", tmp_path / "symbols", "--levels", 16)
+            assert done.returncode == 0, done.stderr
+    sessions = list(plane.registry.current.sessions._trackers)
+    assert len(sessions) == 2
+    assert all(session.startswith("session client ") for session in sessions)
+
+
 def test_it_says_what_the_service_does_not_like(program: Path, target: str, tmp_path: Path) -> None:
     pair = toy.ToyDevice(seed=3).page(toy.symbols_of(16, 3)[0], 16, 0.7)
     swapped = raw(tmp_path / "swapped.raw", pair.quadrature, pair.in_phase)

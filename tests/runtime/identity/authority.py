@@ -17,6 +17,17 @@ from runtime.identity.roles import ROLE_URI
 from runtime.wire.tls import TlsFiles
 
 _DAY = timedelta(days=1)
+_SIGNS_CERTIFICATES = x509.KeyUsage(
+    digital_signature=False,
+    content_commitment=False,
+    key_encipherment=False,
+    data_encipherment=False,
+    key_agreement=False,
+    key_cert_sign=True,
+    crl_sign=True,
+    encipher_only=False,
+    decipher_only=False,
+)
 
 
 @dataclass
@@ -25,13 +36,15 @@ class Authority:
 
     folder: Path
     name: str = "authority"
+    valid_for: timedelta = _DAY
 
     def __post_init__(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._key = ec.generate_private_key(ec.SECP256R1())
         subject = _named(self.name)
-        builder = _begun(subject, subject, self._key.public_key(), _DAY)
+        builder = _begun(subject, subject, self._key.public_key(), self.valid_for)
         builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        builder = builder.add_extension(_SIGNS_CERTIFICATES, critical=True)
         (self.folder / "ca.pem").write_bytes(_pem(builder.sign(self._key, hashes.SHA256())))
 
     def service(self, name: str = "service", valid_for: timedelta = 90 * _DAY) -> TlsFiles:
@@ -50,6 +63,8 @@ class Authority:
         key = ec.generate_private_key(ec.SECP256R1())
         builder = _begun(_named(name), _named(self.name), key.public_key(), valid_for)
         builder = builder.add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
+        issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key())
+        builder = builder.add_extension(issuer, critical=False)
         if names:
             builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
         files = TlsFiles(self.folder / "ca.pem", self.folder / f"{name}.pem", self.folder / f"{name}.key")
@@ -65,7 +80,7 @@ def _begun(
     subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, valid_for: timedelta
 ) -> x509.CertificateBuilder:
     now = datetime.now(UTC)
-    return x509.CertificateBuilder(
+    builder = x509.CertificateBuilder(
         issuer_name=issuer,
         subject_name=subject,
         public_key=key,
@@ -73,6 +88,7 @@ def _begun(
         not_valid_before=now - 2 * _DAY,
         not_valid_after=now + valid_for,
     )
+    return builder.add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
 
 
 def _named(name: str) -> x509.Name:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import shutil
+import ssl
 import subprocess
+import time
 from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
-from analysis.service.identity import documented
+from analysis.service.identity import commands_of, documented
 from lightpage.errors import InvalidInputError
 from runtime.identity.certificates import Certificates
 from runtime.identity.roles import identity_of
@@ -102,6 +104,42 @@ def test_new_files_of_a_mounted_secret_count(authority: Authority, tmp_path: Pat
     assert certificates.context() is not context
 
 
+def test_earlier_files_that_are_put_back_count(tmp_path: Path) -> None:
+    folders = [tmp_path / "earlier", tmp_path / "wider"]
+    for folder in folders:
+        Authority(folder).service()
+    link = tmp_path / "tls"
+    link.symlink_to(folders[0])
+    certificates = Certificates(TlsFiles(link / "ca.pem", link / "service.pem", link / "service.key"))
+    for folder in (*folders, *folders):  # each time with the same number, size and time of change
+        link.unlink()
+        link.symlink_to(folder)
+        assert certificates.pem().ca == (folder / "ca.pem").read_bytes()
+        assert certificates.context().get_ca_certs(binary_form=True) == [_der(folder / "ca.pem")]
+
+
+def test_files_that_are_overwritten_with_their_times_kept_count(authority: Authority, tmp_path: Path) -> None:
+    """As by `cp -p`; one that is made readable for the service changes no more than this either."""
+    files, other = authority.service(), Authority(tmp_path / "other").folder / "ca.pem"
+    texts = [path.read_text() for path in (files.ca, other)]
+    size = max(map(len, texts))
+    files.ca.write_text(texts[0].ljust(size, "\n"))
+    certificates, before = Certificates(files), files.ca.stat()
+    files.ca.write_text(texts[1].ljust(size, "\n"))
+    times = before.st_atime_ns, before.st_mtime_ns
+    until = time.monotonic() + 5
+    os.utime(files.ca, ns=times)
+    while files.ca.stat().st_ctime_ns == before.st_ctime_ns and time.monotonic() < until:  # its clock is coarse
+        os.utime(files.ca, ns=times)
+    after = files.ca.stat()
+    assert (after.st_ino, after.st_size, after.st_mtime_ns) == (before.st_ino, before.st_size, before.st_mtime_ns)
+    assert certificates.context().get_ca_certs(binary_form=True) == [_der(other)]
+
+
+def _der(path: Path) -> bytes:
+    return ssl.PEM_cert_to_DER_cert(path.read_text())
+
+
 def test_half_replaced_files_leave_the_earlier_ones(authority: Authority, caplog: pytest.LogCaptureFixture) -> None:
     files, newer = authority.service(), authority.service("newer")
     certificates = Certificates(files)
@@ -113,6 +151,11 @@ def test_half_replaced_files_leave_the_earlier_ones(authority: Authority, caplog
     assert "the earlier ones stay" in caplog.text
     os.replace(newer.key, files.key)
     assert certificates.pem() is not before
+
+
+def test_the_certificates_of_these_tests_are_those_that_a_strict_client_takes(authority: Authority) -> None:
+    files = authority.service()
+    bash(f"openssl verify -x509_strict -purpose sslserver -CAfile {files.ca} {files.certificate}", authority.folder)
 
 
 def test_authorities_may_have_comments_of_any_letters(authority: Authority) -> None:
@@ -136,13 +179,36 @@ def test_the_console_keeps_the_earlier_certificates_too(authority: Authority) ->
 
 def test_the_commands_for_operators_make_good_certificates(tmp_path: Path) -> None:
     commands, _ = documented()
-    subprocess.run(["bash", "-c", f"set -e\n{commands}"], cwd=tmp_path, check=True, capture_output=True, timeout=60)
+    bash(commands, tmp_path)
     roles = {"watcher": {"read"}, "controller": {"decode"}, "keeper": {"decode", "recalibrate"}, "operator": {"admin"}}
     for name in ("service", *roles):
         TlsFiles(*(tmp_path / "tls" / file for file in ("ca.pem", f"{name}.pem", f"{name}.key"))).read()
     for name, expected in roles.items():
         identity = identity_of((tmp_path / "tls" / f"{name}.pem").read_bytes())
         assert (identity.name, identity.roles) == (name, expected)
+    # Python from 3.13 on has its clients look as closely.
+    for name, purpose in (("service", "sslserver"), *((name, "sslclient") for name in roles)):
+        bash(f"openssl verify -x509_strict -purpose {purpose} -CAfile ca.pem {name}.pem", tmp_path / "tls")
+
+
+def test_the_commands_that_renew_certificates_keep_the_authority_the_keys_and_the_roles(tmp_path: Path) -> None:
+    bash(commands_of("Certificates from nothing"), tmp_path)
+    tls = tmp_path / "tls"
+    before = {path.name: path.read_bytes() for path in tls.iterdir()}
+    bash(commands_of("New certificates"), tmp_path)
+    changed = {path.name for path in tls.iterdir() if path.read_bytes() != before.get(path.name)}
+    names = ("service", "watcher", "controller", "keeper", "operator")
+    assert changed == {*(f"{name}.pem" for name in names), "ca.srl"}
+    for name in names:
+        now, earlier = identity_of((tls / f"{name}.pem").read_bytes()), identity_of(before[f"{name}.pem"])
+        assert (now.name, now.roles) == (earlier.name, earlier.roles)
+        assert now.until >= earlier.until
+        TlsFiles(tls / "ca.pem", tls / f"{name}.pem", tls / f"{name}.key").read()
+        bash(f"openssl verify -x509_strict -CAfile ca.pem {name}.pem", tls)
+
+
+def bash(commands: str, folder: Path) -> None:
+    subprocess.run(["bash", "-ec", commands], cwd=folder, check=True, capture_output=True, timeout=60)
 
 
 def _replace(files: TlsFiles, newer: TlsFiles) -> None:
@@ -156,6 +222,23 @@ def test_a_certificate_that_ends_is_warned_of(
 ) -> None:
     Certificates(authority.service(valid_for=timedelta(days=days)))
     assert (told in caplog.text) if told else not caplog.records
+
+
+def test_the_first_end_is_told(authority: Authority, tmp_path: Path) -> None:
+    files = authority.service(valid_for=timedelta(days=90))
+    certificates, day_s = Certificates(files), 86_400
+    now = time.time()
+    assert certificates.ends_s() - now == pytest.approx(day_s, abs=60), "the authority's comes first"
+    longer = Authority(tmp_path / "longer", valid_for=timedelta(days=400))
+    for days in (30, 90):
+        newer = longer.service(valid_for=timedelta(days=days))
+        for source, target in zip(vars(newer).values(), vars(files).values(), strict=True):
+            shutil.copy(source, target)
+        assert certificates.ends_s() - now == pytest.approx(days * day_s, abs=60), "nobody has connected meanwhile"
+    between = longer.service("between", valid_for=timedelta(days=7))
+    with files.certificate.open("ab") as chain:
+        chain.write(between.certificate.read_bytes())
+    assert certificates.ends_s() - now == pytest.approx(7 * day_s, abs=60), "of a chain"
 
 
 def test_a_certificate_for_callers_is_warned_of(authority: Authority, caplog: pytest.LogCaptureFixture) -> None:

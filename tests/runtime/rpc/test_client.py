@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,15 @@ import pytest
 from lightpage.errors import FrameError, InvalidInputError, LimitError
 from lightpage.recording.frame_pair import FramePair
 from runtime.acquisition.source import Shot
+from runtime.client.client import LightpageClient
 from runtime.errors import LostShotError, Reason, RequestIdError
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.rpc.server import LightpageServer
 from runtime.service.limits import Limits
+from runtime.wire.channel import open_channel
 from runtime.wire.pages import RemotePage
 from tests.runtime.rpc.stage import Start, a_page
-from tests.runtime.rpc.test_edge import Remembering
+from tests.runtime.rpc.test_edge import Remembering, parts
 
 
 def test_a_description_has_the_limits_and_the_default_levels(start: Start) -> None:
@@ -46,6 +51,36 @@ def test_sessions_and_pages_without_one(start: Start) -> None:
     assert [client.decode(pair, session="mine").piston_rad for _ in range(2)] == [1, 2]
     assert [client.decode(pair, stateless=True).piston_rad for _ in range(2)] == [1, 1]
     assert [client.read_page(1, session="mine").piston_rad, client.read_page(1).piston_rad] == [3, 1]
+    assert client.decode(pair, session="x" * 1024).piston_rad == 1
+    with pytest.raises(InvalidInputError, match="session: got 1025 characters, wanted at most 1024"):
+        client.decode(pair, session="x" * 1025)
+
+
+def test_clients_at_one_unix_socket_are_followed_apart(start: Start, tmp_path: Path) -> None:
+    running, address, pair = start(tracker=Remembering), f"unix:{tmp_path}/s", a_page()[1]
+    with (
+        LightpageServer(running.plane, running.recalibrator, address),
+        LightpageClient(address, timeout_s=20) as one,
+        LightpageClient(address, timeout_s=20) as two,
+    ):
+        assert [one.decode(pair).piston_rad for _ in range(3)] == [1, 2, 3]
+        assert [two.decode(pair).piston_rad for _ in range(2)] == [1, 2]
+        assert [one.decode(pair).piston_rad, one.decode(pair, stateless=True).piston_rad] == [4, 1]
+        assert [client.decode(pair, session="both").piston_rad for client in (one, two)] == [1, 2]
+        pages = [page for page in two.decode_pages([pair]) if isinstance(page, RemotePage)]
+        assert [page.piston_rad for page in pages] == [3]
+        assert one.read_page().piston_rad == 1  # the device's own
+
+
+def test_pages_at_a_unix_socket_that_name_no_session_are_decoded_each_as_the_first(
+    start: Start, tmp_path: Path
+) -> None:
+    running, address, pair = start(tracker=Remembering), f"unix:{tmp_path}/s", a_page()[1]
+    with LightpageServer(running.plane, running.recalibrator, address), open_channel(address) as channel:
+        decode = running.stub(channel).DecodeFrames
+        assert [decode(parts(pair), timeout=20).piston_rad for _ in range(2)] == [1, 1]
+        named = pb.DecodeOptions(levels=16, session="mine")
+        assert [decode(parts(pair, options=named), timeout=20).piston_rad for _ in range(2)] == [1, 2]
 
 
 def test_a_page_that_is_asked_for_again(start: Start) -> None:

@@ -7,6 +7,7 @@ import gc
 import queue
 import threading
 import time
+import tracemalloc
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -473,6 +474,26 @@ def test_the_black_level_is_taken_off(start: Start) -> None:
         assert decode(parts(raised, black_level=6), timeout=20).symbols == symbols.tobytes()
         with pytest.raises(grpc.RpcError, match="black_level"):
             decode(parts(raised, black_level=256), timeout=20)
+
+
+def test_a_bit_depth_is_checked_before_a_number_of_as_many_bits_is_made(start: Start) -> None:
+    service = start()
+    # The second one has no pixels, so that nothing of it is left to be read.
+    headers = [header(bit_depth=bits, rows_px=rows, black_level=100) for bits, rows in ((4, 1), (2**32 - 1, 0), (0, 1))]
+    with grpc.insecure_channel(service.server.target) as channel:
+        stub = service.stub(channel)
+        for each in headers:
+            with pytest.raises(grpc.RpcError) as error:
+                stub.DecodeFrames(iter([pb.DecodeFramesRequest(header=each)]), timeout=20)
+            assert details(error.value)["ErrorInfo"].reason == "FRAME_FORMAT"
+        many = [pb.DecodeFramesRequest(header=headers[1])] * 3
+        tracemalloc.start()
+        try:
+            replies = list(stub.DecodePages(iter(many), timeout=20))
+            assert tracemalloc.get_traced_memory()[1] < 64 << 20, "memory at most, beyond what there was before"
+        finally:
+            tracemalloc.stop()
+    assert [reply.refused.reason for reply in replies] == [pb.ERROR_REASON_FRAME_FORMAT] * 3
 
 
 def test_levels_0_mean_the_same_in_every_call(start: Start) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
@@ -137,7 +138,7 @@ def test_callers_of_other_names_share_no_session_and_no_request_id(secured: Runn
             answers.append(client.read_page(request_id="shot"))
     assert [answer.replayed for answer in answers] == [False, False, True]
     assert answers[0].page == answers[2].page != answers[1].page
-    assert set(secured.plane.registry.current.sessions._trackers) == {"3:one/a", "3:two/a"}
+    assert set(secured.plane.registry.current.sessions._trackers) == {"session 3:one/a", "session 3:two/a"}
 
 
 def test_names_and_ids_that_look_alike_are_told_apart(secured: Running) -> None:
@@ -148,6 +149,19 @@ def test_names_and_ids_that_look_alike_are_told_apart(secured: Running) -> None:
     assert own("line", "7/job") != own("line/7", "job")
     assert own("", "job") == "job"
     assert own("line", "") == ""
+
+
+def test_no_name_of_a_session_is_that_of_a_connection(secured: Running, authority: Authority) -> None:
+    pair, sessions = a_page()[1], secured.plane.registry.current.sessions
+    with LightpageClient(secured.server.target, tls=authority.caller("one", ["decode"])) as client:
+        client.decode(pair, 16)
+        (connection,) = sessions._trackers
+        assert connection.startswith("connection 3:one/ipv4:127.0.0.1:")
+        client.decode(pair, 16, session=connection)
+    secured.client.decode(pair, 16)
+    (plain,) = (key for key in sessions._trackers if key.startswith("connection ipv4:"))
+    secured.client.decode(pair, 16, session=plain)
+    assert len(sessions._trackers) == 4
 
 
 def test_without_a_certificate_a_secured_service_lets_nobody_do_anything(secured: Running) -> None:
@@ -187,6 +201,11 @@ def test_new_certificates_count_without_a_restart(start: Start, authority: Autho
         assert ended(server.target, before) is grpc.StatusCode.UNAVAILABLE
     finally:
         server.stop(0.5)
+
+
+def test_metrics_say_when_the_first_certificate_ends(start: Start, secured: Running) -> None:
+    assert secured.count("lightpage_certificate_ends_seconds") == pytest.approx(time.time() + 86_400, abs=60)
+    assert start().plane.metrics.registry.get_sample_value("lightpage_certificate_ends_seconds") is None
 
 
 def test_health_checks_with_tls_need_no_certificate(authority: Authority) -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import re
+import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,12 +43,14 @@ class Signed:
         return path
 
 
-def begin(folder: Path, signer: Signer) -> DataPlane:
+def begin(folder: Path, signer: Signer | None) -> DataPlane:
+    """A service as it is after a restart; without a signer it has no key."""
     base = folder / "base.zip"
     if not base.exists():
         toy.write_toy_bundle(base)
+    if signer is not None:
         signer.sign(base)
-    key = BundleKey(signer.path)
+    key = None if signer is None else BundleKey(signer.path)
     registry = ModelRegistry(Decoder(Bundle.open(base, key=key), threads=1), key=key)
     plane = DataPlane(registry, store=ModelStore(folder / "store", registry.current.decoder.bundle))
     plane.models.resume()
@@ -114,6 +120,18 @@ def test_a_bundle_that_somebody_puts_into_the_store_needs_one(service: Signed, t
             service.plane.models.activate(version)
 
 
+def test_a_signature_may_be_put_beside_a_bundle_that_was_taken_in_without_one(tmp_path: Path) -> None:
+    signer, new = Signer(tmp_path), toy.write_toy_bundle(tmp_path / "new.zip", version="toy-2")
+    signature = signer.signature(new)
+    begin(tmp_path, None).models.take_in(new)
+    plane = begin(tmp_path, signer)
+    with pytest.raises(BundleError, match=r"signature: got none, wanted .*\.sig behind the bundle's name"):
+        plane.models.activate("toy-2")
+    signature_path(tmp_path / "store" / "toy-2.zip").write_bytes(signature)
+    assert plane.models.activate("toy-2")[0].version == "toy-2"
+    assert begin(tmp_path, signer).registry.current.version == "toy-2"
+
+
 def test_without_a_key_no_signature_is_kept(toy_zip: Path, tmp_path: Path) -> None:
     registry = ModelRegistry(Decoder.load(toy_zip, threads=1))
     plane = DataPlane(registry, store=ModelStore(tmp_path / "store", registry.current.decoder.bundle))
@@ -138,9 +156,43 @@ def test_a_signature_that_is_no_plain_file_is_refused(service: Signed, kind: str
 
 
 def test_its_own_models_need_none(service: Signed, tmp_path: Path) -> None:
-    own = toy.write_toy_bundle(tmp_path / "store" / "toy-1+r1.zip", version="toy-1+r1")
-    service.plane.adopt(service.plane.registry.current.decoder.of_another(Bundle.open(own)))
+    recalibrated(service.plane, tmp_path, "toy-1+r1")
     assert begin(tmp_path, service.signer).registry.current.version == "toy-1+r1"
+
+
+def recalibrated(plane: DataPlane, folder: Path, version: str) -> Path:
+    """The bundle of a recalibration that the service has made and put in service."""
+    path = toy.write_toy_bundle(folder / "store" / f"{version}.zip", version=version)
+    plane.adopt(plane.registry.current.decoder.of_another(Bundle.open(path)))
+    return path
+
+
+@pytest.mark.parametrize("earlier", ["no", "another"])
+def test_a_recalibration_under_no_key_or_another_one_needs_a_signature(tmp_path: Path, earlier: str) -> None:
+    signer, before = Signer(tmp_path), Signer(tmp_path, "before")
+    own = recalibrated(begin(tmp_path, before if earlier == "another" else None), tmp_path, "toy-1+r1")
+    plane = begin(tmp_path, signer)
+    told = rf"signature: got none, and it was recalibrated under {earlier} bundle key, wanted .*toy-1\+r1\.zip\.sig"
+    assert plane.registry.current.version == "toy-1"
+    assert re.search(told, plane.store_trouble())
+    with pytest.raises(BundleError, match=told):
+        plane.models.activate("toy-1+r1")
+    recalibrated(plane, tmp_path, "toy-1+r2")
+    assert begin(tmp_path, signer).registry.current.version == "toy-1+r2"
+    signer.sign(own)
+    assert begin(tmp_path, signer).models.activate("toy-1+r1")[0].version == "toy-1+r1"
+    assert begin(tmp_path, signer).registry.current.version == "toy-1+r1"
+    assert begin(tmp_path, None).registry.current.version == "toy-1+r1"
+
+
+def test_the_note_names_the_key_of_recalibrations_and_of_nothing_else(service: Signed, tmp_path: Path) -> None:
+    recalibrated(service.plane, tmp_path, "toy-1+r1")
+    good = service.bundle("toy-2", signed=True)
+    service.plane.models.take_in(good, signature=signature_path(good).read_bytes())
+    told = json.loads((tmp_path / "store" / "current.json").read_text())["keys"]
+    command = f"openssl pkey -pubin -in {service.signer.path} -outform DER"
+    key = subprocess.run(command.split(), check=True, capture_output=True, timeout=30).stdout
+    assert told == {"toy-1+r1": hashlib.sha256(key).hexdigest()}
 
 
 def test_pruning_takes_signatures_along(service: Signed) -> None:
