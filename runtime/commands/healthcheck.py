@@ -31,7 +31,8 @@ def is_serving(
         try:
             response = stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=timeout_s)
         except grpc.RpcError as error:
-            return False, f"{target}: {error.code().name}: {error.details()}"
+            told = error.details() or (f"no service {service!r}" if service else "")
+            return False, f"{target}: {error.code().name}{': ' * bool(told)}{told}"
     status = health_pb2.HealthCheckResponse.ServingStatus.Name(response.status)
     return response.status == health_pb2.HealthCheckResponse.SERVING, f"{target}: {status}"
 

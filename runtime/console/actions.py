@@ -57,12 +57,13 @@ class Actions:
             InvalidInputError: no such object.
             LightpageError: it could not be done; nothing was changed.
         """
+        wanted = 'a JSON object of "action" and "expected", the version of the model in service'
         try:
             asked: Any = json.loads(content)
         except (ValueError, RecursionError) as error:
-            raise InvalidInputError("action", error, 'a JSON object, {"action": ..., "expected": ...}') from None
+            raise InvalidInputError("action", error, wanted) from None
         if not isinstance(asked, dict) or asked.keys() != {"action", "expected"}:
-            raise InvalidInputError("action", repr(asked)[:100], 'a JSON object, {"action": ..., "expected": ...}')
+            raise InvalidInputError("action", repr(asked)[:100], wanted)
         name, expected = asked["action"], asked["expected"]
         if not isinstance(expected, str) or not expected.isprintable() or not expected:
             raise InvalidInputError("expected", repr(expected)[:100], "the version of the model in service")

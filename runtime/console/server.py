@@ -151,6 +151,7 @@ class Console:
             identity.check(ROLE, "an action of the console", time.time())
             outcome = self._actions.do(content, Actor(name, "console"))
         except NotAllowedError as error:
+            _log.warning("console: an action of %s is refused: %s", name, error)
             return _refused(start_response, "403 Forbidden", str(error))
         except InvalidInputError as error:
             return _refused(start_response, "400 Bad Request", str(error))

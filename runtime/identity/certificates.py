@@ -29,8 +29,8 @@ _Stamp = tuple[tuple[int, ...], ...]
 class Certificates:
     """The certificates with which a service meets its callers. Its methods may be called from many threads.
 
-    New files count from the next connection on. Where they are no good, as while they are being replaced, the earlier
-    ones stay, and the log says why.
+    New files count from the next connection on. Where they are no good, as while they are being replaced, or no caller
+    would take them, the earlier ones stay, and the log says why.
 
     Args:
         files: whose `ca` is that of the callers.
@@ -54,8 +54,11 @@ class Certificates:
             stamp = self._stamp_now()
             if stamp not in (self._stamp, self._refused):
                 try:
-                    self._pem, self._context, self._stamp = self._files.read(), self._loaded(), stamp
-                    self._refused = None
+                    pem = self._files.read()
+                    if (trouble := _trouble(_own(pem))) is not None:
+                        expected = "one that callers take"
+                        raise InvalidInputError(f"certificate {self._files.certificate}", trouble, expected)
+                    self._pem, self._context, self._stamp, self._refused = pem, self._loaded(), stamp, None
                     _log.info("certificates: read anew from %s", self._files.certificate)
                     _warn_of(self._pem)
                 except InvalidInputError as error:
@@ -125,23 +128,35 @@ class Certificates:
         return tuple(found)
 
 
-def _warn_of(pem: Pem) -> None:
-    """Say what callers will have against the service's own certificate."""
+def _own(pem: Pem) -> x509.Certificate | None:
+    """The service's own certificate; None where only OpenSSL can read it."""
     try:
-        own = x509.load_pem_x509_certificate(pem.certificate)
-    except ValueError as error:  # OpenSSL takes what this library does not
+        return x509.load_pem_x509_certificate(pem.certificate)
+    except ValueError as error:
         _log.warning("certificates: that of the service cannot be looked at: %s", error)
-        return
-    left = own.not_valid_after_utc - datetime.now(UTC)
-    if left <= SOON:
-        state = "has expired" if left <= timedelta() else "expires soon"
-        _log.warning("certificates: that of the service %s, at %s", state, own.not_valid_after_utc.isoformat())
+        return None
+
+
+def _trouble(own: x509.Certificate | None) -> str | None:
+    """Why no caller takes the service's own certificate, None where nothing is known against it."""
+    if own is None:
+        return None
+    if own.not_valid_after_utc <= datetime.now(UTC):
+        return f"one that has expired, at {own.not_valid_after_utc.isoformat()}"
     try:
         usage = own.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     except x509.ExtensionNotFound:
-        return
-    if ExtendedKeyUsageOID.SERVER_AUTH not in usage:
-        _log.warning("certificates: that of the service is for callers; callers want extendedKeyUsage=serverAuth")
+        return None
+    return None if ExtendedKeyUsageOID.SERVER_AUTH in usage else "one for callers, without extendedKeyUsage=serverAuth"
+
+
+def _warn_of(pem: Pem) -> None:
+    """Say what callers have, or will soon have, against the service's own certificate."""
+    own = _own(pem)
+    if (trouble := _trouble(own)) is not None:
+        _log.warning("certificates: that of the service is %s", trouble)
+    elif own is not None and own.not_valid_after_utc - datetime.now(UTC) <= SOON:
+        _log.warning("certificates: that of the service expires soon, at %s", own.not_valid_after_utc.isoformat())
 
 
 def _configuration(pem: Pem, callers_too: bool) -> grpc.ServerCertificateConfiguration:

@@ -216,6 +216,26 @@ def _replace(files: TlsFiles, newer: TlsFiles) -> None:
     shutil.copy(newer.key, files.key)
 
 
+def test_new_certificates_that_no_caller_takes_do_not_count(
+    authority: Authority, caplog: pytest.LogCaptureFixture
+) -> None:
+    files = authority.service()
+    certificates = Certificates(files)
+    good = certificates.pem()
+    for newer, told in (
+        (authority.service("late", timedelta(days=-1)), "has expired"),
+        (authority.caller("other", ["admin"]), "extendedKeyUsage=serverAuth"),
+    ):
+        caplog.clear()
+        _replace(files, newer)
+        assert certificates.pem() is good
+        assert f"the earlier ones stay: certificate {files.certificate}: got one" in caplog.text
+        assert told in caplog.text
+    newer = authority.service("newer")
+    _replace(files, newer)
+    assert certificates.pem().certificate == newer.certificate.read_bytes()
+
+
 @pytest.mark.parametrize(("days", "told"), [(-1, "has expired"), (13, "expires soon"), (15, "")])
 def test_a_certificate_that_ends_is_warned_of(
     authority: Authority, caplog: pytest.LogCaptureFixture, days: int, told: str
