@@ -46,7 +46,7 @@ class Certificates:
         self._refused: _Stamp | None = None
         """Of files that were no good, as long as those of `_stamp` count."""
         self._pem, self._context = files.read(), self._loaded()
-        _warn_of(self._pem)
+        _warn_of(_own(self._pem))
 
     def pem(self) -> Pem:
         """Those that count now."""
@@ -55,12 +55,13 @@ class Certificates:
             if stamp not in (self._stamp, self._refused):
                 try:
                     pem = self._files.read()
-                    if (trouble := _trouble(_own(pem))) is not None:
+                    own = _own(pem)
+                    if (trouble := _trouble(own)) is not None:
                         expected = "one that callers take"
                         raise InvalidInputError(f"certificate {self._files.certificate}", trouble, expected)
                     self._pem, self._context, self._stamp, self._refused = pem, self._loaded(), stamp, None
                     _log.info("certificates: read anew from %s", self._files.certificate)
-                    _warn_of(self._pem)
+                    _warn_of(own)
                 except InvalidInputError as error:
                     self._refused = stamp
                     _log.warning("certificates: the earlier ones stay: %s", error)
@@ -150,9 +151,8 @@ def _trouble(own: x509.Certificate | None) -> str | None:
     return None if ExtendedKeyUsageOID.SERVER_AUTH in usage else "one for callers, without extendedKeyUsage=serverAuth"
 
 
-def _warn_of(pem: Pem) -> None:
+def _warn_of(own: x509.Certificate | None) -> None:
     """Say what callers have, or will soon have, against the service's own certificate."""
-    own = _own(pem)
     if (trouble := _trouble(own)) is not None:
         _log.warning("certificates: that of the service is %s", trouble)
     elif own is not None and own.not_valid_after_utc - datetime.now(UTC) <= SOON:
