@@ -409,6 +409,8 @@ def failure(
     if (more := made.failed + lost - len(told)) > 0:
         told.append(f"and {more} more")
     got, expected = f"{lost} of {tally.pages} lost and {tally.missing} missing", "pages that can be read"
+    if made.failed:
+        got += f", {made.failed} ranges or recordings without a result"
     if job.choices.operation is Operation.RECALIBRATE:
         failed = sum(row["state"] is DeviceState.FAILED for row in found.devices)
         got = f"{lost} of {len(found.devices)} devices refused and {failed} failed"

@@ -280,7 +280,9 @@ def test_a_recording_that_cannot_be_opened_is_named_and_tried_again(
     (archive.folder / "b.h5").write_bytes(whole[:1000])
     status, figures = archive.run("decode")
     assert (status, figures["pages_read"]) == (75, PAGES)
-    assert "b.h5" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "b.h5" in told
+    assert "0 of 7 lost and 0 missing, 1 ranges or recordings without a result" in told
     assert archive.run("decode")[0] == 75
     assert re.search(r"^this run +0 pages$", capsys.readouterr().out, re.MULTILINE)  # which is not all that there is
     (archive.folder / "b.h5").write_bytes(whole)
