@@ -2,6 +2,27 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
+from typing import ClassVar
+
+
+class Cause(StrEnum):
+    """What a failure is about; `lightpage.failures.cause_of` says it of any failure."""
+
+    LIGHT = "light"
+    """The light of a page: it was read as it is, and cannot be decoded. A finding, which stays."""
+    CONTENT = "content"
+    """The content of a recording, a bundle or a request: healthy storage would give the same again."""
+    STORAGE = "storage"
+    """The storage under a file, which gave nothing or damaged data: another try may go well."""
+    SURROUNDINGS = "surroundings"
+    """What the program needs to run: memory, threads, a worker, a provider."""
+
+    @property
+    def passes(self) -> bool:
+        """Whether another try may go well, and nothing is found about a page."""
+        return self in (Cause.STORAGE, Cause.SURROUNDINGS)
+
 
 class LightpageError(Exception):
     """Base of every error that Lightpage raises on purpose.
@@ -10,7 +31,12 @@ class LightpageError(Exception):
         subject: what the error is about, e.g. ``"recording R.h5: dataset 'in_phase'"``.
         got: what came; of an error of the operating system, what it says without number and path.
         expected: what would have been right.
+
+    Attributes:
+        cause: what errors of the class are about.
     """
+
+    cause: ClassVar[Cause] = Cause.SURROUNDINGS
 
     def __init__(self, subject: str, got: object, expected: object) -> None:
         self.subject = subject
@@ -22,6 +48,8 @@ class LightpageError(Exception):
 class InvalidInputError(LightpageError):
     """The caller's data are wrong: fix the input and call again."""
 
+    cause = Cause.CONTENT
+
 
 class ProfileError(InvalidInputError):
     """A device profile or device state that is malformed or unphysical."""
@@ -31,12 +59,20 @@ class RecordingError(InvalidInputError):
     """A recording that is truncated, foreign or inconsistent."""
 
 
-class UnreadableError(RecordingError):
-    """Data of a recording that the file system did not give, or gave damaged: another try may go well."""
+class StorageError(LightpageError):
+    """The storage under a file gave nothing, or damaged data, which says nothing of the file; another try may go well."""
+
+    cause = Cause.STORAGE
+
+
+class SurroundingsError(LightpageError):
+    """The program lacks what it needs to run, e.g. memory: nothing that it was given is wrong."""
 
 
 class FrameError(InvalidInputError):
     """A camera frame of the wrong size, type or bit depth, or without usable light."""
+
+    cause = Cause.LIGHT
 
 
 class BlackFrameError(FrameError):
@@ -62,9 +98,13 @@ class NoSuchPageError(PageError):
 class LostDataError(LightpageError):
     """Bytes of a file could not be read back from its pages, nor restored from its parity pages."""
 
+    cause = Cause.LIGHT
+
 
 class BundleError(LightpageError):
     """A bundle that is damaged, incomplete, foreign, or newer than this program."""
+
+    cause = Cause.CONTENT
 
 
 class NoCodeError(BundleError):
@@ -74,9 +114,13 @@ class NoCodeError(BundleError):
 class CalibrationError(LightpageError):
     """The known pages do not fit any geometry within the capture range."""
 
+    cause = Cause.LIGHT
+
 
 class RecalibrationRefusedError(LightpageError):
     """The re-fitted geometry would decode worse than the one in use; nothing was changed."""
+
+    cause = Cause.LIGHT
 
 
 class BusyError(LightpageError):
@@ -99,3 +143,5 @@ class MissingResultsError(LightpageError):
 
 class LimitError(LightpageError):
     """A request is larger than the service accepts."""
+
+    cause = Cause.CONTENT

@@ -6,7 +6,7 @@ from enum import StrEnum
 from typing import Self
 
 from lightpage import errors as own_errors
-from lightpage.errors import BundleError, BusyError, InvalidInputError, LightpageError
+from lightpage.errors import BundleError, BusyError, Cause, InvalidInputError, LightpageError
 
 
 class SourceError(LightpageError):
@@ -132,6 +132,8 @@ class LostPageError(LightpageError):
         reason: why.
         recalibration_due: whether the device has changed since it was calibrated, as far as this page shows.
     """
+
+    cause = Cause.LIGHT
 
     def __init__(
         self,

@@ -16,7 +16,7 @@ import click
 
 from lightpage.cli.paths import check_outputs
 from lightpage.cli.progress_bar import Bars
-from lightpage.errors import LightpageError, LostDataError, MissingResultsError, TakenError
+from lightpage.errors import LightpageError, LostDataError, MissingResultsError, StorageError, TakenError
 from lightpage.progress import reporting
 
 GROUP = "lightpage.commands"
@@ -206,7 +206,7 @@ def _fail(error: LightpageError) -> int:
     click.echo("lightpage: error: " + " ".join(str(error).split()), err=True)
     if isinstance(error, LostDataError):
         return EXIT_LOST
-    return EXIT_AGAIN if isinstance(error, (MissingResultsError, TakenError)) else EXIT_ERROR
+    return EXIT_AGAIN if isinstance(error, (MissingResultsError, StorageError, TakenError)) else EXIT_ERROR
 
 
 def main() -> NoReturn:

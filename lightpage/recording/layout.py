@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import RecordingError
+from lightpage.failures import os_failure
 from lightpage.recording.frame_pair import FramePair
 
 FORMAT = "lightpage-recording"
@@ -80,14 +81,15 @@ def open_hdf5(path: Path, subject: str) -> h5py.File:
 
     Raises:
         RecordingError: missing, truncated, or something else.
+        StorageError, SurroundingsError: the storage fails, or a resource is short.
     """
     expected = "a readable, complete HDF5 file"
-    if not path.is_file():
-        raise RecordingError(subject, "no regular file" if path.exists() else "no such file", expected)
     try:
+        if not path.is_file():
+            raise RecordingError(subject, "no regular file" if path.exists() else "no such file", expected)
         return h5py.File(str(path), "r")
     except OSError as error:
-        raise RecordingError(subject, error, expected) from None
+        raise os_failure(subject, error, expected, RecordingError) from None
 
 
 def read_attribute(file: h5py.File, name: str, default: object = None) -> Any:

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile, parse_profile
-from lightpage.errors import ProfileError, RecordingError, UnreadableError
+from lightpage.errors import ProfileError, RecordingError, StorageError
+from lightpage.failures import os_failure
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.black_level import without_black
 from lightpage.recording.frame_pair import FramePair
@@ -427,7 +428,8 @@ class Recording:
         try:
             data: NDArray[Any] = np.asarray(self._file[name][where])
         except OSError as error:
-            raise UnreadableError(self._subject(f"dataset '{name}'"), error, "data that can be read") from None
+            failure = os_failure(self._subject(f"dataset '{name}'"), error, "data that can be read", StorageError)
+            raise failure from None
         data = data.astype(data.dtype.newbyteorder("="), copy=False)  # torch takes no other byte order
         if name in REFERENCES:
             self._check_counts(name, data, "")

@@ -26,7 +26,7 @@ from lightpage.errors import (
     LightpageError,
     RecalibrationRefusedError,
     RecordingError,
-    UnreadableError,
+    StorageError,
 )
 from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.measures import PageMeasures, measure
@@ -171,7 +171,7 @@ class Worker:
             else:
                 known = read_recorded(recording, first_lit_pages(recording, len(task.pages), warn))
                 outcome = recalibrate(decoder, known, out, next_version(decoder.version), self._fit, lambda *_: None)
-        except UnreadableError:
+        except StorageError:
             raise  # it says nothing of the device
         except (RecalibrationRefusedError, CalibrationError, InvalidInputError) as error:
             if task.fine_tuning is not None and not isinstance(error, _OF_THE_DEVICE):

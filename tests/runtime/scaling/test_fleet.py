@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from lightpage.cli.main import run as run_command
-from lightpage.errors import InvalidInputError, LightpageError, RecalibrationRefusedError, UnreadableError
+from lightpage.errors import InvalidInputError, LightpageError, RecalibrationRefusedError, StorageError
 from lightpage.progress import Progress, note, track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
@@ -200,7 +200,7 @@ def test_frames_that_could_not_be_read_say_nothing_of_the_device(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def broken(recording: Recording, page: int) -> FramePair:
-        raise UnreadableError(f"recording {recording.path}", "Input/output error", "data that can be read")
+        raise StorageError(f"recording {recording.path}", "Input/output error", "data that can be read")
 
     with monkeypatch.context() as patch:
         patch.setattr(Recording, "frames", broken)

@@ -1,0 +1,128 @@
+"""What a failure means: tells a page's light, a recording's content, its storage and the program's surroundings apart."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+
+from lightpage.errors import Cause, InvalidInputError, LightpageError, StorageError, SurroundingsError
+
+_STORAGE = frozenset(
+    getattr(errno, name)
+    for name in (
+        "EIO",
+        "ESTALE",
+        "ETIMEDOUT",
+        "ENXIO",
+        "ENODEV",
+        "EREMOTEIO",
+        "ENOLINK",
+        "ENOTCONN",
+        "ECONNRESET",
+        "ECONNABORTED",
+        "ECONNREFUSED",
+        "ENETDOWN",
+        "ENETUNREACH",
+        "ENETRESET",
+        "EHOSTDOWN",
+        "EHOSTUNREACH",
+        "EPROTO",
+        "EBADMSG",
+        "EUCLEAN",
+        "EBUSY",
+        "EINTR",
+        "EKEYEXPIRED",
+        "EKEYREVOKED",
+        "ENOKEY",
+        "ENOMEDIUM",
+        "ESHUTDOWN",
+        "EPIPE",
+    )
+    if hasattr(errno, name)
+)
+"""Error numbers of a disk or a share that fails: another try may go well, and nothing is said of a file's content."""
+
+_SHORT = {
+    errno.ENOMEM: "memory",
+    errno.EMFILE: "open files of the process (ulimit -n)",
+    errno.ENFILE: "open files of the machine",
+    errno.EAGAIN: "threads or processes (ulimit -u)",
+    errno.ENOSPC: "room on the disk",
+    errno.EDQUOT: "room in the quota",
+    errno.ENOBUFS: "buffers of the network",
+}
+"""Error numbers of a resource that is short, and which it is."""
+
+_HDF5_ERRNO = re.compile(r"\berrno = (\d+)")
+"""HDF5 tells the number in its message alone."""
+
+_SHORT_WORDS = {
+    "bad_alloc": "memory",
+    "failed to allocate memory": "memory",
+    "memory allocation failed": "memory",
+    "unable to allocate": "memory",
+    "cannot allocate memory": "memory",
+    "can't start new thread": "threads (ulimit -u)",
+    "resource temporarily unavailable": "threads (ulimit -u)",
+    "pthread_create": "threads (ulimit -u)",
+    "too many open files": "open files of the process (ulimit -n)",
+}
+"""Words of libraries that have no type of their own for a short resource."""
+
+
+def cause_of(error: BaseException) -> Cause:
+    """The cause of any failure.
+
+    Returns:
+        `LIGHT` and `CONTENT` for errors that say something of a page or of its file, `STORAGE` and `SURROUNDINGS` for
+        all others, those that nobody foresaw among them.
+    """
+    if isinstance(error, LightpageError):
+        return error.cause
+    if isinstance(error, OSError) and error_number(error) in _STORAGE:
+        return Cause.STORAGE
+    return Cause.SURROUNDINGS
+
+
+def error_number(error: OSError) -> int | None:
+    """The `errno` of an error, of HDF5 too; None where there is none."""
+    if error.errno is not None:
+        return error.errno
+    told = _HDF5_ERRNO.search(str(error))
+    return int(told[1]) if told else None
+
+
+def os_failure(
+    subject: str, error: OSError, expected: object, otherwise: type[LightpageError] = InvalidInputError
+) -> LightpageError:
+    """The error that a failure of the operating system, or of HDF5, means.
+
+    Args:
+        subject: what was to be read or written.
+        error: what came.
+        expected: what would have been right.
+        otherwise: class of the error where neither storage nor a short resource is the cause, e.g. no such file.
+
+    Returns:
+        A `StorageError`, a `SurroundingsError` that names what is short, or one of class `otherwise`.
+    """
+    number = error_number(error)
+    if number in _STORAGE:
+        return StorageError(subject, os.strerror(number), expected)
+    if number in _SHORT:
+        return SurroundingsError(subject, os.strerror(number), f"more {_SHORT[number]}")
+    return otherwise(subject, error if number is None else OSError(number, os.strerror(number)), expected)
+
+
+def short_resource(subject: str, error: BaseException) -> SurroundingsError | None:
+    """The error of a short resource, however a library says it; None where the failure is another one."""
+    text = " ".join(str(error).split())
+    if isinstance(error, OSError) and (what := _SHORT.get(error_number(error) or 0)):
+        return SurroundingsError(subject, error, f"more {what}")
+    if isinstance(error, MemoryError):
+        return SurroundingsError(subject, text or "too little memory", "more memory")
+    for words, what in _SHORT_WORDS.items():
+        if words in text.lower():
+            return SurroundingsError(subject, text, f"more {what}")
+    return None
