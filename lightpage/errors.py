@@ -60,7 +60,7 @@ class RecordingError(InvalidInputError):
 
 
 class StorageError(LightpageError):
-    """The storage under a file gave nothing, or damaged data, which says nothing of the file; another try may go well."""
+    """The storage under a file gave nothing, or damaged data, which says nothing of the file: try again."""
 
     cause = Cause.STORAGE
 

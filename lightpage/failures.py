@@ -1,4 +1,4 @@
-"""What a failure means: tells a page's light, a recording's content, its storage and the program's surroundings apart."""
+"""What a failure means: light, content, storage or surroundings, told apart in this one place."""
 
 from __future__ import annotations
 
