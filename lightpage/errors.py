@@ -18,11 +18,6 @@ class Cause(StrEnum):
     SURROUNDINGS = "surroundings"
     """What the program needs to run: memory, threads, a worker, a provider."""
 
-    @property
-    def passes(self) -> bool:
-        """Whether another try may go well, and nothing is found about a page."""
-        return self in (Cause.STORAGE, Cause.SURROUNDINGS)
-
 
 class LightpageError(Exception):
     """Base of every error that Lightpage raises on purpose.

@@ -72,17 +72,31 @@ _SHORT_WORDS = {
 
 
 def cause_of(error: BaseException) -> Cause:
-    """The cause of any failure.
-
-    Returns:
-        `LIGHT` and `CONTENT` for errors that say something of a page or of its file, `STORAGE` and `SURROUNDINGS` for
-        all others, those that nobody foresaw among them.
-    """
+    """The cause of any failure; `Cause.SURROUNDINGS` for one that nobody foresaw."""
     if isinstance(error, LightpageError):
         return error.cause
     if isinstance(error, OSError) and error_number(error) in _STORAGE:
         return Cause.STORAGE
     return Cause.SURROUNDINGS
+
+
+def may_pass(error: BaseException) -> bool:
+    """Whether a failure finds nothing about a page, and the same work may go well a moment later."""
+    return isinstance(error, (StorageError, SurroundingsError))
+
+
+def understood(subject: str, error: BaseException) -> LightpageError | None:
+    """The error that an exception of another library means; None where it is a mistake of the program.
+
+    Args:
+        subject: what was being done.
+        error: what came.
+    """
+    if isinstance(error, LightpageError):
+        return error
+    if isinstance(error, OSError) and error_number(error) in _STORAGE:
+        return os_failure(subject, error, "storage that answers")
+    return short_resource(subject, error)
 
 
 def error_number(error: OSError) -> int | None:

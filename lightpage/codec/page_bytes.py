@@ -48,6 +48,8 @@ class Header:
 class Loss(StrEnum):
     """Why a page gives no bytes."""
 
+    STORAGE = "storage"
+    """Its frames could not be read from the recording, which says nothing of the page."""
     OPTICS = "optics"
     """It could not be decoded into symbols."""
     HEADER = "header"
@@ -61,6 +63,7 @@ class Loss(StrEnum):
 
 
 LOSSES = {
+    Loss.STORAGE: "its frames cannot be read from the recording",
     Loss.OPTICS: "it was not decoded into symbols",
     Loss.HEADER: "its header cannot be read",
     Loss.CODE: "its header names another code",

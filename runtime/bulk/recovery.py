@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.stats import beta
 
@@ -19,7 +20,14 @@ from lightpage.codec.page_bytes import LOSSES, Header, Loss, PageBytes
 from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import Successor, Volume
 from lightpage.codec.volume_file import Restored, VolumeFiles, ranges
-from lightpage.errors import InvalidInputError, LostDataError, RecordingError
+from lightpage.errors import (
+    InvalidInputError,
+    LightpageError,
+    LostDataError,
+    MissingResultsError,
+    RecordingError,
+    StorageError,
+)
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
@@ -105,6 +113,10 @@ class Recovery:
         """Recorded pages that gave no bytes."""
         return tuple(page for page in self.pages if page.loss is not None)
 
+    def reason_of(self, page: int) -> str:
+        """Why a recorded page gave no bytes, for people."""
+        return next(each.reason for each in self.pages if each.page == page)
+
     @property
     def failure_bound(self) -> float:
         """Rate of unread pages that is not exceeded with 95% confidence (Clopper and Pearson)."""
@@ -184,7 +196,7 @@ def recover(
     checksum: int | None = None,
     holes: bool = False,
 ) -> Recovery:
-    """Read the file of one volume back.
+    """Read the file of one volume back; pages that storage does not give are unread, as those that are lost.
 
     Args:
         decoder: of the device.
@@ -205,8 +217,11 @@ def recover(
     codec, bundle = reader.codec, decoder.bundle
     pages: list[RecoveredPage] = []
     with VolumeFiles(out) as files:
-        for index, read in track(read_ahead(recording.frames, recording.pages), "recover", total=recording.pages):
-            pages += [read_page(reader, recording, index, read, files.add)]
+        for index, read in track(read_ahead(recording.shown, recording.pages), "recover", total=recording.pages):
+            try:
+                pages.append(read_page(reader, recording.bit_depth, index, read, files.add))
+            except StorageError as error:
+                pages.append(unread_page(reader, index, Loss.STORAGE, error))
         file = files.chosen(volume_id, checksum)
         done = Restored((), ()) if file is None else file.restore()
         if file is not None and (holes or not done.lost):
@@ -288,33 +303,49 @@ def page_reader(decoder: Decoder, recording: Recording, tracker: Tracker, code: 
     return PageReader(PageCodec(code, bundle.pilot_mask), lambda pair: tracker.decode(pair, code.levels, pilots))
 
 
+def unread_page(reader: PageReader, index: int, loss: Loss, error: LightpageError) -> RecoveredPage:
+    """A page that gave nothing, which `reader` passes over.
+
+    Args:
+        reader: of the recording's pages.
+        index: of the page.
+        loss: why, for programs.
+        error: why, for people.
+    """
+    expected = reader.expected
+    reader.skip()
+    number, volume = (None, None) if expected is None else (expected.page, expected.volume)
+    return RecoveredPage(index, number, volume, loss, str(error))
+
+
 def read_page(
     reader: PageReader,
-    recording: Recording,
+    bit_depth: int,
     index: int,
-    read: Future[FramePair],
+    read: Future[tuple[FramePair, NDArray[np.uint8] | None]],
     take: Callable[[PageBytes], Volume | None],
 ) -> RecoveredPage:
     """Read one page of a recording.
 
     Args:
         reader: of its pages.
-        recording: where the page's symbols are, if they are known.
+        bit_depth: of the recording.
         index: of the page.
-        read: its frames.
+        read: its frames and, where they are known, its symbols.
         take: takes the page, and says which volume it belongs to.
+
+    Raises:
+        StorageError: the frames could not be read, which says nothing of the page.
     """
     expected = reader.expected
     try:
-        pair = narrow(read.result(), recording.bit_depth)
-        page, found, seconds, code_seconds = reader.read(pair)
+        frames, symbols = read.result()
+        page, found, seconds, code_seconds = reader.read(narrow(frames, bit_depth))
     except (InvalidInputError, LostPageError) as error:
-        reader.skip()
-        number, volume = (None, None) if expected is None else (expected.page, expected.volume)
-        return RecoveredPage(index, number, volume, Loss.OPTICS, str(error))
+        return unread_page(reader, index, Loss.OPTICS, error)
     reader.follow(take(found), found.header)
     header = found.header if found.header is not None else expected
-    symbols, data = recording.symbols(index), ~reader.codec.pilots
+    data = ~reader.codec.pilots
     rate = None if symbols is None else air_bits(page, symbols, data, reader.codec.code.levels)
     return RecoveredPage(
         index,
@@ -348,10 +379,25 @@ def told_losses(pages: Sequence[RecoveredPage]) -> list[str]:
     return lines
 
 
-def lost_data(recovery: Recovery, out: Path, holes: bool) -> LostDataError | None:
-    """The error that `recover` ends with where data are lost, which names every page; None where none are."""
+def lost_data(recovery: Recovery, out: Path, holes: bool, give_up: bool = False) -> LightpageError | None:
+    """The error that `recover` ends with where data are lost, which names every page; None where none are.
+
+    Args:
+        recovery: what was read.
+        out: the file.
+        holes: whether it was written with zeros in place of what is lost.
+        give_up: whether pages that storage did not give are lost too.
+
+    Returns:
+        A `LostDataError`, or a `MissingResultsError` where pages that storage did not give may still complete the file.
+    """
     if recovery.volume is not None and not recovery.lost:
         return None
+    unreadable = [page.page for page in recovery.unread if page.loss is Loss.STORAGE]
+    if unreadable and not give_up:
+        got = f"no data of recorded pages {ranges(unreadable)} from storage ({recovery.reason_of(unreadable[0])})"
+        expected = "storage that gives them: the same command tries again; with --give-up they are lost"
+        return MissingResultsError(f"file {out}", got, expected)
     told = "; ".join(told_losses(recovery.unread))
     unread = f"{len(recovery.unread)} of {len(recovery.pages)} pages gave no bytes ({told})" if told else ""
     if recovery.volume is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -17,11 +18,11 @@ from lightpage.codec.code import Code, load_code
 from lightpage.codec.volume_file import parse_volume, ranges
 from lightpage.errors import InvalidInputError, LightpageError, LostDataError, MissingResultsError
 from lightpage.files import write_json
-from lightpage.progress import warn
+from lightpage.progress import note, warn
 from runtime.bundle.shipped import DEFAULT
 from runtime.commands.provider_option import PROVIDER
 from runtime.execution.providers import CPU, Provider
-from runtime.scaling.driver import Progressed, Watch, run
+from runtime.scaling.driver import AGAIN_S, Progressed, Watch, run
 from runtime.scaling.engine import Engine
 from runtime.scaling.fine_tuning import deep_recalibration
 from runtime.scaling.job import KNOWN_PAGES, RANGE_PAGES, Choices, Job, Source, named_bundle, of_fleet, of_recordings
@@ -46,9 +47,10 @@ def bulk() -> None:
     """Read archives of recordings, or recalibrate a fleet, with many workers.
 
     Results and a ledger of every page go into the folder OUT. The same command again does only what is missing; without
-    --recordings and --fleet it goes on with what was asked before. Exit status 2 says that pages are lost, or devices
-    refused, 3 that a file is lost, and 75 that the same command may do more: something is missing, or another run is at
-    work.
+    --recordings and --fleet it goes on with what was asked before. A range that storage does not give is tried again
+    after 1, 4 and 16 seconds; then it is missing, and the same command tries it again. Exit status 2 says that pages
+    are lost, or devices refused, 3 that a file is lost, and 75 that the same command may do more: something is missing,
+    or another run is at work.
     """
 
 
@@ -85,6 +87,8 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
 def _pages_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options of operations on page ranges."""
     for option in (
+        click.option("--give-up", is_flag=True, help="Take pages that storage does not give in the end for lost."),
+        click.option("--retry-lost", is_flag=True, help="Read ranges with lost pages once more, whatever the cause."),
         click.option("--again-with", metavar="BUNDLE", help="Read pages again that were not read well."),
         click.option("--tracking/--no-tracking", default=None, help="Follow the image within a range; the default."),
         click.option("--range-pages", type=click.IntRange(1), help=f"Pages of a range; {RANGE_PAGES} by default."),
@@ -170,6 +174,8 @@ def _bulk(
     metrics_insecure: bool,
     metrics_file: Path | None,
     again_with: str | None = None,
+    give_up: bool = False,
+    retry_lost: bool = False,
     wanted: Wanted = ALL_FILES,
     **chosen: bool | int | str | Code | FineTuning | None,
 ) -> None:
@@ -190,15 +196,20 @@ def _bulk(
                 update={"operation": operation, **given}
             )
             provider = Provider.parse(choices.provider)
-            job = _job(ledger.folder, before, choices, recordings, fleet, bundle)
+            job = _job(ledger.folder, before, choices, recordings, fleet, bundle, retry_lost)
+            if give_up:
+                job = job.unopened_given_up()
             if choices.fine_tuning is not None:
                 check = partial(_check_device, ledger, choices.known_pages)
                 job = job.checked(ledger.devices(job), check)
             if again_with is not None:
                 job = _with_round(job, again_with)
             job.write(ledger.folder)
+        ledger.doubt(job, every_loss=retry_lost)
         with _watched(ledger, operation, metrics_address, metrics_file) as watch:
-            made = run(ledger, job, partial(_engine, engine, address, workers, threads, provider), watch)
+            made = run(
+                ledger, job, partial(_engine, engine, address, workers, threads, provider), watch, give_up=give_up
+            )
         found = totals(ledger, job, made.failures)
         files = recovered_files(ledger, job, wanted) if operation is Operation.RECOVER and own == WHOLE else []
     if json_path is not None:
@@ -293,6 +304,7 @@ def _job(
     recordings: tuple[str, ...],
     fleet: Path | None,
     bundle: str | None,
+    retry_lost: bool,
 ) -> Job:
     """What is asked; that of the folder, where it is the same question or none.
 
@@ -315,10 +327,16 @@ def _job(
         asked = before.model_copy(update={"choices": choices})
         if bundle is not None:
             asked = asked.model_copy(update={"bundles": (named_bundle(bundle),) * len(before.bundles)})
-    if before is None:
-        return asked
-    before.check(folder, asked)
-    return before.with_bundles_of(asked).looked_at_again()
+    if before is not None:
+        before.check(folder, asked)
+        asked = before.with_bundles_of(asked).looked_at_again(given_up=retry_lost)
+    for pause_s in AGAIN_S:
+        if not asked.passing():
+            break
+        note(f"recordings or bundles could not be opened; they are tried again in {pause_s:g} s")
+        time.sleep(pause_s)
+        asked = asked.looked_at_again()
+    return asked
 
 
 def _with_round(job: Job, bundle: str) -> Job:
@@ -338,6 +356,7 @@ def figures(job: Job, part: Part, made: Progressed, found: Totals, files: list[R
             "pages": made.pages,
             "ranges": made.ranges,
             "failed": made.failed,
+            "given_up": made.given_up,
             "problems": [str(problem) for problem in made.problems],
             "seconds": made.seconds,
             "pages_per_s": made.pages_per_s,
@@ -409,6 +428,8 @@ def failure(
     if (more := made.failed + lost - len(told)) > 0:
         told.append(f"and {more} more")
     got, expected = f"{lost} of {tally.pages} lost and {tally.missing} missing", "pages that can be read"
+    if made.given_up:
+        got += f", {made.given_up} recordings given up"
     if made.failed:
         got += f", {made.failed} ranges or recordings without a result"
     if job.choices.operation is Operation.RECALIBRATE:
@@ -420,11 +441,11 @@ def failure(
         return MissingResultsError(subject, got, f"{expected}; the same command tries again what is missing")
     if job.choices.operation is Operation.RECOVER:
         broken = ranges([file.volume.id for file in files if file.error is not None])
-        if broken or (lost and not files and part == WHOLE):
+        if broken or ((lost or made.given_up) and not files and part == WHOLE):
             what = f"volumes {broken} without a file" if broken else "no file"
             return LostDataError(subject, f"{what}; {got}", "pages that suffice for every file")
-        if lost:
+        if lost or made.given_up:
             then = "every file is whole all the same" if part == WHOLE else "the files come when all parts are done"
             warn(f"{subject}: {got}; {then}")
         return None
-    return InvalidInputError(subject, got, expected) if lost else None
+    return InvalidInputError(subject, got, expected) if lost or made.given_up else None

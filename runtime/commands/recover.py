@@ -26,6 +26,7 @@ from runtime.decoding.tracking import NoTracker
 @click.option("--out", required=True, type=OutputFile(), help="The file.")
 @click.option("--volume", metavar="ID[:CHECKSUM]", help="Which volume, where the recording holds several.")
 @click.option("--holes", is_flag=True, help="Write zeros where data are lost, in place of no file.")
+@click.option("--give-up", is_flag=True, help="Take pages that storage does not give for lost.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 @click.option("--tracking/--no-tracking", default=True, show_default=True, help="Follow the image, and find it again.")
 def recover(
@@ -36,12 +37,13 @@ def recover(
     volume: str | None,
     holes: bool,
     json_path: Path | None,
+    give_up: bool,
     tracking: bool,
 ) -> None:
     """Read a file back from recorded pages.
 
     Pages that cannot be read are restored from parity pages. Where too many are lost, each is named, no file is written
-    and the exit status is 3.
+    and the exit status is 3. Where storage did not give some of them, it is 75: the same command tries again.
     """
     decoder = load()
     with Recording.open(recording) as pages:
@@ -53,7 +55,7 @@ def recover(
     click.echo(describe(result))
     for line in told_losses(result.unread) if not result.lost and result.volume is not None else ():
         warn(f"no bytes: {line}")
-    if (error := lost_data(result, out, holes)) is not None:
+    if (error := lost_data(result, out, holes, give_up)) is not None:
         raise error
 
 

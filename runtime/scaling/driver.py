@@ -5,14 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from lightpage.progress import track, warn
+from lightpage.progress import note, track, warn
 from runtime.scaling.engine import Engine
 from runtime.scaling.job import Job
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.task import Failed, Operation, Outcome, Problem, Task
+
+AGAIN_S = (1.0, 4.0, 16.0)
+"""Pauses before ranges are read again that had no result for a reason that may pass, e.g. a disk's hiccup."""
 
 TOLD = 5
 """Ranges without a result whose reasons are kept; the others are counted."""
@@ -27,6 +30,7 @@ class Progressed:
         lost: of these, those that are lost.
         ranges: that have a result now.
         failed: ranges, or recordings, without one.
+        given_up: recordings that could not be opened, and are lost.
         problems: why, of the first of them.
         failures: why, of each device that is recalibrated, by its name and first recording.
         restarts: workers that died.
@@ -37,6 +41,7 @@ class Progressed:
     lost: int = 0
     ranges: int = 0
     failed: int = 0
+    given_up: int = 0
     problems: list[Problem] = field(default_factory=list)
     failures: dict[tuple[str, Path], Problem] = field(default_factory=dict)
     restarts: int = 0
@@ -94,16 +99,27 @@ class Watch:
 _NOBODY = Watch()
 
 
-def run(ledger: Ledger, job: Job, engine: Callable[[], Engine], watch: Watch = _NOBODY) -> Progressed:
+def run(
+    ledger: Ledger,
+    job: Job,
+    engine: Callable[[], Engine],
+    watch: Watch = _NOBODY,
+    *,
+    give_up: bool = False,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Progressed:
     """Do all that is missing of a job: its first reading, then its rounds one after the other.
 
-    What has failed is told and left to the next run; all else goes on.
+    Ranges that fail for a reason that may pass are tried again after each pause of `AGAIN_S`. What still fails is told
+    and left to the next run; all else goes on.
 
     Args:
         ledger: of the job, which belongs to this process, or a part of it.
         job: what was asked.
         engine: makes the engine; not called where nothing is missing.
         watch: is told how it fares.
+        give_up: whether pages of recordings that cannot be read in the end are lost.
+        sleep: waits so many seconds.
 
     Raises:
         WorkerError: there are no workers.
@@ -112,8 +128,14 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine], watch: Watch = _
     start = time.perf_counter()
     made = Progressed()
     ledger.sweep(job)
-    problems = (source.problem.about(source.device) for _, source in ledger.sources(job) if source.problem is not None)
-    for problem in dict.fromkeys(problems):  # a bundle is lacking to all recordings of its device
+    for problem, is_given_up in dict.fromkeys(  # a bundle is lacking to all recordings of its device
+        (source.problem.about(source.device), source.given_up)
+        for _, source in ledger.sources(job)
+        if source.problem is not None
+    ):
+        if is_given_up:
+            made.given_up += 1
+            continue
         made.fail(problem)
         watch.fail()
     unit = "device" if job.choices.operation is Operation.RECALIBRATE else "page"
@@ -130,20 +152,94 @@ def run(ledger: Ledger, job: Job, engine: Callable[[], Engine], watch: Watch = _
                 continue
             total = todo if number else whole
             what = f"{job.choices.operation} again" if number else str(job.choices.operation)
-            works = engine()
-            watch.begin(works)
-            steps = _steps(works, missing(), made, watch)
-            with closing(steps):
-                for _ in track(steps, what, unit=unit, total=total, done=total - todo, state=made.state):
-                    pass
+            failed: list[Failed] = []
+            for turn in _turns(give_up):
+                again = [each for each in failed if turn.takes(each)]
+                if turn.pause_s is not None and not again:
+                    continue
+                failed = [each for each in failed if not turn.takes(each)]
+                tasks: Iterable[Task] = missing()
+                if turn.pause_s is not None:
+                    tasks = list(_of_failures(tasks, again, failed, turn.give_up))
+                    todo = sum(task.weight for task in tasks)
+                    note(f"{again[0].problem}; {todo} {unit}s are tried again in {turn.pause_s:g} s")
+                    sleep(turn.pause_s)
+                works = engine()
+                watch.begin(works)
+                steps = _steps(works, tasks, ledger, made, watch, turn.later, failed)
+                with closing(steps):
+                    for _ in track(steps, what, unit=unit, total=total, done=total - todo, state=made.state):
+                        pass
     finally:
         ledger.sweep(job)
     made.seconds = time.perf_counter() - start
     return made
 
 
-def _steps(engine: Engine, tasks: Iterable[Task], made: Progressed, watch: Watch) -> Generator[None, None, None]:
-    """Once for every page that is behind."""
+@dataclass(frozen=True)
+class _Turn:
+    """One going through what is missing.
+
+    Attributes:
+        takes: whether a failure of the turns before is tried again in this one.
+        later: whether a failure of this one is tried again in a later one.
+        pause_s: before it; None for the first one, which does all that is missing.
+        give_up: whether pages that storage does not give are lost.
+    """
+
+    takes: Callable[[Failed], bool]
+    later: Callable[[Failed], bool]
+    pause_s: float | None = None
+    give_up: bool = False
+
+
+def _turns(give_up: bool) -> list[_Turn]:
+    def passes(failed: Failed) -> bool:
+        return failed.problem.passes
+
+    def every(failed: Failed) -> bool:
+        return True
+
+    def none(failed: Failed) -> bool:
+        return False
+
+    before_last = every if give_up else passes
+    turns = [_Turn(passes, before_last, pause_s) for pause_s in (None, *AGAIN_S)]
+    if give_up:
+        return [*turns, _Turn(every, none, 0.0, give_up=True)]
+    return [*turns[:-1], replace(turns[-1], later=none)]
+
+
+def _of_failures(
+    tasks: Iterable[Task], again: Iterable[Failed], settled: Iterable[Failed], give_up: bool
+) -> Iterator[Task]:
+    """Tasks of the recordings that failures `again` are of, but for those that are `settled`."""
+    recordings = {(failed.task.device, failed.task.recording) for failed in again}
+    shards = {failed.task.shard for failed in settled}
+    for task in tasks:
+        if (task.device, task.recording) in recordings and task.shard not in shards:
+            yield task.model_copy(update={"give_up": give_up})
+
+
+def _steps(
+    engine: Engine,
+    tasks: Iterable[Task],
+    ledger: Ledger,
+    made: Progressed,
+    watch: Watch,
+    later: Callable[[Failed], bool],
+    failed: list[Failed],
+) -> Generator[None, None, None]:
+    """Do tasks; once for every page that is behind.
+
+    Args:
+        engine: does them.
+        tasks: what is wanted.
+        ledger: of the run.
+        made, watch: count what becomes of them.
+        later: whether a failure is added to `failed`, in place of being counted.
+        failed: failures that are tried again.
+    """
     given_up: set[tuple[str, Path]] = set()
     died = made.restarts
 
@@ -157,11 +253,17 @@ def _steps(engine: Engine, tasks: Iterable[Task], made: Progressed, watch: Watch
     with closing(engine.run(wanted())) as outcomes:
         for outcome in outcomes:
             count_deaths()
-            if isinstance(outcome, Failed) and outcome.whole_recording:
+            if isinstance(outcome, Failed):
                 key = outcome.task.device, outcome.task.recording
-                if key in given_up:
+                if outcome.whole_recording and key in given_up:
                     continue  # it was under way when the recording was found to be unreadable, and is told already
-                given_up.add(key)
+                if outcome.whole_recording:
+                    given_up.add(key)
+                if later(outcome):
+                    failed.append(outcome)
+                    continue
+            else:
+                ledger.doubted.discard(outcome.task.shard)
             watch.count(outcome)
             for _ in range(made.count(outcome)):
                 yield None

@@ -13,6 +13,7 @@ from pydantic import Field, ValidationError
 
 from lightpage.codec.code import Code
 from lightpage.errors import BundleError, InvalidInputError, LightpageError, RecordingError
+from lightpage.failures import os_failure
 from lightpage.files import replace_text
 from lightpage.recording.reader import Recording
 from runtime.bundle.bundle import Bundle
@@ -42,6 +43,7 @@ class Source(Plain):
         pages: that it has.
         problem: why it could not be opened, or why its device lacks what it needs; None where all is there.
         run: folder of the training run that its device's bundle was made from, where the fleet names it.
+        given_up: whether it is lost for its problem, and not tried again.
     """
 
     device: str
@@ -51,6 +53,7 @@ class Source(Plain):
     pages: int
     problem: Problem | None = None
     run: Path | None = None
+    given_up: bool = False
 
 
 class Choices(Plain):
@@ -122,7 +125,9 @@ class Job(Plain):
             return cls.model_validate_json(path.read_bytes())
         except FileNotFoundError:
             return None
-        except (OSError, ValidationError) as error:
+        except OSError as error:
+            raise os_failure(f"job {path}", error, "a file that can be read") from None
+        except ValidationError as error:
             expected = "what `lightpage bulk` of this version has written"
             raise InvalidInputError(f"job {path}", error, expected) from None
 
@@ -139,17 +144,35 @@ class Job(Plain):
             sources.append(source.model_copy(update={"bundle": places.setdefault(bundle, len(places))}))
         return self.model_copy(update={"bundles": tuple(places), "sources": tuple(sources)})
 
-    def looked_at_again(self) -> Job:
-        """The same; recordings and bundles that could not be opened before are tried once more."""
+    def looked_at_again(self, *, given_up: bool = False) -> Job:
+        """The same; recordings and bundles that could not be opened before are tried once more.
+
+        Args:
+            given_up: whether recordings that were given up are tried too.
+        """
         bundles, lacking = list(self.bundles), dict[int, Problem | None]()
         for place, bundle in enumerate(bundles):
             if not bundle.sha256:
                 bundles[place], lacking[place] = bundle_as_it_is(bundle.path)
         again = (
-            s if s.problem is None else look_at(s.device, s.path, s.bundle, s.run, lacking=lacking.get(s.bundle))
+            s
+            if s.problem is None or (s.given_up and not given_up)
+            else look_at(s.device, s.path, s.bundle, s.run, lacking=lacking.get(s.bundle))
             for s in self.sources
         )
         return self.model_copy(update={"bundles": tuple(bundles), "sources": tuple(again)})
+
+    def passing(self) -> bool:
+        """Whether a recording or bundle could not be opened for a reason that may pass."""
+        return any(source.problem is not None and source.problem.passes for source in self.sources)
+
+    def unopened_given_up(self) -> Job:
+        """The same; recordings that could not be opened are given up, unless it is their bundle that is lacking."""
+        again = (
+            s.model_copy(update={"given_up": s.problem is not None and bool(self.bundles[s.bundle].sha256)})
+            for s in self.sources
+        )
+        return self.model_copy(update={"sources": tuple(again)})
 
     @property
     def devices(self) -> dict[int, tuple[Source, ...]]:
@@ -223,7 +246,7 @@ def bundle_sha256(path: Path) -> str:
         with _told_by(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise BundleError(f"bundle {path}", error, "a bundle that can be read") from None
+        raise os_failure(f"bundle {path}", error, "a bundle that can be read", BundleError) from None
 
 
 def named_bundle(name_or_path: str) -> NamedBundle:
@@ -303,7 +326,7 @@ def look_at(
         stamp = Stamp.of(path)
         with Recording.open(path) as recording:
             return Source(device=device, path=path, bundle=bundle, stamp=stamp, pages=recording.pages, run=run)
-    except RecordingError as error:
+    except LightpageError as error:
         problem = Problem.of(error)
     except FileNotFoundError as error:
         pattern = glob.has_magic(str(path))
@@ -311,7 +334,7 @@ def look_at(
         expected = "files that are there; begin another run for this device" if pattern else "a recording"
         problem = Problem.of(RecordingError(f"recording {path}", got, expected))
     except OSError as error:
-        problem = Problem.of(RecordingError(f"recording {path}", error, "a recording"))
+        problem = Problem.of(os_failure(f"recording {path}", error, "a recording", RecordingError))
     return Source(device=device, path=path, bundle=bundle, stamp=None, pages=0, problem=problem, run=run)
 
 

@@ -13,9 +13,10 @@ from types import TracebackType
 from typing import Self
 
 from lightpage.errors import InvalidInputError, TakenError
+from lightpage.failures import os_failure
 from runtime.scaling.job import Job, Source
 from runtime.scaling.part import WHOLE, Part
-from runtime.scaling.shard import RECORD, PageRecord, ShardRecord
+from runtime.scaling.shard import RECORD, PageRecord, ShardRecord, holds_losses
 from runtime.scaling.task import Operation, RecordedFile, Task
 
 _LOCK, _QUESTION, _SHARDS = "lock", "lock-job", "shards"
@@ -31,6 +32,9 @@ class Ledger:
         folder: of the run, there or yet to be made.
         part: what this process does of it.
 
+    Attributes:
+        doubted: paths of shards whose ranges are read again; until then they count as having no result.
+
     Raises:
         TakenError: another run is at work there, or on this part of it.
         InvalidInputError: the folder cannot be written.
@@ -38,6 +42,7 @@ class Ledger:
 
     def __init__(self, folder: Path, part: Part = WHOLE) -> None:
         self.folder, self.part = folder.absolute(), part
+        self.doubted: set[Path] = set()
         self._subject = f"bulk run {self.folder}"
 
     def __enter__(self) -> Self:
@@ -222,19 +227,38 @@ class Ledger:
             fine_tuning=choices.fine_tuning,
         )
 
+    def doubt(self, job: Job, *, every_loss: bool = False) -> None:
+        """Have ranges read again whose pages were filed as lost for a fault of storage, as earlier versions did.
+
+        Args:
+            job: what was asked.
+            every_loss: whether ranges with lost pages of any cause are read again.
+
+        Raises:
+            StorageError, InvalidInputError: a shard that cannot be read.
+        """
+        if job.choices.operation is Operation.RECALIBRATE:
+            return
+        for index, _ in self.sources(job):
+            folder = self.shard(index, 0).parent
+            for name in self.results(index):
+                if holds_losses(folder / name, misfiled_only=not every_loss):
+                    self.doubted.add(folder / name)
+
     def recalibrated(self, place: int) -> bool:
         """Whether a device has a result, by the place of its first recording."""
         return self.shard(place, 0).name in self.results(place)
 
     def results(self, source: int) -> frozenset[str]:
-        """Names of the shards that a recording has."""
+        """Names of the shards that a recording has, but for those that are doubted."""
         folder = self.shard(source, 0).parent
         try:
-            return frozenset(name.removesuffix(RECORD) for name in os.listdir(folder) if name.endswith(RECORD))
+            names = (name.removesuffix(RECORD) for name in os.listdir(folder) if name.endswith(RECORD))
+            return frozenset(name for name in names if folder / name not in self.doubted)
         except FileNotFoundError:
             return frozenset()
         except OSError as error:
-            raise InvalidInputError(f"folder {folder}", error, "a folder that can be read") from None
+            raise os_failure(f"folder {folder}", error, "a folder that can be read") from None
 
 
 def _make(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from enum import StrEnum
@@ -12,14 +13,18 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from lightpage.codec.header import parse_header
-from lightpage.codec.page_bytes import FILE_BYTES, FileFacts, PageBytes
-from lightpage.errors import InvalidInputError
+from lightpage.codec.page_bytes import FILE_BYTES, FileFacts, Loss, PageBytes
+from lightpage.errors import InvalidInputError, LightpageError
+from lightpage.failures import os_failure
 from lightpage.files import replace_file, replace_text
 from lightpage.metrics.reliability import ConfidenceBin
 from runtime.scaling.task import NamedBundle, Plain
 
 RECORD, SYMBOLS, USER_BYTES, BUNDLE, TRAINING, LOG = ".json", ".h5", ".npz", ".zip", ".run", ".log"
 """Ends of the names of a shard's files. The record is written last: without one, there is no result."""
+
+
+_WRITTEN = "what a bulk run has written; delete it to redo it"
 
 
 class PageState(StrEnum):
@@ -115,11 +120,37 @@ class ShardRecord(Plain):
         """
         path = record_of(shard)
         try:
-            return cls.model_validate_json(path.read_bytes())
-        except (OSError, ValidationError) as error:
-            raise InvalidInputError(
-                f"shard {path}", error, "what a bulk run has written; delete it to redo it"
-            ) from None
+            return cls.model_validate_json(_content(path))
+        except ValidationError as error:
+            raise InvalidInputError(f"shard {path}", error, _WRITTEN) from None
+
+
+_MISFILED, _MISFILED_AS = b"wanted data that can be read", ("UnreadableError", Loss.OPTICS.value)
+"""How version 0.1.0 filed a page that storage had not given: in its reason, and as what it was lost."""
+
+
+def holds_losses(shard: Path, *, misfiled_only: bool) -> bool:
+    """Whether a shard's record holds lost pages.
+
+    Args:
+        shard: path of the shard.
+        misfiled_only: count pages alone that version 0.1.0 has filed as lost since storage did not give them.
+
+    Raises:
+        InvalidInputError, StorageError: the record cannot be read.
+    """
+    content = _content(record_of(shard))
+    if (_MISFILED if misfiled_only else f'"{PageState.LOST}"'.encode()) not in content:
+        return False  # most are so, and need not be parsed
+    lost = (page for page in ShardRecord.read(shard).pages if page.state is PageState.LOST)
+    return any(not misfiled_only or (page.loss in _MISFILED_AS and _MISFILED.decode() in page.reason) for page in lost)
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise os_failure(f"shard {path}", error, "a file that can be read") from None
 
 
 def record_of(shard: Path) -> Path:
@@ -160,10 +191,12 @@ def read_user_bytes(shard: Path) -> Iterable[tuple[int, PageBytes]]:
     """
     path = with_end(shard, USER_BYTES)
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(_content(path)), allow_pickle=False) as arrays:
             numbers, headers, files, data = (arrays[name] for name in ("pages", "headers", "files", "data"))
+    except LightpageError:
+        raise
     except Exception as error:  # numpy and zipfile raise many kinds on damaged data
-        raise InvalidInputError(f"shard {path}", error, "what a bulk run has written; delete it to redo it") from None
+        raise InvalidInputError(f"shard {path}", error, _WRITTEN) from None
     for number, header, facts, content in zip(numbers.tolist(), headers, files, data, strict=True):
         file = FileFacts.parse(facts[:FILE_BYTES].tobytes())
         yield number, PageBytes(parse_header(header.tobytes()), content.tobytes(), file, None, 0.0, 0, 0, 0, 0.0)

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from lightpage.codec.code import Code
 from lightpage.errors import LightpageError
+from lightpage.failures import may_pass
 from runtime.execution.providers import CPU
 
 
@@ -29,16 +30,21 @@ class Plain(BaseModel):
 
 
 class Problem(Plain):
-    """An error in plain parts; see `lightpage.errors.LightpageError`."""
+    """An error in plain parts; see `lightpage.errors.LightpageError`.
+
+    Attributes:
+        passes: whether another try may go well a moment later, see `lightpage.failures.may_pass`.
+    """
 
     subject: str
     got: str
     expected: str
+    passes: bool = False
 
     @classmethod
     def of(cls, error: LightpageError) -> Problem:
         """That of an error."""
-        return cls(subject=error.subject, got=error.got, expected=error.expected)
+        return cls(subject=error.subject, got=error.got, expected=error.expected, passes=may_pass(error))
 
     def about(self, device: str) -> Problem:
         """The same, and of which device of a fleet it is; itself without a fleet."""
@@ -122,6 +128,7 @@ class Task(Plain):
         more: further recordings of a device that is recalibrated, whose pages follow those of the first.
         run: of a device that is recalibrated deeply: folder of the training run that its bundle was made from.
         fine_tuning: how it is trained then; None for a re-fit of the geometry alone.
+        give_up: whether pages that storage does not give are lost, in place of the range having no result.
     """
 
     operation: Operation
@@ -138,6 +145,7 @@ class Task(Plain):
     more: tuple[RecordedFile, ...] = ()
     run: Path | None = None
     fine_tuning: FineTuning | None = None
+    give_up: bool = False
 
     @property
     def files(self) -> tuple[RecordedFile, ...]:

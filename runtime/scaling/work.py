@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.known_pages import first_lit_pages
-from lightpage.codec.page_bytes import PageBytes
+from lightpage.codec.page_bytes import Loss, PageBytes
 from lightpage.codec.volume import Volume
 from lightpage.errors import (
     BundleError,
@@ -28,6 +28,7 @@ from lightpage.errors import (
     RecordingError,
     StorageError,
 )
+from lightpage.failures import may_pass, os_failure, understood
 from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.measures import PageMeasures, measure
 from lightpage.page.pilots import Pilots
@@ -37,7 +38,7 @@ from lightpage.recording.joined import join
 from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import check_recording, decode_unseen, pilots_of
 from runtime.bulk.read_ahead import read_ahead
-from runtime.bulk.recovery import RecoveredPage, code_of, page_reader, read_page
+from runtime.bulk.recovery import RecoveredPage, code_of, page_reader, read_page, unread_page
 from runtime.client.decoded_file import DecodedWriter
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.frames import narrow
@@ -102,20 +103,29 @@ class Worker:
         Errors that nobody foresaw are raised: they end the worker, and the range goes to another one.
         """
         start = time.perf_counter()
-        whole = True
+        opened = read = False
         try:
             _check_stamp(task)
             warm = self._opened(task.bundle, task.provider)
             with _recording_of(task) as recording:
                 check_recording(warm.decoder, recording)
+                opened = True
                 record = self._record(task, recording, warm)
                 read_bytes = round(recording.stored_page_bytes * min(len(task.pages), recording.pages))
-            whole = False
+            read = True
             _check_stamp(task)
             record = record.model_copy(update=self._told(start, read_bytes))
             record.write(task.shard)
-        except LightpageError as error:
-            return Failed(task=task, problem=Problem.of(error), whole_recording=whole)
+        except Exception as error:
+            failure = understood(task.name, error)
+            if failure is None:
+                raise
+            if read or not (task.give_up and isinstance(failure, StorageError | RecordingError)):
+                whole = not read and not (opened and may_pass(failure))
+                return Failed(task=task, problem=Problem.of(failure), whole_recording=whole)
+            lost = tuple(lost_page(page, failure) for page in task.pages)
+            record = ShardRecord(model=task.bundle, pages=lost, seconds=0.0, finished_s=time.time())
+            record.write(task.shard)
         return Done(
             task=task,
             lost=record.lost,
@@ -171,8 +181,6 @@ class Worker:
             else:
                 known = read_recorded(recording, first_lit_pages(recording, len(task.pages), warn))
                 outcome = recalibrate(decoder, known, out, next_version(decoder.version), self._fit, lambda *_: None)
-        except StorageError:
-            raise  # it says nothing of the device
         except (RecalibrationRefusedError, CalibrationError, InvalidInputError) as error:
             if task.fine_tuning is not None and not isinstance(error, _OF_THE_DEVICE):
                 raise
@@ -222,6 +230,11 @@ class _Range:
     decoder: Decoder
     tracker: Tracker
 
+    @property
+    def _findings(self) -> tuple[type[LightpageError], ...]:
+        """Errors that are what becomes of a page; any other leaves the range without a result."""
+        return (InvalidInputError, LostPageError, *([StorageError] if self.task.give_up else []))
+
     def decoded(self) -> ShardRecord:
         """Symbols, confidences, and figures where the symbols are known."""
         levels, mask = self.recording.levels, pilots_of(self.decoder, self.recording)
@@ -236,7 +249,7 @@ class _Range:
                 try:
                     frames, symbols = shown.result()
                     found = decode(frames, symbols)
-                except (InvalidInputError, LostPageError) as error:
+                except self._findings as error:
                     records.append(lost_page(page, error))
                     continue
                 if append is not None:
@@ -267,7 +280,7 @@ class _Range:
             try:
                 frames, symbols = shown.result()
                 found = decode_unseen(self.decoder, self.recording, self.tracker, mask, frames, symbols)
-            except (InvalidInputError, LostPageError) as error:
+            except self._findings as error:
                 records.append(lost_page(page, error))
                 continue
             if found is None or symbols is None:
@@ -284,7 +297,7 @@ class _Range:
         reader = page_reader(self.decoder, self.recording, self.tracker, code)
         kept: list[tuple[int, PageBytes]] = []
         records: list[PageRecord] = []
-        for page, frames in self._read(self.recording.frames):
+        for page, shown in self._read(self.recording.shown):
 
             def take(found: PageBytes, page: int = page) -> Volume | None:
                 volume = Volume.of_page(found)
@@ -292,7 +305,13 @@ class _Range:
                     kept.append((page, found))
                 return volume
 
-            records.append(_recovered_record(read_page(reader, self.recording, page, frames, take)))
+            try:
+                found = read_page(reader, self.recording.bit_depth, page, shown, take)
+            except StorageError as error:
+                if not self.task.give_up:
+                    raise
+                found = unread_page(reader, page, Loss.STORAGE, error)
+            records.append(_recovered_record(found))
         write_user_bytes(self.task.shard, kept)
         return self._shard(records)
 
@@ -354,7 +373,7 @@ def _check_stamp(task: Task) -> None:
         try:
             found = Stamp.of(file.path)
         except OSError as error:
-            raise RecordingError(subject, error, "the file that the run began with") from None
+            raise os_failure(subject, error, "the file that the run began with", RecordingError) from None
         if found != file.stamp:
             expected = f"{file.stamp.size} bytes, changed when the run began: begin another run with the new file"
             raise Changed(subject, f"{found.size} bytes, changed since", expected)
