@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import InvalidInputError, RecordingError
+from lightpage.errors import InvalidInputError, LightpageError, RecordingError, StorageError
 from lightpage.metrics.accumulator import Accumulator
 from lightpage.metrics.information import achievable_rate, page_kilobytes
 from lightpage.metrics.measures import PageMeasures, SymbolMaps
@@ -103,17 +103,17 @@ class Evaluation:
         }
 
 
-class NothingReadError(InvalidInputError):
+class NothingReadError(LightpageError):
     """No page of a recording was read.
 
     Args:
-        subject, got, expected: see `LightpageError`.
+        refusal: why, see `runtime.bulk.refused.refusal`.
         figures: what there is to tell all the same, under the names of `Evaluation.to_json`.
     """
 
-    def __init__(self, subject: str, got: object, expected: object, figures: dict[str, Any]) -> None:
-        super().__init__(subject, got, expected)
-        self.figures = figures
+    def __init__(self, refusal: LightpageError, figures: dict[str, Any]) -> None:
+        super().__init__(refusal.subject, refusal.got, refusal.expected)
+        self.refusal, self.figures = refusal, figures
 
 
 def _refused_json(refused: Sequence[RefusedPage]) -> dict[str, Any]:
@@ -200,7 +200,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         try:
             frames, symbols = read.result()
             page = decode_unseen(decoder, recording, tracker, mask, frames, symbols)
-        except (InvalidInputError, LostPageError) as error:
+        except (InvalidInputError, LostPageError, StorageError) as error:
             refused.append(RefusedPage.of(index, error))
         if page is not None and symbols is not None:
             accumulator.add(page.phase[data], page.concentration[data], symbols[data])
@@ -217,7 +217,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
             "bundle": _describe(decoder, levels),
             **_refused_json(refused),
         }
-        raise NothingReadError(told.subject, told.got, told.expected, figures)
+        raise NothingReadError(told, figures)
     if not timings:
         raise InvalidInputError(
             f"recording {recording.path}",

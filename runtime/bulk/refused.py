@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
-from lightpage.errors import InvalidInputError, LightpageError
+from lightpage.errors import Cause, InvalidInputError, LightpageError, MissingResultsError
 from runtime.errors import LostPageError
 
 _TOLD = 5
@@ -29,6 +29,7 @@ class RefusedPage:
         unconfirmed: whether it was decoded, and its pilots did not bear out the result.
         loss: why, for programs: the name of a `runtime.errors.Reason`; None of a page that was not decoded.
         recalibration_due: whether it shows that the device has changed since it was calibrated.
+        cause: what the reason is about; of storage, nothing is found about the page.
     """
 
     page: int | None
@@ -36,13 +37,14 @@ class RefusedPage:
     unconfirmed: bool = False
     loss: str | None = None
     recalibration_due: bool = False
+    cause: Cause = Cause.CONTENT
 
     @classmethod
     def of(cls, page: int | None, error: LightpageError) -> Self:
         """The page that an error is about."""
         if not isinstance(error, LostPageError):
-            return cls(page, str(error))
-        return cls(page, str(error), True, error.reason.value, error.recalibration_due)
+            return cls(page, str(error), cause=error.cause)
+        return cls(page, str(error), True, error.reason.value, error.recalibration_due, error.cause)
 
 
 def unconfirmed(refused: Sequence[RefusedPage]) -> int:
@@ -50,10 +52,15 @@ def unconfirmed(refused: Sequence[RefusedPage]) -> int:
     return sum(page.unconfirmed for page in refused)
 
 
-def refusal(subject: str, refused: Sequence[RefusedPage], pages: int) -> InvalidInputError:
-    """The error that a command ends with when `refused` of its `pages` pages of `subject` could not be decoded."""
+def refusal(subject: str, refused: Sequence[RefusedPage], pages: int) -> InvalidInputError | MissingResultsError:
+    """The error that a command ends with when `refused` of its `pages` pages of `subject` could not be decoded.
+
+    Returns:
+        A `MissingResultsError` where storage did not give some of them: the same command may read these.
+    """
     told = "; ".join(f"page {'unknown' if r.page is None else r.page}: {r.reason}" for r in refused[:_TOLD])
     more = f"; and {len(refused) - _TOLD} more" if len(refused) > _TOLD else ""
-    return InvalidInputError(
-        subject, f"{len(refused)} of {pages} pages that were refused ({told}{more})", "pages that can be decoded"
-    )
+    got = f"{len(refused)} of {pages} pages that were refused ({told}{more})"
+    if any(page.cause is Cause.STORAGE for page in refused):
+        return MissingResultsError(subject, got, "storage that gives every page; the same command tries again")
+    return InvalidInputError(subject, got, "pages that can be decoded")

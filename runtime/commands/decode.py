@@ -15,7 +15,7 @@ import numpy as np
 from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import parse_profile
-from lightpage.errors import InvalidInputError, LightpageError, RecordingError
+from lightpage.errors import InvalidInputError, LightpageError, RecordingError, StorageError
 from lightpage.files import write_json
 from lightpage.metrics.measures import PageMeasures, measure
 from lightpage.page.symbols import pilot_symbols
@@ -182,7 +182,7 @@ def _read(client: LightpageClient, count: int, levels: int) -> Iterator[RemotePa
     for _ in range(count):
         try:
             page = client.read_page(levels=levels, want_phase=known, want_concentration=known, want_written=known)
-        except (InvalidInputError, LostPageError, SourceError) as error:
+        except (InvalidInputError, LostPageError, SourceError, StorageError) as error:
             yield RefusedPage.of(None, error)
         else:
             yield page
@@ -210,7 +210,7 @@ def _sent(client: LightpageClient, file: Recording, count: int, levels: int) -> 
                 want_phase=known,
                 want_concentration=known,
             )
-        except (InvalidInputError, LostPageError) as error:
+        except (InvalidInputError, LostPageError, StorageError) as error:
             yield RefusedPage.of(index, error)
         else:
             yield replace(page, page=index, written=symbols if known else None, pilot_mask=mask)

@@ -27,7 +27,7 @@ def evaluate(load: Load, recording: str, json_path: Path | None, tracking: bool)
     """Measure a bundle on the pages of a recording that it has not seen.
 
     Pages that cannot be decoded, or whose pilots do not confirm the result, are left out of the figures, named, and
-    make the exit status 2.
+    make the exit status 2; pages that storage does not give make it 75.
     """
     decoder = load()
     with Recording.open(recording) as pages:
@@ -37,7 +37,7 @@ def evaluate(load: Load, recording: str, json_path: Path | None, tracking: bool)
         except NothingReadError as error:
             if json_path is not None:
                 write_json(json_path, error.figures)
-            raise
+            raise error.refusal from None
     if json_path is not None:
         write_json(json_path, result.to_json())
     click.echo(describe(result))

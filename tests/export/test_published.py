@@ -11,9 +11,8 @@ import torch
 from click.testing import CliRunner
 
 from export.command import export_run
-from lightpage.errors import BundleError
+from lightpage.errors import BundleError, InvalidInputError
 from lightpage.recording.reader import Recording
-from runtime.bulk.evaluation import NothingReadError
 from runtime.commands.evaluate import evaluate
 from runtime.decoding.decoder import Decoder
 from runtime.recalibration.known_pages import KnownPages
@@ -54,7 +53,8 @@ def test_a_published_decoder_runs_without_torch_and_says_the_same(
     assert symbols[1] is not None
     figures = tmp_path / "E.json"
     asked = ["--bundle", str(out), "--recording", small_device[3], "--json", str(figures)]
-    with pytest.raises(NothingReadError, match="1 of 8 pages that were refused"):  # ten steps teach it to claim nothing
+    # ten steps teach it to claim nothing
+    with pytest.raises(InvalidInputError, match="1 of 8 pages that were refused"):
         CliRunner().invoke(evaluate, asked, standalone_mode=False, catch_exceptions=False)
     assert json.loads(figures.read_text())["pages_unconfirmed"] == 1
     # its geometry is in its weights: nothing to re-trace

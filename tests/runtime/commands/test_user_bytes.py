@@ -14,8 +14,10 @@ from click.testing import CliRunner, Result
 from lightpage.cli.main import lightpage, run
 from lightpage.cli.simulate import simulate
 from lightpage.codec.checksum import crc32c
-from lightpage.errors import InvalidInputError, LostDataError, RecordingError
+from lightpage.errors import InvalidInputError, LostDataError, RecordingError, StorageError
 from lightpage.page.symbols import pilot_mask
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording
 from runtime.commands.code import code as code_command
 from runtime.commands.encode import encode
 from runtime.commands.recover import recover
@@ -290,3 +292,60 @@ def test_code_needs_known_pages(tmp_path: Path, pages: int, told: str) -> None:
     result = CliRunner().invoke(code_command, asked, standalone_mode=False)
     assert told in str(result.exception)
     assert not (tmp_path / "C.toml").exists()
+
+
+def storage_without(pages: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have storage give no frames of these pages."""
+    frames = Recording.frames
+
+    def read(recording: Recording, page: int) -> FramePair:
+        if page in pages:
+            raise StorageError(f"recording {recording.path}: page {page}", "Input/output error", "data")
+        return frames(recording, page)
+
+    monkeypatch.setattr(Recording, "frames", read)
+
+
+def test_pages_that_storage_does_not_give_are_restored_as_others_are(
+    bundle: Path, pages: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = coded.recording(tmp_path / "R.h5", pages)
+    storage_without({1, 2}, monkeypatch)
+    result, figures = recovered(bundle, recording)
+    assert result.exception is None
+    assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
+    assert [page["loss"] for page in figures["page_results"] if page["loss"]] == ["storage", "storage"]
+
+
+@pytest.mark.parametrize(("options", "status"), [((), 75), (("--give-up",), 3)])
+def test_a_file_that_storage_keeps_back_is_not_lost_unless_it_is_given_up(
+    options: tuple[str, ...],
+    status: int,
+    bundle: Path,
+    pages: np.ndarray,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    recording = coded.recording(tmp_path / "R.h5", pages)
+    asked = f"recover --bundle {bundle} --recording {recording} --out {tmp_path / 'read.bin'} --no-tracking".split()
+    with monkeypatch.context() as patched:
+        storage_without({0, 1, 2}, patched)
+        assert run(lightpage, [*asked, *options]) == status
+        assert not (tmp_path / "read.bin").exists()
+    assert run(lightpage, asked) == 0
+
+
+@pytest.mark.parametrize(("lacking", "read"), [({1}, 2), ({0, 1, 2}, 0)])
+def test_an_evaluation_ends_with_the_status_that_asks_for_another_try(
+    lacking: set[int], read: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bundle = toy.write_toy_bundle(tmp_path / "toy.zip")
+    toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 16, 3)
+    asked = f"evaluate --bundle {bundle} --recording {tmp_path / 'R.h5'} --json {tmp_path / 'E.json'}".split()
+    with monkeypatch.context() as patched:
+        storage_without(lacking, patched)
+        assert run(lightpage, asked) == 75
+    figures = json.loads((tmp_path / "E.json").read_text())
+    assert figures["pages"] == read
+    assert {page["page"]: page["cause"] for page in figures["refused_pages"]} == dict.fromkeys(lacking, "storage")
+    assert run(lightpage, asked) == 0
