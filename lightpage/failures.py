@@ -49,6 +49,7 @@ _SHORT = {
     errno.ENFILE: "open files of the machine",
     errno.EAGAIN: "threads or processes (ulimit -u)",
     errno.ENOSPC: "room on the disk",
+    errno.EFBIG: "room in a file (ulimit -f, or another file system)",
     errno.EDQUOT: "room in the quota",
     errno.ENOBUFS: "buffers of the network",
 }

@@ -1,18 +1,78 @@
-"""Files that are there whole or not at all."""
+"""Files that are there whole or not at all, on file systems that may lack modes, locks, links or synchronisation."""
 
 from __future__ import annotations
 
+import codecs
 import errno
+import fcntl
 import json
 import math
 import os
-import tempfile
+import secrets
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, LightpageError
+from lightpage.failures import os_failure
+from lightpage.progress import warn
+
+_NAME_BYTES = 255
+"""Longest name of a file on the file systems of Linux."""
+
+_LACKING = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM, errno.EACCES})
+"""Error numbers of a file system that lacks what was asked of it, e.g. locks or synchronisation."""
+
+_ENCODINGS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
+
+
+def new_file(folder: Path, name: str) -> tuple[int, Path]:
+    """Make an empty file of a new name in `folder`, with the modes that the process's umask leaves.
+
+    Args:
+        folder: where.
+        name: what the new name begins with, behind a dot; it is cut where the whole would be too long.
+
+    Returns:
+        A descriptor that is open for reading and writing, and the path.
+
+    Raises:
+        OSError: the system does not let it.
+    """
+    while True:
+        end = f"-{secrets.token_hex(6)}"
+        begin = os.fsencode(f".{name}")[: _NAME_BYTES - len(end)]
+        path = folder / (os.fsdecode(begin).encode("utf-8", "surrogateescape").decode("utf-8", "ignore") + end)
+        with suppress(FileExistsError):
+            return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), path
+
+
+def lock(descriptor: int, subject: str, *, shared: bool = False) -> bool:
+    """Lock a file until its descriptor is closed; where its file system has no locks, warn and go without.
+
+    Args:
+        descriptor: of the file.
+        subject: what it is, for the warning.
+        shared: whether others may have it locked so too.
+
+    Returns:
+        Whether the file is locked.
+
+    Raises:
+        BlockingIOError: another process has it locked.
+        OSError: storage fails.
+    """
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        if error.errno not in _LACKING:
+            raise
+        warn(f"{subject}: no lock ({error.strerror}); see to it that no other process writes it")
+        return False
+    return True
 
 
 def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject: str = "file") -> None:
@@ -27,20 +87,20 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject
 
     Raises:
         InvalidInputError: the path cannot be written.
+        StorageError, SurroundingsError: storage fails, or has no room.
     """
     path = Path(path)
     try:
-        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
+        descriptor, made = new_file(path.parent, path.name)
         try:
             with os.fdopen(descriptor, "wb") as file:
                 write(file)
-                os.fchmod(file.fileno(), 0o644)
-            move_into_place(name, path)
+            move_into_place(made, path)
         except BaseException:
-            Path(name).unlink(missing_ok=True)
+            made.unlink(missing_ok=True)
             raise
     except OSError as error:
-        raise InvalidInputError(f"{subject} {path}", error, "a path that can be written") from None
+        raise os_failure(f"{subject} {path}", error, "a path that can be written") from None
 
 
 def move_into_place(made: str | Path, path: Path) -> None:
@@ -50,7 +110,7 @@ def move_into_place(made: str | Path, path: Path) -> None:
         OSError: the system does not let it.
     """
     with open(made, "rb") as file:
-        os.fsync(file.fileno())
+        synchronise(file.fileno())
     os.replace(made, path)
     sync_folder(path.parent)
 
@@ -63,7 +123,7 @@ def move_to_new_name(made: str | Path, path: Path) -> None:
         OSError: the system does not let it.
     """
     with open(made, "rb") as file:
-        os.fsync(file.fileno())
+        synchronise(file.fileno())
     try:
         os.link(made, path)  # in one step, unlike a look whether it is there
     except FileExistsError:
@@ -77,6 +137,19 @@ def move_to_new_name(made: str | Path, path: Path) -> None:
     sync_folder(path.parent)
 
 
+def synchronise(descriptor: int) -> None:
+    """Write a file to the disk, where its file system can.
+
+    Raises:
+        OSError: the disk does not take it.
+    """
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _LACKING:
+            raise
+
+
 def sync_folder(folder: Path) -> None:
     """Write the names in `folder` to the disk where its file system can; the files themselves are whole without."""
     with suppress(OSError):
@@ -85,6 +158,37 @@ def sync_folder(folder: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+def read_text(path: str | Path, subject: str, expected: str, failure: type[LightpageError] = InvalidInputError) -> str:
+    """The text of a file in UTF-8, or in UTF-16 with a byte order mark; a mark is left out.
+
+    Args:
+        path: of the file.
+        subject: what it is, for an error.
+        expected: what would be right, for an error.
+        failure: class of the error.
+
+    Raises:
+        LightpageError: of class `failure`, where the file cannot be read or is in another encoding.
+        StorageError, SurroundingsError: storage fails, or a resource is short.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise os_failure(subject, error, expected, failure) from None
+    except ValueError as error:  # a null in the name
+        raise failure(subject, error, expected) from None
+    encoding = next((encoding for mark, encoding in _ENCODINGS if data.startswith(mark)), "utf-8")
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError as error:
+        line, column = data.count(b"\n", 0, error.start) + 1, error.start - data.rfind(b"\n", 0, error.start)
+        if b"\0" in data[:64]:
+            got = "zero bytes, as in UTF-16 without a byte order mark"
+        else:
+            got = f"byte 0x{data[error.start]:02x} in line {line}, column {column}, which is no {encoding.upper()}"
+        raise failure(subject, got, f"{expected}, in UTF-8") from None
 
 
 def replace_text(path: str | Path, text: str, subject: str = "file") -> None:

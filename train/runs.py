@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -23,7 +22,7 @@ from torch import Tensor, nn
 from lightpage.calibration.document import Calibration, parse_calibration
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import InvalidInputError
-from lightpage.files import replace_file, replace_text
+from lightpage.files import lock, replace_file, replace_text
 from train.fitting.fitted import CHECKPOINTS, FITTED
 from train.models.decoder import SymbolDecoder
 from train.models.hyperparameters import Hyperparameters
@@ -111,7 +110,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
     try:
         try:
             if is_first_process():
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(descriptor, f"--out {folder}")
         except BlockingIOError:
             expected = "another --out, or to wait for its end"
             raise InvalidInputError(f"--out {folder}", "a run that another process is working on", expected) from None

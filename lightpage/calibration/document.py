@@ -15,7 +15,7 @@ from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.parameters import NAMES, as_dict, as_vector
 from lightpage.device.profile import Count, Finite, Profile, TomlTable, to_toml, validate
 from lightpage.errors import ProfileError
-from lightpage.files import replace_text
+from lightpage.files import read_text, replace_text
 
 Real = NDArray[np.float64]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -178,8 +178,5 @@ def load_calibration(path: str | Path) -> Calibration:
     Raises:
         ProfileError: unreadable, not TOML, or a missing, unknown or unphysical key; the message names it.
     """
-    try:
-        text = Path(path).read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ProfileError(f"calibration file {path}", error, "a readable TOML file") from None
-    return parse_calibration(text, f"calibration file {path}")
+    subject = f"calibration file {path}"
+    return parse_calibration(read_text(path, subject, "a readable TOML file", ProfileError), subject)

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from lightpage.codec.checksum import crc16
 from lightpage.codec.mapping import level_bits
-from lightpage.errors import InvalidInputError, LightpageError
-from lightpage.files import replace_text
+from lightpage.errors import InvalidInputError
+from lightpage.files import LightpageError, read_text, replace_text
 
 
 class Code(BaseModel):
@@ -101,8 +101,5 @@ def load_code(path: str | Path) -> Code:
     Raises:
         InvalidInputError: the file cannot be read, or see `parse_code`.
     """
-    try:
-        text = Path(path).read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInputError(f"code {path}", error, "a TOML file with the parameters of a code") from None
+    text = read_text(path, f"code {path}", "a TOML file with the parameters of a code")
     return parse_code(text, f"code {path}")

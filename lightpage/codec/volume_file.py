@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -15,7 +14,8 @@ from lightpage.codec.checksum import Checksum
 from lightpage.codec.page_bytes import PageBytes
 from lightpage.codec.volume import Volume, restore_group
 from lightpage.errors import InvalidInputError, LostDataError
-from lightpage.files import move_into_place
+from lightpage.failures import os_failure
+from lightpage.files import lock, move_into_place
 
 MOST_VOLUMES = 16
 """Collected at once: each has a file of its own on the disk."""
@@ -58,13 +58,13 @@ class VolumeFile:
         self.repeated = 0
         """Pages that came again, with the same bytes."""
         try:
-            self._file = os.fdopen(os.open(self._partial, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644), "r+b")
+            self._file = os.fdopen(os.open(self._partial, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+b")
         except OSError as error:
-            raise InvalidInputError(f"file {self._partial}", error, "a file that can be written") from None
+            raise os_failure(f"file {self._partial}", error, "a file that can be written") from None
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(self._file.fileno(), f"file {self._partial}")
             self._file.truncate(0)
-        except OSError:
+        except BlockingIOError:
             self._file.close()
             expected = "another name, or to wait for its end"
             raise InvalidInputError(f"file {self._partial}", "a file that another process writes", expected) from None

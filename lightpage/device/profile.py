@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from lightpage.device.lens_path import SeidelTerms
 from lightpage.device.problems import problems_of
 from lightpage.errors import ProfileError
+from lightpage.files import read_text
 
 Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
 """Of a part of the device, metres."""
@@ -267,11 +268,5 @@ def load_profile(name_or_path: str | Path) -> Profile:
     if str(name_or_path) in SHIPPED:
         text = resources.files("lightpage.device").joinpath("profiles", f"{name_or_path}.toml").read_text("utf-8")
         return parse_profile(text, f"profile {name_or_path}")
-    path = Path(name_or_path)
-    try:
-        text = path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ProfileError(
-            f"profile {name_or_path}", error, f"a readable TOML file or one of {', '.join(SHIPPED)}"
-        ) from None
-    return parse_profile(text, f"profile {path}")
+    subject, expected = f"profile {name_or_path}", f"a readable TOML file or one of {', '.join(SHIPPED)}"
+    return parse_profile(read_text(name_or_path, subject, expected, ProfileError), subject)

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from lightpage.device.profile import TomlTable, validate
 from lightpage.errors import ProfileError
+from lightpage.files import read_text
 
 # Bounds lie far beyond any device that can be built; they keep a slip of the pen from filling the machine's memory.
 Angle = Annotated[float, Field(ge=-5, le=5, allow_inf_nan=False)]
@@ -191,11 +192,8 @@ def load_device(path: str | Path) -> Device:
     Raises:
         ProfileError: unreadable, not TOML, or a key that does not validate.
     """
-    try:
-        text = Path(path).read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ProfileError(f"device file {path}", error, "a readable TOML file") from None
-    return parse_device(text, f"device file {path}")
+    subject = f"device file {path}"
+    return parse_device(read_text(path, subject, "a readable TOML file", ProfileError), subject)
 
 
 def draw_device(rng: np.random.Generator) -> Device:

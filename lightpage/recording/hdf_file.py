@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from io import FileIO
 from pathlib import Path
 from typing import Any
+
+from lightpage.files import lock
 
 
 class HdfFile(FileIO):
@@ -27,7 +28,7 @@ class HdfFile(FileIO):
         super().__init__(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+")
         self._error: OSError | None = None
         try:
-            fcntl.flock(self, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(self.fileno(), f"file {path}")
             if not keep:
                 super().truncate(0)
         except OSError:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -16,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.errors import NoSuchPageError, PageError, RecordingError
-from lightpage.files import move_into_place, move_to_new_name
+from lightpage.files import lock, move_into_place, move_to_new_name
 from lightpage.page.symbols import check_levels, check_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf_file import HdfFile
@@ -143,7 +142,7 @@ def _take(partial: Path, *, remove: bool) -> bool:
     subject = f"recording {partial}"
     try:
         with partial.open("rb+") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(file.fileno(), subject)
             if remove:
                 partial.unlink()
     except FileNotFoundError:

@@ -15,6 +15,7 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 from lightpage.device.problems import Problem, problems_of
 from lightpage.device.profile import Profile, TomlTable, load_profile
 from lightpage.errors import InvalidInputError
+from lightpage.files import read_text
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.pages import Pages
 from runtime.acquisition.camera_source import CameraSource, Exposures, View
@@ -169,10 +170,11 @@ def load_device_table(path: Path) -> DeviceTable:
         InvalidInputError: it cannot be read, or a key does not validate.
     """
     subject = f"camera configuration {path}"
+    expected = "a TOML file that can be read"
     try:
-        data = tomllib.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InvalidInputError(subject, error, "a TOML file that can be read") from None
+        data = tomllib.loads(read_text(path, subject, expected))
+    except tomllib.TOMLDecodeError as error:
+        raise InvalidInputError(subject, error, expected) from None
     try:
         return DeviceTable.model_validate(data)
     except ValidationError as error:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO
 
 from lightpage.errors import BundleError
+from lightpage.failures import os_failure
 from runtime.bundle.manifest import MANIFEST
 
 MAX_FILES = 32
@@ -20,11 +21,15 @@ MAX_FILES = 32
 MAX_BYTES = 1 << 30
 """All files together, unpacked: a full-scale decoder with two float32 reference frames needs about 200 MB."""
 
+_LITTER = frozenset({"__MACOSX", "thumbs.db", "desktop.ini", "lost+found"})
+"""Names that systems put beside files, in lower case but for the first; names that begin with a dot are litter too."""
+
+_MAX_LITTER = 4 * MAX_FILES
+
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
     struct.error,
-    OSError,
     NotImplementedError,
     RuntimeError,
     EOFError,
@@ -46,11 +51,15 @@ def read_files(path: Path, max_bytes: int = MAX_BYTES, content: bytes | None = N
     """
     if content is not None:
         return _read_zip(path, max_bytes, io.BytesIO(content))
-    if path.is_dir():
-        return _read_folder(path, max_bytes)
-    if not path.is_file():
-        raise BundleError(f"bundle {path}", "nothing", "a folder or a zip file")
-    return _read_zip(path, max_bytes, path)
+    expected = "a folder or a zip file"
+    try:
+        if path.is_dir():
+            return _read_folder(path, max_bytes)
+        if path.is_file():
+            return _read_zip(path, max_bytes, path)
+    except OSError as error:
+        raise os_failure(f"bundle {path}", error, expected, BundleError) from None
+    raise BundleError(f"bundle {path}", "nothing", expected)
 
 
 def check_name(name: str, subject: str) -> None:
@@ -63,9 +72,17 @@ def check_name(name: str, subject: str) -> None:
         raise BundleError(f"{subject}: file name", repr(name), "a plain file name without a path")
 
 
+def is_litter(name: str) -> bool:
+    """Whether a name is one that systems put beside files, e.g. `.DS_Store`, or `..data` of a mounted ConfigMap."""
+    hidden = name.startswith(".") and name not in (".", "..") and not any(mark in name for mark in "\\:\0")
+    return hidden or name in _LITTER or name.lower() in _LITTER
+
+
 def _read_folder(path: Path, max_bytes: int) -> dict[str, bytes]:
-    subject = f"bundle {path}"
-    names = sorted(os.listdir(path))
+    subject, real = f"bundle {path}", os.path.realpath(path)
+    there = sorted(os.listdir(path))
+    _check_count(len(there), subject, _MAX_LITTER)
+    names = [name for name in there if not is_litter(name)]
     if MANIFEST not in names:
         raise BundleError(subject, f"a folder without {MANIFEST}", "a bundle: a folder that has one, or a zip file")
     _check_count(len(names), subject)
@@ -74,14 +91,18 @@ def _read_folder(path: Path, max_bytes: int) -> dict[str, bytes]:
     for name in names:
         check_name(name, subject)
         try:
-            # O_NOFOLLOW: a link is refused by the kernel, with no gap between a check and the use.
-            descriptor = os.open(path / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            # Kubernetes mounts files as links into a hidden folder beside them. O_NOFOLLOW: any other link is refused
+            # by the kernel, with no gap between a check and the use.
+            target = os.path.realpath(path / name)
+            inside = os.path.dirname(os.path.dirname(target)) == real and is_litter(Path(target).parent.name)
+            descriptor = os.open(target if inside else path / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
             with os.fdopen(descriptor, "rb") as file:
                 if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                     raise BundleError(f"{subject}: {name}", "no plain file", "a plain file")
                 files[name] = file.read(left + 1)
         except OSError as error:
-            raise BundleError(f"{subject}: {name}", error, "a readable plain file, no link or folder") from None
+            expected = "a readable plain file, no link or folder"
+            raise os_failure(f"{subject}: {name}", error, expected, BundleError) from None
         left -= len(files[name])
         _check_left(left, max_bytes, subject)
     return files
@@ -94,29 +115,43 @@ def _read_zip(path: Path, max_bytes: int, source: Path | IO[bytes]) -> dict[str,
     try:
         with zipfile.ZipFile(source) as archive:
             entries = archive.infolist()
-            _check_count(len(entries), subject)
+            _check_count(len(entries), subject, _MAX_LITTER)
+            # orig_filename is what was written; zipfile cuts filename at a NUL and makes it portable.
+            entries = [entry for entry in entries if not any(map(is_litter, entry.orig_filename.split("/")))]
+            top = _top_folder([entry.orig_filename for entry in entries])
+            entries = [entry for entry in entries if entry.orig_filename != top]
+            _check_count(len(entries), subject, MAX_FILES)
             for entry in entries:
-                # filename is cut at a NUL and made portable by zipfile; orig_filename is what was written.
-                check_name(entry.orig_filename, subject)
-                check_name(entry.filename, subject)
-                if entry.filename in files:
-                    raise BundleError(f"{subject}: {entry.filename}", "the same name twice", "one file of each name")
+                name = entry.filename.removeprefix(top)
+                check_name(entry.orig_filename.removeprefix(top), subject)
+                check_name(name, subject)
+                if name in files:
+                    raise BundleError(f"{subject}: {name}", "the same name twice", "one file of each name")
                 kind = stat.S_IFMT(entry.external_attr >> 16)
                 if kind not in (0, stat.S_IFREG):
                     raise BundleError(f"{subject}: {entry.filename}", "a link or special file", "a plain file")
                 # The size in the header may lie: read at most what is left, whatever it says.
                 with archive.open(entry) as file:
-                    files[entry.filename] = file.read(left + 1)
-                left -= len(files[entry.filename])
+                    files[name] = file.read(left + 1)
+                left -= len(files[name])
                 _check_left(left, max_bytes, subject)
+    except OSError as error:
+        raise os_failure(subject, error, "a sound zip file", BundleError) from None
     except _DAMAGE as error:
         raise BundleError(subject, error, "a sound zip file") from None
     return files
 
 
-def _check_count(count: int, subject: str) -> None:
-    if count > MAX_FILES:
-        raise BundleError(subject, f"{count} files", f"at most {MAX_FILES}")
+def _top_folder(names: list[str]) -> str:
+    """The folder, with a slash, that holds a bundle packed with its folder; empty where there is none."""
+    top = next((name.partition("/")[0] + "/" for name in names if name.endswith(f"/{MANIFEST}")), "")
+    whole = MANIFEST not in names and all(name.startswith(top) for name in names)
+    return top if whole and not top.startswith("/") else ""
+
+
+def _check_count(count: int, subject: str, most: int = MAX_FILES) -> None:
+    if count > most:
+        raise BundleError(subject, f"{count} files", f"at most {most}")
 
 
 def _check_left(left: int, max_bytes: int, subject: str) -> None:

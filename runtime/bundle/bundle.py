@@ -20,7 +20,8 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.codec.code import Code, parse_code
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import BundleError, InvalidInputError, ProfileError
-from lightpage.files import sync_folder
+from lightpage.failures import os_failure
+from lightpage.files import move_to_new_name, sync_folder, synchronise
 from lightpage.metrics.information import decide
 from lightpage.page.symbols import check_levels, pilot_mask, pilot_symbols
 from lightpage.recording.frame_pair import FramePair
@@ -287,14 +288,13 @@ def write_bundle(path: str | Path, manifest: Manifest, files: Mapping[str, bytes
     contents = {MANIFEST: full.to_json(), **dict(sorted(files.items()))}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
+        work = Path(tempfile.mkdtemp(prefix=f".{path.name[:100]}-", dir=path.parent))
     except OSError as error:
-        raise BundleError(subject, error, "a folder that can be written") from None
+        raise os_failure(subject, error, "a folder that can be written", BundleError) from None
     try:
         if path.suffix == ".zip":
             _write_zip(work / "bundle.zip", contents)
-            # link fails where rename would silently replace a file that came in the meantime.
-            os.link(work / "bundle.zip", path)
+            move_to_new_name(work / "bundle.zip", path)
         else:
             folder = work / "bundle"
             folder.mkdir()
@@ -304,30 +304,27 @@ def write_bundle(path: str | Path, manifest: Manifest, files: Mapping[str, bytes
             os.rename(folder, path)
         sync_folder(path.parent)
     except OSError as error:
-        raise BundleError(subject, error, "a new path that can be written") from None
+        raise os_failure(subject, error, "a new path that can be written", BundleError) from None
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return path
 
 
 def _write_zip(path: Path, contents: Mapping[str, bytes]) -> None:
-    with path.open("wb") as file:
-        with zipfile.ZipFile(file, "w") as archive:
-            for name, data in contents.items():
-                entry = zipfile.ZipInfo(name, _EPOCH)
-                packed = name.endswith(".npz")  # compressed by itself
-                entry.compress_type = zipfile.ZIP_STORED if packed else zipfile.ZIP_DEFLATED
-                entry.external_attr = 0o100644 << 16
-                archive.writestr(entry, data, compresslevel=9)
-        file.flush()
-        os.fsync(file.fileno())
+    with path.open("wb") as file, zipfile.ZipFile(file, "w") as archive:
+        for name, data in contents.items():
+            entry = zipfile.ZipInfo(name, _EPOCH)
+            packed = name.endswith(".npz")  # compressed by itself
+            entry.compress_type = zipfile.ZIP_STORED if packed else zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o100644 << 16
+            archive.writestr(entry, data, compresslevel=9)
 
 
 def _write_file(path: Path, data: bytes) -> None:
     with path.open("wb") as file:
         file.write(data)
         file.flush()
-        os.fsync(file.fileno())
+        synchronise(file.fileno())
 
 
 def _signed(path: Path, key: BundleKey, signature: bytes, max_bytes: int) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,8 +13,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import InvalidInputError
-from lightpage.files import move_into_place
+from lightpage.failures import os_failure
+from lightpage.files import move_into_place, new_file
 
 FORMAT = "lightpage-decoded"
 VERSION = 1
@@ -58,16 +57,15 @@ class DecodedWriter:
     def __init__(self, path: str | Path, levels: int) -> None:
         self.path = Path(path)
         try:
-            descriptor, name = tempfile.mkstemp(prefix=f".{self.path.name}-", dir=self.path.parent)
+            descriptor, self._partial = new_file(self.path.parent, self.path.name)
             os.close(descriptor)
-            self._partial = Path(name)
             try:
-                self._file = h5py.File(name, "w")
+                self._file = h5py.File(str(self._partial), "w", locking=False)  # nobody else knows its name
             except BaseException:
                 self._partial.unlink()
                 raise
         except OSError as error:
-            raise InvalidInputError(f"output {self.path}", error, "a path that can be written") from None
+            raise os_failure(f"output {self.path}", error, "a path that can be written") from None
         self._file.attrs.update({"format": FORMAT, "version": VERSION, "levels": levels})
         self._versions: list[str] = []
         self._pages: list[int] = []
@@ -98,7 +96,6 @@ class DecodedWriter:
                     self._file["model_versions"] = np.array(self._versions, dtype=h5py.string_dtype())
                     self._file["pages"] = np.array(self._pages, np.int64)
                     self._file.close()
-                    os.chmod(self._partial, 0o644)
                     move_into_place(self._partial, self.path)
         finally:
             with suppress(OSError):
@@ -110,7 +107,7 @@ class DecodedWriter:
         try:
             yield
         except OSError as error:
-            raise InvalidInputError(f"output {self.path}", error, "a path with room for it") from None
+            raise os_failure(f"output {self.path}", error, "a path with room for it") from None
 
     def _dataset(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> h5py.Dataset:
         if name not in self._file:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lightpage.errors import InvalidInputError, PageError
+from lightpage.files import read_text
 from lightpage.page.symbols import check_levels
 
 GREYS = 256
@@ -71,10 +72,7 @@ class LookupTable:
         """
         check_levels(levels)
         subject = f"lookup table {path}"
-        try:
-            text = Path(path).read_text("utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise InvalidInputError(subject, error, "a readable text file") from None
+        text = read_text(path, subject, "a readable text file")
         lines = [
             (number, words)
             for number, line in enumerate(text.splitlines(), 1)

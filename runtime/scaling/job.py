@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 from lightpage.codec.code import Code
 from lightpage.errors import BundleError, InvalidInputError, LightpageError, RecordingError
 from lightpage.failures import os_failure
-from lightpage.files import replace_text
+from lightpage.files import read_text, replace_text
 from lightpage.recording.reader import Recording
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import MANIFEST
@@ -379,10 +379,11 @@ def of_fleet(choices: Choices, path: Path, before: Job | None) -> Job:
         InvalidInputError: the file cannot be read, or two devices have one name.
     """
     subject = f"fleet {path}"
+    expected = "[[device]] tables with name, bundle and recordings"
     try:
-        fleet = _Fleet.model_validate(tomllib.loads(path.read_text("utf-8")))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, ValidationError) as error:
-        raise InvalidInputError(subject, error, "[[device]] tables with name, bundle and recordings") from None
+        fleet = _Fleet.model_validate(tomllib.loads(read_text(path, subject, expected)))
+    except (tomllib.TOMLDecodeError, ValidationError) as error:
+        raise InvalidInputError(subject, error, expected) from None
     names = [device.name for device in fleet.device]
     if not names or len(set(names)) < len(names):
         raise InvalidInputError(subject, f"devices {', '.join(names) or 'none'}", "devices of different names")

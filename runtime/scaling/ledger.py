@@ -88,7 +88,7 @@ class Ledger:
     def _locked(self, name: str, kind: int) -> int:
         """A descriptor that holds a lock until it is closed."""
         try:
-            lock = os.open(self.folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            lock = os.open(self.folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise self._not_writable(error) from None
         try:

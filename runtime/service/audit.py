@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from lightpage.files import sync_folder
+from lightpage.files import sync_folder, synchronise
 from runtime.service.caller import NOBODY, Actor
 
 AUDIT_BYTES = 10 << 20
@@ -97,7 +97,7 @@ class AuditLog:
             try:
                 if (written := file.write(line)) != len(line):
                     raise OSError(None, f"{written} of {len(line)} bytes written")
-                os.fsync(file.fileno())
+                synchronise(file.fileno())
             except OSError:
                 with suppress(OSError):
                     file.truncate(size)

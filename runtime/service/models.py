@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import tempfile
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from lightpage.errors import BundleError, InvalidInputError, LimitError
-from lightpage.files import sync_folder
+from lightpage.files import new_file, sync_folder, synchronise
 from runtime.bundle.bundle import read_manifest
 from runtime.bundle.manifest import Manifest, check_version
 from runtime.bundle.signature_file import MOST_BYTES, signature_path
@@ -425,7 +424,7 @@ def _write_beside(path: Path, data: bytes) -> None:
     with path.open("wb") as file:
         file.write(data)
         file.flush()
-        os.fsync(file.fileno())
+        synchronise(file.fileno())
 
 
 class Upload:
@@ -459,9 +458,8 @@ class Upload:
         """
         with self._at_work():
             self._models.check_store(self._size)
-            descriptor, name = tempfile.mkstemp(prefix=UPLOAD, dir=self._store.folder)
-            self._path, self._file = Path(name), os.fdopen(descriptor, "wb")
-            os.fchmod(descriptor, 0o644)
+            descriptor, self._path = new_file(self._store.folder, UPLOAD.strip(".-"))
+            self._file = os.fdopen(descriptor, "wb")
 
     def add(self, data: bytes) -> None:
         """Take the next piece.
@@ -495,7 +493,7 @@ class Upload:
                 found = self._hash.hexdigest()
                 raise BundleError("uploaded model: SHA-256", found, f"{self._digest.hex()}, as announced")
             self._file.flush()
-            os.fsync(self._file.fileno())
+            synchronise(self._file.fileno())
             try:
                 entry = self._models.take_in(self._path, self._check_here, self._signature)
             except Exception as error:

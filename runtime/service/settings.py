@@ -27,6 +27,7 @@ from pydantic_core import ErrorDetails
 from lightpage.device.problems import WANTED, expected_of, problem_of
 from lightpage.device.profile import TomlTable, toml_value
 from lightpage.errors import InvalidInputError
+from lightpage.files import read_text
 from runtime.bundle.shipped import DEFAULT
 from runtime.execution.providers import CPU, Provider
 from runtime.recalibration.known_pages import MIN_PAGES
@@ -500,10 +501,11 @@ def read_settings(
 
 
 def _parsed(file: Path) -> dict[str, Any]:
+    subject, expected = f"settings {file}", "a TOML file that can be read"
     try:
-        return tomllib.loads(file.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InvalidInputError(f"settings {file}", error, "a TOML file that can be read") from None
+        return tomllib.loads(read_text(file, subject, expected))
+    except tomllib.TOMLDecodeError as error:
+        raise InvalidInputError(subject, error, expected) from None
 
 
 def _key_of(variable: str) -> Key | None:

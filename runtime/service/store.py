@@ -8,7 +8,6 @@ import json
 import logging
 import os
 import shutil
-import tempfile
 import threading
 import time
 from collections.abc import Collection, Iterator, Mapping
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from lightpage.errors import BundleError, InvalidInputError
-from lightpage.files import replace_text
+from lightpage.files import new_file, replace_text, synchronise
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import sha256
 from runtime.bundle.signature_file import signature_path
@@ -363,7 +362,7 @@ class ModelStore:
         """The lock file; None, with a warning, where a store cannot be written and has none."""
         path = self.folder / LOCK
         try:
-            return os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
             with suppress(OSError):
                 return os.open(path, os.O_RDONLY)
@@ -379,12 +378,12 @@ class ModelStore:
 
     def _probe(self, needed_bytes: int) -> None:
         self._check_folder()
-        descriptor, name = tempfile.mkstemp(prefix=_PROBE, dir=self.folder)
+        descriptor, name = new_file(self.folder, _PROBE.strip(".-"))
         try:
             with os.fdopen(descriptor, "wb") as file:
                 file.write(bytes(4096))
                 file.flush()
-                os.fsync(file.fileno())
+                synchronise(file.fileno())
         finally:
             os.unlink(name)
         if (free := shutil.disk_usage(self.folder).free) < needed_bytes:

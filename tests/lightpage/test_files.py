@@ -1,5 +1,7 @@
 """Files that are whole, and options that name files to write."""
 
+import errno
+import fcntl
 import os
 import stat
 from pathlib import Path
@@ -9,8 +11,8 @@ import pytest
 from click.testing import CliRunner
 
 from lightpage.cli.paths import OutputFile
-from lightpage.errors import InvalidInputError
-from lightpage.files import move_to_new_name, replace_file, replace_text
+from lightpage.errors import InvalidInputError, StorageError, SurroundingsError
+from lightpage.files import lock, move_to_new_name, new_file, read_text, replace_file, replace_text
 
 
 @click.command()
@@ -65,10 +67,10 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: p
         raise OSError(28, "No space left on device")
 
     (tmp_path / "F").write_text("earlier")
-    with pytest.raises(InvalidInputError, match="F: got No space left"):
+    with pytest.raises(SurroundingsError, match="F: got No space left"):
         replace_file(tmp_path / "F", full)
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(InvalidInputError, match="F: got No space left"):
+    with pytest.raises(SurroundingsError, match="F: got No space left"):
         replace_text(tmp_path / "F", "text")
     assert [path.name for path in tmp_path.iterdir()] == ["F"]
     assert (tmp_path / "F").read_text() == "earlier"
@@ -103,3 +105,76 @@ def test_a_file_that_is_there_keeps_its_name(tmp_path: Path, monkeypatch: pytest
             with pytest.raises(FileExistsError):
                 move_to_new_name(made, final)
     assert (made.read_text(), final.read_text()) == ("second", "first")
+
+
+@pytest.mark.parametrize("mask", [0o077, 0o027, 0o002, 0o022])
+def test_files_have_the_modes_that_the_umask_leaves(mask: int, tmp_path: Path) -> None:
+    before = os.umask(mask)
+    try:
+        replace_text(tmp_path / "F", "text")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "F").stat().st_mode) == 0o666 & ~mask
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS, errno.EPERM])
+def test_what_a_file_system_lacks_is_gone_without(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def lacking(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    for name in ("fsync", "link", "chmod", "fchmod"):
+        monkeypatch.setattr(os, name, lacking)
+    monkeypatch.setattr(fcntl, "flock", lacking)
+    replace_text(tmp_path / "F", "text")
+    move_to_new_name(tmp_path / "F", tmp_path / "G")
+    assert (tmp_path / "G").read_text() == "text"
+    descriptor, _ = new_file(tmp_path, "H")
+    assert not lock(descriptor, "file H")
+    os.close(descriptor)
+    assert "file H: no lock" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [
+        (errno.EIO, StorageError),
+        (errno.ESTALE, StorageError),
+        (errno.EDQUOT, SurroundingsError),
+        (errno.EROFS, InvalidInputError),
+    ],
+)
+def test_what_is_needed_is_named(
+    number: int, kind: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", failing)
+    with pytest.raises(kind, match="F"):
+        replace_text(tmp_path / "F", "text")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_longest_name_can_be_written(tmp_path: Path) -> None:
+    for name in ("n" * 255, "ä" * 127):
+        replace_text(tmp_path / name, "text")
+        assert [path.name for path in tmp_path.iterdir()] == [name]
+        (tmp_path / name).unlink()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_text_is_read_in_the_encodings_that_editors_write(encoding: str, tmp_path: Path) -> None:
+    (tmp_path / "F").write_bytes('name = "ä"\r\n'.encode(encoding))
+    assert read_text(tmp_path / "F", "file F", "text") == 'name = "ä"\r\n'
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [(b"one\nb\xe4d", "byte 0xe4 in line 2, column 2"), ("no mark".encode("utf-16-le") + b"\xff\xff", "UTF-16")],
+)
+def test_another_encoding_is_named(content: bytes, told: str, tmp_path: Path) -> None:
+    (tmp_path / "F").write_bytes(content)
+    with pytest.raises(InvalidInputError, match=told):
+        read_text(tmp_path / "F", "file F", "text")

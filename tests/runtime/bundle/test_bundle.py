@@ -117,9 +117,41 @@ def test_a_manifest_with_a_wrong_key_says_which() -> None:
         parse_manifest(manifest.to_json(), "manifest")
 
 
-@pytest.mark.parametrize(
-    "name", ["../evil.onnx", "/etc/evil", "a/b", "..\\evil", "C:evil", "..", ".hidden", "nul\0byte", "sub/"]
-)
+LITTER = [".DS_Store", "__MACOSX/._manifest.json", "._decoder.onnx", "Thumbs.db", "desktop.ini", ".hidden"]
+
+
+@pytest.mark.parametrize("packed_with_its_folder", [False, True])
+def test_what_systems_put_beside_files_is_passed_over(
+    packed_with_its_folder: bool, toy_zip: Path, tmp_path: Path
+) -> None:
+    path = rewrite_zip(toy_zip, tmp_path / "littered.zip", dict.fromkeys(LITTER, b"x"))
+    if packed_with_its_folder:
+        with zipfile.ZipFile(path) as archive:
+            contents = {f"my bundle/{name}": archive.read(name) for name in archive.namelist()}
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.mkdir("my bundle")
+            for name, data in contents.items():
+                archive.writestr(name, data)
+    assert Bundle.open(path).manifest == Bundle.open(toy_zip).manifest
+
+
+def test_a_bundle_that_kubernetes_mounts_is_read_and_no_other_link(toy_zip: Path, tmp_path: Path) -> None:
+    folder, data = tmp_path / "mounted", tmp_path / "mounted" / "..2026_11_26"
+    data.mkdir(parents=True)
+    with zipfile.ZipFile(toy_zip) as archive:
+        archive.extractall(data)
+    (folder / "..data").symlink_to(data.name)
+    for file in data.iterdir():
+        (folder / file.name).symlink_to(f"..data/{file.name}")
+    assert Bundle.open(folder).version == Bundle.open(toy_zip).version
+    (tmp_path / "outside").write_bytes((data / "golden.npz").read_bytes())
+    (folder / "golden.npz").unlink()
+    (folder / "golden.npz").symlink_to("../outside")
+    with pytest.raises(BundleError, match=r"golden\.npz"):
+        Bundle.open(folder)
+
+
+@pytest.mark.parametrize("name", ["../evil.onnx", "/etc/evil", "a/b", "..\\evil", "C:evil", "..", "nul\0byte", "sub/"])
 def test_a_zip_entry_that_is_a_path_is_refused_and_nothing_is_written(name: str, toy_zip: Path, tmp_path: Path) -> None:
     inside = tmp_path / "inside"
     inside.mkdir()

@@ -78,7 +78,7 @@ def test_what_the_store_cannot_take_is_tried_again(
         raise OSError(errno.EROFS, "Read-only file system")
 
     with monkeypatch.context() as patch:
-        patch.setattr("tempfile.mkstemp", read_only)
+        patch.setattr("runtime.service.store.new_file", read_only)
         incoming.look()
         incoming.look()
     assert caplog.text.count("new.zip is left for later") == 1

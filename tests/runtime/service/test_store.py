@@ -9,7 +9,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections import namedtuple
@@ -18,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from lightpage.errors import BundleError
+from lightpage.files import new_file
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.errors import StoreError
@@ -300,7 +300,8 @@ def test_a_store_that_cannot_be_written_is_noticed_and_nothing_changes(
 ) -> None:
     plane = a_worn_plane(decoder, store)
     with monkeypatch.context() as patch:
-        patch.setattr("tempfile.mkstemp", _read_only)
+        for module in ("runtime.service.store", "lightpage.files"):
+            patch.setattr(f"{module}.new_file", _read_only)
         for change in (plane.rollback, lambda: plane.models.pin("toy-1", True), lambda: plane.models.activate("toy-1")):
             with pytest.raises(StoreError, match="Read-only"):
                 change()
@@ -339,7 +340,7 @@ def test_the_store_is_tried_now_and_then_and_not_whenever_somebody_asks(
     now = time.monotonic()
     monkeypatch.setattr(time, "monotonic", lambda: now)
     assert plane.store_trouble() == ""
-    monkeypatch.setattr("tempfile.mkstemp", _read_only)
+    monkeypatch.setattr("runtime.service.store.new_file", _read_only)
     assert plane.store_trouble() == ""
     now += 29
     assert plane.store_trouble() == ""
@@ -352,14 +353,14 @@ def test_the_store_is_tried_now_and_then_and_not_whenever_somebody_asks(
 def test_a_disk_that_hangs_is_shown_and_holds_no_scrape_up(
     decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plane, answers, made = a_plane(decoder, store), threading.Event(), tempfile.mkstemp
+    plane, answers, made = a_plane(decoder, store), threading.Event(), new_file
 
-    def hung(prefix: str, dir: Path) -> tuple[int, str]:
+    def hung(folder: Path, name: str) -> tuple[int, Path]:
         answers.wait(10)
-        return made(prefix=prefix, dir=dir)
+        return made(folder, name)
 
     with monkeypatch.context() as patch:
-        patch.setattr("tempfile.mkstemp", hung)
+        patch.setattr("runtime.service.store.new_file", hung)
         patch.setattr(metrics_module, "_LOOK_S", 0.01)
         patch.setattr(plane.store_health, "_longest_s", 0.0)
         for _ in range(3):
