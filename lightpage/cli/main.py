@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -13,16 +14,31 @@ from types import FrameType
 from typing import Any, NoReturn, Self
 
 import click
+from click.shell_completion import shell_complete
 
+from lightpage.cli.groups import help_at
 from lightpage.cli.paths import check_outputs
 from lightpage.cli.progress_bar import Bars
-from lightpage.errors import LightpageError, LostDataError, MissingResultsError, StorageError, TakenError
+from lightpage.cli.stand_ins import stand_ins
+from lightpage.cli.streams import LastingStream, take_streams
+from lightpage.errors import (
+    InvalidInputError,
+    LightpageError,
+    LostDataError,
+    MissingResultsError,
+    StorageError,
+    TakenError,
+)
+from lightpage.failures import understood
 from lightpage.progress import reporting
 
 GROUP = "lightpage.commands"
 
 RESUME_KEY = "lightpage.resume"
 """A command that can resume says how under this key of `click.get_current_context().meta`."""
+
+HELP_KEY = "lightpage.help"
+"""Whether help is asked for, in `meta` too."""
 
 RESUME = "run the same command again; nothing half-written was left under a final name"
 
@@ -31,8 +47,11 @@ EXIT_LOST = 3
 """Data are lost."""
 EXIT_AGAIN = 75
 """The same command may go well later: EX_TEMPFAIL of sysexits.h."""
-EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
-"""128 + SIGINT, 128 + SIGTERM, as shells have it."""
+EXIT_INTERRUPTED = 128 + signal.SIGINT
+"""As shells have it; likewise for other signals."""
+
+COMPLETE = "_LIGHTPAGE_COMPLETE"
+"""Variable by which a shell asks what may follow: `eval "$(_LIGHTPAGE_COMPLETE=bash_source lightpage)"`."""
 
 RUNTIME = "onnxruntime"
 """What computes pages; either of two extras brings it."""
@@ -41,6 +60,7 @@ EXTRAS = {
     "camera": frozenset({"harvesters", "genicam"}),
     "cluster": frozenset({"ray"}),
 }
+EXTRA_MODULES = frozenset({RUNTIME}).union(*EXTRAS.values())
 
 SUMMARIES = {
     "bench": "Measure speed: inference alone, whole decode, through gRPC.",
@@ -70,6 +90,13 @@ SUMMARIES = {
 """What the overview says of a command, so that it need not be imported to be listed."""
 
 
+THREADS = {"OPENBLAS_NUM_THREADS": "1", "GOMP_SPINCOUNT": "1000"}
+"""Variables with which libraries of linear algebra do not spin on cores that other work needs. A second thread brings
+their products a tenth at full size and nothing on the bench; beside other work it costs several times their time."""
+_OWN_CHOICE = {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}
+"""Variables by which a user chooses threads; then all stays as it was chosen."""
+
+
 class LazyGroup(click.Group):
     """A group whose commands are entry points, imported when called and not before."""
 
@@ -93,7 +120,10 @@ class LazyGroup(click.Group):
         try:
             command = self.points[cmd_name].load()
         except ModuleNotFoundError as error:
-            raise missing(f"lightpage {cmd_name}", error) from error
+            if not ctx.meta.get(HELP_KEY):
+                raise missing(f"lightpage {cmd_name}", error) from error
+            with stand_ins(EXTRA_MODULES):
+                command = self.points[cmd_name].load()
         if not isinstance(command, click.Command):
             raise LightpageError(f"command {cmd_name}", type(command).__name__, "a click command")
         return _checked(command)
@@ -144,9 +174,9 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
     """Run a command line and return its exit status.
 
     That is 0, 2 for a foreseen error, 3 where data are lost, 75 where the same command may go well later, 130 after
-    Ctrl-C, 143 after SIGTERM.
+    Ctrl-C, 143 after SIGTERM, 129 after SIGHUP.
 
-    SIGTERM ends a command as Ctrl-C does, so that it clears up behind itself.
+    SIGTERM and SIGHUP end a command as Ctrl-C does, so that it clears up behind itself.
 
     An error that nobody foresaw is raised: its traceback is what helps to mend it.
 
@@ -161,6 +191,7 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
         arguments = list(sys.argv[1:] if arguments is None else arguments)
         with termination, reporting(Bars()), command.make_context(name, arguments) as ctx:
             meta = ctx.meta
+            meta[HELP_KEY] = help_at(arguments) is not None
             command.invoke(ctx)
     except click.exceptions.Exit as end:
         return end.exit_code
@@ -170,34 +201,44 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
     except LightpageError as error:
         return _fail(error)
     except ModuleNotFoundError as error:
-        if not any((error.name or "").partition(".")[0] in modules for modules in ({RUNTIME}, *EXTRAS.values())):
+        if (error.name or "").partition(".")[0] not in EXTRA_MODULES:
             raise
         return _fail(missing("lightpage", error))
-    except MemoryError as error:
-        return _fail(LightpageError("memory", str(error) or "too little", "a machine or a device that fits the other"))
     except (KeyboardInterrupt, click.Abort):
         click.echo(f"\nlightpage: interrupted; {meta.get(RESUME_KEY, RESUME)}", err=True)
-        return EXIT_TERMINATED if termination.came else EXIT_INTERRUPTED
+        return EXIT_INTERRUPTED if termination.came is None else 128 + termination.came
+    except Exception as error:
+        if (failure := understood("lightpage", error)) is None:
+            raise
+        return _fail(failure)
     return 0
 
 
 class _Termination:
-    """While its block runs in the main thread, the first SIGTERM interrupts it; a second ends the process as usual."""
+    """While its block runs in the main thread, the first SIGTERM or SIGHUP interrupts it; a second ends the process.
 
-    came = False
+    A signal that the process was told to ignore, as `nohup` tells it of SIGHUP, stays ignored.
+
+    Attributes:
+        came: number of the signal that came; None before.
+    """
+
+    came: int | None = None
 
     def __enter__(self) -> Self:
-        self._before: Any = None
+        self._before: dict[int, Any] = {}
         if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGTERM, self._interrupt)
+            for number in (signal.SIGTERM, signal.SIGHUP):
+                if signal.getsignal(number) != signal.SIG_IGN:
+                    self._before[number] = signal.signal(number, self._interrupt)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGTERM, self._before)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _interrupt(self, number: int, _: FrameType | None) -> NoReturn:
-        self.came = True
+        self.came = number
         signal.signal(number, signal.SIG_DFL)
         raise KeyboardInterrupt
 
@@ -211,7 +252,24 @@ def _fail(error: LightpageError) -> int:
 
 def main() -> NoReturn:
     """The console script."""
-    sys.exit(run(lightpage))
+    streams = take_streams()
+    if os.environ.keys().isdisjoint(_OWN_CHOICE):
+        os.environ.update(THREADS)
+    if instruction := os.environ.get(COMPLETE):
+        sys.exit(_complete(instruction))
+    status = run(lightpage)
+    for stream in streams:
+        stream.flush()
+    if status == 0 and (told := sys.stdout.failure if isinstance(sys.stdout, LastingStream) else None):
+        status = _fail(InvalidInputError("stdout", told, "a stream that takes the result"))
+    sys.exit(status)
+
+
+def _complete(instruction: str) -> int:
+    try:
+        return shell_complete(lightpage, {}, "lightpage", COMPLETE, instruction)
+    except LightpageError:  # what a command needs is not installed
+        return EXIT_ERROR
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from lightpage.cli.groups import Group
 from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import OutputFile, OutputFolder, check_outputs
@@ -42,7 +43,7 @@ LOCAL, RAY = "local", "ray"
 METRICS_SUFFIX = ".prom"
 
 
-@click.group()
+@click.group(cls=Group)
 def bulk() -> None:
     """Read archives of recordings, or recalibrate a fleet, with many workers.
 

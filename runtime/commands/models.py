@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from lightpage.cli.groups import Group
 from runtime.client.answers import ModelInfo
 from runtime.client.client import LightpageClient
 from runtime.commands.connection import TARGET, with_tls
@@ -15,7 +16,7 @@ _EXPECT = click.option("--expect", metavar="VERSION", default="", help="Only if 
 _VERSION = click.argument("version")
 
 
-@click.group(invoke_without_command=True)
+@click.group(cls=Group, invoke_without_command=True)
 @TARGET
 @with_tls
 @click.pass_context

@@ -127,7 +127,7 @@ def test_sigterm_interrupts_too_and_is_told_apart(capsys: pytest.CaptureFixture[
 
 def test_too_little_memory_is_an_error_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["hungry"], group_of(hungry=f"{HERE}:hungry")) == 2
-    assert "memory: got Unable to allocate 7 TiB" in capsys.readouterr().err
+    assert "got Unable to allocate 7 TiB, wanted more memory" in capsys.readouterr().err
 
 
 def test_nothing_that_is_read_is_written_and_nothing_is_written_twice(
