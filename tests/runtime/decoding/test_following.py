@@ -10,10 +10,11 @@ import pytest
 import runtime
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
+from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.simulator.simulator import Simulator
 from runtime.errors import UnconfirmedPageError
-from tests.runtime import coded, toy
+from tests.runtime import toy
 
 
 @pytest.mark.parametrize("tracking", [True, False])
@@ -22,8 +23,9 @@ def test_a_page_that_its_pilots_contradict_is_an_error(tracking: bool, toy_zip: 
     symbols = toy.symbols_of(16, 1)[0]
     page = decoder.decode(toy.ToyDevice().page(symbols, 16), 16)
     assert (page.symbols == symbols).mean() > 0.99
+    other = np.random.default_rng(3).permutation(decoder.pilots(16).phases)
     with pytest.raises(UnconfirmedPageError):
-        decoder.decode(coded.dark(toy.ToyDevice().page(symbols, 16)), 16)
+        decoder.decode(toy.ToyDevice().page(symbols, 16), 16, pilots=Pilots(decoder.bundle.pilot_mask, other))
 
 
 def test_an_image_that_has_moved_is_read_as_well_as_before_unless_it_is_not_followed() -> None:
