@@ -200,8 +200,8 @@ def export_run(
                 try:
                     best, _ = choose_code(proven, pages, tracker_for(proven))
                     manifest = manifest.model_copy(update={"code": best.code.to_toml()})
-                except InvalidInputError as error:
-                    warn(f"no code for user bytes: {error}")
+                except InvalidInputError as lacking:
+                    warn(f"no code for user bytes: {lacking}")
     finally:
         _remove(partial)
     write_bundle(out, manifest, files)

@@ -123,9 +123,9 @@ def os_failure(
         A `StorageError`, a `SurroundingsError` that names what is short, or one of class `otherwise`.
     """
     number = error_number(error)
-    if number in _STORAGE:
+    if number is not None and number in _STORAGE:
         return StorageError(subject, os.strerror(number), expected)
-    if number in _SHORT:
+    if number is not None and number in _SHORT:
         return SurroundingsError(subject, os.strerror(number), f"more {_SHORT[number]}")
     return otherwise(subject, error if number is None else OSError(number, os.strerror(number)), expected)
 

@@ -55,11 +55,14 @@ def drawn(code: LdpcCode, count: int, rng: np.random.Generator) -> tuple[NDArray
     sent = code.encode(bits)
     low, high = 0.1, 3.0
     noise = rng.standard_normal(sent.shape)
+
+    def seen(sigma: float) -> NDArray[np.float64]:
+        return np.asarray(2 * (1 - 2.0 * sent + sigma * noise) / sigma**2)
+
     for _ in range(20):
         sigma = (low + high) / 2
-        llrs = 2 * (1 - 2.0 * sent + sigma * noise) / sigma**2
-        low, high = (sigma, high) if bit_information(llrs, sent) > code.rate + _GAP else (low, sigma)
-    return bits, llrs.astype(np.float32)
+        low, high = (sigma, high) if bit_information(seen(sigma), sent) > code.rate + _GAP else (low, sigma)
+    return bits, seen((low + high) / 2).astype(np.float32)
 
 
 def by_library(code: LdpcCode) -> Callable[[Blocks], NDArray[np.uint8]]:
@@ -157,6 +160,7 @@ def time_page(profile: Profile, code: Code, rounds: int) -> dict[str, float]:
     )[0]
     best, iterations = float("inf"), 0.0
     step = 2 * np.pi / code.levels
+    phase, kappa = np.zeros(symbols.shape), np.zeros(symbols.shape)
     for share in np.linspace(0.45, 0.2, 26):
         noise = share * step
         phase = symbol_phases(symbols, code.levels) + noise * rng.standard_normal(symbols.shape)

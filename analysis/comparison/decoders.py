@@ -173,6 +173,7 @@ def main(
                     own = sizes[:1] if name == FAST else sizes  # whose size is fixed
                     runs += [partial(bench.symbol_method, name, size, common) for size in own]
             outcomes: list[Outcome] = []
+            data_set: dict[str, Any] = {}
             for run in runs:
                 outcomes = compared([*outcomes, run()])
                 click.echo(f"{HEADER}\n{outcomes[-1].line()}", err=True)

@@ -82,10 +82,16 @@ def _maps(part: Any, outcomes: list[dict[str, Any]], out: Path) -> None:
     for axis in axes.flat:
         axis.set_axis_off()
     for axis, outcome, rates in zip(axes.flat, outcomes, maps, strict=False):
-        shown = axis.imshow(rates, vmin=0, vmax=top, cmap="viridis")
+        axis.imshow(rates, vmin=0, vmax=top, cmap="viridis")
         axis.set_title(f"{_name(outcome)}: {outcome['air']:.2f}", fontsize=9)
     part.colorbar(
-        shown, ax=axes, location="bottom", shrink=0.6, aspect=40, extend="both", label="AIR of each symbol, bit"
+        axes.flat[0].images[0],
+        ax=axes,
+        location="bottom",
+        shrink=0.6,
+        aspect=40,
+        extend="both",
+        label="AIR of each symbol, bit",
     )
 
 

@@ -126,7 +126,7 @@ def main(changes: int, seed: int, json_path: Path | None) -> None:
                 thread.start()
             try:
                 for _ in track(range(changes), "changes", total=changes):
-                    version = None
+                    version, asked = None, 0.0
                     for _ in until(time.monotonic() + 60):
                         asked = time.monotonic()
                         if (version := change(client, list(expected), chance)) is not None:

@@ -158,6 +158,7 @@ def scenario(service: RunningService, decoder: Decoder, seconds: float, folder: 
             levels=decoder.page_codec.code.levels,
         )
         try:
+            last = started
             for job in client.watch_job(started.id):
                 last = job
             click.echo(f"recalibration: {last.state}")

@@ -134,7 +134,8 @@ def measured(
             answers[name].append((page.concentration * np.exp(1j * page.phase))[data])
             rate = achievable_rate(page.phase[data], page.concentration[data], symbols[data], levels)
             rates[name].append(float(rate.mean()))
-    feeds = dict(zip(FRAME_INPUTS, (pair.in_phase, pair.quadrature), strict=True))
+    last = recording.frames(recording.pages - 1)
+    feeds = dict(zip(FRAME_INPUTS, (last.in_phase, last.quadrature), strict=True))
     taken: dict[str, list[float]] = {name: [] for name in models}
     for _ in track(range(repeats), "time", unit="round"):
         for name in taken:  # taking turns: a slow moment meets all of them

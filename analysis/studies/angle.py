@@ -69,7 +69,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
             angles.plot(*result["angles"].T, ".-", markersize=3, color=f"C{number}", label=name)
         rates.plot(*result["training_curve"].T, color=f"C{number}", linewidth=0.8, alpha=0.6)
         rates.plot(*result["validation_curve"].T, "o-", color=f"C{number}", markersize=3, label=name)
-        shown = axis.imshow(result["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
+        axis.imshow(result["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
         axis.set_title(f"{name}: own-MI {result['own_mi']:.2f}, AIR {result['air']:.2f} bit/symbol", fontsize="medium")
         axis.set_axis_off()
     angles.axhline(Device().geometry.pipe_angle_deg, color="k", linestyle="--", label="true")
@@ -79,7 +79,7 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     for axis in (angles, rates):
         axis.set_xlabel("step")
         axis.legend()
-    figure.colorbar(shown, ax=maps, label="own-MI, bit/symbol", shrink=0.8)
+    figure.colorbar(maps[0].images[0], ax=maps, label="own-MI, bit/symbol", shrink=0.8)
     return figure
 
 

@@ -144,13 +144,13 @@ def _crosshairs(settings: Settings, progress: Progress) -> Result:
     scale = profile.slm.pitch_m / profile.camera.pitch_m
     rng = np.random.default_rng([settings.seed, 1])
     found = []
+    first = None
     for number, shift in enumerate(truth):
         progress("crosshairs", number / frames)
         view = optics.view(device.in_phase_camera, (float(shift[0]), float(shift[1])))
         counts = expose(resample(power, *optics.camera_axes_m, *view), per_unit, device.sensor, rng)
         found.append(locate(counts, scale))
-        if number == 0:
-            first = counts
+        first = counts if first is None else first
     drift = np.array(found) - found[0]
     day = {"hours": hours, "true": truth, "measured": drift.mean(axis=1), "frame": first, "marks": found[0]}
     return day | {"distance": np.linalg.norm(drift, axis=2).mean(axis=1)}

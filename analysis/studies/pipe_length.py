@@ -68,10 +68,12 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     top = max(float(np.nanmax(result["own_mi_map"])) for result in results)
     for row, localizer in zip(axes, LOCALIZERS, strict=True):
         for axis, length in zip(row, shown_lengths, strict=True):
-            shown = axis.imshow(by_case[localizer, length]["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
+            axis.imshow(by_case[localizer, length]["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
             axis.set_title(f"{localizer}, {length:g} mm")
             axis.set_axis_off()
-    figure.colorbar(shown, ax=[axis for row in axes for axis in row], label="own-MI, bit/symbol", shrink=0.8)
+    figure.colorbar(
+        axes[0][0].images[0], ax=[axis for row in axes for axis in row], label="own-MI, bit/symbol", shrink=0.8
+    )
     axis = figure.add_subplot(grid[-1, :])
     for localizer, colour in zip(LOCALIZERS, ("tab:red", "tab:blue"), strict=True):
         for key, what, style in (("own_mi_kB", "own-MI", "o-"), ("air_kB", "AIR", "s:")):

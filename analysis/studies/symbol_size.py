@@ -55,10 +55,10 @@ def _plot(settings: Settings, cases: Sequence[Case], results: Sequence[Result]) 
     for row, localizer in zip(axes, LOCALIZERS, strict=False):
         for axis, size in zip(row, sizes, strict=False):
             result = by_case[localizer, size]
-            shown = axis.imshow(result["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
+            axis.imshow(result["own_mi_map"], vmin=0, vmax=top, cmap="viridis")
             axis.set_title(f"{localizer}, {size}x{size}: {result['own_mi']:.2f} bit")
             axis.set_axis_off()
-    figure.colorbar(shown, ax=axes[:2, : len(sizes)], label="own-MI, bit/symbol", shrink=0.8)
+    figure.colorbar(axes[0, 0].images[0], ax=axes[:2, : len(sizes)], label="own-MI, bit/symbol", shrink=0.8)
     for axis, key, title in ((axes[0, -1], "own_mi_kB", "claimed"), (axes[1, -1], "air_kB", "carried (AIR)")):
         for localizer in LOCALIZERS:
             axis.plot(range(len(sizes)), [by_case[localizer, size][key] for size in sizes], "o-", label=localizer)

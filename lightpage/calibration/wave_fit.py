@@ -161,10 +161,10 @@ class WaveFit:
         centre = np.zeros(len(PARAMETERS)) if centre is None else centre
         state = self._start(start, quadrature_phase)
         best = WaveFitted(start, np.zeros(len(PARAMETERS)), quadrature_phase, np.inf)
-        fall, whole = 1.0, False
+        fall, whole, slopes = 1.0, False, None
         for number in range(_ROUNDS):
             progress(number / _ROUNDS)
-            if number % _CHORD == 0 and not (whole and fall < _NEARLY):
+            if slopes is None or (number % _CHORD == 0 and not (whole and fall < _NEARLY)):
                 slopes = self._slopes(state, of_light, of_cameras, partial(_within_round, progress, number))
             directions = _directions(state.light, bends="launch" not in groups)
             columns, left = self._equations(state, slopes, directions)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, MutableSequence, Set
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
@@ -42,7 +42,7 @@ class _StandIn(metaclass=_Anything):
 
 
 class _Module(ModuleType):
-    __path__: Sequence[str] = ()
+    __path__: MutableSequence[str] = []  # noqa: RUF012
     __version__ = "0"
 
     def __getattr__(self, name: str) -> Any:
@@ -80,11 +80,11 @@ def _is_installed(package: str) -> bool:
 def stand_ins(packages: Set[str]) -> Iterator[None]:
     """Have packages that are not installed replaced while the `with` statement lasts; what it imported is forgotten."""
     before, finder = set(sys.modules), _Finder({package for package in packages if not _is_installed(package)})
-    sys.meta_path.insert(0, finder)  # type: ignore[arg-type]
+    sys.meta_path.insert(0, finder)
     try:
         yield
     finally:
-        sys.meta_path.remove(finder)  # type: ignore[arg-type]
+        sys.meta_path.remove(finder)
         for name in set(sys.modules) - before:
             if name.partition(".")[0] in packages | _OWN:
                 del sys.modules[name]

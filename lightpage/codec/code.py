@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from lightpage.codec.checksum import crc16
 from lightpage.codec.mapping import level_bits
-from lightpage.errors import InvalidInputError
-from lightpage.files import LightpageError, read_text, replace_text
+from lightpage.errors import InvalidInputError, LightpageError
+from lightpage.files import read_text, replace_text
 
 
 class Code(BaseModel):

@@ -103,7 +103,10 @@ class Interpolation:
         x, y = axes[:2]
         kernels = [np.concatenate([_kernel(phase, axes) for phase in some], axis=1) for some in phases]
         orders = [_pivots(kernel) for kernel in kernels]
-        for count in range(1, len(kernels[0]) + 1):
+        fits: list[tuple[Complex, float]] = []
+        count = 0
+        while count < len(kernels[0]):
+            count += 1
             fits = [_least_squares(kernel, order[:count]) for kernel, order in zip(kernels, orders, strict=True)]
             if np.mean([error for _, error in fits]) <= tolerance**2:
                 break

@@ -196,7 +196,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     due = 0
     before: list[float] = []
     for index, read in track(read_ahead(recording.shown, recording.pages), "evaluate", total=recording.pages):
-        page = None
+        page = symbols = None
         try:
             frames, symbols = read.result()
             page = decode_unseen(decoder, recording, tracker, mask, frames, symbols)

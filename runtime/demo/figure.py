@@ -39,11 +39,11 @@ def write_figure(result: DemoResult, path: Path) -> None:
     for axis, phase in zip(axes[2], result.phases, strict=True):
         # an unlikely symbol costs many bits; the colour tells losses apart, not their depth
         colours = colormaps["magma"].with_extremes(bad=_PILOTS)
-        rate = axis.imshow(np.clip(phase.air, _LEAST_BITS, _MOST_BITS), vmin=_LEAST_BITS, vmax=_MOST_BITS, cmap=colours)
+        axis.imshow(np.clip(phase.air, _LEAST_BITS, _MOST_BITS), vmin=_LEAST_BITS, vmax=_MOST_BITS, cmap=colours)
         axis.set_title(f"{phase.name}: AIR {phase.air_bits_per_symbol:.2f} bit/symbol")
     pilots = Patch(facecolor=_PILOTS, edgecolor="black", label="pilots: known symbols, not counted")
     figure.legend(handles=[pilots], loc="outside lower center")
-    figure.colorbar(rate, ax=axes[2, :], shrink=0.8, label="AIR, bit/symbol")
+    figure.colorbar(axes[2, 0].images[0], ax=axes[2, :], shrink=0.8, label="AIR, bit/symbol")
     for axis in axes.ravel():
         axis.set_xticks([])
         axis.set_yticks([])

@@ -71,19 +71,20 @@ class Ledger:
         Raises:
             TakenError: another one has not ended with it in time.
         """
-        until = time.monotonic() + _QUESTION_S
-        while True:
-            try:
-                lock = self._locked(_QUESTION, fcntl.LOCK_EX)
-                break
-            except TakenError:
-                if time.monotonic() > until:
-                    raise
-                time.sleep(_AGAIN_S)
+        lock = self._question_lock(time.monotonic() + _QUESTION_S)
         try:
             yield
         finally:
             os.close(lock)
+
+    def _question_lock(self, until: float) -> int:
+        while True:
+            try:
+                return self._locked(_QUESTION, fcntl.LOCK_EX)
+            except TakenError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(_AGAIN_S)
 
     def _locked(self, name: str, kind: int) -> int:
         """A descriptor that holds a lock until it is closed."""

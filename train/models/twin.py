@@ -121,6 +121,7 @@ class RayTwin(nn.Module):
         for branch in BRANCHES:
             crossed = {"x": (odd if "x" in branch else even)[:, 0], "y": (odd if "y" in branch else even)[:, 1]}
             k, phase = straight, at_launch
+            leaves = spread = more = torch.zeros_like(straight)
             met = torch.stack([crossed["x"], crossed["y"]], dim=-1)
             if not self.ideal_lenses:
                 entrance, leaves, spread = self._filled(met, positions, width, focal)

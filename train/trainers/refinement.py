@@ -120,6 +120,7 @@ def fit_refinements(
         processes: see `fit_network`.
     """
     passes, features, seconds = [first], inputs.features, 0.0
+    validation = FeatureStore(features, range(0))
     count, seen = len(inputs.pages), inputs.training + inputs.validation
     chosen = choices.of_refinement()
     for number, start in zip(range(1, choices.refinements + 1), chain(starts, repeat(None)), strict=False):
