@@ -9,14 +9,21 @@ import json
 import math
 import os
 import secrets
-from collections.abc import Callable
-from contextlib import suppress
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout, suppress
+from contextvars import ContextVar
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TextIO
 
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.failures import os_failure
 from lightpage.progress import warn
+
+STDOUT = Path("-")
+"""In place of a JSON file, stdout, as users write it; in place of a file to read, stdin."""
+
+_results: ContextVar[TextIO | None] = ContextVar("results", default=None)
 
 _NAME_BYTES = 255
 """Longest name of a file on the file systems of Linux."""
@@ -196,13 +203,32 @@ def replace_text(path: str | Path, text: str, subject: str = "file") -> None:
     replace_file(path, lambda file: file.write(text.encode()), subject)
 
 
+@contextmanager
+def results_on_stdout() -> Iterator[None]:
+    """Keep stdout for `write_json` while the `with` statement lasts; all else that is printed goes to stderr."""
+    token = _results.set(sys.stdout)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _results.reset(token)
+
+
 def write_json(path: str | Path, data: Any) -> None:
     """Write `data` to `path` as JSON, null for what is not a number, replacing what is there in one step.
+
+    Args:
+        path: of the file, or `STDOUT`.
+        data: what JSON can hold.
 
     Raises:
         InvalidInputError: the path cannot be written.
     """
-    replace_text(path, json.dumps(_plain(data), indent=2, allow_nan=False) + "\n", "JSON file")
+    text = json.dumps(_plain(data), indent=2, allow_nan=False) + "\n"
+    if Path(path) == STDOUT:
+        print(text, end="", file=_results.get() or sys.stdout, flush=True)
+    else:
+        replace_text(path, text, "JSON file")
 
 
 def _plain(value: Any) -> Any:

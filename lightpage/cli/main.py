@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from copy import copy
 from functools import wraps
 from importlib.metadata import EntryPoint, entry_points
@@ -17,7 +18,7 @@ import click
 from click.shell_completion import shell_complete
 
 from lightpage.cli.groups import help_at
-from lightpage.cli.paths import check_outputs
+from lightpage.cli.paths import check_outputs, writes_to_stdout
 from lightpage.cli.progress_bar import Bars
 from lightpage.cli.stand_ins import stand_ins
 from lightpage.cli.streams import LastingStream, take_streams
@@ -30,6 +31,7 @@ from lightpage.errors import (
     TakenError,
 )
 from lightpage.failures import understood
+from lightpage.files import results_on_stdout
 from lightpage.progress import reporting
 
 GROUP = "lightpage.commands"
@@ -137,17 +139,20 @@ class LazyGroup(click.Group):
 
 
 def _checked(command: click.Command) -> click.Command:
-    """The command, which first sees to it that it overwrites nothing that it reads."""
-    run_it = command.callback
+    """The command, which sees to it that it overwrites nothing that it reads, and what it may print on stdout."""
+    checked, run_it = copy(command), command.callback
+    if isinstance(checked, click.Group):
+        checked.commands = {name: _checked(each) for name, each in checked.commands.items()}
     if run_it is None:
-        return command
+        return checked
 
     @wraps(run_it)
     def run_checked(*args: object, **options: object) -> object:
-        check_outputs(click.get_current_context())
-        return run_it(*args, **options)
+        context = click.get_current_context()
+        check_outputs(context)
+        with results_on_stdout() if writes_to_stdout(context) else nullcontext():
+            return run_it(*args, **options)
 
-    checked = copy(command)
     checked.callback = run_checked
     return checked
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import tempfile
+import os
 from pathlib import Path
 from typing import Any
 
 import click
 
 from lightpage.errors import InvalidInputError
+from lightpage.failures import os_failure
+from lightpage.files import STDOUT, new_file
 
 
 class NewPath(click.ParamType[Path]):
@@ -22,7 +24,7 @@ class NewPath(click.ParamType[Path]):
         Raises:
             InvalidInputError: its folder cannot be written.
         """
-        path = Path(value)
+        path = _file(value, param)
         folder = path.absolute().parent
         while not folder.exists():
             folder = folder.parent
@@ -31,7 +33,10 @@ class NewPath(click.ParamType[Path]):
 
 
 class OutputFile(click.ParamType[Path]):
-    """An option that names a file to write: known before the work begins to be one that `replace_text` can write."""
+    """An option that names a file to write: known before the work begins to be one that `replace_text` can write.
+
+    `--json` may name `STDOUT`.
+    """
 
     name = "file"
 
@@ -41,7 +46,9 @@ class OutputFile(click.ParamType[Path]):
         Raises:
             InvalidInputError: it is a folder, or its folder is missing or cannot be written.
         """
-        path = Path(value)
+        path = _file(value, param)
+        if path == STDOUT:
+            return path
         if path.is_dir():
             raise InvalidInputError(_option(path, param), "a folder", "a file")
         _check_writable(path.absolute().parent, path, param)
@@ -67,6 +74,12 @@ class OutputFolder(click.ParamType[Path]):
         return path
 
 
+def writes_to_stdout(context: click.Context) -> bool:
+    """Whether an option of a command names `STDOUT` for writing."""
+    outputs = (param.name or "" for param in context.command.params if isinstance(param.type, OutputFile))
+    return any(context.params.get(name) == STDOUT for name in outputs)
+
+
 def check_outputs(context: click.Context) -> None:
     """Check that no option of a command names for writing what another one names.
 
@@ -79,9 +92,21 @@ def check_outputs(context: click.Context) -> None:
         for other, there in paths:
             if param is other or not isinstance(param.type, NewPath | OutputFile):
                 continue
-            if path.resolve() == there.resolve():
+            if path.resolve() == there.resolve() and path != STDOUT:
                 named = other.opts[0] if isinstance(other, click.Option) else other.make_metavar(context)
                 raise InvalidInputError(_option(path, param), f"what {named} names", "a file of its own")
+
+
+def _file(value: Any, param: click.Parameter | None) -> Path:
+    """The path that an option names; stdout for `--json` alone.
+
+    Raises:
+        InvalidInputError: `-` for another option, which would be a file of that name.
+    """
+    path = Path(value)
+    if str(value) == str(STDOUT) and param is not None and param.opts[0] != "--json":
+        raise InvalidInputError(f"{param.opts[0]} -", "stdout", "a file (./- for one of that name)")
+    return path
 
 
 def _option(path: Path, param: click.Parameter | None) -> str:
@@ -90,6 +115,8 @@ def _option(path: Path, param: click.Parameter | None) -> str:
 
 def _check_writable(folder: Path, path: Path, param: click.Parameter | None) -> None:
     try:
-        tempfile.TemporaryFile(dir=folder).close()
+        descriptor, made = new_file(folder, path.name)
+        os.close(descriptor)
+        made.unlink()
     except OSError as error:
-        raise InvalidInputError(_option(path, param), error, "a path that can be written") from None
+        raise os_failure(_option(path, param), error, "a path that can be written") from None

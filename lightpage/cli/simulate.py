@@ -11,6 +11,7 @@ from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
+from lightpage.progress import note
 from lightpage.recording.pages import Pages
 from lightpage.simulator.recording_job import RecordingJob
 
@@ -27,7 +28,12 @@ from lightpage.simulator.recording_job import RecordingJob
     help="Of random symbols.",
 )
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Of symbols, noise and drift.")
-@click.option("--device", "device_file", type=click.Path(), help="True state of the device, TOML; realistic if absent.")
+@click.option(
+    "--device",
+    "device_file",
+    type=click.Path(),
+    help="Its true state, TOML; a realistic one if absent: a pipe 0.6 degree below the profile's.",
+)
 @click.option("--set", "settings", multiple=True, metavar="TABLE.KEY=VALUE", help="Change one number of that state.")
 @click.option("--truth/--no-truth", default=True, help="Keep what only a simulator knows beside the pages.")
 @click.option("--force", is_flag=True, help="Overwrite a recording that exists, or pages begun with other settings.")
@@ -48,7 +54,10 @@ def simulate(
     Interrupted, the same command goes on where it stopped, and the recording is the same as without interruption.
     """
     profile = load_profile(profile_name)
-    device = (load_device(device_file) if device_file else Device()).with_settings(list(settings))
+    device = (load_device(device_file) if device_file else Device()).of_profile(profile).with_settings(list(settings))
+    if profile.pipe.angle_deg:
+        angle = device.geometry.pipe_angle_deg
+        note(f"the true pipe is at {angle:g} degree, its profile's at {profile.pipe.angle_deg:g} (--set, --device)")
     if out.is_dir():
         raise InvalidInputError(f"--out {out}", "a folder", "a file")
     if out.exists() and not force:

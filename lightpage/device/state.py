@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from lightpage.device.profile import TomlTable, validate
+from lightpage.device.profile import Profile, TomlTable, validate
 from lightpage.errors import ProfileError
 from lightpage.files import read_text
 
@@ -125,6 +125,16 @@ class Device(TomlTable):
     slm: SlmDefects = SlmDefects()
     sensor: Sensor = Sensor()
     drift: Drift = Drift()
+
+    def of_profile(self, profile: Profile) -> Device:
+        """A copy whose pipe is off the angle of `profile` by its own angle, unless that was given.
+
+        The default is a deviation: a device that is meant to be at 0.3 degree is not at -0.6 by default.
+        """
+        if "geometry" in self.model_fields_set and "pipe_angle_deg" in self.geometry.model_fields_set:
+            return self
+        angle = profile.pipe.angle_deg + self.geometry.pipe_angle_deg
+        return self.model_copy(update={"geometry": self.geometry.model_copy(update={"pipe_angle_deg": angle})})
 
     def with_settings(self, settings: list[str]) -> Device:
         """A copy with `TABLE.KEY=VALUE` settings applied, values in TOML syntax.

@@ -119,4 +119,5 @@ def open_simulator(rest: str) -> SimulatorSource:
             f"source {spec}", sorted(settings) or seed, "levels, seed (at least 0), device and symbols only"
         )
     written = None if symbols is None else Pages.open(Path(symbols))
-    return SimulatorSource(load_profile(profile), device, levels, seed, spec, written)
+    nominal = load_profile(profile)
+    return SimulatorSource(nominal, device.of_profile(nominal), levels, seed, spec, written)

@@ -14,7 +14,7 @@ import click
 from lightpage.cli.groups import Group
 from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import FiniteRange
-from lightpage.cli.paths import OutputFile, OutputFolder, check_outputs
+from lightpage.cli.paths import OutputFile, OutputFolder
 from lightpage.codec.code import Code, load_code
 from lightpage.codec.volume_file import parse_volume, ranges
 from lightpage.errors import InvalidInputError, LightpageError, LostDataError, MissingResultsError
@@ -182,7 +182,6 @@ def _bulk(
 ) -> None:
     """Run an operation; see the options. Choices that are None are as before, or the default."""
     context = click.get_current_context()
-    check_outputs(context)
     context.meta[RESUME_KEY] = "what is done stays; run the same command again to do the rest"
     if address is not None and engine != RAY:
         raise InvalidInputError("--address", f"with --engine {engine}", f"--engine {RAY}")

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import secrets
+import shutil
+import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import click
 import numpy as np
@@ -16,7 +20,8 @@ from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import DATA_PAGES, PARITY_PAGES, Volume, encode_volume
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import InvalidInputError
-from lightpage.files import write_json
+from lightpage.failures import os_failure
+from lightpage.files import STDOUT, write_json
 from lightpage.page.symbols import pilot_mask, pilot_symbols
 from lightpage.progress import track
 from lightpage.recording.pages import PagesWriter
@@ -65,6 +70,23 @@ def target_of(bundle: str | None, profile_name: str | None, code_path: Path | No
     return Target(opened.profile, code, opened.pilot_mask, opened.written_pilots(code.levels))
 
 
+def _opened(file: Path) -> BinaryIO:
+    """The file, or what comes on stdin where it is `-`, kept in a temporary file: it is read more than once.
+
+    Raises:
+        InvalidInputError, StorageError, SurroundingsError: it cannot be read or kept.
+    """
+    try:
+        if file != STDOUT:
+            return file.open("rb")
+        kept = cast(BinaryIO, tempfile.TemporaryFile())  # noqa: SIM115  # the caller closes it
+        shutil.copyfileobj(sys.stdin.buffer, kept)
+        kept.seek(0)
+        return kept
+    except OSError as error:
+        raise os_failure(f"file {file}", error, "a file that can be read") from None
+
+
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--bundle", help="A bundle of the device: its path, or the name of a shipped one.")
@@ -76,6 +98,7 @@ def target_of(bundle: str | None, profile_name: str | None, code_path: Path | No
 @click.option("--volume", "volume_id", type=int, help="Number that tells files on a medium apart; random if left out.")
 @click.option("--data-pages", default=DATA_PAGES, show_default=True, help="Data pages of a group.")
 @click.option("--parity-pages", default=PARITY_PAGES, show_default=True, help="Pages of a group that may be lost.")
+@click.option("--force", is_flag=True, help="Overwrite pages that exist.")
 @click.option("--json", "json_path", type=OutputFile(), help="Write the figures to this file.")
 def encode(
     file: Path,
@@ -86,17 +109,16 @@ def encode(
     volume_id: int | None,
     data_pages: int,
     parity_pages: int,
+    force: bool,
     json_path: Path | None,
 ) -> None:
-    """Put FILE on pages to write: user bytes in, levels with pilots out."""
+    """Put FILE on pages to write: user bytes in, levels with pilots out. `-` reads stdin."""
+    if out.exists() and not force:
+        raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
     target = target_of(bundle, profile_name, code_path)
     codec = PageCodec(target.code, target.mask)
     number = secrets.randbits(32) if volume_id is None else volume_id
-    try:
-        source = file.open("rb")
-    except OSError as error:
-        raise InvalidInputError(f"file {file}", error, "a file that can be read") from None
-    with source:
+    with _opened(file) as source:
         volume = Volume.of_file(source, number, codec.user_bytes, data_pages, parity_pages)
         told = target.code.model_dump() | volume.to_json()
         with PagesWriter(out, target.profile, target.code.levels, told) as writer:

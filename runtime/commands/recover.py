@@ -64,10 +64,11 @@ def describe(result: Recovery) -> str:
     figures, volume = result.to_json(), result.volume
     air, share, margin = figures["air_bytes_per_page"], figures["share_of_air"], figures["margin_bits_least"]
     lost = f"data pages {ranges(result.lost)}" if result.lost else "none" if volume is not None else "all"
+    restored = "none needed" if volume is not None and not result.lost else "none could be"
     rows = [
         ("code", result.code.describe()),
         ("recorded pages", f"{len(result.pages)}, of which {len(result.unread)} gave no bytes"),
-        ("restored", f"data pages {ranges(result.restored)}" if result.restored else "none needed"),
+        ("restored", f"data pages {ranges(result.restored)}" if result.restored else restored),
         ("lost", lost),
         ("volume", "unknown" if volume is None else f"{volume.id}: {volume.file_bytes} bytes on {volume.pages} pages"),
         ("user bytes a page", f"{result.user_bytes_per_page}"),

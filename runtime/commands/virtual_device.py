@@ -55,8 +55,9 @@ def virtual_device(
     go_on_inside("lightpage.cli.main")
     context = click.get_current_context()
     context.meta[RESUME_KEY] = "the simulated device has ended, and its command with it"
-    device = (load_device(device_file) if device_file else Device()).with_settings(list(settings))
-    with VirtualDevice(load_profile(profile_name), device, out, seed, pixel_format, black_level, hot_pixels) as running:
+    profile = load_profile(profile_name)
+    device = (load_device(device_file) if device_file else Device()).of_profile(profile).with_settings(list(settings))
+    with VirtualDevice(profile, device, out, seed, pixel_format, black_level, hot_pixels) as running:
         click.echo(f"simulated device at camera:{running.config}", err=True)
         status = _run(command or (os.environ.get("SHELL", "/bin/sh"),))
         running.check()

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightpage.device.profile import to_toml
-from lightpage.device.state import Device, draw_device, load_device
+from lightpage.device.profile import load_profile, to_toml
+from lightpage.device.state import Device, Geometry, draw_device, load_device, parse_device
 from lightpage.errors import ProfileError
 
 
@@ -152,3 +152,15 @@ def test_the_same_seed_draws_the_same_device() -> None:
 def test_states_that_no_device_can_be_in_are_named(setting: str) -> None:
     with pytest.raises(ProfileError, match=setting.partition("=")[0].replace(".", r"\.")):
         Device().with_settings([setting])
+
+
+def test_a_pipe_deviates_from_the_angle_of_its_profile_unless_its_own_is_given() -> None:
+    profile = load_profile("bench")
+    sheared = profile.model_copy(update={"pipe": profile.pipe.model_copy(update={"angle_deg": 0.3})})
+    assert Device().of_profile(profile) == Device()
+    assert Device().of_profile(sheared).geometry.pipe_angle_deg == pytest.approx(0.3 - 0.6)
+    assert parse_device("[geometry]\nfocal_length_relative_error = 0.001").of_profile(sheared).geometry == Geometry(
+        pipe_angle_deg=0.3 - 0.6, focal_length_relative_error=0.001
+    )
+    given = parse_device("[geometry]\npipe_angle_deg = -0.6")
+    assert given.of_profile(sheared) == given

@@ -17,6 +17,7 @@ from lightpage.codec.checksum import crc32c
 from lightpage.errors import InvalidInputError, LostDataError, RecordingError, StorageError
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.pages import Pages
 from lightpage.recording.reader import Recording
 from runtime.commands.code import code as code_command
 from runtime.commands.encode import encode
@@ -219,7 +220,7 @@ class TestBadInput:
         assert "got No space left on device" in str(result.exception)
         monkeypatch.setattr("lightpage.recording.pages.move_into_place", full)
         with pytest.raises(RecordingError, match="No space left"):
-            coded.pages(bundle, tmp_path / ".", b"again", "--data-pages", "1")
+            coded.pages(bundle, tmp_path, b"again", "--data-pages", "1", "--force")
         assert not (tmp_path / "read.bin").exists()
         assert not list(tmp_path.glob("*.partial"))
 
@@ -349,3 +350,57 @@ def test_an_evaluation_ends_with_the_status_that_asks_for_another_try(
     assert figures["pages"] == read
     assert {page["page"]: page["cause"] for page in figures["refused_pages"]} == dict.fromkeys(lacking, "storage")
     assert run(lightpage, asked) == 0
+
+
+def test_json_goes_to_stdout_alone_and_all_else_to_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bundle = toy.write_toy_bundle(tmp_path / "toy.zip")
+    toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 16, 3)
+    asked = ["--bundle", str(bundle), "--json", "-"]
+    assert run(lightpage, ["evaluate", "--recording", str(tmp_path / "R.h5"), *asked]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["pages"] == 3
+    assert "AIR" in told.err
+    bulk = ["bulk", "evaluate", str(tmp_path / "out"), "--recordings", str(tmp_path / "R.h5"), "--workers", "1"]
+    assert run(lightpage, [*bulk, *asked]) == 0
+    assert json.loads(capsys.readouterr().out)["pages_read"] == 3
+    assert not Path("-").exists()
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        "recover --recording R.h5 --bundle toy.zip --out -",
+        "encode F --bundle toy.zip --out -",
+        "decode --recording R.h5 --target 127.0.0.1:1 --out -",
+        "export run --out -",
+        "calibrate --profile bench --recording R.h5 --out -",
+    ],
+)
+def test_files_of_other_kinds_do_not_go_to_stdout(asked: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(lightpage, asked.split()) == 2
+    assert "--out -" in capsys.readouterr().err
+
+
+def test_pages_are_not_overwritten_unless_that_is_asked_for(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+    asked = f"encode {tmp_path / 'sent.bin'} --bundle {bundle} --out {tmp_path / 'pages.h5'}".split()
+    before = (tmp_path / "pages.h5").read_bytes()
+    assert run(lightpage, asked) == 2
+    assert (tmp_path / "pages.h5").read_bytes() == before
+    assert run(lightpage, [*asked, "--force"]) == 0
+    assert (tmp_path / "pages.h5").read_bytes() != before
+
+
+def test_a_file_may_come_on_stdin(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+    asked = ["-", "--bundle", str(bundle), "--out", str(tmp_path / "piped.h5"), "--volume", "9"]
+    asked += ["--data-pages", "3", "--parity-pages", "2"]
+    assert CliRunner().invoke(encode, asked, input=coded.CONTENT, standalone_mode=False).exception is None
+    with Pages.open(tmp_path / "piped.h5") as piped:
+        assert (np.stack(list(piped)) == pages).all()
+
+
+def test_what_could_not_be_restored_is_not_called_needless(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+    spoilt = {page: coded.dark for page in (0, 1, 2)}
+    result, _ = recovered(bundle, coded.recording(tmp_path / "R.h5", pages, spoilt))
+    assert isinstance(result.exception, LostDataError)
+    assert "none needed" not in result.output
+    assert "none could be" in result.output
