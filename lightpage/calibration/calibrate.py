@@ -58,6 +58,19 @@ _WANTED = "right symbols and profile, a device in the capture range"
 _WANTED_REFLECTIONS = f"{_WANTED}, a page wide enough for its light to meet the pipe's walls"
 _LEAST_QUADRATURE = 0.5
 """Sine of the angle between the arms below which the two frames hardly differ."""
+_LARGEST_QUADRATURE_ERROR_DEG = 20.0
+"""Distance of the fitted angle between the arms from +90 or -90 degrees beyond which the cameras see different images;
+a device in the capture range is within 6."""
+_ALONE = 0.2
+"""Share of the patches that one camera has found below which the other one does not see the same image."""
+_FLIPS = {
+    "mirrored left to right": (slice(None), slice(None, None, -1)),
+    "mirrored top to bottom": (slice(None, None, -1), slice(None)),
+    "turned by 180 degrees": (slice(None, None, -1), slice(None, None, -1)),
+}
+"""How a camera may show an image otherwise than the profile has it, and the index that undoes it."""
+_AS_IT_IS = (slice(None), slice(None))
+_CAMERAS = ("in-phase camera", "quadrature camera")
 
 
 @dataclass(frozen=True)
@@ -224,6 +237,11 @@ def check_found(coherence: float, significant: float, symbols: int, reflected: M
             )
 
 
+def _significant(found: Sequence[Measurement]) -> int:
+    """How many patches were found."""
+    return sum(each.significance > SIGNIFICANT for each in found)
+
+
 class _Registration:
     """The state that the stages pass on."""
 
@@ -273,7 +291,36 @@ class _Registration:
         """Measure the direct branch on each camera by itself and fit places and slopes."""
         self._begin(stage.name)
         in_phase, quadrature = self._on_each_camera(stage)
+        if stage.middle_only:
+            self._check_orientation(stage, [_significant(in_phase), _significant(quadrature)])
         self._fit(stage, in_phase + quadrature, centre)
+
+    def _check_orientation(self, stage: _Stage, found: list[int]) -> None:
+        """Look for the image of a camera that has not found it among its mirror images.
+
+        Args:
+            stage: of the search.
+            found: patches that either camera has found.
+
+        Raises:
+            CalibrationError: a camera shows the image mirrored or turned, or it alone does not show it.
+        """
+        wanted = "frames as the profile has them: set the camera, or turn its frames in the recording"
+        told = []
+        for camera, (own, other) in enumerate(zip(found, found[::-1], strict=True)):
+            if own >= _FEWEST or own > _ALONE * other:
+                continue
+            for how, index in _FLIPS.items():
+                sampler = self._frame_samplers(self.pages[0], index)[camera]
+                if _significant(self._measure(sampler, stage, (camera,), camera / 2)) >= _FEWEST:
+                    told.append(f"{_CAMERAS[camera]} {how}")
+                    break
+        if told:
+            raise CalibrationError("calibration, cameras", " and ".join(told), wanted)
+        for camera, (own, other) in enumerate(zip(found, found[::-1], strict=True)):
+            if other >= _FEWEST and own < _ALONE * other:
+                got = f"{own} patches of known symbols where the {_CAMERAS[1 - camera]} has found {other}"
+                raise CalibrationError(f"calibration, {_CAMERAS[camera]}", got, "the same image on both cameras")
 
     def complex_field(self, stage: _Stage, centre: Real | None = None, prior_scale: float | Real = 1.0) -> None:
         """Measure branches on the recovered field and fit."""
@@ -321,6 +368,13 @@ class _Registration:
         significant = len(self._found) / len(self._looked)
         reflected = {branch: self._share(branch) for branch in _REFLECTED}
         check_found(after, significant, self.pages[0].symbols.size, reflected)
+        angle_deg = float(np.rad2deg(self.quadrature_phase))
+        if abs(abs(angle_deg) - 90) > _LARGEST_QUADRATURE_ERROR_DEG:
+            raise CalibrationError(
+                "angle between the homodyne arms",
+                f"{angle_deg:.0f} degrees",
+                f"+90 or -90 within {_LARGEST_QUADRATURE_ERROR_DEG:g}: two cameras that show the same image",
+            )
         return Registered(
             parameters=self.parameters,
             deviations=self.deviations,
@@ -355,11 +409,11 @@ class _Registration:
         homodyne = np.array([np.cos(quadrature_phase), np.sin(quadrature_phase)], dtype=np.float32)
         return self.solve_field(page.pair, self.references, registration, homodyne)
 
-    def _frame_samplers(self, page: KnownPage) -> list[FrameSampler]:
+    def _frame_samplers(self, page: KnownPage, index: tuple[slice, slice] = _AS_IT_IS) -> list[FrameSampler]:
         frames = (page.pair.in_phase, page.pair.quadrature)
         references = (self.references.in_phase, self.references.quadrature)
         return [
-            FrameSampler(frame, reference, camera, self.twin, self.parameters)
+            FrameSampler(frame[index], reference[index], camera, self.twin, self.parameters)
             for camera, (frame, reference) in enumerate(zip(frames, references, strict=True))
         ]
 

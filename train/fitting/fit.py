@@ -158,7 +158,7 @@ def fit(
                 training,
                 DataLoader(validation, batch_size=1),
                 ckpt_path=last if last.exists() else None,
-                weights_only=False,
+                weights_only=True,
             )
     except SystemExit:  # Lightning's answer to Ctrl-C, once it has closed its files
         raise KeyboardInterrupt from None
@@ -224,4 +224,4 @@ def _without_hints() -> Iterator[None]:
 
 
 def _checkpoint(path: Path) -> dict[str, Any]:
-    return dict(torch.load(path, map_location="cpu", weights_only=False))
+    return dict(torch.load(path, map_location="cpu", weights_only=True))

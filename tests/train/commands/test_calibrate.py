@@ -195,3 +195,26 @@ def test_a_calibration_that_is_stopped_leaves_the_earlier_one_alone(
         run(recording, out, "--json", str(tmp_path / "figures.json"))
     assert out.read_text() == "the earlier one"
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["R.h5", "calibration.toml"]
+
+
+@pytest.mark.parametrize(
+    ("in_phase", "quadrature", "told"),
+    [
+        ("", "x", "quadrature camera mirrored left to right"),
+        ("y", "", "in-phase camera mirrored top to bottom"),
+        ("xy", "xy", "in-phase camera turned by 180 degrees and quadrature camera turned by 180 degrees"),
+    ],
+)
+def test_a_camera_that_is_mounted_otherwise_is_named(
+    in_phase: str, quadrature: str, told: str, bench_recording: Path, tmp_path: Path
+) -> None:
+    flips = {"in_phase": in_phase, "quadrature": quadrature}
+    shutil.copy(bench_recording, tmp_path / "R.h5")
+    with h5py.File(tmp_path / "R.h5", "r+") as file:
+        for name, flip in flips.items():
+            for dataset in (file[f"reference_{name}"], file[name]):
+                axes = [axis for axis, letter in ((-2, "y"), (-1, "x")) if letter in flip]
+                dataset[...] = np.flip(dataset[()], axes)
+    with pytest.raises(CalibrationError, match=told):
+        run(tmp_path / "R.h5", tmp_path / "C.toml")
+    assert not (tmp_path / "C.toml").exists()
