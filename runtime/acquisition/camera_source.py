@@ -35,6 +35,7 @@ Counts = NDArray[np.unsignedinteger[Any]]
 
 _log = logging.getLogger(__name__)
 
+_OPEN = (True, True)
 _GONE = frozenset({Reason.CAMERA_GONE, Reason.TRIGGER_GONE})
 _MOST_REPEATS = 20
 """Of a shot of reference or dark frames."""
@@ -130,6 +131,9 @@ class CameraSource(FrameSource):
         self._next = 0
         self._dark: tuple[DarkFrame, DarkFrame] | None = None
         self._repairs: tuple[PixelRepair, ...] = ()
+        self._wanted = _OPEN
+        self._moved: tuple[bool, bool] | None = _OPEN
+        """What was last asked of the beams, signal and reference, None where they may be otherwise."""
         self._outcomes: Counter[str] = Counter()
         self._saturated: dict[str, float] = {}
 
@@ -261,6 +265,16 @@ class CameraSource(FrameSource):
                 _log.info("%s: black level %d, %d hot pixels", camera.name, dark.black_level, len(dark.hot))
             return self._dark
 
+    def trouble(self) -> str:
+        """See `FrameSource.trouble`."""
+        is_open = self._wanted != _OPEN or self._moved == _OPEN  # while they are blocked on purpose, all is well
+        return "" if is_open else f"{self.beams.name}: a beam may be blocked, since it could not be let through"
+
+    def mend(self) -> None:
+        """See `FrameSource.mend`."""
+        with self._lock:
+            self._move_beams()
+
     def _page(self, page: int | None) -> tuple[int, NDArray[np.uint8] | None]:
         """Number and symbols of page `page`, or of the next one; without pages of its own the number only counts."""
         count = len(self.pages)
@@ -295,12 +309,15 @@ class CameraSource(FrameSource):
         while True:
             try:
                 self.arm()
+                self._move_beams()
                 frames = attempt()
             except LostShotError as error:
                 self._outcomes[error.reason.value] += 1
                 self.on_lost(index, error)
-                # a camera that was switched off and on for a moment answers, and waits for no trigger
-                self._armed = self._armed and error.reason not in (*_GONE, Reason.MISSING_FRAME)
+                # a camera that was switched off and on for a moment answers, and waits for no trigger; devices that
+                # contradict what they said before may have been set otherwise
+                anew = error.reason in (*_GONE, Reason.MISSING_FRAME) or self._pairing.contradicted
+                self._armed = self._armed and not anew
                 if error.reason in _GONE:
                     if time.monotonic() + _AGAIN_S < deadline:
                         time.sleep(_AGAIN_S)
@@ -343,8 +360,32 @@ class CameraSource(FrameSource):
 
     @contextmanager
     def _beams_as(self, *, signal: bool, reference: bool) -> Iterator[None]:
-        self.beams.let_through(signal=signal, reference=reference)
+        """Let through what is asked for, and both beams after it, however it ends.
+
+        Where they cannot be opened, every later shot tries it first; until then there is `trouble`.
+        """
+        self._wanted = signal, reference
         try:
+            self._move_beams()
             yield
-        finally:
-            self.beams.let_through(signal=True, reference=True)
+        except BaseException:
+            self._wanted = _OPEN
+            try:
+                self._move_beams()
+            except Exception as error:  # what came first is what is told
+                _log.error("%s; tried again before the next shot: %s", self.trouble(), error)
+            raise
+        self._wanted = _OPEN
+        self._move_beams()
+
+    def _move_beams(self) -> None:
+        """Have the beams as they are wanted, unless they are so.
+
+        Raises:
+            LostShotError, SourceError: see `Beams.let_through`.
+        """
+        if self._moved != self._wanted:
+            signal, reference = self._wanted
+            self._moved = None
+            self.beams.let_through(signal=signal, reference=reference)
+            self._moved = signal, reference

@@ -43,6 +43,11 @@ _SILENT_TRIES = 3
 """The same where a camera has sent no frame since the start: its trigger does not arrive, and waiting mends nothing."""
 _MOST_QUIET = 20
 """A line that is never silent is given up after so many times the silence that is waited for."""
+_MOST_WAITING = 64
+"""Frames of a camera that are dropped at once: more than any driver keeps."""
+_CONTRADICTIONS = frozenset({Reason.OTHER_SHOT, Reason.SKIPPED_FRAME, Reason.STRAY_FRAME})
+_MOST_CONTRADICTIONS = 3
+"""Shots in a row that contradict what is remembered of the devices, after which it is forgotten."""
 _FOLLOWING = 0.1
 """Share of an accepted shot's deviation by which the reference follows."""
 
@@ -134,6 +139,12 @@ class Pairing:
         self._referenced_at = -float("inf")
         self._next_at = -float("inf")
         self._settled = False
+        self._contradicted = 0
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether so many shots in a row contradict what is remembered that the devices are no longer as they were."""
+        return self._contradicted >= _MOST_CONTRADICTIONS
 
     @property
     def synchronised(self) -> bool:
@@ -151,6 +162,7 @@ class Pairing:
     def forget(self) -> None:
         """Synchronise before the next shot: a device that was set up anew may be slower, or another one."""
         self._referenced_at = -float("inf")
+        self._contradicted = 0
 
     def shot(
         self, deadline: float, display: Callable[[], None] | None = None, displayed: Callable[[], bool] | None = None
@@ -181,9 +193,14 @@ class Pairing:
                 )
         except BaseException as error:
             self._settled = False
-            if isinstance(error, LostShotError) and error.reason in (Reason.CAMERA_GONE, Reason.TRIGGER_GONE):
-                self.forget()
+            if isinstance(error, LostShotError):
+                self._contradicted += error.reason in _CONTRADICTIONS
+                if error.reason in (Reason.CAMERA_GONE, Reason.TRIGGER_GONE):
+                    self.forget()
+                elif self.contradicted:
+                    self._referenced_at = -float("inf")
             raise
+        self._contradicted = 0
         return taken.frames
 
     def _check_times(self, taken: _Taken) -> None:
@@ -289,10 +306,12 @@ class Pairing:
         return frame
 
     def _drain(self) -> int:
-        """Drop the frames that wait; returns how many."""
+        """Drop the frames that wait, of a camera that never ends some of them; returns how many."""
         dropped = 0
         for channel in self._channels:
-            while channel.frame(0.0) is not None:
+            for _ in range(_MOST_WAITING):
+                if channel.frame(0.0) is None:
+                    break
                 dropped += 1
                 channel.last_id = None
         return dropped

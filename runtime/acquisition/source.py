@@ -152,6 +152,17 @@ class FrameSource(ABC):
         """Share of pixels at full scale in each camera's last frame; empty where nobody looks."""
         return {}
 
+    def trouble(self) -> str:
+        """Why no page can be photographed until `mend` has gone well; empty where one can."""
+        return ""
+
+    def mend(self) -> None:  # noqa: B027 — a source without a device has nothing to mend
+        """Try to end the trouble.
+
+        Raises:
+            LostShotError, SourceError: it stays.
+        """
+
     def close(self) -> None:  # noqa: B027 — a source without a device needs none
         """Let go of files and devices."""
 

@@ -145,6 +145,9 @@ class ExternalBeams:
     def let_through(self, *, signal: bool, reference: bool) -> None:
         """Wait until the controller says that the beams are so; see `Beams`."""
         wanted = BeamState(signal, reference)
+        if wanted == BOTH and self._states.announced() is None:  # it has blocked none
+            self._states.want(BOTH)
+            return
         there, _ = self._states.wait(wanted, self._timeout_s)
         if there != wanted:
             raise LostShotError(

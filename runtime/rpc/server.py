@@ -179,7 +179,7 @@ class LightpageServer:
         await self._health.tell({**dict.fromkeys(self._names, serving), STORE_HEALTH: self._store.is_well()})
 
     async def _look(self) -> dict[str, bool]:
-        trouble = self._plane.heart.trouble()
+        trouble = self._plane.trouble()
         if bool(trouble) == self._serving and not self._stopping:
             if trouble:
                 _log.error("not serving: %s", trouble)

@@ -153,6 +153,10 @@ class DataPlane:
         """Whether `read_page` can work."""
         return self._source is not None
 
+    def trouble(self) -> str:
+        """Why the service cannot be said to serve; empty where it can."""
+        return self.heart.trouble() or ("" if self._source is None else self._source.trouble())
+
     @property
     def default_levels(self) -> int:
         """The level count where a caller names none: that of the source's pages, or 256."""

@@ -99,7 +99,7 @@ class PulseGenerator:
         self._ready: int | None = None
         """Session of the line in which the device was set up."""
         self._switched: dict[int, bool] = {}
-        """Other channels, as they were last asked to be."""
+        """Other channels, as they were last switched."""
 
     @property
     def identity(self) -> str | None:
@@ -176,9 +176,15 @@ class PulseGenerator:
                 f"one of 1 to {CHANNELS} and none of the cameras' ({cameras})",
             )
         with self._lock:
+            before = self._switched.pop(channel, None)
+            try:
+                self._line.send(f":PULSE{channel}:POL INV")
+                self._switch(channel, on, self._line.session)
+            except BaseException:
+                if before is not None:  # what was not done is not to be done again by `arm`, unasked
+                    self._switched[channel] = before
+                raise
             self._switched[channel] = on
-            self._line.send(f":PULSE{channel}:POL INV")
-            self._switch(channel, on, self._line.session)
 
     def channel_state(self, channel: int) -> bool:
         """Whether a channel is on, as the device says; connects if needed.

@@ -37,10 +37,13 @@ REFUSALS = {
 _IDENTIFY = "*IDN?"
 _IDENTIFICATION = re.compile(r"[!-~][ -~]*,[ -~]+,[ -~]+")
 """Maker, model, serial number, and mostly versions."""
+_END = re.compile(rb"\r\n|\r|\n")
 _REFUSED = re.compile(r"\?([1-8])")
 _POLL_S = 0.02
 """Longest wait inside pyserial."""
 _LONGEST_LINE = 512
+_QUOTED = 60
+"""Last bytes that came which an error quotes."""
 _ROUNDS = 2
 """Identifications in a row, each with silence after, that make a port synchronised."""
 
@@ -87,6 +90,12 @@ class ScpiPort:
         self._path, self._baud, self._times = port, baud, times
         self._port: Serial | None = None
         self._buffer = bytearray()
+        self._heard = bytearray()
+        """The last bytes that came since the port was synchronised last."""
+        self._bare_cr = False
+        """Whether lines end with CR alone."""
+        self._latency_s = 0.0
+        """How long the device has taken for its identification."""
         self._synchronised = self._echo = False
         self._known = False
         """Whether `identity` has come often enough, since the port was opened, to be relied on."""
@@ -149,7 +158,12 @@ class ScpiPort:
         port = self._port
         if port is not None and self._synchronised:
             try:
-                self._synchronised = not (self._buffer or port.in_waiting)  # nothing was asked: whose answer is that?
+                if port.in_waiting:
+                    self._read(port)
+                if self._buffer.strip(b"\r\n"):  # nothing was asked: whose answer is that?
+                    self._synchronised = False
+                else:
+                    self._buffer.clear()
             except GONE:
                 self.close()
         if port is not None and self._synchronised and session in (None, self.session):
@@ -200,7 +214,8 @@ class ScpiPort:
         return begin, end
 
     def _answer(self, port: Serial, message: str, answer: re.Pattern[str]) -> str:
-        until = time.monotonic() + self._times.answer_s
+        answer_s = max(self._times.answer_s, min(2 * self._latency_s, self._times.answer_s + self._times.late_s))
+        until = time.monotonic() + answer_s
         line = self._line(port, until)
         if line == message:  # the port echoes
             self._echo = True
@@ -216,7 +231,8 @@ class ScpiPort:
             return line
         self._synchronised = False
         if line is None:
-            raise self._gone(f"no answer to {message} within {self._times.answer_s:g} s", "an answer")
+            told = f", but {self._quoted()}" if self._buffer else ""
+            raise self._gone(f"no answer to {message} within {answer_s:.3g} s{told}", "an answer")
         self._identified(line)
         raise self._gone(f"{line!r} to {message}", f"an answer like {answer.pattern}")
 
@@ -226,15 +242,16 @@ class ScpiPort:
         Raises:
             LostShotError: that cannot be had in time; the port is closed.
         """
-        self._synchronised = False
+        self._synchronised, self._latency_s = False, 0.0
+        self._heard.clear()
         end = time.monotonic() + self._times.synchronise_s
         rounds = 0
         while rounds < _ROUNDS:
             if time.monotonic() > end:
+                told = self._quoted()
                 self.close()
-                raise self._gone(
-                    f"no clear answer to {_IDENTIFY} within {self._times.synchronise_s:g} s", "its identification"
-                )
+                got = f"no clear answer to {_IDENTIFY} within {self._times.synchronise_s:g} s: {told} came"
+                raise self._gone(got, "maker, model, serial number and versions in a line; the right port and baud")
             if not self._quiet(port, end):
                 continue
             self._send(port, _IDENTIFY)
@@ -245,7 +262,8 @@ class ScpiPort:
 
     def _one_round(self, port: Serial, end: float) -> bool:
         """Whether every identification that was due has come and nothing after it."""
-        until = min(end, time.monotonic() + self._times.answer_s)
+        asked = time.monotonic()
+        until = min(end, asked + max(self._times.answer_s, self._times.late_s))
         known, came, echo = self.identity, False, False
         while self._due:
             line = self._line(port, until)
@@ -257,6 +275,7 @@ class ScpiPort:
                 echo = True
             elif self._identified(line):
                 came, until = True, min(end, time.monotonic() + self._times.late_s)
+                self._latency_s = max(self._latency_s, time.monotonic() - asked)
         self._echo = echo
         return self._quiet(port, end) and self.identity == known
 
@@ -283,24 +302,34 @@ class ScpiPort:
         return nothing
 
     def _line(self, port: Serial, until: float) -> str | None:
-        """The next line without its CR and LF, or None where it does not end in time; a damaged one keeps its LF."""
+        """The next line that says something, without its end of CR, LF or both; None where it does not end in time."""
         while (line := self._next_line()) is None and time.monotonic() < until:
-            self._read(port)
+            if not self._read(port) and self._buffer.endswith(b"\r"):
+                self._bare_cr = True  # no LF has followed
         return line
 
     def _next_line(self) -> str | None:
-        end = self._buffer.find(b"\n") + 1
-        if not end and len(self._buffer) < _LONGEST_LINE:
+        del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(b"\r\n"))]
+        found = _END.search(self._buffer)
+        if found is not None and found[0] == b"\r" and found.end() == len(self._buffer) and not self._bare_cr:
+            found = None  # its LF is on its way
+        if found is None and len(self._buffer) < _LONGEST_LINE:
             return None
-        end = end or len(self._buffer)
+        end, after = found.span() if found is not None else (len(self._buffer),) * 2
         line = bytes(self._buffer[:end])
-        del self._buffer[:end]
-        return line.removesuffix(b"\r\n").decode("latin-1") if end < _LONGEST_LINE else repr(line)
+        del self._buffer[:after]
+        return line.decode("latin-1") if end < _LONGEST_LINE else repr(line)
 
     def _read(self, port: Serial) -> int:
-        found = port.read(max(1, port.in_waiting))
+        """Take what has come; returns its length without NULs, which some devices send between lines."""
+        found = port.read(max(1, port.in_waiting)).replace(b"\0", b"")
         self._buffer += found
+        self._heard = (self._heard + found)[-_QUOTED:]
         return len(found)
+
+    def _quoted(self) -> str:
+        """The last bytes that came, for an error."""
+        return f"{bytes(self._heard)!r}" if self._heard else "nothing"
 
     def _gone(self, got: object, expected: object) -> LostShotError:
         return LostShotError(self.name, got, expected, Reason.TRIGGER_GONE)

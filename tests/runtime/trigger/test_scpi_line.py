@@ -6,7 +6,7 @@ import re
 import termios
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -130,7 +130,7 @@ def test_late_identifications_are_waited_for(lab: Lab) -> None:
     with pytest.raises(LostShotError):
         lab.width(1)
     lab.port.late_s = (0.2, 0.22)
-    left = [Fault.LATE, Fault.LATE, Fault.LATE]
+    left = [Fault.LATE, Fault.LATE]
     lab.port.fault = lambda message: left.pop(0) if left and message == "*IDN?" else None
     assert (lab.width(2), lab.width(1)) == (2e-5, 1e-5)
     assert not left
@@ -279,3 +279,50 @@ def test_no_such_port(tmp_path: Path) -> None:
 def test_messages_are_one_line_of_ascii(message: str) -> None:
     with pytest.raises(InvalidInputError, match="ASCII"):
         ScpiLine("socket://127.0.0.1:1").send(message)
+
+
+class Styled(Pty):
+    """A port that writes otherwise than the family does."""
+
+    def __init__(self, answer: Callable[[str], str], link: Path, style: Callable[[bytes], bytes]) -> None:
+        super().__init__(answer, link)
+        self._style = style
+
+    def _write(self, content: bytes) -> None:
+        super()._write(self._style(content))
+
+
+@pytest.mark.parametrize(
+    "style",
+    [
+        lambda answer: answer.replace(b"\r\n", b"\n"),
+        lambda answer: answer.replace(b"\r\n", b"\r"),
+        lambda answer: answer.replace(b"\r\n", b"\r\n\0\0"),
+        lambda answer: b"\0" + answer,
+        lambda answer: b"\r\n" + answer,
+    ],
+    ids=["LF", "CR", "NULs behind", "NUL before", "empty line before"],
+)
+def test_lines_may_end_otherwise(style: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    device = PulseGeneratorEmulator()
+    with plugged(Styled(device.answer, tmp_path / "tty", style), device) as lab:
+        session = lab.line.session
+        assert [lab.width(channel) for channel in (1, 2, 1)] == [1e-5, 2e-5, 1e-5]
+        assert lab.line.session == session  # no answer was taken for one of another message
+
+
+def test_a_slow_device_is_given_the_time_that_it_takes(tmp_path: Path) -> None:
+    device = PulseGeneratorEmulator()
+    port = Pty(device.answer, tmp_path / "tty")
+    port.fault, port.late_s = lambda message: Fault.LATE, (0.2, 0.22)  # an answer is waited for 0.15 s
+    with plugged(port, device) as lab:
+        assert [lab.width(channel) for channel in (1, 2, 1)] == [1e-5, 2e-5, 1e-5]
+
+
+def test_answers_that_are_not_understood_are_quoted(tmp_path: Path) -> None:
+    with Pty(lambda message: "ERROR 113 ready>", tmp_path / "tty") as port:
+        line = ScpiLine(port.address, times=TIMES)
+        with pytest.raises(LostShotError, match=r"ERROR 113 ready>") as caught:
+            line.send(":PULSE1:STATE ON")
+        assert caught.value.reason is Reason.TRIGGER_GONE
+        line.close()
