@@ -20,8 +20,9 @@ from lightpage.device.profile import Profile
 from lightpage.errors import RecordingError
 from lightpage.files import move_into_place
 from lightpage.page.symbols import check_levels, check_symbols
+from lightpage.recording.hdf5 import open_hdf5
 from lightpage.recording.hdf_file import HdfFile
-from lightpage.recording.layout import open_hdf5, read_attribute
+from lightpage.recording.stored import ArrayFile
 
 FORMAT = "lightpage-pages"
 VERSION = 1
@@ -103,20 +104,21 @@ class Pages:
         Raises:
             RecordingError: it holds no pages, or is inconsistent.
         """
-        self._file, self.path = file, path
+        self.path, self._subject = path, f"pages {path}"
+        self._file = ArrayFile(file, self._subject)
         for name, expected in (("format", FORMAT), ("version", VERSION)):
-            if (got := read_attribute(file, name)) != expected:
-                raise RecordingError(f"pages {path}: attribute '{name}'", repr(got), repr(expected))
-        levels = read_attribute(file, "levels")
-        check_levels(levels, f"pages {path}: attribute 'levels'")
+            if (got := self._file.attribute(name)) != expected:
+                raise RecordingError(f"{self._subject}: attribute '{name}'", repr(got), repr(expected))
+        levels = self._file.attribute("levels")
+        check_levels(levels, f"{self._subject}: attribute 'levels'")
         self.levels = int(levels)
-        symbols, subject = file.get("symbols"), f"pages {path}: dataset 'symbols'"
-        expected = "uint8 (pages, ny, nx), at least one page"
-        if not isinstance(symbols, h5py.Dataset):
+        subject, expected = f"{self._subject}: dataset 'symbols'", "uint8 (pages, ny, nx), at least one page"
+        if (symbols := self._file.array("symbols")) is None:
             raise RecordingError(subject, "none", expected)
-        if symbols.ndim != 3 or symbols.dtype != np.uint8 or 0 in symbols.shape:
-            raise RecordingError(subject, f"{symbols.dtype} {symbols.shape}", expected)
-        self._symbols = symbols
+        shape, kind = symbols.shape, symbols.dtype
+        if len(shape) != 3 or kind != np.uint8 or 0 in shape:
+            raise RecordingError(subject, f"{kind} {shape}", expected)
+        self._shape = shape
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -145,19 +147,19 @@ class Pages:
         self._file.close()
 
     def __len__(self) -> int:
-        return int(self._symbols.shape[0])
+        return self._shape[0]
 
     @property
     def code(self) -> str | None:
         """What the pages hold, JSON text, or None."""
-        text = read_attribute(self._file, "code")
+        text = self._file.attribute("code")
         return text if isinstance(text, str) else None
 
     @property
     def page_shape(self) -> tuple[int, int]:
         """Symbols as (rows, columns)."""
-        _, rows, columns = self._symbols.shape
-        return int(rows), int(columns)
+        _, rows, columns = self._shape
+        return rows, columns
 
     def check_against(self, profile: Profile) -> None:
         """Check that the pages are for devices of this profile.
@@ -177,7 +179,7 @@ class Pages:
         """
         for _ in self:
             pass
-        text = self._file.attrs.get("code")
+        text = self._file.attribute("code")
         try:
             told = {} if text is None else json.loads(text)
         except (TypeError, ValueError):
@@ -189,12 +191,14 @@ class Pages:
         """The symbols [ny, nx] of one page.
 
         Raises:
-            RecordingError: its data cannot be read, or are no symbols of the levels.
+            RecordingError: they are no symbols of the levels.
+            StorageError: its data cannot be read.
         """
-        try:
-            symbols: NDArray[np.uint8] = np.asarray(self._symbols[page])
-        except OSError as error:
-            raise RecordingError(f"pages {self.path}: page {page}", error, "data that can be read") from None
+        if not -len(self) <= page < len(self):
+            raise IndexError(page)
+        page %= len(self)
+        symbols: NDArray[np.uint8]
+        (symbols,) = self._file.rows("symbols", f"{self._subject}: page {page}", page, page + 1)
         if int(symbols.max()) >= self.levels:
             raise RecordingError(
                 f"pages {self.path}: page {page}", f"a symbol of {symbols.max()}", f"0 to {self.levels - 1}"

@@ -1,0 +1,184 @@
+"""Reading HDF5 files: opening, links and attributes, tried again where storage fails, and errors in plain words."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+
+from lightpage.errors import Cause, LightpageError, RecordingError, StorageError
+from lightpage.failures import cause_of, error_number, hdf5_failure
+
+T = TypeVar("T")
+
+PAUSES_S = (0.1, 0.5)
+"""Before the second and the third try."""
+
+sleep = time.sleep
+
+DATA = "data that can be read"
+READABLE = "a readable, complete HDF5 file"
+
+_UNFINISHED = ("unable to lock file", "already open for", "truncated file")
+"""What HDF5 says of a file that is not closed, or not whole."""
+
+
+def patiently(
+    read: Callable[[], T],
+    subject: str,
+    expected: str = DATA,
+    otherwise: type[LightpageError] = StorageError,
+    renew: Callable[[], object] = lambda: None,
+) -> T:
+    """What `read` returns, tried up to three times where storage fails for a moment.
+
+    Args:
+        read: reads by HDF5.
+        subject, expected, otherwise: see `lightpage.failures.hdf5_failure`.
+        renew: called before another try.
+
+    Raises:
+        StorageError: the storage fails on.
+        SurroundingsError: a resource is short.
+        LightpageError: of class `otherwise`, for any other failure of HDF5; and what `read` or `renew` raises itself.
+    """
+    for number, pause in enumerate((*PAUSES_S, None)):
+        try:
+            if number:
+                renew()
+            return read()
+        except (OSError, KeyError, RuntimeError) as error:
+            failure = hdf5_failure(subject, error, expected, otherwise)
+            if pause is None or not isinstance(failure, StorageError) or error_number(error) is None:
+                raise failure from None
+            sleep(pause)
+    raise AssertionError  # the last pause is None
+
+
+def open_hdf5(path: Path, subject: str) -> h5py.File:
+    """An HDF5 file opened for reading.
+
+    Raises:
+        RecordingError: missing, truncated, being written, or something else.
+        StorageError, SurroundingsError: the storage fails, or a resource is short.
+    """
+    return patiently(lambda: open_once(path, subject), subject, READABLE, RecordingError)
+
+
+def open_once(path: Path, subject: str) -> h5py.File:
+    """The same, tried once.
+
+    Raises:
+        RecordingError: as there.
+        OSError: what HDF5 or the system says of storage and resources.
+    """
+    if not path.is_file():
+        got, partial = "no regular file" if path.exists() else "no such file", path.with_name(path.name + ".partial")
+        if partial.is_file():
+            raise RecordingError(subject, f"{got}, only {partial.name}", f"{READABLE}: write it to its end")
+        raise RecordingError(subject, got, READABLE)
+    try:
+        return h5py.File(str(path.absolute()), "r")  # its sources are found from any folder
+    except OSError as error:
+        if not path.stat().st_size or any(words in str(error) for words in _UNFINISHED):
+            raise RecordingError(
+                subject,
+                "an unfinished file: another program still writes it, or was stopped while writing or copying it",
+                f"{READABLE}: wait for its end, or write or copy it anew; where nobody writes it any more, "
+                "'h5clear --status FILE' may open it",
+            ) from None
+        if "signature not found" in str(error):
+            raise RecordingError(subject, "no HDF5 file", READABLE) from None
+        raise
+
+
+def find(file: h5py.File, name: str, subject: str) -> h5py.Dataset | h5py.Group | None:
+    """What lies under a path in a file, or None where nothing is there, or HDF5's null.
+
+    Raises:
+        RecordingError: a link that leads to nothing.
+        StorageError: it cannot be read.
+    """
+    place: Any = file
+    for part in name.split("/"):
+        links = getattr(place.id, "links", None)  # a dataset has none
+        if links is None or not patiently(lambda at=links, part=part: at.exists(part.encode()), subject):
+            return None
+        place = _linked(place, part, subject)
+    return None if isinstance(place, h5py.Dataset) and place.shape is None else place
+
+
+def _linked(group: h5py.Group, part: str, subject: str) -> Any:
+    link = patiently(lambda: group.get(part, getlink=True), subject)
+    try:
+        return patiently(lambda: group[part], subject)
+    except StorageError:
+        if isinstance(link, h5py.ExternalLink):
+            path = resolved(link.filename, Path(group.file.filename), os.environ.get("HDF5_EXT_PREFIX", ""))
+            open_hdf5(path, f"{subject}: linked file {path}").close()
+        elif not isinstance(link, h5py.SoftLink):
+            raise
+        expected = "a link to an array: copy the file that holds it along, or link it anew"
+        raise RecordingError(subject, f"a link to '{link.path}', which is not there", expected) from None
+
+
+def resolved(name: str, file: Path, prefixes: str) -> Path:
+    """The path of a file that an HDF5 file names, by HDF5's rules.
+
+    Args:
+        name: as it stands in `file`.
+        file: absolute path of the file that names it.
+        prefixes: folders to look in, from the environment; `${ORIGIN}` is the folder of `file`.
+
+    Returns:
+        The first place that exists, else the one beside `file`.
+    """
+    base = os.path.basename(name) if os.path.isabs(name) else name
+    beside = file.parent / base
+    places = [
+        *([Path(name)] if os.path.isabs(name) else []),
+        *(Path(prefix.replace("${ORIGIN}", str(file.parent)), base) for prefix in prefixes.split(os.pathsep) if prefix),
+        beside,
+        Path(base).absolute(),
+        Path(os.path.realpath(file)).parent / base,
+    ]
+    return next((place for place in places if _may_be(place)), beside)
+
+
+def _may_be(path: Path) -> bool:
+    """Whether a file is there; where the system does not say, opening it will tell why."""
+    try:
+        path.stat()
+    except OSError as error:
+        return cause_of(error) is Cause.STORAGE or isinstance(error, PermissionError)
+    return True
+
+
+def read_attribute(place: h5py.Group, name: str, subject: str, default: object = None) -> Any:
+    """An attribute of a file or a group as a plain Python value; `default` where it is absent, or HDF5's null.
+
+    Raises:
+        RecordingError: a value of a type that numpy knows not.
+        StorageError: it cannot be read.
+    """
+    subject = f"{subject}: attribute '{name}'"
+    if not patiently(lambda: name in place.attrs, subject):
+        return default
+    try:
+        value = patiently(lambda: place.attrs[name], subject)
+    except (TypeError, ValueError):
+        raise RecordingError(subject, "a value of a type that cannot be read", "a number or text") from None
+    if isinstance(value, h5py.Empty):
+        return default
+    if isinstance(value, (np.generic, np.ndarray)) and value.size == 1:
+        value = value.item()
+    elif isinstance(value, np.ndarray) and value.dtype.kind == "S":
+        value = np.char.decode(value, "utf-8", "replace")
+    if isinstance(value, str):  # what is no UTF-8 comes as lone surrogates, which cannot be printed
+        value = value.encode("utf-8", "surrogateescape")
+    return value.decode("utf-8", "replace").rstrip("\0 ") if isinstance(value, bytes) else value
