@@ -99,13 +99,20 @@ class Pages:
     """A file of pages opened for reading and checked; use it in a `with` statement."""
 
     def __init__(self, file: h5py.File, path: Path) -> None:
-        """Check `file`; `Pages.open` is the usual way in.
+        """Check `file`, which is closed with this; `Pages.open` is the usual way in.
 
         Raises:
             RecordingError: it holds no pages, or is inconsistent.
         """
         self.path, self._subject = path, f"pages {path}"
         self._file = ArrayFile(file, self._subject)
+        try:
+            self._check()
+        except BaseException:
+            self.close()
+            raise
+
+    def _check(self) -> None:
         for name, expected in (("format", FORMAT), ("version", VERSION)):
             if (got := self._file.attribute(name)) != expected:
                 raise RecordingError(f"{self._subject}: attribute '{name}'", repr(got), repr(expected))
@@ -118,7 +125,8 @@ class Pages:
         shape, kind = symbols.shape, symbols.dtype
         if len(shape) != 3 or kind != np.uint8 or 0 in shape:
             raise RecordingError(subject, f"{kind} {shape}", expected)
-        self._shape = shape
+        pages, rows, columns = shape
+        self._shape = pages, rows, columns
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -127,12 +135,7 @@ class Pages:
         Raises:
             RecordingError: missing, truncated, foreign or inconsistent.
         """
-        file = open_hdf5(path, f"pages {path}")
-        try:
-            return cls(file, path)
-        except BaseException:
-            file.close()
-            raise
+        return cls(open_hdf5(path, f"pages {path}"), path)
 
     def __enter__(self) -> Self:
         return self
@@ -158,8 +161,7 @@ class Pages:
     @property
     def page_shape(self) -> tuple[int, int]:
         """Symbols as (rows, columns)."""
-        _, rows, columns = self._shape
-        return rows, columns
+        return self._shape[1:]
 
     def check_against(self, profile: Profile) -> None:
         """Check that the pages are for devices of this profile.

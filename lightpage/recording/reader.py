@@ -57,18 +57,22 @@ class Recording:
     """A recording opened for reading and checked; use it in a `with` statement, or close it."""
 
     def __init__(self, file: h5py.File, path: Path) -> None:
-        """Check `file`, which must be open for reading; `Recording.open` is the usual way in.
+        """Check `file`, which must be open for reading, and is closed with this; `Recording.open` is the usual way in.
 
         Raises:
             RecordingError: the file is not a recording, or it is inconsistent.
         """
         self.path = path
         self._file = ArrayFile(file, f"recording {path}")
-        self._check_header()
-        self._check_frames()
-        self._check_page()
-        for name in (*SHOT_DATA, *DARK, *HOT, LOSSES):
-            self._file.array(name)
+        try:
+            self._check_header()
+            self._check_frames()
+            self._check_page()
+            for name in (*SHOT_DATA, *DARK, *HOT, LOSSES):
+                self._file.array(name)
+        except BaseException:
+            self.close()
+            raise
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -79,12 +83,7 @@ class Recording:
                 file, the dataset or attribute, what came and what was wanted.
         """
         path = Path(path)
-        file = open_hdf5(path, f"recording {path}")
-        try:
-            return cls(file, path)
-        except BaseException:
-            file.close()
-            raise
+        return cls(open_hdf5(path, f"recording {path}"), path)
 
     def __enter__(self) -> Self:
         return self

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 import os
+import re
 import threading
 from bisect import bisect_left
 from collections import OrderedDict
@@ -26,7 +27,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import RecordingError
+from lightpage.errors import RecordingError, StorageError
 from lightpage.progress import warn
 from lightpage.recording.hdf5 import READABLE, find, open_hdf5, open_once, patiently, read_attribute, resolved
 from lightpage.words import counted
@@ -165,6 +166,9 @@ class ArrayFile:
         """Close the file; nothing can be read afterwards."""
         with self._lock:
             self._sources.close()
+            for array in self._arrays.values():
+                if array is not None:  # one behind a link keeps another file open
+                    array.dataset.id.close()
             self._file.close()
 
     def _found_stamp(self) -> tuple[int, int]:
@@ -410,6 +414,7 @@ class StoredArray:
             first, step, _, block = shown[grows]
             for number in numbers():
                 if (start := first + number * step) >= self.shape[grows]:
+                    self._check_end(file_name, name, number)
                     break
                 shown[grows] = start, 1, 1, block
                 axes = [_indices(slab, stop=size) for slab, size in zip(shown, self.shape, strict=True)]
@@ -425,6 +430,24 @@ class StoredArray:
         prefixes = os.environ.get("HDF5_VDS_PREFIX", "")
         path = self._path if file_name == "." else resolved(file_name, self._path, prefixes)
         return _Part(path, name, tuple(shown), tuple(taken))
+
+    def _check_end(self, file_name: str, name: str, number: int) -> None:
+        """Check that no source is there from `number` on: HDF5 ends at the first that it cannot open.
+
+        Raises:
+            RecordingError: this one is missing, and a later one is there.
+            StorageError: this one is there by now.
+        """
+        end = self._part(file_name, name, number, (), ())
+        if "%b" not in file_name:
+            return
+        before, _, after = (re.escape(text.replace("%%", "%")) for text in os.path.basename(file_name).partition("%b"))
+        pattern = re.compile(f"{before}([0-9]+){after.replace('%b', '[0-9]+')}")
+        with suppress(OSError):
+            found = [int(match[1]) for entry in os.listdir(end.path.parent) if (match := pattern.fullmatch(entry))]
+            if max(found, default=-1) >= number:
+                self._source(end)
+                raise StorageError(self.subject, f"no data of {end.path}", "storage that answers")
 
     def _selected(self, space: Any) -> list[Slab | NDArray[np.intp]]:
         """What a mapping selects along each axis; nothing where it is the whole array."""
