@@ -295,8 +295,17 @@ class StoredArray:
     def _check_chunks(self, properties: Any) -> None:
         """Check that all chunks are there and can be decoded; keep them in memory where pages share them."""
         chunk = self.dataset.chunks
+        counts = [-(-size // step) for size, step in zip(self.shape, chunk, strict=True)]
+        across, end = math.prod(counts[1:]), _size_of(self._path, self.subject)
         missing_filters = self._missing_filters(properties)
-        end = _size_of(self._path, self.subject)
+        there = patiently(self.dataset.id.get_num_chunks, self.subject)
+        if there < math.prod(counts) or self.stored_bytes > end or missing_filters:
+            self._look_at_chunks(across, end, missing_filters)
+        if properties.get_nfilters() and chunk[0] > 1:
+            self._keep_chunks(across)
+
+    def _look_at_chunks(self, across: int, end: int, missing_filters: list[tuple[int, str]]) -> None:
+        """Check each chunk: there are `across` of them side by side, and the file ends at `end`."""
         seen: dict[int, int] = {}
         skipped = ~0
 
@@ -308,19 +317,14 @@ class StoredArray:
             skipped &= info.filter_mask
 
         patiently(lambda: (seen.clear(), self.dataset.id.chunk_iter(look)), self.subject)
-        across = math.prod(-(-size // step) for size, step in zip(self.shape[1:], chunk[1:], strict=True))
-        if unwritten := [row for row in range(0, len(self) if across else 0, chunk[0]) if seen.get(row, 0) < across]:
-            raise self._unwritten(
-                [row for first in unwritten for row in range(first, min(first + chunk[0], len(self)))]
-            )
+        step = self.dataset.chunks[0]
+        if unwritten := [row for row in range(0, len(self) if across else 0, step) if seen.get(row, 0) < across]:
+            raise self._unwritten(range(unwritten[0], min(unwritten[-1] + step, len(self))))
         for index, told in missing_filters:
             if seen and not skipped >> index & 1:
-                expected = (
-                    "one that HDF5 knows: pip install hdf5plugin, or repack with gzip (h5repack -f GZIP=4 IN OUT)"
-                )
-                raise RecordingError(self.subject, f"data compressed by the filter {told}, which is not here", expected)
-        if properties.get_nfilters() and chunk[0] > 1:
-            self._keep_chunks(across)
+                got = f"data compressed by the filter {told}, which HDF5 does not have here"
+                expected = "it (pip install hdf5plugin), or data repacked with gzip (h5repack -f GZIP=4 IN OUT)"
+                raise RecordingError(self.subject, got, expected)
 
     def _keep_chunks(self, across: int) -> None:
         chunk = self.dataset.chunks
