@@ -51,7 +51,6 @@ _SHORT = {
     errno.ENOSPC: "room on the disk",
     errno.EFBIG: "room in a file (ulimit -f, or another file system)",
     errno.EDQUOT: "room in the quota",
-    errno.EFBIG: "room for a file of this size (ulimit -f, or the file system)",
     errno.ENOBUFS: "buffers of the network",
 }
 """Error numbers of a resource that is short, and which it is."""

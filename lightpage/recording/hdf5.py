@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from collections.abc import Callable
@@ -28,6 +29,28 @@ _UNFINISHED = ("unable to lock file", "already open for", "truncated file")
 """What HDF5 says of a file that is not closed, or not whole."""
 
 
+def retried(call: Callable[[], T], renew: Callable[[], object] = lambda: None) -> T:
+    """What `call` returns, tried up to three times where storage fails for a moment.
+
+    Args:
+        call: reads or writes, by HDF5 or the system.
+        renew: called before another try.
+
+    Raises:
+        OSError, KeyError, RuntimeError: what the last try raised.
+    """
+    for number, pause in enumerate((*PAUSES_S, None)):
+        try:
+            if number:
+                renew()
+            return call()
+        except (OSError, KeyError, RuntimeError) as error:
+            if pause is None or cause_of(error) is not Cause.STORAGE:
+                raise
+            sleep(pause)
+    raise AssertionError  # the last pause is None
+
+
 def patiently(
     read: Callable[[], T],
     subject: str,
@@ -35,29 +58,21 @@ def patiently(
     otherwise: type[LightpageError] = StorageError,
     renew: Callable[[], object] = lambda: None,
 ) -> T:
-    """What `read` returns, tried up to three times where storage fails for a moment.
+    """The same, with its failure in plain words.
 
     Args:
-        read: reads by HDF5.
+        read, renew: see `retried`.
         subject, expected, otherwise: see `lightpage.failures.hdf5_failure`.
-        renew: called before another try.
 
     Raises:
         StorageError: the storage fails on.
         SurroundingsError: a resource is short.
         LightpageError: of class `otherwise`, for any other failure of HDF5; and what `read` or `renew` raises itself.
     """
-    for number, pause in enumerate((*PAUSES_S, None)):
-        try:
-            if number:
-                renew()
-            return read()
-        except (OSError, KeyError, RuntimeError) as error:
-            failure = hdf5_failure(subject, error, expected, otherwise)
-            if pause is None or not isinstance(failure, StorageError) or error_number(error) is None:
-                raise failure from None
-            sleep(pause)
-    raise AssertionError  # the last pause is None
+    try:
+        return retried(read, renew)
+    except (OSError, KeyError, RuntimeError) as error:
+        raise hdf5_failure(subject, error, expected, otherwise) from None
 
 
 def open_hdf5(path: Path, subject: str) -> h5py.File:
@@ -85,6 +100,8 @@ def open_once(path: Path, subject: str) -> h5py.File:
     try:
         return h5py.File(str(path.absolute()), "r")  # its sources are found from any folder
     except OSError as error:
+        if _lacks_locks(error):  # reading needs none
+            return h5py.File(str(path.absolute()), "r", locking=False)
         if not path.stat().st_size or any(words in str(error) for words in _UNFINISHED):
             raise RecordingError(
                 subject,
@@ -95,6 +112,12 @@ def open_once(path: Path, subject: str) -> h5py.File:
         if "signature not found" in str(error):
             raise RecordingError(subject, "no HDF5 file", READABLE) from None
         raise
+
+
+def _lacks_locks(error: OSError) -> bool:
+    """Whether a file could not be opened because its file system has no locks, or it is open without one already."""
+    text = str(error)
+    return "locking flag" in text or ("unable to lock file" in text and error_number(error) != errno.EAGAIN)
 
 
 def find(file: h5py.File, name: str, subject: str) -> h5py.Dataset | h5py.Group | None:

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.errors import RecordingError
+from lightpage.failures import os_failure
 from lightpage.files import move_into_place
 from lightpage.page.symbols import check_levels, check_symbols
 from lightpage.recording.hdf5 import open_hdf5
-from lightpage.recording.hdf_file import HdfFile
+from lightpage.recording.hdf_file import open_to_write
 from lightpage.recording.stored import ArrayFile
 
 FORMAT = "lightpage-pages"
@@ -46,10 +47,7 @@ class PagesWriter:
         check_levels(levels, f"pages {path}: levels")
         self.path, self._partial = path, path.with_name(path.name + ".partial")
         self._shape, self._levels = profile.page_shape, levels
-        try:
-            self._disk = HdfFile(self._partial)
-        except OSError as error:
-            raise RecordingError(f"pages {self._partial}", error, "a file that can be written") from None
+        self._disk = open_to_write(self._partial, f"pages {self._partial}")
         self._file = h5py.File(self._disk, "w")  # type: ignore[arg-type]  # the stubs know only names
         attributes = {"format": FORMAT, "version": VERSION, "levels": levels, "profile": profile.to_toml()}
         for name, value in {**attributes, "code": json.dumps(code)}.items():
@@ -73,7 +71,7 @@ class PagesWriter:
         try:
             self._disk.check()
         except OSError as error:
-            raise RecordingError(f"pages {self.path}", error, "room for them on the disk") from None
+            raise os_failure(f"pages {self.path}", error, "room for them on the disk", RecordingError) from None
 
     def __enter__(self) -> Self:
         return self
@@ -90,7 +88,7 @@ class PagesWriter:
             move_into_place(self._partial, self.path)
         except OSError as failure:
             self._partial.unlink(missing_ok=True)
-            raise RecordingError(f"pages {self.path}", failure, "a file that can be completed") from None
+            raise os_failure(f"pages {self.path}", failure, "a file that can be completed", RecordingError) from None
         finally:
             self._disk.close()
 
