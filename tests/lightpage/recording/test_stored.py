@@ -504,6 +504,20 @@ class TestUnfinishedFiles:
         assert "foreign.h5.partial" in refusal(foreign)
 
 
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_file_system_without_locks_is_read(foreign: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    original = h5py.File.__init__
+
+    def opened(file: h5py.File, name: object, *args: object, locking: object = None, **kwargs: object) -> None:
+        if isinstance(name, str) and locking is None:
+            raise OSError(number, f"Unable to open file (unable to lock file, errno = {number})")
+        original(file, name, *args, locking=locking, **kwargs)
+
+    monkeypatch.setattr(h5py.File, "__init__", opened)
+    with Recording.open(foreign) as recording:
+        assert recording.frames(0).in_phase.any()
+
+
 class TestAttributes:
     def change(self, path: Path, **values: object) -> None:
         with h5py.File(path, "r+") as file:
