@@ -137,7 +137,9 @@ def hdf5_failure(
     number = error_number(error)
     if number is not None:
         return os_failure(subject, OSError(number, os.strerror(number)), expected, otherwise)
-    return short_resource(subject, error) or otherwise(subject, "damaged data", expected)
+    if short := short_resource(subject, error):
+        return SurroundingsError(subject, "too little", short.expected)
+    return otherwise(subject, "damaged data", expected)
 
 
 def short_resource(subject: str, error: BaseException) -> SurroundingsError | None:

@@ -6,6 +6,7 @@ import errno
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +17,9 @@ from lightpage.errors import Cause, LightpageError, RecordingError, StorageError
 from lightpage.failures import cause_of, error_number, hdf5_failure
 
 T = TypeVar("T")
+
+hdf: Any = h5py
+"""The stubs of h5py know little of links and of its low level."""
 
 PAUSES_S = (0.1, 0.5)
 """Before the second and the third try."""
@@ -93,9 +97,9 @@ def open_once(path: Path, subject: str) -> h5py.File:
         OSError: what HDF5 or the system says of storage and resources.
     """
     if not path.is_file():
-        got, partial = "no regular file" if path.exists() else "no such file", path.with_name(path.name + ".partial")
-        if partial.is_file():
-            raise RecordingError(subject, f"{got}, only {partial.name}", f"{READABLE}: write it to its end")
+        got, unfinished = "no regular file" if path.exists() else "no such file", path.with_name(path.name + ".partial")
+        if unfinished.is_file():
+            raise RecordingError(subject, f"{got}, only {unfinished.name}", f"{READABLE}: write it to its end")
         raise RecordingError(subject, got, READABLE)
     try:
         return h5py.File(str(path.absolute()), "r")  # its sources are found from any folder
@@ -120,7 +124,7 @@ def _lacks_locks(error: OSError) -> bool:
     return "locking flag" in text or ("unable to lock file" in text and error_number(error) != errno.EAGAIN)
 
 
-def find(file: h5py.File, name: str, subject: str) -> h5py.Dataset | h5py.Group | None:
+def find(file: h5py.File, name: str, subject: str) -> Any:
     """What lies under a path in a file, or None where nothing is there, or HDF5's null.
 
     Raises:
@@ -130,21 +134,21 @@ def find(file: h5py.File, name: str, subject: str) -> h5py.Dataset | h5py.Group 
     place: Any = file
     for part in name.split("/"):
         links = getattr(place.id, "links", None)  # a dataset has none
-        if links is None or not patiently(lambda at=links, part=part: at.exists(part.encode()), subject):
+        if links is None or not patiently(partial(links.exists, part.encode()), subject):
             return None
         place = _linked(place, part, subject)
     return None if isinstance(place, h5py.Dataset) and place.shape is None else place
 
 
-def _linked(group: h5py.Group, part: str, subject: str) -> Any:
+def _linked(group: Any, part: str, subject: str) -> Any:
     link = patiently(lambda: group.get(part, getlink=True), subject)
     try:
         return patiently(lambda: group[part], subject)
     except StorageError:
-        if isinstance(link, h5py.ExternalLink):
+        if isinstance(link, hdf.ExternalLink):
             path = resolved(link.filename, Path(group.file.filename), os.environ.get("HDF5_EXT_PREFIX", ""))
             open_hdf5(path, f"{subject}: linked file {path}").close()
-        elif not isinstance(link, h5py.SoftLink):
+        elif not isinstance(link, hdf.SoftLink):
             raise
         expected = "a link to an array: copy the file that holds it along, or link it anew"
         raise RecordingError(subject, f"a link to '{link.path}', which is not there", expected) from None
@@ -196,7 +200,7 @@ def read_attribute(place: h5py.Group, name: str, subject: str, default: object =
         value = patiently(lambda: place.attrs[name], subject)
     except (TypeError, ValueError):
         raise RecordingError(subject, "a value of a type that cannot be read", "a number or text") from None
-    if isinstance(value, h5py.Empty):
+    if isinstance(value, hdf.Empty):
         return default
     if isinstance(value, (np.generic, np.ndarray)) and value.size == 1:
         value = value.item()

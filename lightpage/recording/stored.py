@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from lightpage.errors import RecordingError, StorageError
 from lightpage.progress import warn
-from lightpage.recording.hdf5 import READABLE, find, open_hdf5, open_once, patiently, read_attribute, resolved
+from lightpage.recording.hdf5 import READABLE, find, hdf, open_hdf5, open_once, patiently, read_attribute, resolved
 from lightpage.words import counted
 
 CACHE_BYTES = 1 << 30
@@ -38,7 +38,7 @@ CACHE_BYTES = 1 << 30
 _OPEN_SOURCES = 16
 """Files of virtual datasets that stay open; there may be more of them than the system lets a process open."""
 
-_UNLIMITED = h5py.h5s.UNLIMITED
+_UNLIMITED = hdf.h5s.UNLIMITED
 _EXTFILE_PREFIX = os.environ.get("HDF5_EXTFILE_PREFIX", "")
 """HDF5 looks at it once, when it is loaded."""
 
@@ -81,9 +81,6 @@ class Sources:
             raise RecordingError(subject, "sources that lead back to themselves", "a source that holds data")
         if path not in self._open:
             self._open[path] = open_hdf5(path, f"{subject}: source {path}"), {}
-            if len(self._open) > _OPEN_SOURCES:
-                _, (file, _) = self._open.popitem(last=False)
-                file.close()
         self._open.move_to_end(path)
         file, arrays = self._open[path]
         if name not in arrays:
@@ -92,7 +89,13 @@ class Sources:
             if not isinstance(found, h5py.Dataset):
                 raise RecordingError(subject, "none", "the array that the virtual dataset shows")
             arrays[name] = StoredArray(found, subject, self, (*chain, (path, name)))
+            while len(self._open) > 1 and (len(self._open) > _OPEN_SOURCES or self._kept_bytes() > CACHE_BYTES):
+                _, (file, _) = self._open.popitem(last=False)
+                file.close()
         return arrays[name]
+
+    def _kept_bytes(self) -> int:
+        return sum(array.kept_bytes for _, arrays in self._open.values() for array in arrays.values())
 
     def close(self) -> None:
         """Close all files."""
@@ -130,8 +133,9 @@ class ArrayFile:
                 self._be_open()
                 subject = f"{self._subject}: dataset '{name}'"
                 found = find(self._file, name, subject)
-                if isinstance(found, h5py.Group):
-                    raise RecordingError(subject, "a group", "an array")
+                if not isinstance(found, (h5py.Dataset, type(None))):
+                    got = "a group" if isinstance(found, h5py.Group) else "a named type"
+                    raise RecordingError(subject, got, "an array")
                 self._arrays[name] = None if found is None else StoredArray(found, subject, self._sources)
             return self._arrays[name]
 
@@ -220,6 +224,7 @@ class StoredArray:
     Attributes:
         subject, shape, dtype: of the array.
         stored_bytes: that it takes on the disk.
+        kept_bytes: memory for chunks that pages share.
 
     Raises:
         RecordingError: data were never written, are in files that are not there, or are stored in a way that cannot be
@@ -227,10 +232,8 @@ class StoredArray:
         StorageError, SurroundingsError: it cannot be read.
     """
 
-    def __init__(
-        self, found: h5py.Dataset, subject: str, sources: Sources, chain: tuple[tuple[Path, str], ...] = ()
-    ) -> None:
-        self.subject, self._sources = subject, sources
+    def __init__(self, found: Any, subject: str, sources: Sources, chain: tuple[tuple[Path, str], ...] = ()) -> None:
+        self.subject, self._sources, self.kept_bytes = subject, sources, 0
         try:
             self.shape: tuple[int, ...] = found.shape
             self.dtype: np.dtype[Any] = found.dtype
@@ -238,19 +241,19 @@ class StoredArray:
             raise RecordingError(subject, "a type that cannot be read", "whole numbers") from None
         self._path, self._name = Path(found.file.filename), found.name.strip("/")
         self._chain = chain or ((self._path, self._name),)
-        self.dataset = found
+        self.dataset: Any = found
         self._parts: list[_Part] = []
         properties = found.id.get_create_plist()
         layout = properties.get_layout()
-        if layout == h5py.h5d.VIRTUAL:
+        if layout == hdf.h5d.VIRTUAL:
             self.stored_bytes = self._check_parts(properties)
             return
         self.stored_bytes = float(patiently(found.id.get_storage_size, subject))
-        if layout == h5py.h5d.CHUNKED:
+        if layout == hdf.h5d.CHUNKED:
             self._check_chunks(properties)
         elif properties.get_external_count():
             self._check_external(properties)
-        elif layout == h5py.h5d.CONTIGUOUS and self.stored_bytes < found.nbytes:
+        elif layout == hdf.h5d.CONTIGUOUS and self.stored_bytes < found.nbytes:
             raise self._unwritten(range(len(self)))
 
     def __len__(self) -> int:
@@ -316,7 +319,11 @@ class StoredArray:
                 seen[first] = seen.get(first, 0) + 1
             skipped &= info.filter_mask
 
-        patiently(lambda: (seen.clear(), self.dataset.id.chunk_iter(look)), self.subject)
+        def look_at_all() -> None:
+            seen.clear()
+            self.dataset.id.chunk_iter(look)
+
+        patiently(look_at_all, self.subject)
         step = self.dataset.chunks[0]
         if unwritten := [row for row in range(0, len(self) if across else 0, step) if seen.get(row, 0) < across]:
             raise self._unwritten(range(unwritten[0], min(unwritten[-1] + step, len(self))))
@@ -336,12 +343,13 @@ class StoredArray:
                 f"'h5repack -l {self._name}:CHUNK={one} IN OUT' makes reading fast"
             )
             return
-        access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
+        self.kept_bytes = needed
+        access = hdf.h5p.create(hdf.h5p.DATASET_ACCESS)
         _, before, _ = access.get_chunk_cache()
         access.set_chunk_cache(100 * across + 1, max(before, needed), 1.0)
         file, name = self.dataset.file, self.dataset.name
         self.dataset.id.close()  # the memory is that of its first opening
-        self.dataset = patiently(lambda: h5py.Dataset(h5py.h5d.open(file.id, name.encode(), access)), self.subject)
+        self.dataset = patiently(lambda: hdf.Dataset(hdf.h5d.open(file.id, name.encode(), access)), self.subject)
 
     def _missing_filters(self, properties: Any) -> list[tuple[int, str]]:
         """Position and name of each filter that HDF5 cannot decode here."""
@@ -456,9 +464,9 @@ class StoredArray:
     def _selected(self, space: Any) -> list[Slab | NDArray[np.intp]]:
         """What a mapping selects along each axis; nothing where it is the whole array."""
         kind = space.get_select_type()
-        if kind == h5py.h5s.SEL_ALL:
+        if kind == hdf.h5s.SEL_ALL:
             return []
-        if kind == h5py.h5s.SEL_HYPERSLABS:
+        if kind == hdf.h5s.SEL_HYPERSLABS:
             if space.is_regular_hyperslab():
                 return list(zip(*space.get_regular_hyperslab(), strict=True))
             blocks = np.asarray(space.get_select_hyper_blocklist(), np.intp)
@@ -522,16 +530,16 @@ def _take_off(space: Any, axes: Sequence[Indices]) -> None:
     pieces = [[axis] if isinstance(axis, range) else [range(one, one + 1) for one in axis] for axis in axes]
     for block in product(*pieces):
         start, size, step = zip(*((axis.start, len(axis), axis.step) for axis in block), strict=True)
-        space.select_hyperslab(start, size, step, op=h5py.h5s.SELECT_NOTB)
+        space.select_hyperslab(start, size, step, op=hdf.h5s.SELECT_NOTB)
 
 
 def _decodes(code: int) -> bool:
-    return h5py.h5z.filter_avail(code) and bool(h5py.h5z.get_filter_info(code) & h5py.h5z.FILTER_CONFIG_DECODE_ENABLED)
+    return hdf.h5z.filter_avail(code) and bool(hdf.h5z.get_filter_info(code) & hdf.h5z.FILTER_CONFIG_DECODE_ENABLED)
 
 
 def _size_of(path: Path, subject: str, expected: str = "a file that can be read") -> int:
     return patiently(lambda: path.stat().st_size, subject, expected, RecordingError)
 
 
-def _told(rows: Sequence[int]) -> str:
+def _told(rows: Indices | Sequence[int]) -> str:
     return f"{rows[0]}" if len(rows) == 1 else f"{rows[0]} to {rows[-1]}"

@@ -410,6 +410,14 @@ class TestChunksAndFilters:
         assert f"{word} ({code})" in told
         assert "hdf5plugin" in told
 
+    def test_a_filter_of_hdf5plugin_is_taken_from_there(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.unknown_filter(foreign, "in_phase", 32001)
+        loaded: list[str] = []
+        monkeypatch.setattr(stored.importlib, "import_module", loaded.append)
+        monkeypatch.setattr(stored, "_decodes", lambda code: bool(loaded))
+        Recording.open(foreign).close()
+        assert loaded == ["hdf5plugin"]
+
     def test_pages_to_write_are_looked_at_too(self, foreign: Path) -> None:
         with h5py.File(foreign, "r+") as file:
             file.attrs["format"] = "lightpage-pages"
@@ -706,3 +714,21 @@ class TestStorageThatFails:
             failing(monkeypatch, EIO_OF_HDF5, 3, "/d")
             with pytest.raises(StorageError, match=r"source .*source\.h5"):
                 recording.frames(1)
+
+
+def test_whatever_is_damaged_is_told_in_plain_words(foreign: Path, pauses: list[float]) -> None:
+    content, rng = foreign.read_bytes(), np.random.default_rng(0)
+    told: list[str] = []
+    for place in rng.integers(0, 12_000, 150):
+        damaged = bytearray(content)
+        damaged[place] ^= 255
+        foreign.write_bytes(damaged)
+        try:
+            with Recording.open(foreign) as recording:
+                for page in range(recording.pages):
+                    recording.shown(page)
+        except LightpageError as error:
+            told.append(str(error))
+    assert told
+    assert not any("synchronously" in text for text in told)
+    assert not pauses
