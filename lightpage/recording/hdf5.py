@@ -124,6 +124,14 @@ def _lacks_locks(error: OSError) -> bool:
     return "locking flag" in text or ("unable to lock file" in text and error_number(error) != errno.EAGAIN)
 
 
+def open_named(path: Path, subject: str, variable: str) -> h5py.File:
+    """The same of a file that another one names; `variable` of the environment says where else it may lie."""
+    if not _may_be(path):
+        expected = f"the file, copied along to there or to a folder that {variable} names"
+        raise RecordingError(subject, "no such file", expected)
+    return open_hdf5(path, subject)
+
+
 def find(file: h5py.File, name: str, subject: str) -> Any:
     """What lies under a path in a file, or None where nothing is there, or HDF5's null.
 
@@ -147,7 +155,7 @@ def _linked(group: Any, part: str, subject: str) -> Any:
     except StorageError:
         if isinstance(link, hdf.ExternalLink):
             path = resolved(link.filename, Path(group.file.filename), os.environ.get("HDF5_EXT_PREFIX", ""))
-            open_hdf5(path, f"{subject}: linked file {path}").close()
+            open_named(path, f"{subject}: linked file {path}", "HDF5_EXT_PREFIX").close()
         elif not isinstance(link, hdf.SoftLink):
             raise
         expected = "a link to an array: copy the file that holds it along, or link it anew"

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from lightpage.errors import RecordingError, StorageError
 from lightpage.progress import warn
-from lightpage.recording.hdf5 import READABLE, find, hdf, open_hdf5, open_once, patiently, read_attribute, resolved
+from lightpage.recording.hdf5 import READABLE, find, hdf, open_named, open_once, patiently, read_attribute, resolved
 from lightpage.words import counted
 
 CACHE_BYTES = 1 << 30
@@ -80,7 +80,7 @@ class Sources:
         if (path, name) in chain:
             raise RecordingError(subject, "sources that lead back to themselves", "a source that holds data")
         if path not in self._open:
-            self._open[path] = open_hdf5(path, f"{subject}: source {path}"), {}
+            self._open[path] = open_named(path, f"{subject}: source {path}", "HDF5_VDS_PREFIX"), {}
         self._open.move_to_end(path)
         file, arrays = self._open[path]
         if name not in arrays:
