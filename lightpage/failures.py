@@ -76,7 +76,7 @@ def cause_of(error: BaseException) -> Cause:
     """The cause of any failure; `Cause.SURROUNDINGS` for one that nobody foresaw."""
     if isinstance(error, LightpageError):
         return error.cause
-    if isinstance(error, OSError) and error_number(error) in _STORAGE:
+    if error_number(error) in _STORAGE:
         return Cause.STORAGE
     return Cause.SURROUNDINGS
 
@@ -100,9 +100,9 @@ def understood(subject: str, error: BaseException) -> LightpageError | None:
     return short_resource(subject, error)
 
 
-def error_number(error: OSError) -> int | None:
+def error_number(error: BaseException) -> int | None:
     """The `errno` of an error, of HDF5 too; None where there is none."""
-    if error.errno is not None:
+    if isinstance(error, OSError) and error.errno is not None:
         return error.errno
     told = _HDF5_ERRNO.search(str(error))
     return int(told[1]) if told else None
@@ -128,6 +128,18 @@ def os_failure(
     if number is not None and number in _SHORT:
         return SurroundingsError(subject, os.strerror(number), f"more {_SHORT[number]}")
     return otherwise(subject, error if number is None else OSError(number, os.strerror(number)), expected)
+
+
+def hdf5_failure(
+    subject: str, error: Exception, expected: object, otherwise: type[LightpageError] = StorageError
+) -> LightpageError:
+    """The same of any error that HDF5 raises; without a number, and with no resource short, data are damaged."""
+    number = error_number(error)
+    if number is not None:
+        return os_failure(subject, OSError(number, os.strerror(number)), expected, otherwise)
+    if short := short_resource(subject, error):
+        return SurroundingsError(subject, "too little", short.expected)
+    return otherwise(subject, "damaged data", expected)
 
 
 def short_resource(subject: str, error: BaseException) -> SurroundingsError | None:

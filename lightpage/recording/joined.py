@@ -10,6 +10,8 @@ import h5py
 import numpy as np
 
 from lightpage.errors import RecordingError
+from lightpage.failures import os_failure
+from lightpage.recording.hdf5 import open_hdf5
 from lightpage.recording.layout import FORMAT, FRAMES, REFERENCES, VERSION
 from lightpage.recording.reader import Recording
 
@@ -34,7 +36,7 @@ def join(paths: Sequence[Path], out: Path) -> None:
             if value != kinds[0][name]:
                 raise RecordingError(f"recording {path}: {name}", value, f"{kinds[0][name]}, as {paths[0]} has")
     try:
-        with h5py.File(str(paths[0]), "r") as first, h5py.File(str(out), "w") as file:
+        with open_hdf5(paths[0], f"recording {paths[0]}") as first, h5py.File(str(out), "w") as file:
             attributes = ("camera_bit_depth", "levels", "black_level", "profile")
             file.attrs.update({"format": FORMAT, "version": VERSION})
             file.attrs.update({name: first.attrs[name] for name in attributes if name in first.attrs})
@@ -45,7 +47,7 @@ def join(paths: Sequence[Path], out: Path) -> None:
                 if name in first:
                     file.create_virtual_dataset(name, _layout(name, paths))  # type: ignore[attr-defined]
     except OSError as error:
-        raise RecordingError(f"recording {out}", error, "a file that can be written") from None
+        raise os_failure(f"recording {out}", error, "a file that can be written", RecordingError) from None
 
 
 def _kind(path: Path) -> dict[str, Any]:
@@ -67,14 +69,15 @@ def _layout(name: str, paths: Sequence[Path]) -> Any:
     """The pages of all recordings behind one another. The stubs of h5py know of no virtual datasets."""
     parts = []
     for path in paths:
-        with h5py.File(str(path), "r") as file:
+        with open_hdf5(path, f"recording {path}") as file:
             parts.append((path, file[name].shape, file[name].dtype))
     shape = (sum(shape[0] for _, shape, _ in parts), *parts[0][1][1:])
     kind = np.result_type(*(kind for _, _, kind in parts))
     layout = h5py.VirtualLayout(shape, kind)  # type: ignore[attr-defined]
     start = 0
     for path, own, kind in parts:
-        pages = h5py.VirtualSource(str(path.absolute()), name, own, kind)  # type: ignore[attr-defined]
+        source = str(path.absolute()).replace("%", "%%")  # or HDF5 looks for a number
+        pages = h5py.VirtualSource(source, name, own, kind)  # type: ignore[attr-defined]
         layout[start : start + own[0]] = pages
         start += own[0]
     return layout

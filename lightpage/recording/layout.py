@@ -5,15 +5,11 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import RecordingError
-from lightpage.failures import os_failure
 from lightpage.recording.frame_pair import FramePair
 
 FORMAT = "lightpage-recording"
@@ -74,30 +70,6 @@ class LostShot:
     reason: str
     detail: str
     time_s: float
-
-
-def open_hdf5(path: Path, subject: str) -> h5py.File:
-    """An HDF5 file opened for reading.
-
-    Raises:
-        RecordingError: missing, truncated, or something else.
-        StorageError, SurroundingsError: the storage fails, or a resource is short.
-    """
-    expected = "a readable, complete HDF5 file"
-    try:
-        if not path.is_file():
-            raise RecordingError(subject, "no regular file" if path.exists() else "no such file", expected)
-        return h5py.File(str(path), "r")
-    except OSError as error:
-        raise os_failure(subject, error, expected, RecordingError) from None
-
-
-def read_attribute(file: h5py.File, name: str, default: object = None) -> Any:
-    """A root attribute as a plain Python value."""
-    value = file.attrs.get(name, default)
-    if isinstance(value, (np.generic, np.ndarray)) and value.size == 1:
-        value = value.item()
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 
 def hash_frames(frames: FramePair) -> str:

@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
 from lightpage.errors import RecordingError
+from lightpage.failures import os_failure
 from lightpage.files import move_into_place
 from lightpage.page.symbols import check_levels, check_symbols
-from lightpage.recording.hdf_file import HdfFile
-from lightpage.recording.layout import open_hdf5, read_attribute
+from lightpage.recording.hdf5 import open_hdf5
+from lightpage.recording.hdf_file import open_to_write
+from lightpage.recording.stored import ArrayFile
 
 FORMAT = "lightpage-pages"
 VERSION = 1
@@ -45,10 +47,7 @@ class PagesWriter:
         check_levels(levels, f"pages {path}: levels")
         self.path, self._partial = path, path.with_name(path.name + ".partial")
         self._shape, self._levels = profile.page_shape, levels
-        try:
-            self._disk = HdfFile(self._partial)
-        except OSError as error:
-            raise RecordingError(f"pages {self._partial}", error, "a file that can be written") from None
+        self._disk = open_to_write(self._partial, f"pages {self._partial}")
         self._file = h5py.File(self._disk, "w")  # type: ignore[arg-type]  # the stubs know only names
         attributes = {"format": FORMAT, "version": VERSION, "levels": levels, "profile": profile.to_toml()}
         for name, value in {**attributes, "code": json.dumps(code)}.items():
@@ -72,7 +71,7 @@ class PagesWriter:
         try:
             self._disk.check()
         except OSError as error:
-            raise RecordingError(f"pages {self.path}", error, "room for them on the disk") from None
+            raise os_failure(f"pages {self.path}", error, "room for them on the disk", RecordingError) from None
 
     def __enter__(self) -> Self:
         return self
@@ -89,7 +88,7 @@ class PagesWriter:
             move_into_place(self._partial, self.path)
         except OSError as failure:
             self._partial.unlink(missing_ok=True)
-            raise RecordingError(f"pages {self.path}", failure, "a file that can be completed") from None
+            raise os_failure(f"pages {self.path}", failure, "a file that can be completed", RecordingError) from None
         finally:
             self._disk.close()
 
@@ -98,25 +97,34 @@ class Pages:
     """A file of pages opened for reading and checked; use it in a `with` statement."""
 
     def __init__(self, file: h5py.File, path: Path) -> None:
-        """Check `file`; `Pages.open` is the usual way in.
+        """Check `file`, which is closed with this; `Pages.open` is the usual way in.
 
         Raises:
             RecordingError: it holds no pages, or is inconsistent.
         """
-        self._file, self.path = file, path
+        self.path, self._subject = path, f"pages {path}"
+        self._file = ArrayFile(file, self._subject)
+        try:
+            self._check()
+        except BaseException:
+            self.close()
+            raise
+
+    def _check(self) -> None:
         for name, expected in (("format", FORMAT), ("version", VERSION)):
-            if (got := read_attribute(file, name)) != expected:
-                raise RecordingError(f"pages {path}: attribute '{name}'", repr(got), repr(expected))
-        levels = read_attribute(file, "levels")
-        check_levels(levels, f"pages {path}: attribute 'levels'")
+            if (got := self._file.attribute(name)) != expected:
+                raise RecordingError(f"{self._subject}: attribute '{name}'", repr(got), repr(expected))
+        levels = self._file.attribute("levels")
+        check_levels(levels, f"{self._subject}: attribute 'levels'")
         self.levels = int(levels)
-        symbols, subject = file.get("symbols"), f"pages {path}: dataset 'symbols'"
-        expected = "uint8 (pages, ny, nx), at least one page"
-        if not isinstance(symbols, h5py.Dataset):
+        subject, expected = f"{self._subject}: dataset 'symbols'", "uint8 (pages, ny, nx), at least one page"
+        if (symbols := self._file.array("symbols")) is None:
             raise RecordingError(subject, "none", expected)
-        if symbols.ndim != 3 or symbols.dtype != np.uint8 or 0 in symbols.shape:
-            raise RecordingError(subject, f"{symbols.dtype} {symbols.shape}", expected)
-        self._symbols = symbols
+        shape, kind = symbols.shape, symbols.dtype
+        if len(shape) != 3 or kind != np.uint8 or 0 in shape:
+            raise RecordingError(subject, f"{kind} {shape}", expected)
+        pages, rows, columns = shape
+        self._shape = pages, rows, columns
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -125,12 +133,7 @@ class Pages:
         Raises:
             RecordingError: missing, truncated, foreign or inconsistent.
         """
-        file = open_hdf5(path, f"pages {path}")
-        try:
-            return cls(file, path)
-        except BaseException:
-            file.close()
-            raise
+        return cls(open_hdf5(path, f"pages {path}"), path)
 
     def __enter__(self) -> Self:
         return self
@@ -145,19 +148,18 @@ class Pages:
         self._file.close()
 
     def __len__(self) -> int:
-        return int(self._symbols.shape[0])
+        return self._shape[0]
 
     @property
     def code(self) -> str | None:
         """What the pages hold, JSON text, or None."""
-        text = read_attribute(self._file, "code")
+        text = self._file.attribute("code")
         return text if isinstance(text, str) else None
 
     @property
     def page_shape(self) -> tuple[int, int]:
         """Symbols as (rows, columns)."""
-        _, rows, columns = self._symbols.shape
-        return int(rows), int(columns)
+        return self._shape[1:]
 
     def check_against(self, profile: Profile) -> None:
         """Check that the pages are for devices of this profile.
@@ -177,7 +179,7 @@ class Pages:
         """
         for _ in self:
             pass
-        text = self._file.attrs.get("code")
+        text = self._file.attribute("code")
         try:
             told = {} if text is None else json.loads(text)
         except (TypeError, ValueError):
@@ -189,12 +191,14 @@ class Pages:
         """The symbols [ny, nx] of one page.
 
         Raises:
-            RecordingError: its data cannot be read, or are no symbols of the levels.
+            RecordingError: they are no symbols of the levels.
+            StorageError: its data cannot be read.
         """
-        try:
-            symbols: NDArray[np.uint8] = np.asarray(self._symbols[page])
-        except OSError as error:
-            raise RecordingError(f"pages {self.path}: page {page}", error, "data that can be read") from None
+        if not -len(self) <= page < len(self):
+            raise IndexError(page)
+        page %= len(self)
+        symbols: NDArray[np.uint8]
+        (symbols,) = self._file.rows("symbols", f"{self._subject}: page {page}", page, page + 1)
         if int(symbols.max()) >= self.levels:
             raise RecordingError(
                 f"pages {self.path}: page {page}", f"a symbol of {symbols.max()}", f"0 to {self.levels - 1}"

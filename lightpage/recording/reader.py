@@ -11,6 +11,7 @@ Datasets: `in_phase` and `quadrature` [page, row, column], `reference_in_phase` 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile, parse_profile
-from lightpage.errors import ProfileError, RecordingError, StorageError
-from lightpage.failures import os_failure
+from lightpage.errors import ProfileError, RecordingError
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.recording.black_level import without_black
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.hdf5 import open_hdf5
 from lightpage.recording.layout import (
     CAMERAS,
     DARK,
@@ -41,10 +42,9 @@ from lightpage.recording.layout import (
     LostShot,
     frame_type,
     hash_frames,
-    open_hdf5,
     page_hashes,
-    read_attribute,
 )
+from lightpage.recording.stored import ArrayFile, StoredArray
 from lightpage.recording.writer import RecordingWriter
 
 __all__ = ["Recording", "RecordingWriter", "hash_frames", "page_hashes"]
@@ -57,16 +57,22 @@ class Recording:
     """A recording opened for reading and checked; use it in a `with` statement, or close it."""
 
     def __init__(self, file: h5py.File, path: Path) -> None:
-        """Check `file`, which must be open for reading; `Recording.open` is the usual way in.
+        """Check `file`, which must be open for reading, and is closed with this; `Recording.open` is the usual way in.
 
         Raises:
             RecordingError: the file is not a recording, or it is inconsistent.
         """
         self.path = path
-        self._file = file
-        self._check_header()
-        self._check_frames()
-        self._check_page()
+        self._file = ArrayFile(file, f"recording {path}")
+        try:
+            self._check_header()
+            self._check_frames()
+            self._check_page()
+            for name in (*SHOT_DATA, *DARK, *HOT, LOSSES):
+                self._file.array(name)
+        except BaseException:
+            self.close()
+            raise
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -77,12 +83,7 @@ class Recording:
                 file, the dataset or attribute, what came and what was wanted.
         """
         path = Path(path)
-        file = open_hdf5(path, f"recording {path}")
-        try:
-            return cls(file, path)
-        except BaseException:
-            file.close()
-            raise
+        return cls(open_hdf5(path, f"recording {path}"), path)
 
     def __enter__(self) -> Self:
         return self
@@ -99,7 +100,7 @@ class Recording:
     @property
     def pages(self) -> int:
         """Number of pages."""
-        return int(self._file["in_phase"].shape[0])
+        return self._shape[0]
 
     @property
     def levels(self) -> int:
@@ -119,16 +120,15 @@ class Recording:
     @property
     def frame_shape(self) -> tuple[int, int]:
         """Camera pixels as (rows, columns)."""
-        _, rows, columns = self._file["in_phase"].shape
-        return int(rows), int(columns)
+        return self._shape[1:]
 
     @property
     def page_shape(self) -> tuple[int, int] | None:
         """Symbols as (rows, columns), or None when the file holds neither symbols nor pilots."""
         for name in ("symbols", "pilots"):
-            if name in self._file:
-                rows, columns = self._file[name].shape[-2:]
-                return int(rows), int(columns)
+            if (found := self._file.array(name)) is not None:
+                rows, columns = found.shape[-2:]
+                return rows, columns
         return None
 
     @property
@@ -136,22 +136,18 @@ class Recording:
         """Bytes that the frame pair of a page takes in the file, compressed as it is; mean over the pages.
 
         Of recordings that are shown as one, it is what their own files take.
-
-        Raises:
-            RecordingError: one of these cannot be read.
         """
-        stored = sum(_stored_bytes(self._file[name]) for name in FRAMES)
-        return stored / max(1, self.pages)
+        return sum(self._array(name).stored_bytes for name in FRAMES) / max(1, self.pages)
 
     @property
     def has_symbols(self) -> bool:
         """Whether the written symbols are known."""
-        return "symbols" in self._file
+        return self._file.array("symbols") is not None
 
     @property
     def declared_levels(self) -> int | None:
         """Level count as the file states it, None where it does not."""
-        return self._levels if "levels" in self._file.attrs else None
+        return self._levels if self._attribute("levels") is not None else None
 
     @property
     def code_text(self) -> str | None:
@@ -178,7 +174,7 @@ class Recording:
         Raises:
             RecordingError: the data cannot be read.
         """
-        return FramePair(*(self._read(name, ()) for name in REFERENCES))
+        return FramePair(*(self._read(name) for name in REFERENCES))
 
     def shown(self, index: int) -> tuple[FramePair, NDArray[np.uint8] | None]:
         """Frames and symbols of a page; see `frames` and `symbols`."""
@@ -198,7 +194,7 @@ class Recording:
         Raises:
             RecordingError: the data cannot be read.
         """
-        return self._read("pilots", ()).astype(np.bool_) if "pilots" in self._file else None
+        return self._read("pilots").astype(np.bool_) if self._file.array("pilots") is not None else None
 
     def frame_infos(self, page: int) -> tuple[FrameInfo, FrameInfo] | None:
         """What the cameras said of a page's in-phase and quadrature frame, or None where that was not noted.
@@ -206,12 +202,13 @@ class Recording:
         Raises:
             RecordingError: no such page, or the data cannot be read, or do not fit the frames.
         """
-        if not all(name in self._file for name in SHOT_DATA):
+        known = [self._file.array(name) for name in SHOT_DATA]
+        if None in known:
             return None
-        names = [self._file[CAMERAS].attrs.get(name) for name in ("serials", "pixel_formats")]
         subject, expected = self._subject(f"group '{CAMERAS}'"), f"({self.pages}, 2), and two serials and pixel formats"
-        shapes = {self._file[name].shape for name in SHOT_DATA}
-        if shapes != {(self.pages, 2)} or any(name is None or len(name) != 2 for name in names):
+        names = [self._file.attribute(name, group=CAMERAS) for name in ("serials", "pixel_formats")]
+        shapes = {array.shape for array in known if array is not None}
+        if shapes != {(self.pages, 2)} or any(np.shape(name) != (2,) for name in names):
             raise RecordingError(subject, f"shapes {sorted(shapes)}, {names}", expected)
         ids, device, host, exposures = (self._read_page(name, page) for name in SHOT_DATA)
         first, second = (
@@ -229,15 +226,15 @@ class Recording:
 
     def dark_frames(self) -> FramePair | None:
         """What the cameras saw without light, as it was, or None where that was not recorded."""
-        if not all(name in self._file for name in DARK):
+        if any(self._file.array(name) is None for name in DARK):
             return None
-        return FramePair(*(self._read(name, ()) for name in DARK))
+        return FramePair(*(self._read(name) for name in DARK))
 
     def hot_pixels(self) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
         """Row and column [n, 2] of the pixels of each camera that were mended, or None where that was not noted."""
-        if not all(name in self._file for name in HOT):
+        if any(self._file.array(name) is None for name in HOT):
             return None
-        first, second = (self._read(name, ()).astype(np.intp).reshape(-1, 2) for name in HOT)
+        first, second = (self._read(name).astype(np.intp).reshape(-1, 2) for name in HOT)
         return first, second
 
     def losses(self) -> list[LostShot]:
@@ -246,11 +243,11 @@ class Recording:
         Raises:
             RecordingError: a note that cannot be read.
         """
-        if LOSSES not in self._file:
+        if self._file.array(LOSSES) is None:
             return []
         try:
-            return [LostShot(**json.loads(text)) for text in self._file[LOSSES].asstr()[()]]
-        except (OSError, TypeError, ValueError) as error:
+            return [LostShot(**json.loads(text)) for text in self._read(LOSSES)]
+        except (TypeError, ValueError) as error:
             raise RecordingError(self._subject(f"dataset '{LOSSES}'"), error, "notes of lost shots") from None
 
     def page_hash(self, page: int) -> str:
@@ -309,7 +306,7 @@ class Recording:
 
     def _attribute(self, name: str, default: object = None) -> Any:
         """A root attribute as a plain Python value."""
-        return read_attribute(self._file, name, default)
+        return self._file.attribute(name, default)
 
     def _whole(self, name: str, default: int | None = None) -> int:
         value = self._attribute(name, default)
@@ -350,20 +347,22 @@ class Recording:
             raise RecordingError(self._subject("attribute 'profile'"), type(text).__name__, "TOML text")
         self._profile_text: str | None = text
 
-    def _dataset(self, name: str, dimensions: int) -> h5py.Dataset:
-        found = self._file.get(name)
-        if not isinstance(found, h5py.Dataset):
-            raise RecordingError(
-                self._subject(f"dataset '{name}'"),
-                "none" if found is None else "a group",
-                f"an array of {dimensions} dimensions",
-            )
-        if found.ndim != dimensions:
-            raise RecordingError(self._subject(f"dataset '{name}'"), f"shape {found.shape}", f"{dimensions} dimensions")
+    def _array(self, name: str) -> StoredArray:
+        found = self._file.array(name)
+        if found is None:
+            raise RecordingError(self._subject(f"dataset '{name}'"), "none", "an array")
+        return found
+
+    def _dataset(self, name: str, dimensions: int) -> StoredArray:
+        found = self._array(name)
+        if len(found.shape) != dimensions:
+            raise RecordingError(found.subject, f"shape {found.shape}", f"{dimensions} dimensions")
         return found
 
     def _check_frames(self) -> None:
         first = self._dataset("in_phase", 3)
+        pages, rows, columns = first.shape
+        self._shape = pages, rows, columns
         wanted_type = frame_type(self._bit_depth)
         for name, shape in {
             "in_phase": first.shape,
@@ -383,15 +382,15 @@ class Recording:
                 raise RecordingError(subject, f"shape {dataset.shape}", "at least one page and one pixel")
 
     def _check_page(self) -> None:
-        if "pilots" in self._file:
+        if self._file.array("pilots") is not None:
             pilots = self._dataset("pilots", 2)
             if pilots.dtype.kind not in "bui":
                 raise RecordingError(self._subject("dataset 'pilots'"), f"type {pilots.dtype}", "booleans")
-            known = np.count_nonzero(self._read("pilots", ()))
-            if not 0 < known < pilots.size:
+            known, size = np.count_nonzero(self._read("pilots")), math.prod(pilots.shape)
+            if not 0 < known < size:
                 raise RecordingError(
                     self._subject("dataset 'pilots'"),
-                    f"{known} pilots of {pilots.size} symbols",
+                    f"{known} pilots of {size} symbols",
                     "some of them, not all",
                 )
         if not self.has_symbols:
@@ -402,14 +401,14 @@ class Recording:
             raise RecordingError(subject, f"type {symbols.dtype}", "uint8")
         if symbols.shape[0] != self.pages or 0 in symbols.shape[1:]:
             raise RecordingError(subject, f"shape {symbols.shape}", f"shape ({self.pages}, ny, nx), as 'in_phase' has")
-        if "pilots" in self._file and self._file["pilots"].shape != symbols.shape[1:]:
+        if (own := self._file.array("pilots")) is not None and own.shape != symbols.shape[1:]:
             raise RecordingError(
-                self._subject("dataset 'pilots'"),
-                f"shape {self._file['pilots'].shape}",
+                own.subject,
+                f"shape {own.shape}",
                 f"shape {symbols.shape[1:]}, as 'symbols' has",
             )
         for start in range(0, self.pages, _SYMBOL_PAGES_AT_ONCE):
-            chunk = self._read("symbols", slice(start, start + _SYMBOL_PAGES_AT_ONCE))
+            chunk = self._read("symbols", start, min(start + _SYMBOL_PAGES_AT_ONCE, self.pages))
             if int(chunk.max()) >= self._levels:
                 raise RecordingError(
                     subject, f"a symbol of {chunk.max()}", f"0 to {self._levels - 1}, since levels = {self._levels}"
@@ -418,18 +417,16 @@ class Recording:
     def _read_page(self, name: str, page: int) -> NDArray[Any]:
         if not 0 <= page < self.pages:
             raise RecordingError(self._subject("page"), page, f"0 to {self.pages - 1}")
-        frame = self._read(name, page)
+        frame: NDArray[Any] = self._read(name, page, page + 1)[0]
         if name in FRAMES:
             self._check_counts(name, frame, f" page {page}")
             frame = self._without_black(frame)
         return frame
 
-    def _read(self, name: str, where: Any) -> NDArray[Any]:
-        try:
-            data: NDArray[Any] = np.asarray(self._file[name][where])
-        except OSError as error:
-            failure = os_failure(self._subject(f"dataset '{name}'"), error, "data that can be read", StorageError)
-            raise failure from None
+    def _read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """An array, or its rows from `start` to `stop`, in this machine's byte order."""
+        page = f" page {start}" if stop == start + 1 else ""
+        data = self._file.rows(name, self._subject(f"dataset '{name}'{page}"), start, stop)
         data = data.astype(data.dtype.newbyteorder("="), copy=False)  # torch takes no other byte order
         if name in REFERENCES:
             self._check_counts(name, data, "")
@@ -447,15 +444,6 @@ class Recording:
                 f"a count of {frame.max()}",
                 f"at most {full_scale}, since camera_bit_depth = {self._bit_depth}",
             )
-
-
-def _stored_bytes(frames: Any) -> int:
-    """What a dataset takes, in its file or in those that it shows. The stubs of h5py know nothing of it."""
-    stored = int(frames.id.get_storage_size())
-    for source in frames.virtual_sources() if frames.is_virtual else ():
-        with open_hdf5(Path(source.file_name), f"recording {source.file_name}") as file:
-            stored += int(file[source.dset_name].id.get_storage_size())
-    return stored
 
 
 def _size(shape: tuple[int, int] | None) -> str:

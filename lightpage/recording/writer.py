@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lightpage.device.profile import Profile
-from lightpage.errors import NoSuchPageError, PageError, RecordingError
+from lightpage.errors import LightpageError, NoSuchPageError, PageError, RecordingError
+from lightpage.failures import error_number, hdf5_failure, os_failure, short_resource
 from lightpage.files import lock, move_into_place, move_to_new_name
 from lightpage.page.symbols import check_levels, check_symbols
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.hdf_file import HdfFile
+from lightpage.recording.hdf5 import retried
+from lightpage.recording.hdf_file import open_to_write
 from lightpage.recording.layout import (
     CAMERAS,
     DARK,
@@ -68,16 +70,32 @@ def pages_there(
     if not _take(partial, remove=False):
         return 0
     try:
-        with h5py.File(str(partial), "r") as file:
+        with retried(lambda: h5py.File(str(partial), "r", locking=False)) as file:
             pages = _pages_of(file)
             other = _difference(file, pages, _header(profile, levels, bit_depth, code), symbols)
-    except (OSError, KeyError, TypeError, ValueError):  # it was cut off, and is begun anew
+    except _CUT_OFF as error:
+        _check_damage(partial, error)
         return 0
     if not (pages and other):
         return pages
     if overwrite:
         return 0
     raise _others(partial, pages, other)
+
+
+_CUT_OFF = (OSError, KeyError, RuntimeError, TypeError, ValueError)
+"""What HDF5 raises of a file that was cut off while it was written; it is begun anew."""
+
+
+def _check_damage(partial: Path, error: Exception) -> None:
+    """Check that an error says something of an unfinished file, and not that it cannot be read now.
+
+    Raises:
+        StorageError, SurroundingsError, RecordingError: it cannot be read.
+    """
+    if error_number(error) is not None or short_resource("", error):
+        expected = "a file that can be read: its pages are not begun anew"
+        raise hdf5_failure(f"recording {partial}", error, expected, RecordingError) from None
 
 
 def _pages_of(file: h5py.File) -> int:
@@ -152,7 +170,7 @@ def _take(partial: Path, *, remove: bool) -> bool:
             subject, "pages that another process is writing now", "another name, or to wait for its end"
         ) from None
     except OSError as error:
-        raise RecordingError(subject, error, "a file that can be read and written") from None
+        raise os_failure(subject, error, "a file that can be read and written", RecordingError) from None
     return True
 
 
@@ -291,7 +309,7 @@ class RecordingWriter:
             self._file.flush()
             self._disk.check()
         except OSError as error:
-            raise RecordingError(f"{self._subject}: page {self._pages}", error, "room for it on the disk") from None
+            raise self._failure(f"{self._subject}: page {self._pages}", error, "room for it on the disk") from None
         self._pages += 1
 
     def set_truth(self, device_toml: str) -> None:
@@ -353,7 +371,7 @@ class RecordingWriter:
         except FileExistsError:
             raise self._exists() from None
         except OSError as error:
-            raise RecordingError(self._subject, error, "a file that can be completed") from None
+            raise self._failure(self._subject, error, "a file that can be completed") from None
         finally:
             self._disk.close()
 
@@ -371,6 +389,14 @@ class RecordingWriter:
             raise RecordingError(f"{self._subject}: bit depth", bit_depth, f"{MIN_BIT_DEPTH} to {MAX_BIT_DEPTH}")
         self._profile, self._levels, self._bit_depth = profile, levels, bit_depth
         self._pages = 0
+
+    def _failure(self, subject: str, error: OSError, expected: str) -> LightpageError:
+        """The error of a write, which says what stays of the pages before."""
+        failure = os_failure(subject, error, expected, RecordingError)
+        if not self._pages:
+            return failure
+        kept = f"{counted(self._pages, 'page')} stay in {self._partial.name}; the same command goes on with them"
+        return type(failure)(subject, failure.got, f"{failure.expected}. {kept}")
 
     def _exists(self) -> RecordingError:
         there = f"; the pages are in {self._partial}" if self._pages else ""
@@ -408,10 +434,7 @@ class RecordingWriter:
     def _create(self, references: FramePair, pilots: ArrayLike | None) -> None:
         fixed = self._checked_fixed(references, pilots)
         discard_partial(self.path)
-        try:
-            self._disk = HdfFile(self._partial)
-        except OSError as error:
-            raise RecordingError(f"recording {self._partial}", error, "a file that can be written") from None
+        self._disk = open_to_write(self._partial, f"recording {self._partial}")
         self._file = h5py.File(self._disk, "w")  # type: ignore[arg-type]  # the stubs know only names
         for name, value in self._header().items():
             self._file.attrs[name] = value
@@ -425,7 +448,7 @@ class RecordingWriter:
             self._disk.check()
         except OSError as error:
             self.abandon()
-            raise RecordingError(f"recording {self._partial}", error, "room for it on the disk") from None
+            raise self._failure(f"recording {self._partial}", error, "room for it on the disk") from None
 
     def _continue(self, references: FramePair, pilots: ArrayLike | None) -> bool:
         """Open the partial file if it is sound and was started with the same arguments.
@@ -437,14 +460,13 @@ class RecordingWriter:
         fixed = self._checked_fixed(references, pilots)
         if not _take(self._partial, remove=False):
             return False
-        try:
-            disk = HdfFile(self._partial, keep=True)
-        except OSError as error:
-            raise RecordingError(f"recording {self._partial}", error, "a file that can be read and written") from None
+        subject, expected = f"recording {self._partial}", "a file that can be read and written"
+        disk = open_to_write(self._partial, subject, expected, keep=True)
         try:
             file = h5py.File(disk, "r+")  # type: ignore[arg-type]
-        except OSError:  # the file was cut off or is none of HDF5's
+        except _CUT_OFF as error:
             disk.close()
+            _check_damage(self._partial, error)
             return False
         pages, other = 0, ""
         try:
@@ -461,7 +483,15 @@ class RecordingWriter:
                     if file[name].shape[0] < pages:
                         same = False
                     file[name].resize(pages, axis=0)
-        except (OSError, KeyError, TypeError, ValueError):
+                disk.check()
+        except _CUT_OFF as error:
+            try:
+                _check_damage(self._partial, error)
+            except LightpageError:
+                disk.give_up()
+                file.close()
+                disk.close()
+                raise
             same = False
         except BaseException:
             file.close()

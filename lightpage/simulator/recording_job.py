@@ -9,9 +9,11 @@ import numpy as np
 
 from lightpage.device.profile import Profile, to_toml
 from lightpage.device.state import Device
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, RecordingError
+from lightpage.failures import os_failure
 from lightpage.page.symbols import random_symbols
 from lightpage.progress import track
+from lightpage.recording.hdf5 import patiently
 from lightpage.recording.pages import Pages
 from lightpage.recording.reader import RecordingWriter
 from lightpage.recording.writer import discard_partial, partial_path
@@ -64,8 +66,8 @@ class RecordingJob:
         # references alone would not tell two devices apart: the pipe does not show in them
         text = f"light = {LIGHT}\nlevels = {self.levels}\nseed = {self.seed}\ntruth = {str(self.truth).lower()}\n"
         if self._written is not None:
-            with self._written.path.open("rb") as file:
-                text += f"symbols = {file_digest(file, 'sha256').hexdigest()}\n"
+            digest = patiently(self._digest, f"pages {self._written.path}", otherwise=RecordingError)
+            text += f"symbols = {digest}\n"
         text += f"{to_toml(self.device)}\n# profile\n{self.profile.to_toml()}"
         try:
             begun = self.settings.read_text("utf-8") if self.settings.exists() else None
@@ -79,7 +81,12 @@ class RecordingJob:
                 discard_partial(self.out)
             self.settings.write_text(text, "utf-8")
         except OSError as error:
-            raise InvalidInputError(f"--out {self.out}", error, "a place that can be written") from None
+            raise os_failure(f"--out {self.out}", error, "a place that can be written") from None
+
+    def _digest(self) -> str:
+        assert self._written is not None  # or there is nothing to tell apart
+        with self._written.path.open("rb") as file:
+            return file_digest(file, "sha256").hexdigest()
 
     def run(self, pages: int) -> None:
         """Simulate what is missing of `pages` pages, with a progress bar, and give the file its final name.

@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 
 from lightpage.device.profile import Profile
-from lightpage.errors import NoSuchPageError, RecordingError
+from lightpage.errors import NoSuchPageError, RecordingError, StorageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
@@ -39,7 +39,7 @@ class RecordingSource(FrameSource):
 
         Raises:
             PageError: no such page.
-            RecordingError: it cannot be read.
+            RecordingError, StorageError: it cannot be read.
         """
         recording = self._recording
         with self._lock:
@@ -50,8 +50,8 @@ class RecordingSource(FrameSource):
             try:
                 pair, symbols = narrow(recording.frames(page), self.bit_depth), recording.symbols(page)
                 return Shot(pair, page, symbols, recording.pilots(), recording.frame_infos(page))
-            except RecordingError as error:
-                raise RecordingError(f"page {page}, {error.subject}", error.got, error.expected) from None
+            except (RecordingError, StorageError) as error:
+                raise type(error)(f"page {page}, {error.subject}", error.got, error.expected) from None
 
     def page_count(self) -> int:
         """See `FrameSource.page_count`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lightpage.failures import os_failure
 from lightpage.files import move_into_place, new_file
+from lightpage.recording.hdf_file import open_to_write
 
 FORMAT = "lightpage-decoded"
 VERSION = 1
@@ -56,16 +57,14 @@ class DecodedWriter:
 
     def __init__(self, path: str | Path, levels: int) -> None:
         self.path = Path(path)
+        subject, expected = f"output {self.path}", "a path that can be written"
         try:
             descriptor, self._partial = new_file(self.path.parent, self.path.name)
-            os.close(descriptor)
-            try:
-                self._file = h5py.File(str(self._partial), "w", locking=False)  # nobody else knows its name
-            except BaseException:
-                self._partial.unlink()
-                raise
         except OSError as error:
-            raise os_failure(f"output {self.path}", error, "a path that can be written") from None
+            raise os_failure(subject, error, expected) from None
+        os.close(descriptor)
+        self._disk = open_to_write(self._partial, subject, expected)
+        self._file = h5py.File(self._disk, "w")  # type: ignore[arg-type]  # the stubs know only names
         self._file.attrs.update({"format": FORMAT, "version": VERSION, "levels": levels})
         self._versions: list[str] = []
         self._pages: list[int] = []
@@ -81,6 +80,7 @@ class DecodedWriter:
                 dataset = self._dataset(name, values.shape, values.dtype)
                 dataset.resize(len(self._versions) + 1, axis=0)
                 dataset[-1] = values
+            self._disk.check()
         self._pages.append(len(self._pages) if page.page is None else page.page)
         self._versions.append(page.model_version)
 
@@ -96,10 +96,11 @@ class DecodedWriter:
                     self._file["model_versions"] = np.array(self._versions, dtype=h5py.string_dtype())
                     self._file["pages"] = np.array(self._pages, np.int64)
                     self._file.close()
+                    self._disk.check()
                     move_into_place(self._partial, self.path)
         finally:
-            with suppress(OSError):
-                self._file.close()
+            self._file.close()
+            self._disk.close()
             self._partial.unlink(missing_ok=True)
 
     @contextmanager

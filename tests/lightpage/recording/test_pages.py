@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lightpage.device.profile import parse_profile
-from lightpage.errors import PageError, RecordingError
+from lightpage.errors import PageError, RecordingError, SurroundingsError
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.pages import Pages, PagesWriter
 from tests.lightpage.full_disk import full_disk
@@ -131,14 +131,14 @@ class TestFullDisk:
 
     @pytest.mark.parametrize("room", [0, 100, 5_000, 20_000, 60_000])
     def test_it_leaves_nothing(self, tmp_path: Path, room: int) -> None:
-        with full_disk(room), pytest.raises(RecordingError, match=r"pages .*p\.h5"):
+        with full_disk(room), pytest.raises(SurroundingsError, match=r"pages .*p\.h5"):
             write(tmp_path / "p.h5", self.MANY)
         assert list(tmp_path.iterdir()) == []
 
     def test_it_leaves_the_earlier_file(self, tmp_path: Path) -> None:
         path = write(tmp_path / "p.h5")
         before = path.read_bytes()
-        with full_disk(20_000), pytest.raises(RecordingError, match=r"pages .*p\.h5"):
+        with full_disk(20_000), pytest.raises(SurroundingsError, match=r"pages .*p\.h5"):
             write(path, self.MANY)
         assert [entry.name for entry in tmp_path.iterdir()] == ["p.h5"]
         assert path.read_bytes() == before

@@ -14,13 +14,14 @@ import pytest
 from lightpage.cli import main as cli_main
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
-from lightpage.errors import InvalidInputError, LightpageError, PageError, RecordingError
+from lightpage.errors import InvalidInputError, LightpageError, PageError, RecordingError, StorageError
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import PagesWriter
 from lightpage.recording.reader import Recording
 from runtime.acquisition.recording import RecordingSource
 from runtime.acquisition.simulator import SimulatorSource
+from runtime.acquisition.source import own_fault
 from runtime.acquisition.sources import open_source
 from runtime.commands import record
 from runtime.errors import LostShotError, Reason, SourceError
@@ -30,6 +31,20 @@ from tests.runtime import toy
 @pytest.fixture
 def recording(tmp_path: Path) -> tuple[Path, np.ndarray]:
     return tmp_path / "r.h5", toy.write_toy_recording(tmp_path / "r.h5", toy.ToyDevice(), 16, 3)
+
+
+def test_storage_that_fails_is_the_source_s_fault_and_names_the_page(
+    recording: tuple[Path, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise StorageError("recording R.h5: dataset 'in_phase'", "Input/output error", "data")
+
+    source = RecordingSource(recording[0])
+    monkeypatch.setattr(Recording, "frames", fail)
+    with pytest.raises(StorageError, match="page 1, recording"):
+        source.shot(page=1)
+    with pytest.raises(SourceError, match="page 1"), own_fault():
+        source.shot(page=1)
 
 
 def test_a_recording_is_read_in_turn_again_and_again_or_by_number(recording: tuple[Path, np.ndarray]) -> None:

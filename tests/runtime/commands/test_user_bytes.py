@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 from lightpage.cli.main import lightpage, run
 from lightpage.cli.simulate import simulate
 from lightpage.codec.checksum import crc32c
-from lightpage.errors import InvalidInputError, LostDataError, RecordingError, StorageError
+from lightpage.errors import InvalidInputError, LostDataError, RecordingError, StorageError, SurroundingsError
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import Pages
@@ -219,7 +219,7 @@ class TestBadInput:
         assert isinstance(result.exception, InvalidInputError)
         assert "got No space left on device" in str(result.exception)
         monkeypatch.setattr("lightpage.recording.pages.move_into_place", full)
-        with pytest.raises(RecordingError, match="No space left"):
+        with pytest.raises(SurroundingsError, match="No space left"):
             coded.pages(bundle, tmp_path, b"again", "--data-pages", "1", "--force")
         assert not (tmp_path / "read.bin").exists()
         assert not list(tmp_path.glob("*.partial"))

@@ -1,0 +1,735 @@
+"""What is opened is what it says: nothing that HDF5 fills in, finds elsewhere or cannot decode is believed."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from lightpage.errors import LightpageError, RecordingError, StorageError, SurroundingsError
+from lightpage.progress import reporting
+from lightpage.recording import hdf5, stored
+from lightpage.recording.joined import join
+from lightpage.recording.pages import Pages
+from lightpage.recording.reader import Recording
+from tests.lightpage.recording.test_recording import LEVELS, PAGES, write_foreign
+
+UNLIMITED = h5py.h5s.UNLIMITED
+FRAME = (14, 20)
+
+
+@pytest.fixture
+def foreign(tmp_path: Path) -> Path:
+    return write_foreign(tmp_path / "foreign.h5")
+
+
+@pytest.fixture
+def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The pauses that were made before further tries."""
+    made: list[float] = []
+    monkeypatch.setattr(hdf5, "sleep", made.append)
+    return made
+
+
+def replace(path: Path, name: str, put: Callable[[h5py.File, np.ndarray], object]) -> np.ndarray:
+    """Take a dataset out of a recording, and have `put` put it back in another way."""
+    with h5py.File(path, "r+") as file:
+        data = file[name][()]
+        del file[name]
+        put(file, data)
+    return data
+
+
+def show(
+    file: h5py.File, name: str, source: Path | str, data: np.ndarray, *, shown: object = (), taken: object = ()
+) -> None:
+    """Put a virtual dataset of `data`'s shape into a file, which shows the dataset `d` of another one."""
+    layout = h5py.VirtualLayout(data.shape, data.dtype)
+    whole = h5py.VirtualSource(str(source), "d", data.shape, data.dtype)
+    layout[shown] = whole if taken == () else whole[taken]
+    file.create_virtual_dataset(name, layout)
+
+
+def external(path: Path, name: str = "in_phase", raw: str = "frames.raw", size: int = UNLIMITED) -> np.ndarray:
+    def put(file: h5py.File, data: np.ndarray) -> None:
+        file.create_dataset(name, data=data, external=[(str(path.with_name(raw)), 0, size)])
+
+    return replace(path, name, put)
+
+
+def virtual(path: Path, name: str = "in_phase", source: str = "source.h5") -> np.ndarray:
+    """Move a dataset into a file beside the recording, which shows it there."""
+
+    def put(file: h5py.File, data: np.ndarray) -> None:
+        with h5py.File(path.with_name(source), "w") as other:
+            other["d"] = data
+        show(file, name, source, data)
+
+    return replace(path, name, put)
+
+
+def refusal(path: Path, kind: type[LightpageError] = RecordingError) -> str:
+    with pytest.raises(kind) as caught:
+        Recording.open(path)
+    told = str(caught.value)
+    assert str(path) in told
+    return told
+
+
+EVERY = ["in_phase", "quadrature", "reference_in_phase", "symbols", "pilots"]
+
+
+class TestVirtualDatasets:
+    @pytest.mark.parametrize("name", EVERY)
+    def test_what_sources_hold_is_read(self, foreign: Path, name: str) -> None:
+        data = virtual(foreign, name)
+        with Recording.open(foreign) as recording:
+            got = {
+                "in_phase": lambda: np.stack([recording.frames(page).in_phase for page in range(PAGES)]),
+                "quadrature": lambda: np.stack([recording.frames(page).quadrature for page in range(PAGES)]),
+                "reference_in_phase": lambda: recording.references().in_phase,
+                "symbols": lambda: np.stack([recording.symbols(page) for page in range(PAGES)]),
+                "pilots": recording.pilots,
+            }[name]()
+        np.testing.assert_array_equal(got, data)
+
+    @pytest.mark.parametrize("name", EVERY)
+    def test_a_source_that_was_not_copied_along_is_named(self, foreign: Path, name: str) -> None:
+        virtual(foreign, name)
+        foreign.with_name("source.h5").unlink()
+        told = refusal(foreign)
+        assert f"dataset '{name}'" in told
+        assert "source.h5: got no such file" in told
+        assert "copied along" in told
+
+    def test_a_source_without_the_dataset_or_with_too_little_or_of_another_type_is_named(self, foreign: Path) -> None:
+        data = virtual(foreign)
+        for content in (
+            {"other": data},
+            {"d": data[:2]},
+            {"d": data[:, :7]},
+            {"d": 1 - data.astype(int)},
+            {"d": data.astype("i4")},
+        ):
+            with h5py.File(foreign.with_name("source.h5"), "w") as other:
+                other.update(content)
+            assert "source.h5: dataset 'd'" in refusal(foreign)
+
+    @pytest.mark.parametrize("content", [b"", b"no HDF5", None])
+    def test_a_source_that_is_no_whole_file_is_named(self, foreign: Path, content: bytes | None) -> None:
+        virtual(foreign)
+        source = foreign.with_name("source.h5")
+        source.write_bytes(source.read_bytes()[:3000] if content is None else content)
+        assert "source.h5" in refusal(foreign)
+
+    def test_sources_beside_the_recording_are_found_from_any_folder(
+        self, foreign: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        data = virtual(foreign)
+        elsewhere = tmp_path_factory.mktemp("elsewhere")
+        monkeypatch.chdir(foreign.parent)
+        with Recording.open(foreign.name) as recording:
+            monkeypatch.chdir(elsewhere)
+            assert recording.stored_page_bytes >= data[0].nbytes
+            np.testing.assert_array_equal(recording.frames(1).in_phase, data[1])
+        link = elsewhere / "link.h5"
+        link.symlink_to(foreign)
+        with Recording.open(link) as recording:
+            np.testing.assert_array_equal(recording.frames(1).in_phase, data[1])
+
+    @pytest.mark.parametrize("prefix", ["{folder}/moved", "/missing:{folder}/moved", "${{ORIGIN}}/moved"])
+    def test_sources_are_looked_for_where_the_environment_says(
+        self, foreign: Path, monkeypatch: pytest.MonkeyPatch, prefix: str
+    ) -> None:
+        data = virtual(foreign)
+        foreign.with_name("moved").mkdir()
+        foreign.with_name("source.h5").rename(foreign.parent / "moved" / "source.h5")
+        refusal(foreign)
+        monkeypatch.setenv("HDF5_VDS_PREFIX", prefix.format(folder=foreign.parent))
+        with Recording.open(foreign) as recording:
+            np.testing.assert_array_equal(recording.frames(2).in_phase, data[2])
+
+    def test_sources_named_by_a_path_that_is_gone_are_found_beside_the_recording(self, foreign: Path) -> None:
+        replace(foreign, "in_phase", lambda file, data: show(file, "in_phase", "/gone/source.h5", data))
+        with h5py.File(foreign) as file, h5py.File(foreign.with_name("source.h5"), "w") as other:
+            other["d"] = data = file["quadrature"][()]
+        with Recording.open(foreign) as recording:
+            np.testing.assert_array_equal(recording.frames(0).in_phase, data[0])
+
+    def test_a_source_in_the_same_file_and_one_behind_another_are_read(self, foreign: Path) -> None:
+        data = virtual(foreign)
+        with h5py.File(foreign.with_name("outer.h5"), "w") as outer:
+            show(outer, "d", "source.h5", data)
+        with h5py.File(foreign, "r+") as file:
+            del file["in_phase"]
+            show(file, "in_phase", "outer.h5", data)
+            file["d"] = data + 1
+            del file["quadrature"]
+            show(file, "quadrature", ".", data)
+        with Recording.open(foreign) as recording:
+            np.testing.assert_array_equal(recording.frames(1).in_phase, data[1])
+            np.testing.assert_array_equal(recording.frames(1).quadrature, data[1] + 1)
+        foreign.with_name("source.h5").unlink()
+        assert "outer.h5: dataset 'd': source" in refusal(foreign)
+
+    def test_sources_that_lead_back_to_themselves_are_refused(self, foreign: Path) -> None:
+        data = virtual(foreign)
+        with h5py.File(foreign.with_name("source.h5"), "w") as other:
+            show(other, "d", "source.h5", data)
+        refusal(foreign)
+
+    def test_pages_without_a_source_are_named(self, foreign: Path) -> None:
+        data = virtual(foreign)
+        with h5py.File(foreign, "r+") as file:
+            del file["in_phase"]
+            show(file, "in_phase", "source.h5", data, shown=np.s_[:2], taken=np.s_[:2])
+        assert "page 2 of 3" in refusal(foreign)
+
+    def test_part_of_a_page_without_a_source_is_refused(self, foreign: Path) -> None:
+        data = virtual(foreign)
+        with h5py.File(foreign, "r+") as file:
+            del file["in_phase"]
+            show(file, "in_phase", "source.h5", data, shown=np.s_[:, :, :19], taken=np.s_[:, :, :19])
+        refusal(foreign)
+
+    @pytest.mark.parametrize("rows", [slice(0, None, 2), [0, 2]])
+    def test_cameras_that_take_turns_and_halves_of_frames_are_put_together(
+        self, foreign: Path, rows: slice | list[int]
+    ) -> None:
+        def put(file: h5py.File, data: np.ndarray) -> None:
+            layout = h5py.VirtualLayout(data.shape, data.dtype)
+            for name, place in {"even": np.s_[rows], "left": np.s_[1::2, :, :9], "right": np.s_[1::2, :, 9:]}.items():
+                with h5py.File(foreign.with_name(f"{name}.h5"), "w") as other:
+                    other["d"] = data[place][0] if name == "left" else data[place]
+                    layout[place] = h5py.VirtualSource(str(foreign.with_name(f"{name}.h5")), "d", other["d"].shape)
+            file.create_virtual_dataset("in_phase", layout)
+
+        data = replace(foreign, "in_phase", put)
+        with Recording.open(foreign) as recording:
+            for page in range(PAGES):
+                np.testing.assert_array_equal(recording.frames(page).in_phase, data[page])
+
+    def test_more_sources_than_a_process_may_open_are_read(self, foreign: Path) -> None:
+        paths = [foreign.with_name(f"{number}.h5") for number in range(stored._OPEN_SOURCES + 3)]
+        for path in paths:
+            shutil.copy(foreign, path)
+        join(paths, joined := foreign.with_name("joined.h5"))
+        with Recording.open(joined) as recording, Recording.open(foreign) as one:
+            for page in range(recording.pages):
+                np.testing.assert_array_equal(recording.frames(page).in_phase, one.frames(page % PAGES).in_phase)
+            assert recording.stored_page_bytes == pytest.approx(one.stored_page_bytes)
+
+    def test_a_source_that_goes_or_changes_while_it_is_read_is_told(self, foreign: Path) -> None:
+        shutil.copy(foreign, other := foreign.with_name("other.h5"))
+        join([other], joined := foreign.with_name("joined.h5"))
+        with Recording.open(joined) as recording:
+            recording._file._sources.close()  # as where too many are open
+            other.unlink()
+            with pytest.raises(RecordingError, match=r"other\.h5"):
+                recording.frames(0)
+
+    def numbered(self, path: Path, there: list[int]) -> np.ndarray:
+        def put(file: h5py.File, data: np.ndarray) -> None:
+            for number in there:
+                with h5py.File(path.with_name(f"part-{number}.h5"), "w") as other:
+                    other["d"] = data[number]
+            properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+            space = h5py.h5s.create_simple(data.shape, (UNLIMITED, *data.shape[1:]))
+            space.select_hyperslab((0, 0, 0), (UNLIMITED, 1, 1), (1, 1, 1), (1, *data.shape[1:]))
+            properties.set_virtual(space, b"part-%b.h5", b"d", h5py.h5s.create_simple(data.shape[1:]))
+            h5py.h5d.create(file.id, b"in_phase", h5py.h5t.STD_U16LE, space, properties)
+
+        return replace(path, "in_phase", put)
+
+    def test_numbered_sources_are_read(self, foreign: Path) -> None:
+        data = self.numbered(foreign, [0, 1, 2])
+        with Recording.open(foreign) as recording:
+            assert recording.pages == PAGES
+            np.testing.assert_array_equal(recording.frames(2).in_phase, data[2])
+
+    def test_a_gap_in_numbered_sources_is_named(self, foreign: Path) -> None:
+        self.numbered(foreign, [0, 2])
+        assert "part-1.h5" in refusal(foreign)
+
+    def test_a_growing_source_that_is_missing_or_short_is_refused(self, foreign: Path) -> None:
+        def put(file: h5py.File, data: np.ndarray) -> None:
+            layout = h5py.VirtualLayout(data.shape, data.dtype, maxshape=(None, *data.shape[1:]))
+            for number, place in enumerate((slice(0, UNLIMITED, 2), slice(1, UNLIMITED, 2))):
+                path = foreign.with_name(f"{number}.h5")
+                with h5py.File(path, "w") as other:
+                    other.create_dataset("d", data=data[number::2], maxshape=(None, *data.shape[1:]))
+                    layout[place] = h5py.VirtualSource(other["d"])[:UNLIMITED]
+            file.create_virtual_dataset("in_phase", layout)
+
+        data = replace(foreign, "in_phase", put)
+        with Recording.open(foreign) as recording:
+            for page in range(PAGES):
+                np.testing.assert_array_equal(recording.frames(page).in_phase, data[page])
+        with h5py.File(foreign.with_name("1.h5"), "r+") as other:
+            other["d"].resize(0, 0)
+        refusal(foreign)
+        foreign.with_name("1.h5").unlink()
+        assert "1.h5" in refusal(foreign)
+
+    def test_a_joined_recording_of_files_with_percent_signs_is_read(self, foreign: Path) -> None:
+        other = foreign.with_name("50%b 100%.h5")
+        shutil.copy(foreign, other)
+        join([other], joined := foreign.with_name("joined.h5"))
+        with Recording.open(joined) as recording:
+            assert recording.frames(0).in_phase.any()
+
+
+class TestExternalFiles:
+    def test_they_are_read(self, foreign: Path) -> None:
+        data = external(foreign)
+        with Recording.open(foreign) as recording:
+            np.testing.assert_array_equal(recording.frames(1).in_phase, data[1])
+            assert recording.stored_page_bytes >= data[0].nbytes
+
+    @pytest.mark.parametrize("name", EVERY)
+    @pytest.mark.parametrize("keep", [None, 0.9])
+    def test_one_that_is_missing_or_cut_short_is_named(self, foreign: Path, name: str, keep: float | None) -> None:
+        data, raw = external(foreign, name), foreign.with_name("frames.raw")
+        if keep is None:
+            raw.unlink()
+        else:
+            os.truncate(raw, int(keep * data.nbytes))
+        told = refusal(foreign)
+        assert f"dataset '{name}'" in told
+        assert "frames.raw" in told
+
+    def test_behind_a_virtual_dataset_too(self, foreign: Path) -> None:
+        virtual(foreign)
+        external(foreign.with_name("source.h5"), "d")
+        os.truncate(foreign.with_name("frames.raw"), 100)
+        told = refusal(foreign)
+        assert "source.h5" in told
+        assert "frames.raw" in told
+
+    def test_the_environment_says_where_they_are(self, foreign: Path) -> None:
+        def put(file: h5py.File, data: np.ndarray) -> None:
+            file.create_dataset("in_phase", data=data, external=[("beside.raw", 0, UNLIMITED)])
+
+        program = "import sys; from lightpage.recording.reader import Recording; Recording.open(sys.argv[1]).frames(0)"
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(foreign.parent)
+            replace(foreign, "in_phase", put)
+        for prefix, status in (("${ORIGIN}", 0), ("/missing", 1)):
+            run = subprocess.run(
+                [sys.executable, "-c", program, foreign],
+                env={**os.environ, "HDF5_EXTFILE_PREFIX": prefix},
+                capture_output=True,
+                text=True,
+                timeout=60,
+            )
+            assert run.returncode == status, run.stderr
+        assert "beside.raw" in run.stderr
+
+
+class TestLinks:
+    @pytest.mark.parametrize("name", EVERY)
+    @pytest.mark.parametrize(
+        "link", [h5py.SoftLink("/nowhere"), h5py.ExternalLink("gone.h5", "d"), h5py.ExternalLink("there.h5", "e")]
+    )
+    def test_a_link_to_nothing_is_named(self, foreign: Path, name: str, link: object) -> None:
+        with h5py.File(foreign.with_name("there.h5"), "w") as other:
+            other["d"] = 1
+        replace(foreign, name, lambda file, _: file.__setitem__(name, link))
+        assert f"dataset '{name}'" in refusal(foreign)
+
+    def test_what_links_lead_to_is_read_and_checked(self, foreign: Path) -> None:
+        data = virtual(foreign)
+        replace(
+            foreign, "quadrature", lambda file, _: file.__setitem__("quadrature", h5py.ExternalLink("source.h5", "d"))
+        )
+        with Recording.open(foreign) as recording:
+            np.testing.assert_array_equal(recording.frames(1).quadrature, data[1])
+        with h5py.File(foreign.with_name("source.h5"), "w") as other:
+            other.create_dataset("d", data.shape, data.dtype, chunks=(1, *FRAME))
+        refusal(foreign)
+
+
+class TestChunksAndFilters:
+    @pytest.mark.parametrize("options", [{}, {"compression": "gzip"}, {"maxshape": (None, *FRAME)}])
+    def test_pages_that_were_never_written_are_named(self, foreign: Path, options: dict[str, object]) -> None:
+        def put(file: h5py.File, data: np.ndarray) -> None:
+            made = file.create_dataset("quadrature", data.shape, data.dtype, chunks=(1, *FRAME), **options)
+            made[0] = data[0]
+
+        replace(foreign, "quadrature", put)
+        told = refusal(foreign)
+        assert "dataset 'quadrature'" in told
+        assert "1 to 2 of 3" in told
+
+    @pytest.mark.parametrize("name", EVERY)
+    def test_an_array_of_which_nothing_was_written_is_named(self, foreign: Path, name: str) -> None:
+        replace(foreign, name, lambda file, data: file.create_dataset(name, data.shape, data.dtype))
+        assert f"dataset '{name}'" in refusal(foreign)
+
+    def test_a_part_of_a_page_that_was_never_written_is_refused(self, foreign: Path) -> None:
+        def put(file: h5py.File, data: np.ndarray) -> None:
+            made = file.create_dataset("in_phase", data.shape, data.dtype, chunks=(1, 7, 5))
+            made[:, :, :15] = data[:, :, :15]
+
+        replace(foreign, "in_phase", put)
+        refusal(foreign)
+
+    def test_zeros_that_were_written_are_data(self, foreign: Path) -> None:
+        for name in ("in_phase", "symbols"):
+            replace(
+                foreign, name, lambda f, d, n=name: f.create_dataset(n, data=0 * d, chunks=True, compression="gzip")
+            )
+        with Recording.open(foreign) as recording:
+            assert not recording.frames(2).in_phase.any()
+            assert not recording.symbols(2).any()
+
+    def unknown_filter(self, path: Path, name: str, code: int) -> None:
+        """Compress a dataset by LZF, and have the file call that by another number."""
+        replace(
+            path,
+            name,
+            lambda file, data: file.create_dataset(name, data=0 * data, chunks=data.shape, compression="lzf"),
+        )
+        told = (32000).to_bytes(2, "little") + (8).to_bytes(2, "little")  # number, length of the name
+        content = path.read_bytes()
+        assert content.count(told) == 1
+        path.write_bytes(content.replace(told, code.to_bytes(2, "little") + told[2:]).replace(b"lzf\0", b"\0\0\0\0"))
+
+    @pytest.mark.parametrize(("code", "word"), [(32001, "blosc"), (32015, "zstd"), (32004, "lz4"), (311, "unknown")])
+    @pytest.mark.parametrize("name", ["in_phase", "symbols"])
+    def test_a_filter_that_is_not_here_is_named(self, foreign: Path, name: str, code: int, word: str) -> None:
+        self.unknown_filter(foreign, name, code)
+        told = refusal(foreign)
+        assert f"{word} ({code})" in told
+        assert "hdf5plugin" in told
+
+    def test_a_filter_of_hdf5plugin_is_taken_from_there(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.unknown_filter(foreign, "in_phase", 32001)
+        loaded: list[str] = []
+        monkeypatch.setattr(stored.importlib, "import_module", loaded.append)
+        monkeypatch.setattr(stored, "_decodes", lambda code: bool(loaded))
+        Recording.open(foreign).close()
+        assert loaded == ["hdf5plugin"]
+
+    def test_pages_to_write_are_looked_at_too(self, foreign: Path) -> None:
+        with h5py.File(foreign, "r+") as file:
+            file.attrs["format"] = "lightpage-pages"
+        Pages.open(foreign).close()
+        self.unknown_filter(foreign, "symbols", 32001)
+        with pytest.raises(RecordingError, match="blosc"):
+            Pages.open(foreign)
+
+    @pytest.mark.parametrize("kind", ["f4", "i2", "c8", "?", "S2", [("a", "u1"), ("b", "u1")]])
+    def test_what_are_no_counts_is_refused(self, foreign: Path, kind: object) -> None:
+        replace(foreign, "in_phase", lambda file, data: file.__setitem__("in_phase", np.zeros(data.shape, kind)))
+        assert "type" in refusal(foreign)
+
+    def test_a_type_that_numpy_knows_not_is_refused(self, foreign: Path) -> None:
+        def put(file: h5py.File, data: np.ndarray) -> None:
+            h5py.h5d.create(file.id, b"in_phase", h5py.h5t.STD_B16LE, h5py.h5s.create_simple(data.shape))
+
+        replace(foreign, "in_phase", put)
+        assert "type" in refusal(foreign)
+
+
+class TestChunkMemory:
+    def shared(self, path: Path, rows: int = 14) -> None:
+        for name in ("in_phase", "quadrature", "symbols"):
+            replace(
+                path,
+                name,
+                lambda file, data, name=name: file.create_dataset(
+                    name, data=data, chunks=(PAGES, min(rows, data.shape[1]), data.shape[2]), compression="gzip"
+                ),
+            )
+
+    @pytest.mark.parametrize("rows", [14, 4])
+    def test_chunks_that_pages_share_are_kept(self, foreign: Path, rows: int) -> None:
+        self.shared(foreign, rows)
+        with Recording.open(foreign) as recording:
+            for name in ("in_phase", "quadrature", "symbols"):
+                dataset = recording._file.array(name).dataset
+                slots, size, _ = dataset.id.get_access_plist().get_chunk_cache()
+                across = -(-dataset.shape[1] // dataset.chunks[1])
+                assert size >= across * np.prod(dataset.chunks) * dataset.dtype.itemsize
+                assert slots > across
+            recording.frames(1)
+
+    def test_chunks_beyond_the_memory_are_told_of(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.shared(foreign)
+        monkeypatch.setattr(stored, "CACHE_BYTES", 1000)
+        notes: list[str] = []
+
+        class Watcher:
+            def track(self, items: object, *_: object) -> object:
+                return items
+
+            note = staticmethod(notes.append)
+
+        with reporting(Watcher()), Recording.open(foreign) as recording:
+            recording.frames(0)
+        assert any("h5repack -l in_phase:CHUNK=1x14x20" in note for note in notes)
+
+
+class TestUnfinishedFiles:
+    def test_one_that_is_being_written(self, foreign: Path) -> None:
+        program = f"import h5py\nwith h5py.File({str(foreign)!r}, 'r+') as f: f.flush(); input(print(flush=True))"
+        with subprocess.Popen([sys.executable, "-c", program], stdin=-1, stdout=-1, text=True) as writer:
+            assert writer.stdout is not None
+            assert writer.stdin is not None
+            writer.stdout.readline()
+            told = refusal(foreign)
+            writer.communicate("\n", timeout=60)
+        assert "another program still writes it" in told
+
+    @pytest.mark.parametrize("swmr", [False, True])
+    def test_one_whose_writer_was_stopped(self, tmp_path: Path, swmr: bool) -> None:
+        path = tmp_path / "stopped.h5"
+        program = f"import h5py, os\nf = h5py.File({str(path)!r}, 'w', libver='latest'); f['d'] = 1\n"
+        program += f"if {swmr}: f.swmr_mode = True\nf.flush(); os._exit(0)"
+        subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+        told = refusal(path)
+        assert "stopped while writing" in told
+        assert "h5clear" in told
+
+    def test_empty_and_truncated_ones(self, foreign: Path) -> None:
+        content = foreign.read_bytes()
+        for size in (0, len(content) // 2):
+            foreign.write_bytes(content[:size])
+            told = refusal(foreign)
+            assert "unfinished" in told
+            assert "eof" not in told
+
+    def test_one_that_has_not_got_its_name_yet(self, foreign: Path) -> None:
+        foreign.rename(foreign.with_name("foreign.h5.partial"))
+        assert "foreign.h5.partial" in refusal(foreign)
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_file_system_without_locks_is_read(foreign: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    original = h5py.File.__init__
+
+    def opened(file: h5py.File, name: object, *args: object, locking: object = None, **kwargs: object) -> None:
+        if isinstance(name, str) and locking is None:
+            raise OSError(number, f"Unable to open file (unable to lock file, errno = {number})")
+        original(file, name, *args, locking=locking, **kwargs)
+
+    monkeypatch.setattr(h5py.File, "__init__", opened)
+    with Recording.open(foreign) as recording:
+        assert recording.frames(0).in_phase.any()
+
+
+class TestAttributes:
+    def change(self, path: Path, **values: object) -> None:
+        with h5py.File(path, "r+") as file:
+            file.attrs.update(values)
+
+    def test_null_is_absent(self, foreign: Path) -> None:
+        null = h5py.Empty("f4")
+        self.change(foreign, levels=null, black_level=null, profile=null, code=h5py.Empty("S1"))
+        for name in ("symbols", "pilots"):
+            replace(foreign, name, lambda file, _, name=name: file.__setitem__(name, null))
+        with Recording.open(foreign) as recording:
+            assert (recording.levels, recording.black_level, recording.declared_levels) == (256, 0, None)
+            assert (recording.profile_text, recording.code_text, recording.page_shape) == (None, None, None)
+            assert (recording.symbols(0), recording.pilots(), recording.own_profile()) == (None, None, None)
+        self.change(foreign, camera_bit_depth=null)
+        assert "'camera_bit_depth': got none" in refusal(foreign)
+
+    def test_null_frames_are_absent(self, foreign: Path) -> None:
+        replace(foreign, "quadrature", lambda file, _: file.__setitem__("quadrature", h5py.Empty("u2")))
+        assert "dataset 'quadrature': got none" in refusal(foreign)
+
+    @pytest.mark.parametrize("kind", ["i1", ">i2", "u4", "u8", "f2", "f8", ">f4"])
+    def test_numbers_of_any_kind_are_read(self, foreign: Path, kind: str) -> None:
+        self.change(foreign, levels=np.array([LEVELS], kind), camera_bit_depth=np.dtype(kind).type(12))
+        with Recording.open(foreign) as recording:
+            assert (recording.levels, recording.bit_depth) == (LEVELS, 12)
+
+    @pytest.mark.parametrize("value", [True, 3.5, np.nan, [16, 16], "16", h5py.Reference(), 2 + 0j])
+    def test_what_is_no_whole_number_is_refused(self, foreign: Path, value: object) -> None:
+        self.change(foreign, levels=value)
+        assert "attribute 'levels'" in refusal(foreign)
+
+    def test_texts_of_any_kind_are_read(self, foreign: Path) -> None:
+        padded = np.bytes_(b"lightpage-recording".ljust(40, b"\0"))
+        with h5py.File(foreign, "r+") as file:
+            del file.attrs["format"]
+            kind = h5py.h5t.C_S1.copy()
+            kind.set_size(30)
+            kind.set_strpad(h5py.h5t.STR_SPACEPAD)
+            made = h5py.h5a.create(file.id, b"format", kind, h5py.h5s.create(h5py.h5s.SCALAR))
+            made.write(np.array(b"lightpage-recording".ljust(30), "S30"))
+        Recording.open(foreign).close()
+        self.change(foreign, format=padded, code=b"\xff caf\xe9")
+        with Recording.open(foreign) as recording:
+            assert recording.code_text is not None
+            recording.code_text.encode()
+        self.change(foreign, format=np.array(["lightpage-recording"], object))
+        Recording.open(foreign).close()
+
+    def test_a_type_that_numpy_knows_not_is_refused(self, foreign: Path) -> None:
+        with h5py.File(foreign, "r+") as file:
+            del file.attrs["levels"]
+            h5py.h5a.create(file.id, b"levels", h5py.h5t.STD_B16LE, h5py.h5s.create(h5py.h5s.SCALAR))
+        assert "attribute 'levels'" in refusal(foreign)
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, error: Exception, times: int, name: str = "/in_phase") -> None:
+    """Have the next reads of a dataset fail."""
+    original, left = h5py.Dataset.__getitem__, [times]
+
+    def read(dataset: h5py.Dataset, *args: object, **kwargs: object) -> object:
+        if dataset.name == name and left[0]:
+            left[0] -= 1
+            raise error
+        return original(dataset, *args, **kwargs)
+
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", read)
+
+
+EIO_OF_HDF5 = OSError(
+    "Can't synchronously read data (file read failed: errno = 5, error message = 'Input/output error')"
+)
+
+
+class TestStorageThatFails:
+    @pytest.mark.parametrize(
+        "error", [EIO_OF_HDF5, OSError(errno.ESTALE, "Stale file handle"), KeyError(str(EIO_OF_HDF5))]
+    )
+    def test_a_momentary_failure_costs_nothing(
+        self, foreign: Path, monkeypatch: pytest.MonkeyPatch, pauses: list[float], error: Exception
+    ) -> None:
+        with Recording.open(foreign) as recording:
+            expected = recording.frames(1)
+            failing(monkeypatch, error, 2)
+            np.testing.assert_array_equal(recording.frames(1).in_phase, expected.in_phase)
+            assert pauses == list(hdf5.PAUSES_S)
+            assert recording.pages == PAGES
+
+    def test_one_that_lasts_is_a_storage_error_and_the_next_page_is_tried_anew(
+        self, foreign: Path, monkeypatch: pytest.MonkeyPatch, pauses: list[float]
+    ) -> None:
+        with Recording.open(foreign) as recording:
+            failing(monkeypatch, EIO_OF_HDF5, 3)
+            with pytest.raises(StorageError, match="dataset 'in_phase' page 1: got Input/output error"):
+                recording.frames(1)
+            assert recording.pages == PAGES
+            assert recording.has_symbols
+            assert recording.frames(1).in_phase.any()
+        assert len(pauses) == 2
+
+    def test_another_file_of_the_same_name_is_not_read(
+        self, foreign: Path, monkeypatch: pytest.MonkeyPatch, pauses: list[float]
+    ) -> None:
+        with Recording.open(foreign) as recording:
+            failing(monkeypatch, EIO_OF_HDF5, 1)
+            foreign.unlink()
+            foreign.write_bytes(b"another")
+            with pytest.raises(RecordingError, match="another file"):
+                recording.frames(1)
+
+    def test_a_share_that_is_gone_for_a_moment_is_no_finding(
+        self, foreign: Path, monkeypatch: pytest.MonkeyPatch, pauses: list[float]
+    ) -> None:
+        away = foreign.with_name("away")
+        with Recording.open(foreign) as recording:
+            failing(monkeypatch, EIO_OF_HDF5, 1)
+            foreign.rename(away)
+            with pytest.raises(StorageError):
+                recording.frames(1)
+            away.rename(foreign)
+            assert recording.frames(1).in_phase.any()
+            assert recording.code_text is None
+
+    def test_damaged_data_are_told_once_and_in_words(self, foreign: Path, pauses: list[float]) -> None:
+        replace(
+            foreign, "in_phase", lambda f, d: f.create_dataset("in_phase", data=d, chunks=(1, *FRAME), fletcher32=True)
+        )
+        with h5py.File(foreign) as file:
+            at = file["in_phase"].id.get_chunk_info(1).byte_offset
+        content = bytearray(foreign.read_bytes())
+        content[at + 9] ^= 255
+        foreign.write_bytes(content)
+        with Recording.open(foreign) as recording:
+            recording.frames(0)
+            with pytest.raises(StorageError, match="dataset 'in_phase' page 1: got damaged data"):
+                recording.frames(1)
+        assert not pauses
+
+    def test_a_file_that_cannot_be_opened_for_a_moment(
+        self, foreign: Path, monkeypatch: pytest.MonkeyPatch, pauses: list[float]
+    ) -> None:
+        original, left = h5py.File.__init__, [2]
+
+        def opened(file: h5py.File, *args: object, **kwargs: object) -> None:
+            left[0] -= 1
+            if left[0] >= 0:
+                raise OSError(errno.EIO, "Unable to open file")
+            original(file, *args, **kwargs)
+
+        monkeypatch.setattr(h5py.File, "__init__", opened)
+        Recording.open(foreign).close()
+        assert pauses == list(hdf5.PAUSES_S)
+        left[0] = 3
+        refusal(foreign, StorageError)
+
+    @pytest.mark.parametrize("number", [errno.EMFILE, errno.ENOMEM])
+    def test_a_short_resource_is_called_that(
+        self, foreign: Path, monkeypatch: pytest.MonkeyPatch, pauses: list[float], number: int
+    ) -> None:
+        with Recording.open(foreign) as recording:
+            failing(monkeypatch, OSError(f"Can't read data (errno = {number})"), 1)
+            with pytest.raises(SurroundingsError):
+                recording.frames(0)
+        assert not pauses
+
+    def test_pages_to_write_are_read_again_too(
+        self, foreign: Path, monkeypatch: pytest.MonkeyPatch, pauses: list[float]
+    ) -> None:
+        with h5py.File(foreign, "r+") as file:
+            file.attrs["format"] = "lightpage-pages"
+        with Pages.open(foreign) as pages:
+            expected = pages[1]
+            failing(monkeypatch, EIO_OF_HDF5, 2, "/symbols")
+            np.testing.assert_array_equal(pages[1], expected)
+            failing(monkeypatch, EIO_OF_HDF5, 3, "/symbols")
+            with pytest.raises(StorageError, match="page 1"):
+                pages[1]
+
+    def test_a_source_that_fails_for_a_moment_is_not_filled_in(
+        self, foreign: Path, monkeypatch: pytest.MonkeyPatch, pauses: list[float]
+    ) -> None:
+        data = virtual(foreign)
+        with Recording.open(foreign) as recording:
+            failing(monkeypatch, EIO_OF_HDF5, 2, "/d")
+            np.testing.assert_array_equal(recording.frames(1).in_phase, data[1])
+            failing(monkeypatch, EIO_OF_HDF5, 3, "/d")
+            with pytest.raises(StorageError, match=r"source .*source\.h5"):
+                recording.frames(1)
+
+
+def test_whatever_is_damaged_is_told_in_plain_words(foreign: Path, pauses: list[float]) -> None:
+    content, rng = foreign.read_bytes(), np.random.default_rng(0)
+    told: list[str] = []
+    for place in rng.integers(0, 12_000, 150):
+        damaged = bytearray(content)
+        damaged[place] ^= 255
+        foreign.write_bytes(damaged)
+        try:
+            with Recording.open(foreign) as recording:
+                for page in range(recording.pages):
+                    recording.shown(page)
+        except LightpageError as error:
+            told.append(str(error))
+    assert told
+    assert not any("synchronously" in text for text in told)
+    assert not pauses
