@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import ProfileError, RecordingError
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
+from lightpage.recording.alignment import check_alignment
 from lightpage.recording.black_level import without_black
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf5 import open_hdf5
@@ -444,6 +445,7 @@ class Recording:
                 f"a count of {frame.max()}",
                 f"at most {full_scale}, since camera_bit_depth = {self._bit_depth}",
             )
+        check_alignment(self._subject(f"dataset '{name}'{where}"), frame, self._bit_depth, RecordingError)
 
 
 def _size(shape: tuple[int, int] | None) -> str:

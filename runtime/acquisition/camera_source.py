@@ -19,6 +19,7 @@ from pydantic import ConfigDict, Field
 from lightpage.device.profile import Profile, TomlTable
 from lightpage.errors import FrameError
 from lightpage.page.levels import MAX_LEVELS
+from lightpage.recording.alignment import check_alignment
 from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
@@ -340,6 +341,7 @@ class CameraSource(FrameSource):
         camera, full_scale = self._cameras[one], 2**self.bit_depth - 1
         if pixels.shape != self.frame_shape:
             raise SourceError(f"{camera.name}: frame", f"{pixels.shape}", f"{self.frame_shape}")
+        check_alignment(f"{camera.name}: frame", pixels, self.bit_depth, SourceError)
         self._saturated[camera.name] = float(np.count_nonzero(pixels >= full_scale) / pixels.size)
         pixels = pixels.astype(frame_type(self.bit_depth), copy=False)
         pixels = self._views[one].upright(pixels)

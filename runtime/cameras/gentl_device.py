@@ -132,7 +132,7 @@ class GenTLDevice:
             self._set("Gain", settings.gain_db, GAIN_TOLERANCE_DB, "gain_db")
         if settings.black_level_counts is not None:
             self._set("BlackLevel", settings.black_level_counts, BLACK_LEVEL_TOLERANCE, "black_level_counts")
-        self._check("PayloadSize", pixel_format(settings.pixel_format).nbytes(rows * columns))
+        self._check_payload(pixel_format(settings.pixel_format).nbytes(rows * columns))
         self._set_trigger()
         with self._setting("buffers", settings.buffers):
             self._acquirer.num_buffers = max(settings.buffers, self._acquirer.min_num_buffers)
@@ -280,6 +280,13 @@ class GenTLDevice:
         if (abs(got - value) > tolerance) if tolerance else got != value:
             raise self._refused(setting or feature, value, feature, got, "")
         return got
+
+    def _check_payload(self, least: int) -> None:
+        """Check that a frame has room for its pixels; some cameras send more behind them."""
+        with self._setting("PayloadSize", least):
+            got = self._nodes.PayloadSize.get_value(False, True)
+        if got < least:
+            raise self._refused("PayloadSize", f"at least {least}", "PayloadSize", got, "")
 
     @contextmanager
     def _setting(self, setting: str, expected: object, feature: str = "") -> Iterator[None]:

@@ -288,3 +288,111 @@ def test_a_modulator_is_opened_for_its_pages_before_the_cameras(tmp_path: Path) 
     with pytest.raises(SourceError, match="no window"):
         other.arm()
     assert not any(camera.opened for camera in other._cameras)
+
+
+class StuckBeams:
+    """Shutters of which one does not answer."""
+
+    name = "stuck shutters"
+
+    def __init__(self) -> None:
+        self.open, self.stuck = {"signal": True, "reference": True}, set[str]()
+
+    def let_through(self, *, signal: bool, reference: bool) -> None:
+        for beam, wanted in (("signal", signal), ("reference", reference)):
+            if beam in self.stuck:
+                raise LostShotError(self.name, f"no answer of {beam}", "an answer", Reason.BEAM_CONTROL_FAILED)
+            self.open[beam] = wanted
+
+    def close(self) -> None:
+        self.stuck.clear()
+
+
+def with_beams(lab: Lab, tmp_path: Path, **exposures: int) -> tuple[CameraSource, StuckBeams]:
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))), **exposures)
+    source.beams = beams = StuckBeams()
+    return source, beams
+
+
+def test_a_shutter_that_fails_leaves_no_beam_blocked(tmp_path: Path) -> None:
+    source, beams = with_beams(Lab(), tmp_path)
+    with source:
+        beams.stuck = {"reference"}  # the signal beam is blocked first, and opened again
+        for take in (source.references, source.dark_frames):
+            with pytest.raises(LostShotError):
+                take()
+            assert beams.open["signal"]
+
+
+def test_while_a_beam_stays_blocked_pages_are_lost_by_that_name_and_then_no_more(tmp_path: Path) -> None:
+    lab = Lab()
+    source, beams = with_beams(lab, tmp_path, repeats=0)
+    with source:
+        source.shot()
+
+        def fails() -> None:
+            beams.stuck = {"signal"}
+            raise KeyboardInterrupt
+
+        lab.plan = fails  # type: ignore[assignment]
+        with pytest.raises(KeyboardInterrupt):
+            source.references()
+        assert not beams.open["signal"]
+        assert "stuck shutters" in source.trouble()
+        with pytest.raises(LostShotError) as raised:
+            source.shot()
+        assert raised.value.reason is Reason.BEAM_CONTROL_FAILED
+        with pytest.raises(LostShotError):
+            source.mend()
+        beams.stuck.clear()
+        source.mend()
+        assert source.trouble() == ""
+        assert beams.open == {"signal": True, "reference": True}
+        source.shot()
+
+
+def test_beams_that_are_blocked_on_purpose_are_no_trouble(tmp_path: Path) -> None:
+    lab = Lab()
+    source, _ = with_beams(lab, tmp_path, reference_frames=1)
+    told: list[str] = []
+    fire = lab.fire
+
+    def watched() -> float:
+        told.append(source.trouble())
+        return fire()
+
+    lab.fire = watched  # type: ignore[method-assign]
+    with source:
+        source.references()
+    assert set(told) == {""}
+
+
+def test_clocks_that_jump_are_learnt_anew_after_three_shots(tmp_path: Path) -> None:
+    lab = Lab()
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))), repeats=5)
+    with source:
+        source.shot()
+        for camera in lab.cameras:
+            camera.clock_s += 100.0
+        assert source.shot(10.0).page_index == 1
+        assert source.shots_by_outcome() == {"TAKEN": 2, "OTHER_SHOT": 3}
+
+
+def test_counts_in_the_high_bits_are_named(tmp_path: Path) -> None:
+    lab = Lab()
+    for camera in lab.cameras:
+        camera.bit_depth = 12
+    source, modulator = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    with source:
+        source.shot()
+        show = modulator.show
+
+        def shown(*asked: object) -> None:
+            show(*asked)  # type: ignore[arg-type]
+            modulator.pair = type(modulator.pair)(
+                *(16 * frame.astype(np.uint16) for frame in (modulator.pair.in_phase, modulator.pair.quadrature))
+            )
+
+        modulator.show = shown  # type: ignore[method-assign, assignment]
+        with pytest.raises(SourceError, match="multiples of 16"):
+            source.shot()
