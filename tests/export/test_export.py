@@ -26,6 +26,7 @@ from lightpage.device.state import Device
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import RecordingWriter
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from lightpage.waves.grid import field_grid
@@ -299,3 +300,17 @@ def test_the_angle_is_the_arc_tangent_in_every_octant() -> None:
     dark = torch.zeros(3)
     assert (angle(dark, dark) == 0).all()
     assert angle(torch.full((1,), torch.nan), dark[:1]).isnan().all()
+
+
+@pytest.mark.usefixtures("frame_types")
+def test_a_bundle_without_pages_to_choose_a_code_by_is_written_all_the_same(run_folder: Path, tmp_path: Path) -> None:
+    profile = small_profile()
+    simulator, symbols = Simulator(profile, Device(), seed=4), random_symbols(profile, 256, 1, np.random.default_rng(4))
+    with RecordingWriter(tmp_path / "R.h5", profile, 256, 8, simulator.references()) as writer:
+        writer.append(symbols[0], simulator.page(symbols[0]))
+    asked = [str(run_folder), "--out", str(tmp_path / "b.zip"), "--recording", str(tmp_path / "R.h5")]
+    done = CliRunner().invoke(export, [*asked, "--json", str(tmp_path / "F.json")], standalone_mode=False)
+    assert done.exception is None
+    figures = json.loads((tmp_path / "F.json").read_text())
+    assert (figures["code"], figures["parity_error"] < 1e-3) == (None, True)
+    assert Bundle.open(tmp_path / "b.zip").code is None

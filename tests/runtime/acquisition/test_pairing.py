@@ -195,3 +195,17 @@ def test_the_lab_itself_shows_what_is_on_display() -> None:
     assert frame is not None
     assert frame.pixels is not None
     assert frame.pixels[0, 0] == 7
+
+
+def test_a_camera_that_never_stops_sending_hangs_nobody() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    shoot(pairing, lab)
+    camera = lab.cameras[0]
+    camera.edge()
+    frame = camera.frame(1.0)
+    camera.frame = lambda timeout_s: frame  # type: ignore[method-assign]
+    for _ in range(2):
+        assert tried(pairing, lab) is Reason.STRAY_FRAME
+    del camera.frame  # type: ignore[method-assign]
+    assert tried(pairing, lab) is None
