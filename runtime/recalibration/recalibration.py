@@ -10,7 +10,6 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from statistics import fmean
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ from runtime.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_v
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.decoding.tracking import Tracker
-from runtime.recalibration.judgement import judge, judged_pages
+from runtime.recalibration.judgement import Verdict, judge, judged_pages
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit, RefitResult
 
@@ -68,38 +67,35 @@ def recalibrate(
     fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))
     tracker = tracker_for(decoder) if tracker is None else tracker.fork()
     measuring = partial(_within, progress, "measure the model in service", 0.0)
-    judged = judged_pages(tracker, decoder.bundle, held_back, measuring)
-    before, lost_before = (
-        fmean(0.0 if page.lost else page.air for page in judged),
-        sum(page.lost is not None for page in judged),
-    )
+    before = judged_pages(tracker, decoder.bundle, held_back, measuring)
     fitted = replace(fitted, image_px=tracker.image_px)
     try:
         result = fit(decoder.bundle, fitted, lambda step, share: progress(step, 0.05 + 0.85 * share), decoder)
         judging = partial(_within, progress, "judge by the held-back pages", 0.9)
         judging(0.0)
         refitted = decoder.of_bundle(_refitted(decoder.bundle, result))
-        judged = judged_pages(tracker.refitted(refitted), decoder.bundle, held_back, judging)
+        after = judged_pages(tracker.refitted(refitted), decoder.bundle, held_back, judging)
     except (CalibrationError, FrameError) as error:
         raise RecalibrationRefusedError(error.subject, error.got, error.expected) from error
-    after = fmean(page.air for page in judged)
-    judge(before, judged, pages.levels)
+    verdict = judge(before, after, pages.levels)
     progress("write the new bundle", 0.95)
     bundle = refitted.bundle
     golden, p = _golden(refitted, held_back.pairs[0])
     files = {**bundle.files, GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=p)}
-    write_bundle(out, _new_manifest(bundle.manifest, pages, version, before, after), files)
+    write_bundle(out, _new_manifest(bundle.manifest, pages, version, verdict), files)
     return RecalibrationOutcome(
         path=out,
         version=version,
         previous_version=decoder.version,
         report=result.report,
-        air_before=before,
-        air_after=after,
-        pages_lost_before=lost_before,
+        air_before=verdict.before,
+        air_after=verdict.after,
+        pages_lost_before=sum(page.lost is not None for page in before),
         pages_used=len(pages.pairs),
         pages_held_back=len(held_back.pairs),
         seconds=time.perf_counter() - start,
+        air_limit=verdict.limit,
+        air_standard_error=verdict.error,
     )
 
 
@@ -136,11 +132,11 @@ def _refitted(bundle: Bundle, result: RefitResult) -> Bundle:
     return replace(bundle, manifest=manifest, files=files)
 
 
-def _new_manifest(manifest: Manifest, pages: KnownPages, version: str, before: float, after: float) -> Manifest:
+def _new_manifest(manifest: Manifest, pages: KnownPages, version: str, verdict: Verdict) -> Manifest:
     """The manifest of a re-fitted bundle."""
-    figures = {"recalibration_air_bits_per_symbol": after, "recalibration_pages": len(pages.pairs)}
-    if math.isfinite(before):
-        figures["recalibration_air_bits_per_symbol_before"] = before
+    figures = {"recalibration_air_bits_per_symbol": verdict.after, "recalibration_pages": len(pages.pairs)}
+    if math.isfinite(verdict.before):
+        figures["recalibration_air_bits_per_symbol_before"] = verdict.before
     return manifest.model_copy(
         update={
             "version": version,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ from lightpage.recording.reader import hash_frames
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
+from runtime.errors import UnconfirmedPageError
+from runtime.recalibration.judgement import JudgedPage, judge
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RefitReport, RefitResult
 from runtime.recalibration.recalibration import next_version, recalibrate
@@ -284,3 +287,46 @@ def test_the_store_says_why_the_base_is_served_where_its_note_or_bundle_is_lost(
         assert [record.levelname for record in caplog.records] == ["WARNING"]
         assert f"serving the base: model store {store.folder}: " in caplog.text
         assert why in caplog.text
+
+
+def judged(change: float, scatter: float, drifted: bool = True) -> tuple[list[JudgedPage], list[JudgedPage]]:
+    """Two held-back pages before and after; the difference has this mean, and this scatter from symbol to symbol."""
+    rng = np.random.default_rng(4)
+    old = rng.normal(3.0, 1.0, (2, 4000))
+    noise = rng.normal(0.0, scatter, old.shape)
+    new = old + change + noise - noise.mean()
+    return [JudgedPage(page, None, drifted) for page in old], [JudgedPage(page, None, drifted) for page in new]
+
+
+@pytest.mark.parametrize(("change", "taken"), [(-1.1, False), (-0.9, True), (0.0, True), (1.0, True)])
+def test_a_model_may_read_less_by_the_standard_error_of_the_comparison_at_most(change: float, taken: bool) -> None:
+    scatter = 0.3
+    error = scatter / np.sqrt(8000)
+    before, after = judged(change * error, scatter)
+    if not taken:
+        with pytest.raises(RecalibrationRefusedError) as caught:
+            judge(before, after, 256)
+        told = float(caught.value.expected.removeprefix("at least ").partition(":")[0])
+        assert told == pytest.approx(np.mean([page.air for page in before]) - error, abs=2e-4)
+        return
+    verdict = judge(before, after, 256)
+    assert verdict.error == pytest.approx(error, rel=0.05)
+    assert verdict.limit == pytest.approx(verdict.before - verdict.error)
+    assert verdict.after >= verdict.limit
+
+
+@pytest.mark.parametrize(("change", "taken"), [(-5.0, False), (0.0, False), (1.8, False), (2.2, True), (8.0, True)])
+def test_a_model_of_a_device_that_has_not_drifted_stays_unless_something_is_gained(change: float, taken: bool) -> None:
+    before, after = judged(change * 0.3 / np.sqrt(8000), 0.3, drifted=False)
+    if taken:
+        assert judge(before, after, 256).after > np.mean([page.air for page in before])
+        return
+    with pytest.raises(RecalibrationRefusedError):
+        judge(before, after, 256)
+
+
+def test_a_page_that_was_lost_before_counts_with_no_bits_and_as_a_drift() -> None:
+    before, after = judged(0.0, 0.0, drifted=False)
+    lost = UnconfirmedPageError("pilots", "none", "some")
+    verdict = judge([replace(page, lost=lost) for page in before], after, 256)
+    assert (verdict.before, verdict.drifted) == (0.0, True)
