@@ -14,17 +14,28 @@ from pathlib import Path
 
 from lightpage.errors import (
     InvalidInputError,
+    LightpageError,
     LimitError,
     RecalibrationRefusedError,
     RecordingError,
 )
+from lightpage.failures import os_failure
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
 from runtime.acquisition.source import FrameSource, own_fault
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.archive import check_name
 from runtime.bundle.bundle import Bundle
-from runtime.errors import CallerLeft, JobCancelledError, NoSourceError, OtherModelError, SourceError, StoppingError
+from runtime.errors import (
+    CallerLeft,
+    JobCancelledError,
+    NoSourceError,
+    OtherModelError,
+    SourceError,
+    StoppingError,
+    StoreError,
+    let_go,
+)
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.known_pages import KnownPages, read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
@@ -41,6 +52,9 @@ _log = logging.getLogger(__name__)
 
 _POLL_S = 0.25
 """How often a silent recalibration looks whether its caller is still there."""
+
+
+_ROOM = "a service started with --store FOLDER, or a temporary folder that can be written: TMPDIR, or --tmpfs /tmp"
 
 
 @dataclass(frozen=True)
@@ -92,6 +106,8 @@ class Recalibrator:
         folder = None if plane.store is None else plane.store.folder
         self.jobs = Jobs(folder, plane.limits.jobs_kept, plane.registry.current.version)
         self._stop = threading.Event()
+        self._making = threading.Lock()
+        """Held while the folder below is looked for and made."""
         self._temporary: tempfile.TemporaryDirectory[str] | None = None
 
     def source_pages(self, count: int, pages: Sequence[int] = ()) -> PagesToUse:
@@ -192,11 +208,20 @@ class Recalibrator:
         )
 
     def check_start(self, expected_version: str = "") -> None:
-        """See whether a job may begin now; raises as `start` would."""
+        """See whether a job may begin now; raises as `start` would, and `StoreError` without a folder for it."""
         if self._stop.is_set():
             raise StoppingError("recalibration", "a service that stops", "one that serves; nothing was changed")
         self.jobs.check_free()
         _check_version(self._plane.registry.current, expected_version)
+        self._store()
+
+    def no_room(self) -> LightpageError | None:
+        """Why no recalibration can keep its model, None where one can."""
+        try:
+            self._store()
+        except LightpageError as error:
+            return error
+        return None
 
     def close(self, wait_s: float = GRACE_S) -> None:
         """Stop a running recalibration at its next step, which is waited for at most `wait_s`; drop temporary bundles.
@@ -266,7 +291,10 @@ class Recalibrator:
         self._count(end)
         # Before the last step is told: whoever hears the end may start the next one at once.
         self.jobs.end(running, end)
+        if isinstance(end, BaseException):
+            let_go(end)  # of the pages
         tell(end)
+        del end  # it holds this frame, which holds it
 
     def _work(
         self,
@@ -306,11 +334,21 @@ class Recalibrator:
         return outcome
 
     def _store(self) -> ModelStore:
-        """The service's store; without one, a temporary folder that keeps no more than the models held."""
+        """The service's store; without one, a temporary folder that keeps no more than the models held.
+
+        Raises:
+            StoreError: there is no folder that can be written.
+            StorageError, SurroundingsError: the disk fails, or has no room.
+        """
         if self._plane.store is not None:
             return self._plane.store
-        if self._temporary is None:
-            self._temporary = tempfile.TemporaryDirectory(prefix="lightpage-models-")
+        with self._making:
+            if self._temporary is None:
+                try:
+                    self._temporary = tempfile.TemporaryDirectory(prefix="lightpage-models-")
+                except OSError as error:
+                    subject = "temporary folder of recalibrated models"
+                    raise os_failure(subject, error, _ROOM, StoreError) from None
         return ModelStore(Path(self._temporary.name), self._plane.registry.current.decoder.bundle, kept=0)
 
     def _count(self, result: RecalibrationOutcome | BaseException) -> None:
@@ -413,7 +451,10 @@ def _follow(
             caller.check()
             continue
         if isinstance(step, BaseException):
-            raise step
+            try:
+                raise step
+            finally:
+                del step  # it holds this frame, which holds it
         yield step
         if isinstance(step, RecalibrationOutcome):
             return
