@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from itertools import count as counting
 from pathlib import Path
 
 from lightpage.errors import (
@@ -39,7 +40,7 @@ from runtime.errors import (
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.known_pages import KnownPages, read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
-from runtime.recalibration.recalibration import next_version, recalibrate
+from runtime.recalibration.recalibration import next_version, reading_share, recalibrate
 from runtime.recalibration.separate_process import recalibrate_apart
 from runtime.service.caller import NOBODY, Actor, Caller
 from runtime.service.dataplane import DataPlane
@@ -76,12 +77,14 @@ class PagesToUse:
     Attributes:
         of: where they come from, for people.
         read: reads them on behalf of a caller, and calls what it is given before each.
+        count: how many are to be read, 0 where that is not known, or they are here already.
         own: whether they are the service's own: then it is not the caller's fault if they are dark or damaged.
         release: called once they are not needed any more, also where the job does not begin.
     """
 
     of: str
     read: Callable[[Callable[[], None], Caller], KnownPages]
+    count: int = 0
     own: bool = True
     release: Callable[[], None] = _nothing
 
@@ -121,7 +124,9 @@ class Recalibrator:
         self.check_count(len(pages) or count)
         expected: list[int | None] = list(pages) or [None] * count
         return PagesToUse(
-            "source", lambda heard, caller: read_known(source, expected, heard, lambda: slots.held(caller))
+            "source",
+            lambda heard, caller: read_known(source, expected, heard, lambda: slots.held(caller)),
+            len(expected),
         )
 
     def recorded_pages(self, name: str, count: int) -> PagesToUse:
@@ -146,7 +151,7 @@ class Recalibrator:
                 with own_fault():
                     return read_recorded(recording, range(count or recording.pages), heard)
 
-        return PagesToUse(f"recording {name}", read)
+        return PagesToUse(f"recording {name}", read, count)
 
     def sent_pages(self, pages: KnownPages, release: Callable[[], None] = _nothing) -> PagesToUse:
         """Pages whose frames a caller has sent, checked.
@@ -275,13 +280,20 @@ class Recalibrator:
             self.jobs.tell(name, fraction)
             tell(Step(name, fraction))
 
+        share, read = reading_share(pages.count), counting()
+
+        def heard() -> None:
+            progress("read the pages", share * min(1.0, next(read) / (pages.count + 1)))
+
+        def working(name: str, fraction: float) -> None:
+            progress(name, share + (1 - share) * fraction)
+
         actor = running.caller.actor
         end: RecalibrationOutcome | BaseException
         try:
-            heard = partial(progress, "read the pages", 0.0)
             heard()
             self._plane.models.check_store()
-            end = self._work(pages, pages.read(heard, running.caller), progress, check, expected_version, actor)
+            end = self._work(pages, pages.read(heard, running.caller), working, check, expected_version, actor)
         except CallerLeft as left:  # whoever waits for a slot knows no more than that
             end = _cause(check, left)
         except BaseException as error:

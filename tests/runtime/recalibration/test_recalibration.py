@@ -20,6 +20,7 @@ from lightpage.errors import (
 )
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
+from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
 from runtime.bundle.bundle import Bundle
@@ -188,8 +189,28 @@ def test_every_page_that_is_judged_by_is_told_of_before_and_after_the_fit(decode
 
     recalibrate(decoder, known(count=5), tmp_path / "n.zip", "toy-1+r1", toy.fit_references, step)
     before, after = told["measure the model in service"], told["judge by the held-back pages"]
-    assert before == pytest.approx([0, 0.0125, 0.025, 0.0375])
-    assert sorted(set(after)) == pytest.approx([0.9, 0.9125, 0.925, 0.9375])
+    assert before == pytest.approx([0, 1 / 29, 2 / 29, 3 / 29])
+    assert sorted(set(after)) == pytest.approx([24 / 29, 25 / 29, 26 / 29, 27 / 29])
+
+
+@pytest.mark.parametrize("count", [2, 40])
+def test_progress_is_in_proportion_to_the_work_however_many_pages_are_judged_by(
+    count: int, decoder: Decoder, tmp_path: Path
+) -> None:
+    """A page is worth the same before and after the fit, and the fit as much as twenty of them."""
+    told = list[tuple[str, float]]()
+
+    def fit(bundle: Bundle, pages: KnownPages, progress: Progress, own: Decoder) -> RefitResult:
+        progress("fit", 0.0)
+        progress("fit", 1.0)
+        return toy.fit_references(bundle, pages, quiet, own)
+
+    recalibrate(decoder, known(count=count), tmp_path / "n.zip", "toy-1+r1", fit, lambda *step: told.append(step))
+    assert [share for _, share in told] == sorted(share for _, share in told)
+    fitted = [share for name, share in told if name == "fit"]
+    (written,) = [share for name, share in told if name == "write the new bundle"]
+    assert fitted[1] - fitted[0] == pytest.approx(20 / (count - 1) * fitted[0])
+    assert written - fitted[1] == pytest.approx(fitted[0])
 
 
 def test_unusable_pages_are_named(decoder: Decoder, tmp_path: Path) -> None:
