@@ -6,7 +6,6 @@ import time
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from statistics import fmean
 
 import torch
 
@@ -21,7 +20,7 @@ from runtime.bundle.bundle import Bundle, write_bundle
 from runtime.bundle.manifest import Manifest, Provenance
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
-from runtime.recalibration.judgement import JudgedPage, judge, judged_pages
+from runtime.recalibration.judgement import JudgedPage, Verdict, judge, judged_pages
 from runtime.recalibration.known_pages import KnownPages, read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome, RefitReport
 from runtime.recalibration.recalibration import next_version
@@ -82,8 +81,7 @@ class TorchRecalibration:
         held_back = read_recorded(recording, split.left)
         held_back.check(decoder)
         progress("measure the model in service", 0.0)
-        judged_before = _judged(decoder, held_back)
-        before = fmean(0.0 if page.lost else page.air for page in judged_before)
+        before = _judged(decoder, held_back)
         folder.mkdir(parents=True, exist_ok=True)
         fitted = split.training[:_CALIBRATED_PAGES]
         calibration = _calibration(decoder, recording, fitted, folder / _CALIBRATION, progress)
@@ -97,13 +95,12 @@ class TorchRecalibration:
         try:
             made, _ = export_run(folder / _RUN, unproven, None, version, progress, precision=precision)
             progress("judge by the held-back pages", 0.0)
-            judged = _judged(Decoder(made, decoder.threads), held_back)
+            after = _judged(Decoder(made, decoder.threads), held_back)
         finally:
             unproven.unlink(missing_ok=True)
-        after = fmean(page.air for page in judged)
-        judge(before, judged, recording.levels, "fine-tuned model")
+        verdict = judge(before, after, recording.levels, "fine-tuned model")
         hashes = tuple(usable[page] for page in split.left)
-        write_bundle(out, _manifest(bundle.manifest, made.manifest, hashes, before, after, choices.seed), made.files)
+        write_bundle(out, _manifest(bundle.manifest, made.manifest, hashes, verdict, choices.seed), made.files)
         return RecalibrationOutcome(
             path=out,
             version=version,
@@ -111,12 +108,14 @@ class TorchRecalibration:
             report=RefitReport(
                 calibration.angle_deg(bundle.profile), calibration.coherence_before, calibration.coherence_after
             ),
-            air_before=before,
-            air_after=after,
-            pages_lost_before=sum(page.lost is not None for page in judged_before),
+            air_before=verdict.before,
+            air_after=verdict.after,
+            pages_lost_before=sum(page.lost is not None for page in before),
             pages_used=len(usable),
             pages_held_back=len(split.left),
             seconds=time.perf_counter() - begun,
+            air_limit=verdict.limit,
+            air_standard_error=verdict.error,
         )
 
 
@@ -179,13 +178,11 @@ def _calibration(
     return found
 
 
-def _manifest(
-    before: Manifest, made: Manifest, judged_by: tuple[str, ...], air_before: float, air_after: float, seed: int
-) -> Manifest:
+def _manifest(before: Manifest, made: Manifest, judged_by: tuple[str, ...], verdict: Verdict, seed: int) -> Manifest:
     """The manifest of the new bundle, which remembers what the one in service was made of, and its code."""
     figures = {
-        "recalibration_air_bits_per_symbol": air_after,
-        "recalibration_air_bits_per_symbol_before": air_before,
+        "recalibration_air_bits_per_symbol": verdict.after,
+        "recalibration_air_bits_per_symbol_before": verdict.before,
         "recalibration_pages": len(made.trained_pages) + len(judged_by),
     }
     calibrated = dict.fromkeys((*before.calibrated_pages, *made.calibrated_pages, *judged_by))

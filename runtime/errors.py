@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from traceback import clear_frames
 from typing import Self
 
 from lightpage import errors as own_errors
@@ -169,11 +170,29 @@ class UnconfirmedPageError(LostPageError):
 
     page: object = None
 
+    def of(self, page: object) -> Self:
+        """Itself, with what was decoded."""
+        self.page = page
+        return self
+
     def about(self, page: str) -> Self:
         """See `LostPageError`."""
-        other = super().about(page)
-        other.page = self.page
-        return other
+        return super().about(page).of(self.page)
+
+
+def let_go(error: BaseException) -> None:
+    """Drop what the frames hold that led to an error, and to those behind it: pairs of camera frames among it.
+
+    Whoever keeps the error for a while then keeps its class and words alone.
+    """
+    seen: set[int] = set()
+    waiting: list[BaseException | None] = [error]
+    while waiting:
+        one = waiting.pop()
+        if one is not None and id(one) not in seen:
+            seen.add(id(one))
+            clear_frames(one.__traceback__)
+            waiting += [one.__cause__, one.__context__]
 
 
 ERRORS: dict[str, type[LightpageError]] = {

@@ -14,10 +14,17 @@ using std::chrono::milliseconds;
 
 constexpr int kReplyBytes = 64 << 20;  // the service's largest reply
 constexpr std::size_t kChunkBytes = 1 << 20;
+constexpr std::size_t kSocketBytes = 107;  // of a Unix socket's path, as the system has it
 constexpr milliseconds kFirstPause{100}, kLongestPause{1000};  // between attempts where the service does not answer
 
 std::shared_ptr<grpc::Channel> open_channel(const std::string& target,
                                             const std::shared_ptr<grpc::ChannelCredentials>& credentials) {
+  if (target.rfind("unix:", 0) == 0 && target.size() - 5 > kSocketBytes) {
+    throw Error(grpc::StatusCode::INVALID_ARGUMENT,
+                target + ": got " + std::to_string(target.size() - 5) + " bytes, wanted a path of at most " +
+                    std::to_string(kSocketBytes) + " bytes for a Unix socket",
+                "", "");
+  }
   grpc::ChannelArguments options;
   options.SetMaxReceiveMessageSize(kReplyBytes);
   options.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);  // the device is on the local network
@@ -25,6 +32,9 @@ std::shared_ptr<grpc::Channel> open_channel(const std::string& target,
   options.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, 100);
   options.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 1000);
   options.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, 2000);  // an attempt to connect may take so long
+  // A service that has gone without a word is noticed while a call waits for it.
+  options.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, 30000);
+  options.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, 20000);
   return grpc::CreateCustomChannel(target, credentials, options);
 }
 

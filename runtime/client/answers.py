@@ -118,7 +118,11 @@ def remote_data(reply: pb.ReadDataReply) -> RemoteData:
 
 @dataclass(frozen=True)
 class Recalibrated:
-    """The result of a recalibration: AIR in bits per symbol on held-back pages; None where the fit does not say."""
+    """The result of a recalibration: AIR in bits per symbol on held-back pages; None where the fit does not say.
+
+    `air_limit` is the least `air_after` that would have been accepted, `air_standard_error` that of the difference;
+    None from a service of an earlier version.
+    """
 
     model_version: str
     previous_version: str
@@ -132,6 +136,8 @@ class Recalibrated:
     seconds: float
     pages_lost_before: int = 0
     image: ImagePosition | None = None
+    air_limit: float | None = None
+    air_standard_error: float | None = None
 
 
 _ORIGINS = {
@@ -174,6 +180,8 @@ def recalibrated(result: pb.RecalibrationResult) -> Recalibrated:
         seconds=result.seconds,
         pages_lost_before=result.pages_lost_before,
         image=image_of(result.image) if result.HasField("image") else None,
+        air_limit=optional("air_limit"),
+        air_standard_error=optional("air_standard_error"),
     )
 
 

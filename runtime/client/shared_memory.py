@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.recording.frame_pair import FramePair
+from runtime.wire.address import check_socket_path
 from runtime.wire.shared_memory import GRANTED, HANDLE_BYTES, SIZE, WHY_BYTES, memory_path
 
 _ANSWER_S = 10.0
@@ -36,6 +37,7 @@ class SharedMemory:
     def __init__(self, target: str, size: int) -> None:
         if not target.startswith("unix:"):
             raise InvalidInputError("target of shared memory", target, "unix:PATH: memory is shared on one machine")
+        check_socket_path("socket of shared memory", memory_path(target))
         if not 0 < size < 1 << 63:
             raise InvalidInputError("size of shared memory", size, "1 to 2^63 - 1 bytes")
         subject, expected = f"shared memory of {target}", "a service that was started with --shared-memory"

@@ -277,7 +277,7 @@ def _shown(metrics: BulkMetrics, address: str) -> ConsoleServer:
 
     host, _, port = address.rpartition(":")
     try:
-        server = ConsoleServer(make_wsgi_app(metrics.registry), int(port), host.strip("[]"))
+        server = ConsoleServer(make_wsgi_app(metrics.registry), int(port), host)
     except OSError as error:
         got, expected = error.strerror or error, "an address of this machine and a free port"
         raise InvalidInputError(f"--metrics {address}", got, expected) from None

@@ -11,6 +11,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from lightpage.cli.main import run
 from runtime.commands.connection import tls_options
+from runtime.wire.address import check_address
 from runtime.wire.channel import open_channel
 from runtime.wire.tls import TlsFiles
 
@@ -49,6 +50,7 @@ def is_serving(
 @tls_options(environment=False)  # those of other commands must not change how the image asks
 def main(target: str, service: str, timeout_s: float, tls: TlsFiles | None) -> None:
     """Exit with 0 when the service answers SERVING, else with 1."""
+    check_address("--target", target)
     serving, said = is_serving(target, service=service, timeout_s=timeout_s, tls=tls)
     click.echo(said, err=not serving)
     sys.exit(0 if serving else 1)

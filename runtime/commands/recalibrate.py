@@ -67,7 +67,10 @@ def recalibrate(
     detach: bool,
     json_path: Path | None,
 ) -> None:
-    """Re-fit the geometry of a drifted device from known pages, keep it only if it decodes better.
+    """Re-fit the geometry of a drifted device from known pages; keep it unless it reads less than the one in use.
+
+    Less is what exceeds the standard error of the comparison on pages that were not fitted to. Where nothing has
+    drifted, it is kept only if it reads more by twice that.
 
     Offline with --bundle, --recording and --out; over the endpoint with --target, from the service's source or, with
     --recording, from a file in its recordings folder, or with --send from a file here. The recalibration of a service
@@ -118,6 +121,8 @@ def summary(result: RecalibrationOutcome | Recalibrated, seconds: float) -> dict
         "coherence_after": report.coherence_after,
         "air_before": result.air_before,
         "air_after": result.air_after,
+        "air_limit": result.air_limit,
+        "air_standard_error": result.air_standard_error,
         "pages_lost_before": result.pages_lost_before,
         "image_shift_x_px": None if report.image is None else report.image.shift_x_px,
         "image_shift_y_px": None if report.image is None else report.image.shift_y_px,

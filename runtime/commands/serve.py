@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
@@ -54,17 +54,29 @@ from runtime.service.observation import Observer
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry, no_tracker
 from runtime.service.self_calibration import SelfCalibration
-from runtime.service.settings import ADDRESS, OFF, STORE_VARIABLE, Effective, Option, ServiceSettings, service_settings
+from runtime.service.settings import (
+    ADDRESS,
+    OFF,
+    STORE_VARIABLE,
+    Effective,
+    MetricsTable,
+    Option,
+    ServiceSettings,
+    service_settings,
+)
 from runtime.service.shared_memory import SharedMemory
 from runtime.service.store import ModelStore
 from runtime.service.traces import Traces
-from runtime.wire.address import check_free, is_local
+from runtime.wire.address import check_free, host_and_port, is_local
 from runtime.wire.shared_memory import memory_path
 
 _log = logging.getLogger(__name__)
 
 _REST_S = 3.0
 """For what still computes once all calls have ended."""
+
+_HANGUP = getattr(signal, "SIGHUP", None)
+_STOPS = [kind for kind in (signal.SIGTERM, signal.SIGINT, _HANGUP) if kind is not None]
 
 _KEYS = {
     "bundle": ("service", "bundle"),
@@ -167,7 +179,7 @@ _KEYS = {
 @click.option("--flight-recorder-pages", show_default=str(PAGES), type=click.IntRange(1), help="Kept there at most.")
 @click.pass_context
 def serve(context: click.Context, /, config: Path | None, print_config: bool, **_: Any) -> None:
-    """Run the service until SIGTERM or Ctrl-C; calls in flight are finished first."""
+    """Run the service until SIGTERM, Ctrl-C or SIGHUP; calls in flight are finished first."""
     effective = service_settings(config, options=_given(context))
     if print_config:
         click.echo(effective.to_toml(), nl=False)
@@ -222,13 +234,16 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
             observers=observers,
             monitor=monitor,
             audit=AuditLog(settings.audit_file, audit.file_bytes, audit.kept),
+            device_sessions=settings.device_sessions,
         )
         plane.models.resume()
         source_name = pages.name if pages is not None else "no source"
         recalibrator = Recalibrator(plane, recordings=service.recordings)
-        actions = Actions(plane, recalibrator)
+        if (trouble := recalibrator.no_room()) is not None:
+            _log.warning("recalibrations will be refused: %s", trouble)
+        actions = Actions(plane, recalibrator, settings.self_calibration.pages)
         console = Console(metrics, history, registry, monitor, source_name, actions)
-        stack.enter_context(_shown(console, settings.metrics.port, settings.metrics.host, certificates))
+        stack.enter_context(_shown(console, settings.metrics, certificates))
         traces = None
         if settings.traces.endpoint is not None:
             traces = stack.enter_context(Traces(settings.traces.endpoint, settings.traces.share))
@@ -260,7 +275,8 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         click.echo(f"serving {registry.current.version} from {source_name} at {server.target}")
         _log_start(registry.current.version, source_name, server.target, provider, len(effective.origins))
         wait_for_stop()
-        click.echo("stopping")
+        with suppress(OSError):  # the terminal may have gone, and sent the signal
+            click.echo("stopping")
         _log.info("stopping with model %s", registry.current.version)
     _log.info("stopped")
 
@@ -315,8 +331,9 @@ def _take_dark_frames(source: FrameSource) -> None:
 
 @contextmanager
 def stop_signals() -> Iterator[Callable[[], None]]:
-    """Yields what waits for SIGTERM or SIGINT; a second one of either ends the process the usual way.
+    """Yields what waits for SIGTERM, SIGINT or SIGHUP; a second one of them ends the process the usual way.
 
+    SIGHUP comes when a terminal is closed. Where it was to be ignored, as under nohup, it is.
     It waits for the byte that the interpreter's own handler writes. Waiting for a lock that a Python handler releases
     would miss a signal that comes between the last look for one and the sleep.
     """
@@ -335,8 +352,9 @@ def stop_signals() -> Iterator[Callable[[], None]]:
     with receiver, sender:
         waking = signal.set_wakeup_fd(sender.fileno())
         try:
-            for kind in (signal.SIGTERM, signal.SIGINT):
-                before[kind] = signal.signal(kind, no_more)
+            for kind in _STOPS:
+                if kind != _HANGUP or signal.getsignal(kind) != signal.SIG_IGN:
+                    before[kind] = signal.signal(kind, no_more)
             yield wait
         finally:
             signal.set_wakeup_fd(waking)
@@ -345,16 +363,16 @@ def stop_signals() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def _shown(console: Console, port: int | None, host: str, certificates: Certificates | None) -> Iterator[None]:
-    if port is None:
+def _shown(console: Console, settings: MetricsTable, certificates: Certificates | None) -> Iterator[None]:
+    if settings.port is None:
         yield
         return
     try:
-        server = ConsoleServer(console, port, host, certificates)
+        server = ConsoleServer(console, settings.port, settings.host, certificates, settings.names)
     except OSError as error:
         got, expected = error.strerror or error, "an address of this machine and a free port"
-        raise InvalidInputError(f"metrics at {host}:{port}", got, expected) from None
-    root = f"{'http' if certificates is None else 'https'}://{host}:{server.port}"
+        raise InvalidInputError(f"metrics at {host_and_port(settings.host, settings.port)}", got, expected) from None
+    root = f"{'http' if certificates is None else 'https'}://{host_and_port(settings.host, server.port)}"
     click.echo(f"metrics at {root}/metrics, console at {root}/")
     with server:
         yield

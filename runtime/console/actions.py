@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from lightpage.errors import InvalidInputError
 from runtime.client.answers import job_info
 from runtime.identity.roles import Role
+from runtime.recalibration.known_pages import MIN_PAGES
 from runtime.service.caller import Actor
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.wire.status import without_folders
-
-PAGES = 2
-"""Known pages of a recalibration: one to fit, one to judge by."""
 
 ROLE = Role.ADMIN
 """Who may do all of it."""
@@ -27,10 +25,12 @@ class Actions:
     Args:
         plane: whose models.
         recalibrator: of the service.
+        pages: numbers of the source's fully known pages, as self-calibration has them; none for the first two that the
+            source has.
     """
 
-    def __init__(self, plane: DataPlane, recalibrator: Recalibrator) -> None:
-        self._plane, self._recalibrator = plane, recalibrator
+    def __init__(self, plane: DataPlane, recalibrator: Recalibrator, pages: Sequence[int] = ()) -> None:
+        self._plane, self._recalibrator, self._pages = plane, recalibrator, pages or range(MIN_PAGES)
         self._named: Mapping[str, Callable[[str, Actor], str]] = {
             "recalibrate": self._recalibrate,
             "roll back": self._roll_back,
@@ -72,7 +72,8 @@ class Actions:
         return self._named[name](expected, actor)
 
     def _recalibrate(self, expected: str, actor: Actor) -> str:
-        pages = self._recalibrator.source_pages(PAGES)
+        # By number: whoever reads the source's next pages goes on where it was.
+        pages = self._recalibrator.source_pages(0, self._pages)
         return f"job {self._recalibrator.start(pages, expected, 'console', actor).id} has begun"
 
     def _roll_back(self, expected: str, actor: Actor) -> str:

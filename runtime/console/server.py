@@ -9,7 +9,7 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Self
@@ -30,6 +30,7 @@ from runtime.service.caller import Actor
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.registry import Model, ModelRegistry
+from runtime.wire.address import names_machine
 from runtime.wire.status import without_folders
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ _SERIES = (
     "piston_rad",
     "residual_rad",
 )
+_MISDIRECTED = "this host name is none of this service's: ask by IP address, or name it in metrics.names"
 _STATIC = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/console.js": ("console.js", "text/javascript; charset=utf-8"),
@@ -212,17 +214,30 @@ class ConsoleServer:
     Args:
         console: what to serve, a `Console` or any other application.
         port: 0 takes a free one.
-        host: to listen on.
+        host: to listen on, IPv6 with or without brackets.
         certificates: with which it meets its callers, who must have some too; None for no TLS.
+        names: further names of this machine by which it may be asked, see `names_machine`.
 
     Raises:
-        OSError: the port is taken.
+        OSError: the port is taken, or there is no such host.
     """
 
     def __init__(
-        self, console: WSGIApplication, port: int, host: str = "127.0.0.1", certificates: Certificates | None = None
+        self,
+        console: WSGIApplication,
+        port: int,
+        host: str = "127.0.0.1",
+        certificates: Certificates | None = None,
+        names: Iterable[str] = (),
     ) -> None:
-        self._server = make_server(host, port, _served(console), _Server, handler_class=_Handler)
+        known = frozenset(name.lower() for name in (host, socket.gethostname(), *names))
+
+        def known_now() -> frozenset[str]:
+            return known if certificates is None else known | certificates.names()
+
+        host = host.strip("[]")
+        kind = _Server6 if _is_ipv6(host, port) else _Server
+        self._server = make_server(host, port, _served(console, known_now), kind, handler_class=_Handler)
         self._server.certificates = certificates
         self._thread = threading.Thread(target=self._server.serve_forever, name="lightpage-console", daemon=True)
         self._thread.start()
@@ -305,6 +320,17 @@ class _Server(ThreadingWSGIServer):
         _log.debug("console: connection of %s", client_address[0], exc_info=True)
 
 
+class _Server6(_Server):
+    """Listens on IPv6; on all of its addresses, also on those of IPv4."""
+
+    address_family = socket.AF_INET6
+
+    def server_bind(self) -> None:
+        """See `socketserver.TCPServer`."""
+        self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+        super().server_bind()
+
+
 class _Handler(WSGIRequestHandler):
     """Says who calls. Logs no requests: there is one a second for each browser."""
 
@@ -361,8 +387,24 @@ def _cut_off(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-def _served(application: WSGIApplication) -> WSGIApplication:
-    """An application as it is served: HEAD is GET without the content, failures are logged, nothing names versions."""
+def _is_ipv6(host: str, port: int) -> bool:
+    """Whether a host has addresses of IPv6 alone.
+
+    Raises:
+        OSError: there is no such host.
+    """
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except UnicodeError as error:
+        raise OSError(f"no host: {error}") from None
+    return all(family == socket.AF_INET6 for family, *_ in found)
+
+
+def _served(application: WSGIApplication, known: Callable[[], Collection[str]]) -> WSGIApplication:
+    """An application as it is served: HEAD is GET without the content, failures are logged, nothing names versions.
+
+    A request for a host that is not among the `known` names of this machine is refused, see `names_machine`.
+    """
 
     def answer(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         begun: list[tuple[str, list[tuple[str, str]]]] = []
@@ -373,7 +415,11 @@ def _served(application: WSGIApplication) -> WSGIApplication:
 
         is_head = environ["REQUEST_METHOD"] == "HEAD"
         try:
-            content = b"".join(application(environ | {"REQUEST_METHOD": "GET"} if is_head else environ, begin))
+            host = environ.get("HTTP_HOST")
+            if host is None or names_machine(host, known()):
+                content = b"".join(application(environ | {"REQUEST_METHOD": "GET"} if is_head else environ, begin))
+            else:
+                content = b"".join(_refused(begin, "421 Misdirected Request", _MISDIRECTED))
         except Exception:
             _log.exception("console: %s", environ.get("PATH_INFO"))
             content = b"".join(_refused(begin, "500 Internal Server Error", "see the log"))

@@ -133,9 +133,7 @@ def confirmed(page: DecodedPage, found: FoundImage | None = None) -> DecodedPage
         cure = "its image lies further off or it has changed, calibrate anew" if lost else "it has changed, recalibrate"
         share = f"at least {LEAST_CONFIRMED_SHARE:.0%} of them"
         expected = f"{share}: frames and pilots of this device, as it was calibrated (if {cure})"
-    error = UnconfirmedPageError("pilots", told, expected, reason, check.recalibration_due)
-    error.page = page
-    raise error
+    raise UnconfirmedPageError("pilots", told, expected, reason, check.recalibration_due).of(page)
 
 
 def unconfirmed_page(error: UnconfirmedPageError) -> DecodedPage:

@@ -100,6 +100,15 @@ class Certificates:
         ends += [ssl.cert_time_to_seconds(str(each["notAfter"])) for each in self._context.get_ca_certs()]
         return min(ends, default=math.inf)
 
+    def names(self) -> frozenset[str]:
+        """Names of the service in its own certificate, in lower case; none where only OpenSSL can read it."""
+        try:
+            own = x509.load_pem_x509_certificate(self.pem().certificate)
+            told = own.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        except (ValueError, x509.ExtensionNotFound):
+            return frozenset()
+        return frozenset(name.lower() for name in told.get_values_for_type(x509.DNSName))
+
     def _loaded(self) -> ssl.SSLContext:
         """The context of the files as they are.
 

@@ -63,7 +63,9 @@ class Refit(Protocol):
 class RecalibrationOutcome:
     """A new bundle and why it is better: AIR in bits per symbol on held-back pages, decoded as the service does it.
 
-    `pages_lost_before` of these pages the earlier model would not have given out; they count with no bits.
+    `pages_lost_before` of these pages the earlier model would not have given out; they count with no bits. `air_limit`
+    is the least `air_after` that would have been accepted, see `runtime.recalibration.judgement.judge`, and
+    `air_standard_error` that of the difference; None where an earlier version has judged.
     """
 
     path: Path
@@ -76,3 +78,5 @@ class RecalibrationOutcome:
     pages_used: int
     pages_held_back: int
     seconds: float
+    air_limit: float | None = None
+    air_standard_error: float | None = None

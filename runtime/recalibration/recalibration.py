@@ -6,11 +6,11 @@ import math
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from statistics import fmean
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +25,15 @@ from runtime.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_v
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
 from runtime.decoding.tracking import Tracker
-from runtime.recalibration.judgement import judge, judged_pages
+from runtime.recalibration.judgement import Verdict, judge, judged_pages
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit, RefitResult
 
 _RECALIBRATED = re.compile(r"(.*)\+r(\d+)")
+
+FIT_WORTH, WRITING_WORTH = 20, 1
+"""Pages that are decoded in the time of a fit, and of writing the bundle: of a bench device, 0.4 s for a page, 8 s and
+0.5 s for these."""
 
 FIT_PAGES = 1
 """Pages that are fitted on: one has thousands of symbols, and another adds less than what drifts between pages."""
@@ -67,39 +71,41 @@ def recalibrate(
     fitted_count = min(FIT_PAGES, len(pages.pairs) - 1)
     fitted, held_back = pages.part(slice(fitted_count)), pages.part(slice(fitted_count, None))
     tracker = tracker_for(decoder) if tracker is None else tracker.fork()
-    measuring = partial(_within, progress, "measure the model in service", 0.0)
-    judged = judged_pages(tracker, decoder.bundle, held_back, measuring)
-    before, lost_before = (
-        fmean(0.0 if page.lost else page.air for page in judged),
-        sum(page.lost is not None for page in judged),
-    )
+    shares = _Shares.of(len(held_back.pairs))
+    measuring = partial(_within, progress, "measure the model in service", 0.0, shares.measured)
+    before = judged_pages(tracker, decoder.bundle, held_back, measuring)
     fitted = replace(fitted, image_px=tracker.image_px)
+
+    def fitting(step: str, share: float) -> None:
+        _within(progress, step, shares.measured, shares.fitted, share)
+
     try:
-        result = fit(decoder.bundle, fitted, lambda step, share: progress(step, 0.05 + 0.85 * share), decoder)
-        judging = partial(_within, progress, "judge by the held-back pages", 0.9)
+        result = fit(decoder.bundle, fitted, fitting, decoder)
+        judging = partial(_within, progress, "judge by the held-back pages", shares.fitted, shares.judged)
         judging(0.0)
         refitted = decoder.of_bundle(_refitted(decoder.bundle, result))
-        judged = judged_pages(tracker.refitted(refitted), decoder.bundle, held_back, judging)
+        after = judged_pages(tracker.refitted(refitted), decoder.bundle, held_back, judging)
     except (CalibrationError, FrameError) as error:
         raise RecalibrationRefusedError(error.subject, error.got, error.expected) from error
-    after = fmean(page.air for page in judged)
-    judge(before, judged, pages.levels)
-    progress("write the new bundle", 0.95)
+    verdict = judge(before, after, pages.levels)
+    progress("write the new bundle", shares.judged)
     bundle = refitted.bundle
     golden, p = _golden(refitted, held_back.pairs[0])
     files = {**bundle.files, GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=p)}
-    write_bundle(out, _new_manifest(bundle.manifest, pages, version, before, after), files)
+    write_bundle(out, _new_manifest(bundle.manifest, pages, version, verdict), files)
     return RecalibrationOutcome(
         path=out,
         version=version,
         previous_version=decoder.version,
         report=result.report,
-        air_before=before,
-        air_after=after,
-        pages_lost_before=lost_before,
+        air_before=verdict.before,
+        air_after=verdict.after,
+        pages_lost_before=sum(page.lost is not None for page in before),
         pages_used=len(pages.pairs),
         pages_held_back=len(held_back.pairs),
         seconds=time.perf_counter() - start,
+        air_limit=verdict.limit,
+        air_standard_error=verdict.error,
     )
 
 
@@ -124,9 +130,29 @@ def next_version(version: str, taken: Sequence[str] = ()) -> str:
     return f"{base}+r{last + 1}"
 
 
-def _within(progress: Progress, step: str, start: float, share: float) -> None:
-    """Tell of a share of a step that takes a twentieth of the work."""
-    progress(step, start + 0.05 * share)
+@dataclass(frozen=True)
+class _Shares:
+    """Shares of the work that are behind after its steps, in proportion to the time that these take."""
+
+    measured: float
+    fitted: float
+    judged: float
+
+    @classmethod
+    def of(cls, pages: int) -> Self:
+        """The shares where so many pages are judged by, twice each."""
+        whole = 2 * pages + FIT_WORTH + WRITING_WORTH
+        return cls(pages / whole, (pages + FIT_WORTH) / whole, (2 * pages + FIT_WORTH) / whole)
+
+
+def reading_share(pages: int) -> float:
+    """Share of a recalibration that is behind once so many pages have been read for it; 0 where none need be."""
+    return pages / (pages + 2 * (pages - FIT_PAGES) + FIT_WORTH + WRITING_WORTH) if pages else 0.0
+
+
+def _within(progress: Progress, step: str, start: float, end: float, share: float) -> None:
+    """Tell of a share of a step that lies between two shares of the work."""
+    progress(step, start + (end - start) * share)
 
 
 def _refitted(bundle: Bundle, result: RefitResult) -> Bundle:
@@ -136,11 +162,11 @@ def _refitted(bundle: Bundle, result: RefitResult) -> Bundle:
     return replace(bundle, manifest=manifest, files=files)
 
 
-def _new_manifest(manifest: Manifest, pages: KnownPages, version: str, before: float, after: float) -> Manifest:
+def _new_manifest(manifest: Manifest, pages: KnownPages, version: str, verdict: Verdict) -> Manifest:
     """The manifest of a re-fitted bundle."""
-    figures = {"recalibration_air_bits_per_symbol": after, "recalibration_pages": len(pages.pairs)}
-    if math.isfinite(before):
-        figures["recalibration_air_bits_per_symbol_before"] = before
+    figures = {"recalibration_air_bits_per_symbol": verdict.after, "recalibration_pages": len(pages.pairs)}
+    if math.isfinite(verdict.before):
+        figures["recalibration_air_bits_per_symbol_before"] = verdict.before
     return manifest.model_copy(
         update={
             "version": version,

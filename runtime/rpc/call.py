@@ -17,7 +17,6 @@ from concurrent.futures import Executor, Future
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from traceback import clear_frames
 from typing import Any, TypeVar
 
 import grpc
@@ -25,13 +24,14 @@ from google.protobuf.descriptor import ServiceDescriptor
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
-from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError
+from runtime.errors import CallerLeft, MalformedError, OverloadedError, StalledError, StoppingError, let_go
 from runtime.identity.roles import LOCAL, NEEDED, NOBODY, Identity, Role, identity_of
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call_log import CallLog, reason_told
 from runtime.service.caller import Actor, Caller
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
+from runtime.service.sessions import named_session, own_name
 from runtime.service.stages import CallTimes
 from runtime.service.traces import MOST_PAGES, EndedCall, Traces
 from runtime.wire.frame_parts import parsed_part
@@ -88,12 +88,11 @@ class Call:
 
     def own(self, name: str) -> str:
         """A name that the caller gave to a session or a request, where other callers' are others; empty for none."""
-        own = self.identity.name
-        return f"{len(own)}:{own}/{name}" if name and own else name
+        return name and own_name(name, self.identity.name)
 
     def session(self, name: str) -> str:
         """Where the pages of a session that the caller named are followed; empty for none."""
-        return f"session {self.own(name)}" if name else ""
+        return name and named_session(name, self.identity.name)
 
     @property
     def connection_session(self) -> str:
@@ -251,15 +250,31 @@ class Dispatcher:
                 replies: AsyncGenerator[Any, None] = handler(request, call)
             else:
                 replies = self._stepped(handler(request, call), call)
-            longest_s = self._longest_s.get(name)
+            longest_s, loop = self._longest_s.get(name), asyncio.get_running_loop()
+            end = None if longest_s is None else loop.time() + longest_s
+            reader = _Reader(replies, partial(self._no_load, asyncio.current_task()))
             try:
-                async with asyncio.timeout(longest_s):
-                    async for reply in replies:
+                while True:
+                    async with asyncio.timeout_at(end):
+                        reply = await anext(replies, None)
+                    if reply is None:
+                        break
+                    waiting = loop.call_later(self._limits.reader_s, reader.stalls)
+                    try:
                         yield serialise(reply)
+                    finally:
+                        waiting.cancel()
+                    reader.check(name)
             except TimeoutError:
-                raise StalledError(f"answer of {name}", f"not taken within {longest_s} s", "a faster reader") from None
+                raise _slow(name) from None
             finally:
-                await replies.aclose()
+                await reader.close()
+
+    def _no_load(self, task: asyncio.Task[Any]) -> None:
+        """From here on a call counts as one that only watches."""
+        if task in self._active:
+            self._active.discard(task)
+            self._watching.add(task)
 
     async def _stepped(self, replies: Generator[Any, None, None], call: Call) -> AsyncGenerator[Any, None]:
         """The replies of a generator that blocks, each made in a thread."""
@@ -330,11 +345,12 @@ class Dispatcher:
         except Exception as error:
             code = _code_of_leaving(context) if isinstance(error, CallerLeft) else status_of(error)
             self._ended(call, headers, code, error)
-            clear_frames(error.__traceback__)  # the library keeps the error for a while, and so would it all that came
+            let_go(error)  # the library keeps the error for a while, and so would it all that came
             await context.abort(code, told(error), trailers(error))
         finally:
             call.caller.leave()
-            mine.discard(task)
+            self._active.discard(task)
+            self._watching.discard(task)
             self._told.discard(task)
 
     def _identity(self, context: Any) -> Identity:
@@ -372,6 +388,43 @@ class Dispatcher:
                 headers,
             )
         self._log.ended(call, code, error)
+
+
+class _Reader:
+    """The caller of a stream of replies. What is made for one who takes none is dropped.
+
+    What has been handed to gRPC by then stays there until the caller takes it or leaves: no status goes before it.
+
+    Args:
+        replies: the stream.
+        stall: called when the caller has stalled.
+    """
+
+    def __init__(self, replies: AsyncGenerator[Any, None], stall: Callable[[], None]) -> None:
+        self._replies, self._stall = replies, stall
+        self._closing: asyncio.Future[None] | None = None
+
+    def stalls(self) -> None:
+        """Make no more replies; called from the loop while none is being made."""
+        self._stall()
+        self._closing = asyncio.ensure_future(self._replies.aclose())
+
+    def check(self, name: str) -> None:
+        """See that the caller of `name` did not stall.
+
+        Raises:
+            StalledError: it did.
+        """
+        if self._closing is not None:
+            raise _slow(name)
+
+    async def close(self) -> None:
+        """Make no more replies."""
+        await (self._replies.aclose() if self._closing is None else self._closing)
+
+
+def _slow(name: str) -> StalledError:
+    return StalledError(f"answer of {name}", "a reply that is not taken in time", "a faster reader")
 
 
 def _parsed(parse: Callable[[bytes], Any], data: bytes, call: Call) -> Any:

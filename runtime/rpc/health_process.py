@@ -20,7 +20,7 @@ from lightpage.errors import InvalidInputError
 from runtime.helper_process import parent_link
 from runtime.identity.certificates import Certificates
 from runtime.rpc.health_servicer import HealthServicer
-from runtime.wire.channel import add_port
+from runtime.wire.channel import SERVER_KEEPALIVE, add_port
 from runtime.wire.tls import TlsFiles
 
 SILENCE_S = 3.0
@@ -30,7 +30,7 @@ SILENCE_S = 3.0
 async def serve(address: str, link: socket.socket, tls: TlsFiles | None = None) -> None:
     """Answer health checks at an address until the link is closed; says first at which port, or why not."""
     reader, writer = await asyncio.open_connection(sock=link)
-    server = grpc.aio.server(options=(("grpc.so_reuseport", 0),))
+    server = grpc.aio.server(options=(("grpc.so_reuseport", 0), *SERVER_KEEPALIVE))
     servicer = HealthServicer()
     health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
     await servicer.tell({"": False})

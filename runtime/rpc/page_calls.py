@@ -64,38 +64,42 @@ class PageCalls:
         self._check_count("pages" if request.pages else "count", len(request.pages) or request.count)
         caller = _caller(request.options, call)
         numbers: list[int | None] = list(request.pages) or [None] * request.count
-        with self._plane.ranges.held(caller):
-            for number in numbers:
-                one = pb.ReadPageRequest(options=request.options, want_written=request.want_written)
-                one.correlation_id = request.correlation_id
-                if number is not None:
-                    one.page = number
-                stages = call.times.page()
-                try:
+        for number in numbers:
+            one = pb.ReadPageRequest(options=request.options, want_written=request.want_written)
+            one.correlation_id = request.correlation_id
+            if number is not None:
+                one.page = number
+            stages = call.times.page()
+            try:
+                with self._plane.ranges.held(caller):  # not while the caller takes its time to read the reply
                     reply = pb.ReadPagesReply(read=self._read(one, caller, stages))
-                except (CallerLeft, SlotsTakenError):
-                    raise
-                except Exception as error:
-                    stages.begin(Stage.RESPOND)
-                    self._plane.metrics.rejected(reason_told(error))
-                    refused = refusal_of(error)
-                    refused.page, refused.correlation_id = number or 0, request.correlation_id
-                    reply = pb.ReadPagesReply(refused=refused)
-                yield reply
-                call.times.done(stages)
+            except (CallerLeft, SlotsTakenError):
+                raise
+            except Exception as error:
+                stages.begin(Stage.RESPOND)
+                self._plane.metrics.rejected(reason_told(error))
+                refused = refusal_of(error)
+                refused.page, refused.correlation_id = number or 0, request.correlation_id
+                reply = pb.ReadPagesReply(refused=refused)
+            yield reply
+            call.times.done(stages)
 
     def ReadData(self, request: pb.ReadDataRequest, call: Call) -> Iterator[pb.ReadDataReply]:
         """Read the bytes of a range of pages."""
         self._check_count("pages", request.pages)
         if request.first_page + request.pages > _MOST_PAGES:
             raise InvalidInputError("first_page", request.first_page, f"less than {_MOST_PAGES} with all")
-        with self._plane.ranges.held(call.caller):
-            for page in read_data(self._plane, request.first_page, request.pages, call.caller, call.times.page):
-                if page.error is not None:
-                    self._plane.metrics.rejected(reason_told(page.error))
-                yield data_reply(page)
-                if page.stages is not None:
-                    call.times.done(page.stages)
+        pages = read_data(self._plane, request.first_page, request.pages, call.caller, call.times.page)
+        while True:
+            with self._plane.ranges.held(call.caller):  # not while the caller takes its time to read the reply
+                page = next(pages, None)
+            if page is None:
+                return
+            if page.error is not None:
+                self._plane.metrics.rejected(reason_told(page.error))
+            yield data_reply(page)
+            if page.stages is not None:
+                call.times.done(page.stages)
 
     def _read(self, request: pb.ReadPageRequest, caller: Caller, stages: Stages) -> pb.ReadPageReply:
         page, options = request.page if request.HasField("page") else None, request.options

@@ -26,10 +26,8 @@ from runtime.service.limits import Limits
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.traces import Traces
 from runtime.wire.address import check_free
-from runtime.wire.channel import add_port
+from runtime.wire.channel import SERVER_KEEPALIVE, add_port
 
-_KEEPALIVE_MS = 30_000
-"""A connection silent for so long is asked for a sign of life, so that a dead client's call ends."""
 _LAST_WORD_S = 0.1
 """From NOT_SERVING to the end of those who watch: they hear it first."""
 _END_S = 1.0
@@ -154,7 +152,7 @@ class LightpageServer:
                 ("grpc.max_receive_message_length", gate.largest),
                 ("grpc.max_send_message_length", limits.reply_bytes),
                 ("grpc.so_reuseport", 0),  # a second server on the port is a mistake, not a helper
-                ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
+                *SERVER_KEEPALIVE,
                 *_connection_ages(limits),
             ),
         )

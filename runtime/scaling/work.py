@@ -426,6 +426,7 @@ def _summary(outcome: RecalibrationOutcome) -> dict[str, float | str | None]:
         "angle_deg": outcome.report.angle_deg,
         "air_before": outcome.air_before,
         "air_after": outcome.air_after,
+        "air_limit": outcome.air_limit,
         "pages_used": outcome.pages_used,
         "pages_held_back": outcome.pages_held_back,
     }

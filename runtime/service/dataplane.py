@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ from runtime.service.heart import Heart
 from runtime.service.limits import Limits
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.models import Models
-from runtime.service.monitor import Monitor
+from runtime.service.monitor import Monitor, SessionMonitors
 from runtime.service.observation import Observer, Seen, observed
 from runtime.service.receiver import PairReceiver, ReceiveBudget
 from runtime.service.registry import Model, ModelRegistry
@@ -44,7 +44,7 @@ from runtime.service.store_health import StoreHealth
 class Answer:
     """A decoded page with the model that decoded it, the seconds that it took, and user bytes if asked for.
 
-    `monitor_signs` names the signs by which many pages together say that a recalibration is due.
+    `monitor_signs` names the signs by which many pages of its device or session say that a recalibration is due.
     """
 
     page: DecodedPage
@@ -79,8 +79,10 @@ class DataPlane:
         limits: what is accepted.
         metrics: what is counted.
         observers: are told of every page.
-        monitor: says by all pages whether a recalibration is due; it is told of every page first.
+        monitor: says by all pages of the service's own device whether a recalibration is due: those of the source, and
+            those of `device_sessions`. Other sessions of callers get monitors of their own with the same settings.
         audit: where changes of models are written down, None for the log alone.
+        device_sessions: sessions of callers whose frames are of the device, by their names in `Caller.session`.
 
     Raises:
         InvalidInputError: the source is not for this device.
@@ -96,6 +98,7 @@ class DataPlane:
         observers: Sequence[Observer] = (),
         monitor: Monitor | None = None,
         audit: AuditLog | None = None,
+        device_sessions: Collection[str] = (),
     ) -> None:
         self.registry, self.store = registry, store
         self.limits = limits or Limits()
@@ -103,7 +106,10 @@ class DataPlane:
         self.monitor, self.audit = monitor, audit or AuditLog()
         self._changing = threading.Lock()
         """Held from before a change of models until it is written down, so that the record has them in their order."""
-        self.observers = tuple(observers) if monitor is None else (monitor, *observers)
+        self.observers, self._device_sessions = tuple(observers), frozenset(("", *device_sessions))
+        self._session_monitors = None if monitor is None else SessionMonitors(monitor.settings)
+        if self._session_monitors is not None:
+            self.metrics.sessions_due.set_function(self._session_monitors.due)
         self._source = source
         if source is not None:
             _check_source(source, registry.current.decoder)
@@ -241,16 +247,16 @@ class DataPlane:
             levels = levels_for(model.decoder, levels, self.default_levels, user_data)
             if user_data:
                 pilots = pilots or model.decoder.written_pilots(levels)
-            subject = "frame pair"
+            subject, monitor = "frame pair", self._monitor_of(caller)
             seen = Seen(subject, None, model.version)
-            seen.note(tells=sure, pair=pair)
-            with observed(self.observers, seen):
+            seen.note(tells=sure, pair=pair, of_device=monitor is not None and monitor is self.monitor)
+            with observed(self._observers(monitor), seen):
                 with self._optics(user_data):
-                    page = self._decode(model, caller, pair, levels, pilots, subject, stages, sure=sure)
+                    page = self._decode(model, caller, pair, levels, pilots, subject, stages, monitor, sure=sure)
                 found = self._user_data(model, page, stages) if user_data else None
                 seen.note(page=page, user_data=found)
             self.decodes.took(time.perf_counter() - began)
-        return self._answer(page, model, stages, found)
+        return self._answer(page, model, stages, found, monitor)
 
     def read_page(
         self,
@@ -283,7 +289,7 @@ class DataPlane:
         with self.decodes.held(caller):
             model, begun = self.registry.current, time.perf_counter()
             seen = Seen(f"{'next page' if page is None else f'page {page}'} of {source.name}", page, model.version)
-            with observed(self.observers, seen):
+            with observed(self._observers(self.monitor), seen):
                 stages.begin(Stage.RECEIVE)
                 found = self._shot(source, page, caller, user_data)
                 subject = f"page {found.page_index} of {source.name}"
@@ -300,16 +306,28 @@ class DataPlane:
                     own = model.decoder
                     pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
                 with own_fault(f"{subject}: "), self._optics(user_data):
-                    decoded = self._decode(model, caller, found.pair, levels, pilots, subject, stages)
+                    decoded = self._decode(model, caller, found.pair, levels, pilots, subject, stages, self.monitor)
                 data = self._user_data(model, decoded, stages, expected) if user_data else None
                 seen.note(page=decoded, user_data=data)
             self.decodes.took(time.perf_counter() - begun)
-        return ReadAnswer(self._answer(decoded, model, stages, data), found, mask)
+        return ReadAnswer(self._answer(decoded, model, stages, data, self.monitor), found, mask)
 
-    def _answer(self, page: DecodedPage, model: Model, stages: Stages, found: PageBytes | None) -> Answer:
+    def _monitor_of(self, caller: Caller) -> Monitor | None:
+        """What follows the frames that a caller sends; None where each is decoded as if it were the first."""
+        if caller.stateless or self._session_monitors is None:
+            return None
+        return self.monitor if caller.session in self._device_sessions else self._session_monitors.of(caller.session)
+
+    def _observers(self, monitor: Monitor | None) -> Sequence[Observer]:
+        """Who is told of a page, its monitor first."""
+        return self.observers if monitor is None else (monitor, *self.observers)
+
+    def _answer(
+        self, page: DecodedPage, model: Model, stages: Stages, found: PageBytes | None, monitor: Monitor | None
+    ) -> Answer:
         stages.begin(Stage.RESPOND)
         receive_s = stages.seconds().get(Stage.RECEIVE, 0.0)
-        return Answer(page, model.version, receive_s, stages.elapsed_s, found, self._signs)
+        return Answer(page, model.version, receive_s, stages.elapsed_s, found, _signs(monitor))
 
     def _shot(self, source: FrameSource, page: int | None, caller: Caller, user_data: bool) -> Shot:
         """A page of the source; a lost shot is counted."""
@@ -355,17 +373,8 @@ class DataPlane:
         self.metrics.in_service(model.version)
         if self.monitor is not None:
             self.monitor.begin(model.version)
-
-    @property
-    def _due(self) -> bool:
-        return self.monitor is not None and self.monitor.due
-
-    @property
-    def _signs(self) -> tuple[str, ...]:
-        if self.monitor is None or not self.monitor.due:
-            return ()
-        raised = tuple(sign.name for sign in self.monitor.state().signs if sign.raised and sign.decides)
-        return raised or ("other",)
+        if self._session_monitors is not None:
+            self._session_monitors.begin(model.version)
 
     @staticmethod
     def _mask(found: Shot, decoder: Decoder) -> NDArray[np.bool_]:
@@ -380,6 +389,7 @@ class DataPlane:
         pilots: Pilots | None,
         subject: str,
         stages: Stages,
+        monitor: Monitor | None,
         *,
         sure: bool = True,
     ) -> DecodedPage:
@@ -396,12 +406,19 @@ class DataPlane:
             if isinstance(error, UnconfirmedPageError):
                 _inferred(unconfirmed_page(error), stages)
             self.metrics.lost(error, tells=sure)
-            lost = error.about(subject)
-            lost.recalibration_due = (lost.recalibration_due and sure) or self._due
-            raise lost from None
+            error.recalibration_due = (error.recalibration_due and sure) or (monitor is not None and monitor.due)
+            raise error.about(subject) from None
         _inferred(page, stages)
         self.metrics.page(page, model.version)
         return page
+
+
+def _signs(monitor: Monitor | None) -> tuple[str, ...]:
+    """Signs of a monitor by which a recalibration is due; empty where it is not."""
+    if monitor is None or not monitor.due:
+        return ()
+    raised = tuple(sign.name for sign in monitor.state().signs if sign.raised and sign.decides)
+    return raised or ("other",)
 
 
 def _inferred(page: DecodedPage, stages: Stages) -> None:

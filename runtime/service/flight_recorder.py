@@ -148,7 +148,7 @@ class FlightRecorder:
             return f"{data.loss.value}_lost".upper(), f"{data.failed_blocks} of {data.blocks} blocks failed"
         if data is not None and data.margin_bits < self._settings.low_margin_bits:
             why = "LOW_MARGIN", f"margin {data.margin_bits:.4f} bit a symbol"
-        elif self._monitor is not None and self._monitor.due:
+        elif seen.of_device and self._monitor is not None and self._monitor.due:
             why = "RECALIBRATION_DUE", "; ".join(self._monitor.state().reasons)
         else:
             return None

@@ -64,13 +64,17 @@ RECALIBRATION_S = 300.0
 reads without a pause on both cores, since its priority leaves it what they do not use and a tenth of a core."""
 
 CONCURRENT_RANGES = 4
-"""Ranges of pages being read for their bytes: each holds a thread for as long as its caller takes."""
+"""Ranges of pages of which a page is being read. A range whose caller takes its time to read a reply does not count."""
 
 RANGE_PAGES = 4096
 """Pages of one range."""
 
 RANGE_S = 3600.0
-"""A range that is not read to its end by then is dropped, with a caller that does not take it."""
+"""A range that is not read to its end by then is dropped."""
+
+READER_S = 60.0
+"""A caller that does not take a reply of a stream for so long has stalled, and its call is ended: until then the reply
+and what was read ahead for it lie in memory."""
 
 CONCURRENT_WATCHES = 2
 """Controllers that watch what is to be shown: one, and one whose connection has been lost."""
@@ -119,6 +123,7 @@ class Limits(TomlTable):
     concurrent_ranges: _Count = CONCURRENT_RANGES
     range_pages: Annotated[int, Field(ge=1, le=1 << 32)] = RANGE_PAGES
     range_s: _Seconds = RANGE_S
+    reader_s: _Seconds = READER_S
     concurrent_watches: _Count = CONCURRENT_WATCHES
     grace_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = GRACE_S
     connection_age_s: _Seconds | None = None

@@ -93,6 +93,7 @@ class ServiceMetrics:
         self.monitor_due = Gauge("lightpage_monitor_due", "1 where many pages say so.", registry=own)
         self.monitor_signs = Gauge("lightpage_monitor_sign", "Smoothed over pages.", ["sign"], registry=own)
         self.monitor_raised = Gauge("lightpage_monitor_sign_raised", "1 where beyond it.", ["sign"], registry=own)
+        self.sessions_due = Gauge("lightpage_sessions_due", "Callers' sessions that say so.", registry=own)
         self.flight_pages = Counter("lightpage_flight_pages", "Kept, dropped or failed.", ["result"], registry=own)
         self.model = Gauge("lightpage_model_info", "1 for the model in service.", ["version"], registry=own)
         self._begin_at_zero()

@@ -6,7 +6,7 @@ import logging
 import math
 import statistics
 import threading
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -16,6 +16,7 @@ from lightpage.codec.page_bytes import Loss
 from runtime.errors import Reason
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.observation import Observation
+from runtime.service.sessions import MOST_SESSIONS
 
 _log = logging.getLogger(__name__)
 
@@ -272,12 +273,17 @@ class Monitor:
     Args:
         settings: when a recalibration is due.
         metrics: where the signs are shown, None for nowhere.
+        whose: goes before what is logged, e.g. ``"session a: "``; empty for the service's own device.
     """
 
-    def __init__(self, settings: MonitorSettings | None = None, metrics: ServiceMetrics | None = None) -> None:
-        self.settings, self._metrics = settings or MonitorSettings(), metrics
+    def __init__(
+        self, settings: MonitorSettings | None = None, metrics: ServiceMetrics | None = None, whose: str = ""
+    ) -> None:
+        self.settings, self._metrics, self._whose = settings or MonitorSettings(), metrics, whose
+        self._showing = threading.Lock()
+        """Held from a look at the state until it is shown, so that no thread shows an earlier one last."""
         self._lock = threading.Lock()
-        """Guards all that follows; never held while listeners are told."""
+        """Guards all that follows; never held while listeners are told. Taken after the lock above."""
         self._listeners: list[Callable[[], None]] = []
         self._begin("")
 
@@ -290,7 +296,7 @@ class Monitor:
         """Start anew with a model that is put in service; pages of others say nothing from now on."""
         with self._lock:
             self._begin(version)
-        self._show(self.state())
+        self._show()
 
     def listen(self, listener: Callable[[], None]) -> None:
         """Call `listener`, from the thread of the page, whenever a recalibration has become due."""
@@ -334,19 +340,59 @@ class Monitor:
                     each.add(value)
             before, self._due = self._due, any(each.raised and each.sign.decides for each in self._signs)
             now, listeners = self._due, list(self._listeners)
-        state = self.state()
-        self._show(state)
+        self._show()
         if now and not before:
-            _log.warning("recalibration due: %s", "; ".join(state.reasons))
+            _log.warning("%srecalibration due: %s", self._whose, "; ".join(self.state().reasons))
             for listener in listeners:
                 listener()
         elif before and not now:
-            _log.info("recalibration no longer due")
+            _log.info("%srecalibration no longer due", self._whose)
 
-    def _show(self, state: MonitorState) -> None:
+    def _show(self) -> None:
+        """Show how the device stands now."""
         if self._metrics is None:
             return
-        self._metrics.monitor_due.set(state.due)
-        for sign in state.signs:
-            self._metrics.monitor_signs.labels(sign.name).set(math.nan if sign.value is None else sign.value)
-            self._metrics.monitor_raised.labels(sign.name).set(sign.raised)
+        with self._showing:
+            state = self.state()
+            self._metrics.monitor_due.set(state.due)
+            for sign in state.signs:
+                self._metrics.monitor_signs.labels(sign.name).set(math.nan if sign.value is None else sign.value)
+                self._metrics.monitor_raised.labels(sign.name).set(sign.raised)
+
+
+class SessionMonitors:
+    """A monitor for each session whose frames callers send: what they show says nothing of the service's own device.
+
+    Args:
+        settings: when a recalibration is due.
+        most: sessions that are remembered; of more, the one that was silent for longest is forgotten, and begins anew.
+    """
+
+    def __init__(self, settings: MonitorSettings, most: int = MOST_SESSIONS) -> None:
+        self._settings, self._most, self._version = settings, most, ""
+        self._lock = threading.Lock()
+        self._monitors: OrderedDict[str, Monitor] = OrderedDict()
+
+    def begin(self, version: str) -> None:
+        """Start anew with a model that is put in service."""
+        with self._lock:
+            self._version = version
+            self._monitors.clear()
+
+    def of(self, session: str) -> Monitor:
+        """The monitor of a session."""
+        with self._lock:
+            monitor = self._monitors.pop(session, None)
+            if monitor is None:
+                monitor = Monitor(self._settings, whose=f"{session}: ")
+                monitor.begin(self._version)
+            self._monitors[session] = monitor
+            while len(self._monitors) > self._most:
+                self._monitors.popitem(last=False)
+            return monitor
+
+    def due(self) -> int:
+        """Number of sessions whose pages say that a recalibration is due."""
+        with self._lock:
+            monitors = list(self._monitors.values())
+        return sum(monitor.due for monitor in monitors)

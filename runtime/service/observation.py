@@ -43,6 +43,7 @@ class Observation:
         detail: of the loss, for people.
         tells: whether it says something of the device. A lost page whose pilots a caller sent does not: they
             may be wrong.
+        of_device: whether it is of the service's own device, and not of frames of a caller's own session.
         pair: its frames, None where no pair was photographed.
         infos: what the cameras said of them.
         page: what was decoded, of a page that its pilots do not confirm too; None where nothing was.
@@ -60,6 +61,7 @@ class Observation:
     lost: Reason | None = None
     detail: str = ""
     tells: bool = True
+    of_device: bool = True
     pair: FramePair | None = None
     infos: tuple[FrameInfo, FrameInfo] | None = None
     page: DecodedPage | None = None

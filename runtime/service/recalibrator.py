@@ -10,25 +10,37 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from itertools import count as counting
 from pathlib import Path
 
 from lightpage.errors import (
     InvalidInputError,
+    LightpageError,
     LimitError,
     RecalibrationRefusedError,
     RecordingError,
 )
+from lightpage.failures import os_failure
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
 from runtime.acquisition.source import FrameSource, own_fault
 from runtime.bulk.evaluation import check_recording
 from runtime.bundle.archive import check_name
 from runtime.bundle.bundle import Bundle
-from runtime.errors import CallerLeft, JobCancelledError, NoSourceError, OtherModelError, SourceError, StoppingError
+from runtime.errors import (
+    CallerLeft,
+    JobCancelledError,
+    NoSourceError,
+    OtherModelError,
+    SourceError,
+    StoppingError,
+    StoreError,
+    let_go,
+)
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.known_pages import KnownPages, read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome, Refit
-from runtime.recalibration.recalibration import next_version, recalibrate
+from runtime.recalibration.recalibration import next_version, reading_share, recalibrate
 from runtime.recalibration.separate_process import recalibrate_apart
 from runtime.service.caller import NOBODY, Actor, Caller
 from runtime.service.dataplane import DataPlane
@@ -41,6 +53,9 @@ _log = logging.getLogger(__name__)
 
 _POLL_S = 0.25
 """How often a silent recalibration looks whether its caller is still there."""
+
+
+_ROOM = "a service started with --store FOLDER, or a temporary folder that can be written: TMPDIR, or --tmpfs /tmp"
 
 
 @dataclass(frozen=True)
@@ -62,12 +77,14 @@ class PagesToUse:
     Attributes:
         of: where they come from, for people.
         read: reads them on behalf of a caller, and calls what it is given before each.
+        count: how many are to be read, 0 where that is not known, or they are here already.
         own: whether they are the service's own: then it is not the caller's fault if they are dark or damaged.
         release: called once they are not needed any more, also where the job does not begin.
     """
 
     of: str
     read: Callable[[Callable[[], None], Caller], KnownPages]
+    count: int = 0
     own: bool = True
     release: Callable[[], None] = _nothing
 
@@ -92,6 +109,8 @@ class Recalibrator:
         folder = None if plane.store is None else plane.store.folder
         self.jobs = Jobs(folder, plane.limits.jobs_kept, plane.registry.current.version)
         self._stop = threading.Event()
+        self._making = threading.Lock()
+        """Held while the folder below is looked for and made."""
         self._temporary: tempfile.TemporaryDirectory[str] | None = None
 
     def source_pages(self, count: int, pages: Sequence[int] = ()) -> PagesToUse:
@@ -105,7 +124,9 @@ class Recalibrator:
         self.check_count(len(pages) or count)
         expected: list[int | None] = list(pages) or [None] * count
         return PagesToUse(
-            "source", lambda heard, caller: read_known(source, expected, heard, lambda: slots.held(caller))
+            "source",
+            lambda heard, caller: read_known(source, expected, heard, lambda: slots.held(caller)),
+            len(expected),
         )
 
     def recorded_pages(self, name: str, count: int) -> PagesToUse:
@@ -130,7 +151,7 @@ class Recalibrator:
                 with own_fault():
                     return read_recorded(recording, range(count or recording.pages), heard)
 
-        return PagesToUse(f"recording {name}", read)
+        return PagesToUse(f"recording {name}", read, count)
 
     def sent_pages(self, pages: KnownPages, release: Callable[[], None] = _nothing) -> PagesToUse:
         """Pages whose frames a caller has sent, checked.
@@ -192,11 +213,20 @@ class Recalibrator:
         )
 
     def check_start(self, expected_version: str = "") -> None:
-        """See whether a job may begin now; raises as `start` would."""
+        """See whether a job may begin now; raises as `start` would, and `StoreError` without a folder for it."""
         if self._stop.is_set():
             raise StoppingError("recalibration", "a service that stops", "one that serves; nothing was changed")
         self.jobs.check_free()
         _check_version(self._plane.registry.current, expected_version)
+        self._store()
+
+    def no_room(self) -> LightpageError | None:
+        """Why no recalibration can keep its model, None where one can."""
+        try:
+            self._store()
+        except LightpageError as error:
+            return error
+        return None
 
     def close(self, wait_s: float = GRACE_S) -> None:
         """Stop a running recalibration at its next step, which is waited for at most `wait_s`; drop temporary bundles.
@@ -250,13 +280,20 @@ class Recalibrator:
             self.jobs.tell(name, fraction)
             tell(Step(name, fraction))
 
+        share, read = reading_share(pages.count), counting()
+
+        def heard() -> None:
+            progress("read the pages", share * min(1.0, next(read) / (pages.count + 1)))
+
+        def working(name: str, fraction: float) -> None:
+            progress(name, share + (1 - share) * fraction)
+
         actor = running.caller.actor
         end: RecalibrationOutcome | BaseException
         try:
-            heard = partial(progress, "read the pages", 0.0)
             heard()
             self._plane.models.check_store()
-            end = self._work(pages, pages.read(heard, running.caller), progress, check, expected_version, actor)
+            end = self._work(pages, pages.read(heard, running.caller), working, check, expected_version, actor)
         except CallerLeft as left:  # whoever waits for a slot knows no more than that
             end = _cause(check, left)
         except BaseException as error:
@@ -266,7 +303,10 @@ class Recalibrator:
         self._count(end)
         # Before the last step is told: whoever hears the end may start the next one at once.
         self.jobs.end(running, end)
+        if isinstance(end, BaseException):
+            let_go(end)  # of the pages
         tell(end)
+        del end  # it holds this frame, which holds it
 
     def _work(
         self,
@@ -306,11 +346,21 @@ class Recalibrator:
         return outcome
 
     def _store(self) -> ModelStore:
-        """The service's store; without one, a temporary folder that keeps no more than the models held."""
+        """The service's store; without one, a temporary folder that keeps no more than the models held.
+
+        Raises:
+            StoreError: there is no folder that can be written.
+            StorageError, SurroundingsError: the disk fails, or has no room.
+        """
         if self._plane.store is not None:
             return self._plane.store
-        if self._temporary is None:
-            self._temporary = tempfile.TemporaryDirectory(prefix="lightpage-models-")
+        with self._making:
+            if self._temporary is None:
+                try:
+                    self._temporary = tempfile.TemporaryDirectory(prefix="lightpage-models-")
+                except OSError as error:
+                    subject = "temporary folder of recalibrated models"
+                    raise os_failure(subject, error, _ROOM, StoreError) from None
         return ModelStore(Path(self._temporary.name), self._plane.registry.current.decoder.bundle, kept=0)
 
     def _count(self, result: RecalibrationOutcome | BaseException) -> None:
@@ -413,7 +463,10 @@ def _follow(
             caller.check()
             continue
         if isinstance(step, BaseException):
-            raise step
+            try:
+                raise step
+            finally:
+                del step  # it holds this frame, which holds it
         yield step
         if isinstance(step, RecalibrationOutcome):
             return

@@ -2,30 +2,45 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, StorageError
 from runtime.errors import RequestIdError, SlotsTakenError, StoppingError
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.service.caller import Caller
+from runtime.wire.status import error_from, refusal_of
+
+_NOTHING_DONE = (SlotsTakenError, StoppingError, InvalidInputError, StorageError)
+"""Errors that come before a shot: the next call with the same id tries again."""
+
+_OWN_BYTES = 500
+"""An entry itself, and its place among the others."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class _Entry:
-    """What is known of a request id; `request` tells whether it is the same request."""
+    """What is known of a request id: plain bytes alone, so that no frame of a page is kept.
+
+    Attributes:
+        request: tells whether it is the same request.
+        done: whether the answer or the failure is there.
+        answer: of a request that went well.
+        failure: a serialised `ErrorDetail`; None where it went well.
+        ended_at: when it was done, by the clock.
+        size: bytes that are counted for it.
+    """
 
     request: bytes
     done: bool = False
     answer: bytes = b""
-    error: Exception | None = None
+    failure: bytes | None = None
     ended_at: float = float("inf")
-
-    def size(self, request_id: str) -> int:
-        """Bytes that are kept of it: a request may be as long as a message, and an error has no answer."""
-        return len(request_id) + len(self.request) + len(self.answer)
+    size: int = 0
 
 
 class Replays:
@@ -42,11 +57,20 @@ class Replays:
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
         self._entries: OrderedDict[str, _Entry] = OrderedDict()
+        self._held = 0
+        """Bytes of all entries that are done."""
+
+    @property
+    def held_bytes(self) -> int:
+        """How much of all answers and failures is kept, with their requests."""
+        with self._lock:
+            return self._held
 
     def once(self, request_id: str, request: bytes, caller: Caller, work: Callable[[], bytes]) -> tuple[bytes, bool]:
         """The answer to a request, made by `work` if there is none yet, and whether it was there already.
 
-        An error is an answer too, unless nothing was done: the service was too busy, or the request wrong.
+        An error is an answer too, unless nothing was done: the service was too busy, its storage failed, or the request
+        was wrong. The first caller gets the error that came, later ones an error of the same class and words.
 
         Args:
             request_id: the caller's, not empty.
@@ -80,42 +104,43 @@ class Replays:
             if not entry.done:
                 expected = "its answer; ask again with the same id"
                 raise SlotsTakenError(f"request {request_id!r}", "no answer yet", expected, retry_s=1.0)
-        if entry.error is not None:
-            raise entry.error.with_traceback(None)  # else it grows with each answer
+        if entry.failure is not None:
+            raise error_from(pb.ErrorDetail.FromString(entry.failure))
         return entry.answer, not mine
 
     def _work(self, request_id: str, entry: _Entry, work: Callable[[], bytes]) -> None:
+        kept = False
         try:
             entry.answer = work()
+            kept = True
         except Exception as error:
-            entry.error = error
-        except BaseException:
-            self._drop(request_id, entry)
+            entry.failure = refusal_of(error).detail.SerializeToString()
+            kept = not isinstance(error, _NOTHING_DONE)
             raise
         finally:
-            entry.ended_at = self._clock()
-            if isinstance(entry.error, (SlotsTakenError, StoppingError, InvalidInputError)):
-                self._drop(request_id, entry)
-            entry.done = True
-            self._tell()
+            with self._changed:
+                entry.done, entry.ended_at = True, self._clock()
+                if kept:
+                    parts = (request_id, entry.request, entry.answer, entry.failure or b"")
+                    entry.size = _OWN_BYTES + sum(map(sys.getsizeof, parts))
+                    self._held += entry.size
+                else:
+                    del self._entries[request_id]
+                self._changed.notify_all()
 
     def _tell(self) -> None:
         with self._changed:
             self._changed.notify_all()
 
-    def _drop(self, request_id: str, entry: _Entry) -> None:
-        with self._lock:
-            if self._entries.get(request_id) is entry:
-                del self._entries[request_id]
-
     def _forget(self) -> None:
         """Drop answers that are too old, then the oldest where there are too many bytes of them."""
-        now = self._clock()
-        held = sum(entry.size(request_id) for request_id, entry in self._entries.items())
-        for request_id, entry in list(self._entries.items()):
+        now, gone = self._clock(), list[str]()
+        for request_id, entry in self._entries.items():
             if not entry.done:
                 continue
-            if now - entry.ended_at <= self._keep_s and held <= self._keep_bytes:
+            if now - entry.ended_at <= self._keep_s and self._held <= self._keep_bytes:
                 break
-            held -= entry.size(request_id)
+            self._held -= entry.size
+            gone.append(request_id)
+        for request_id in gone:
             del self._entries[request_id]

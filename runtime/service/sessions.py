@@ -12,6 +12,21 @@ MOST_SESSIONS = 256
 """Sessions that a model remembers; of more, the one that was silent for longest is forgotten, and begins anew."""
 
 
+def own_name(name: str, caller: str) -> str:
+    """A name that a caller gave to something, where other callers' are others.
+
+    Args:
+        name: not empty.
+        caller: the name in its certificate; empty without one, and then the name is shared.
+    """
+    return f"{len(caller)}:{caller}/{name}" if caller else name
+
+
+def named_session(name: str, caller: str) -> str:
+    """The session that a caller has named, as `Caller.session` has it; see `own_name`."""
+    return f"session {own_name(name, caller)}"
+
+
 class Sessions:
     """A tracker for each session.
 

@@ -35,6 +35,7 @@ from runtime.service.audit import AUDIT_BYTES, AUDIT_KEPT
 from runtime.service.flight_recorder import PAGES, RING_BYTES, FlightSettings
 from runtime.service.limits import Limits
 from runtime.service.self_calibration import SelfCalibrationSettings
+from runtime.service.sessions import named_session
 from runtime.service.traces import check_endpoint
 from runtime.wire.address import check_address, is_local
 from runtime.wire.tls import TlsFiles
@@ -166,10 +167,17 @@ class TlsTable(SettingsTable):
 
 
 class MetricsTable(SettingsTable):
-    """Where metrics and the console are shown; without a port, nowhere."""
+    """Where metrics and the console are shown; without a port, nowhere.
+
+    Attributes:
+        host: to listen on.
+        port: 0 takes a free one.
+        names: by which they may be asked for, beside IP addresses, `localhost`, `host` and this machine's own name.
+    """
 
     host: _Text = "127.0.0.1"
     port: _Port | None = None
+    names: Annotated[tuple[_Text, ...], Field(strict=False)] = ()
 
 
 class TracesTable(SettingsTable):
@@ -203,9 +211,14 @@ class InferenceTable(SettingsTable):
 
 
 class SelfCalibrationTable(SettingsTable):
-    """See `SelfCalibrationSettings`; `enabled` left out means: where pages are named."""
+    """See `SelfCalibrationSettings`; `enabled` left out means: where pages are named.
+
+    `device_sessions` are sessions whose frames, which callers send, are of the device: the monitor counts them as it
+    does the pages of the source. With TLS each is CALLER/SESSION, CALLER being the name in the caller's certificate.
+    """
 
     enabled: bool | None = None
+    device_sessions: Annotated[tuple[_Text, ...], Field(strict=False)] = ()
     pages: Annotated[tuple[_PageNumber, ...], Field(strict=False)] = SelfCalibrationSettings.pages
     least_s: _Seconds = SelfCalibrationSettings.least_s
     longest_s: _Seconds = SelfCalibrationSettings.longest_s
@@ -279,6 +292,14 @@ class ServiceSettings(TomlTable):
         return bool(self.self_calibration.pages) if enabled is None else enabled
 
     @property
+    def device_sessions(self) -> list[str]:
+        """Sessions whose frames are of the device, as `Caller.session` has them."""
+        named = self.self_calibration.device_sessions
+        if self.tls.files() is None:
+            return [named_session(name, "") for name in named]
+        return [named_session(name, caller) for caller, _, name in (one.partition("/") for one in named)]
+
+    @property
     def audit_file(self) -> Path | None:
         """The record of model changes, None for none."""
         if self.audit.file is not None or self.service.store is None:
@@ -349,6 +370,12 @@ class ServiceSettings(TomlTable):
             "self_calibration.pages",
             own.pages,
             f"at most limits.recalibration_pages, which is {limits.recalibration_pages}",
+        )
+        _want(
+            self.tls.files() is None or all(all(one.partition("/")) for one in own.device_sessions),
+            "self_calibration.device_sessions",
+            own.device_sessions,
+            "CALLER/SESSION with [tls], since sessions belong to the name in a certificate",
         )
         _want(
             self.service.address != OFF,

@@ -7,6 +7,7 @@ import ipaddress
 import os
 import re
 import socket
+from collections.abc import Collection
 from pathlib import Path
 
 from lightpage.errors import InvalidInputError
@@ -14,6 +15,8 @@ from lightpage.errors import InvalidInputError
 _HOST_PORT = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
 _UNIX = "unix:"
 _LARGEST_PORT = 65535
+SOCKET_BYTES = 107
+"""Of a Unix socket's path: the system keeps it in 108 bytes, the last of which is 0."""
 _ANSWER_S = 1.0
 
 
@@ -28,6 +31,35 @@ def is_local(address: str) -> bool:
         return host == "localhost"
 
 
+def host_and_port(host: str, port: int | str) -> str:
+    """HOST:PORT; an IPv6 address goes into brackets if it has none."""
+    return f"[{host}]:{port}" if ":" in host and not host.startswith("[") else f"{host}:{port}"
+
+
+def names_machine(host: str, known: Collection[str]) -> bool:
+    """Whether a request's ``Host`` names this machine in a way that no stranger can choose.
+
+    A page of a stranger may have its own name resolve to this machine (DNS rebinding), and then reads what is served
+    there as if it were its own. An IP address, `localhost`, and names that somebody gave this service are not
+    of that kind.
+
+    Args:
+        host: HOST or HOST:PORT.
+        known: names beside those, in lower case; ``*.NAME`` stands for all one label below NAME.
+    """
+    name = host.rpartition("]")[0].lstrip("[") if host.startswith("[") else host.partition(":")[0]
+    name = name.lower().removesuffix(".")
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return (
+            name == "localhost"
+            or name.endswith(".localhost")
+            or not {name, f"*.{name.partition('.')[2]}"}.isdisjoint(known)
+        )
+    return True
+
+
 def check_address(name: str, address: str, least_port: int = 1) -> None:
     """Check that an address is HOST:PORT (or unix:PATH): gRPC would guess a port, or take one modulo 65,536.
 
@@ -35,12 +67,24 @@ def check_address(name: str, address: str, least_port: int = 1) -> None:
         InvalidInputError: it is not.
     """
     if address.startswith(_UNIX):
-        if not address.removeprefix(_UNIX):
+        if not (path := address.removeprefix(_UNIX)):
             raise InvalidInputError(name, repr(address), "unix:PATH, or HOST:PORT")
+        check_socket_path(name, path)
         return
     match = _HOST_PORT.fullmatch(address)
     if match is None or not least_port <= int(match[2]) <= _LARGEST_PORT:
         raise InvalidInputError(name, repr(address), f"HOST:PORT with a port from {least_port} to {_LARGEST_PORT}")
+
+
+def check_socket_path(name: str, path: str) -> None:
+    """Check that a Unix socket can have a path.
+
+    Raises:
+        InvalidInputError: it is too long for the system.
+    """
+    if (size := len(os.fsencode(path))) > SOCKET_BYTES:
+        expected = f"a path of at most {SOCKET_BYTES} bytes for a Unix socket; a relative one may be shorter"
+        raise InvalidInputError(name, f"{path}, {size} bytes", expected)
 
 
 def check_free(name: str, address: str) -> None:
@@ -68,6 +112,7 @@ def check_free(name: str, address: str) -> None:
 
 def _check_socket_free(subject: str, path: str) -> None:
     """Check that no process listens at a socket: gRPC would take it away from one that does."""
+    check_socket_path(subject, path)
     folder, at = Path(path).parent, Path(path)
     if not folder.is_dir():
         raise InvalidInputError(subject, f"no folder {folder}", "a socket's path in a folder that is there")

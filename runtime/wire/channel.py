@@ -22,6 +22,23 @@ CONNECT_MS = 2000
 are all at work takes its time to answer, and a host that is being switched on drops what it is sent."""
 
 
+KEEPALIVE_MS = 30_000
+"""A connection silent for so long is asked for a sign of life, so that either end notices that the other has gone."""
+
+_CLIENT_KEEPALIVE = (
+    ("grpc.keepalive_time_ms", KEEPALIVE_MS),
+    ("grpc.keepalive_timeout_ms", 20_000),  # a service whose cores are all at work takes its time
+)
+
+SERVER_KEEPALIVE = (
+    ("grpc.keepalive_time_ms", KEEPALIVE_MS),
+    ("grpc.keepalive_permit_without_calls", 1),
+    # By default a server hangs up on whoever asks more often than once in five minutes while no data flows.
+    ("grpc.http2.min_ping_interval_without_data_ms", 5_000),
+)
+"""Of every server of this project: callers may ask for a sign of life every 10 s, with calls or without."""
+
+
 def open_channel(target: str, tls: TlsFiles | None = None) -> grpc.Channel:
     """A channel to `target` (HOST:PORT); it connects at the first call, and again whenever the connection was lost.
 
@@ -40,6 +57,7 @@ def open_channel(target: str, tls: TlsFiles | None = None) -> grpc.Channel:
         ("grpc.max_reconnect_backoff_ms", most_ms),
         ("grpc.min_reconnect_backoff_ms", CONNECT_MS),
         ("grpc.service_config", _service_config()),
+        *_CLIENT_KEEPALIVE,
     )
     if tls is None:
         return grpc.insecure_channel(target, options=options)

@@ -22,4 +22,6 @@ def result_message(outcome: RecalibrationOutcome) -> pb.RecalibrationResult:
         seconds=outcome.seconds,
         pages_lost_before=outcome.pages_lost_before,
         image=None if outcome.report.image is None else image_message(outcome.report.image),
+        air_limit=outcome.air_limit,
+        air_standard_error=outcome.air_standard_error,
     )

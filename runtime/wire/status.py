@@ -16,6 +16,7 @@ from lightpage.errors import (
     BundleError,
     BusyError,
     CalibrationError,
+    Cause,
     FrameError,
     FramesDisagreeError,
     InvalidInputError,
@@ -26,7 +27,10 @@ from lightpage.errors import (
     NoSuchPageError,
     RecalibrationRefusedError,
     SaturatedFrameError,
+    StorageError,
+    SurroundingsError,
 )
+from lightpage.failures import cause_of, os_failure, short_resource
 from runtime.errors import (
     ERRORS,
     CallerLeft,
@@ -76,6 +80,8 @@ _MEANINGS: tuple[tuple[type[BaseException], grpc.StatusCode, pb.ErrorReason], ..
     (BusyError, _Code.ABORTED, pb.ERROR_REASON_RECALIBRATION_RUNS),
     (NoSourceError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_NO_SOURCE),
     (SourceError, _Code.FAILED_PRECONDITION, pb.ERROR_REASON_SOURCE_BROKEN),
+    (StorageError, _Code.UNAVAILABLE, pb.ERROR_REASON_STORAGE),
+    (SurroundingsError, _Code.RESOURCE_EXHAUSTED, pb.ERROR_REASON_SURROUNDINGS),
     (StoppingError, _Code.UNAVAILABLE, pb.ERROR_REASON_STOPPING),
     (WorkerError, _Code.ABORTED, pb.ERROR_REASON_WORKER),
     (ModelExistsError, _Code.ALREADY_EXISTS, pb.ERROR_REASON_MODEL),
@@ -94,6 +100,9 @@ _MEANINGS: tuple[tuple[type[BaseException], grpc.StatusCode, pb.ErrorReason], ..
     (grpc.RpcError, _Code.CANCELLED, pb.ERROR_REASON_UNSPECIFIED),  # while reading from a sender who has gone
 )
 """Of each error class its status and its reason; the first that fits counts."""
+
+_RETRY_S: dict[type[LightpageError], float] = {StorageError: 2.0, SurroundingsError: 5.0}
+"""When to try again what failed by what passes, seconds: a disk that hiccups, and memory that others give back."""
 
 _EARLIER_KINDS = frozenset(
     [
@@ -133,6 +142,17 @@ _FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")
 """The folders of an absolute path, up to its last name."""
 
 
+def foreseen(error: BaseException) -> BaseException:
+    """Our own error for one that a library or the system raised for want of a resource or of storage, else itself."""
+    if isinstance(error, LightpageError | CallerLeft | grpc.RpcError) or not isinstance(error, Exception):
+        return error
+    if (short := short_resource("service", error)) is not None:
+        return short
+    if isinstance(error, OSError) and cause_of(error) is Cause.STORAGE:
+        return os_failure("service", error, "storage that can be read and written; try again")
+    return error
+
+
 def status_of(error: BaseException) -> grpc.StatusCode:
     """The status code for an error; INTERNAL for what nobody foresaw."""
     return _meaning(error)[0]
@@ -152,6 +172,7 @@ def reason_name(error: BaseException) -> str:
 
 
 def _meaning(error: BaseException) -> tuple[grpc.StatusCode, pb.ErrorReason]:
+    error = foreseen(error)
     for kind, code, reason in _MEANINGS:
         if isinstance(error, kind):
             return code, reason
@@ -180,6 +201,7 @@ def detail_of(error: LightpageError) -> pb.ErrorDetail:
 
 def told(error: BaseException) -> str:
     """What a caller reads. An unforeseen error gives its class only: its text may hold anything."""
+    error = foreseen(error)
     if isinstance(error, LightpageError):
         detail = detail_of(error)
         return f"{detail.thing}: got {detail.got}, wanted {detail.wanted}"[:2000]
@@ -190,6 +212,7 @@ def told(error: BaseException) -> str:
 
 def trailers(error: BaseException) -> tuple[tuple[str, bytes], ...]:
     """The metadata that end a call beside its status: `ErrorDetail`, and google.rpc's details."""
+    error = foreseen(error)
     code = status_of(error)
     info = rpc_details.ErrorInfo(reason=reason_name(error), domain=DOMAIN)
     details: list[Any] = [info]
@@ -204,7 +227,7 @@ def trailers(error: BaseException) -> tuple[tuple[str, bytes], ...]:
             info.metadata["model_version"] = detail.got
         if (job := getattr(error, "job", None)) is not None:
             info.metadata["job"] = job
-        if (retry_s := getattr(error, "retry_s", None)) is not None:
+        if (retry_s := getattr(error, "retry_s", _RETRY_S.get(type(error)))) is not None:
             delay = Duration()
             delay.FromNanoseconds(int(1e9 * retry_s))
             details.append(rpc_details.RetryInfo(retry_delay=delay))
@@ -222,6 +245,7 @@ def trailers(error: BaseException) -> tuple[tuple[str, bytes], ...]:
 
 def refusal_of(error: BaseException) -> pb.Refusal:
     """How a call would have ended, for one page of many; an unforeseen error tells its class only."""
+    error = foreseen(error)
     code = status_of(error).value[0]
     if isinstance(error, LightpageError):
         return pb.Refusal(code=code, detail=detail_of(error), reason=reason_of(error))

@@ -30,6 +30,7 @@ from runtime.acquisition.sources import open_source
 from runtime.bundle.bundle import Bundle
 from runtime.client.client import LightpageClient
 from runtime.commands import recalibrate as cli_recalibrate
+from runtime.commands.serve import stop_signals
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
 from runtime.rpc.server import LightpageServer
@@ -697,7 +698,7 @@ class Served:
         return self.process.returncode, out, err
 
 
-@pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_serve_decodes_until_it_is_told_to_stop(
     kind: signal.Signals, toy_zip: Path, recording: tuple[Path, np.ndarray]
 ) -> None:
@@ -792,3 +793,16 @@ def test_serve_refuses_a_damaged_bundle_in_one_line(toy_zip: Path, tmp_path: Pat
     assert served.process.returncode == 2
     assert out == ""
     assert len(err.strip().splitlines()) == 1
+
+
+def test_a_hangup_that_was_to_be_ignored_is() -> None:
+    """As nohup has it."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_signals() as wait_for_stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+            os.kill(os.getpid(), signal.SIGTERM)
+            wait_for_stop()
+    finally:
+        signal.signal(signal.SIGHUP, before)

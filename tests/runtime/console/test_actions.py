@@ -14,7 +14,15 @@ from pathlib import Path
 
 import pytest
 
+from runtime.acquisition.source import Shot
+from runtime.bundle.bundle import Bundle
+from runtime.console.actions import Actions
+from runtime.decoding.decoder import Decoder
 from runtime.identity.roles import Identity, Role
+from runtime.service.caller import Actor, Caller
+from runtime.service.dataplane import DataPlane
+from runtime.service.recalibrator import Recalibrator
+from runtime.service.registry import ModelRegistry
 from runtime.wire.tls import TlsFiles
 from tests.runtime import toy
 from tests.runtime.console.stage import Stage, stage
@@ -234,3 +242,32 @@ def test_a_caller_that_hangs_up_is_no_fault(
             connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
     assert asked(secured, tls, "/metrics", None)[0] == 200
     assert capfd.readouterr().err == ""
+
+
+class Numbered(toy.ToySource):
+    """Notes which pages are asked for; None stands for the next one."""
+
+    def __init__(self) -> None:
+        super().__init__(toy.ToyDevice())
+        self.asked: list[int | None] = []
+
+    def shot(self, timeout_s: float = 1.0, page: int | None = None) -> Shot:
+        self.asked.append(page)
+        return super().shot(timeout_s, page)
+
+
+@pytest.mark.parametrize("pages", [(), (7, 9, 11)])
+def test_a_recalibration_reads_the_calibration_pages_and_not_the_controllers_next_ones(
+    pages: tuple[int, ...], toy_zip: Path
+) -> None:
+    source = Numbered()
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), source)
+    recalibrator = Recalibrator(plane, toy.fit_references)
+    try:
+        asked = json.dumps({"action": "recalibrate", "expected": "toy-1"}).encode()
+        Actions(plane, recalibrator, pages).do(asked, Actor("operator"))
+        assert recalibrator.jobs.wait_idle(20)
+        assert source.asked == list(pages or (0, 1))
+        assert plane.read_page(None, None, Caller()).shot.page_index == 0
+    finally:
+        recalibrator.close()

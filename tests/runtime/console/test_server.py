@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import io
 import json
 import math
@@ -16,11 +17,12 @@ from PIL import Image
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import EXIT_ERROR, lightpage
+from runtime.console.fetch import fetch
 from runtime.console.history import History
 from runtime.console.pictures import SIDE_PX, confidence_png, frame_png
 from runtime.console.server import POINTS, RECENT, ConsoleServer
 from runtime.service.observation import Observation
-from tests.runtime.console.stage import stage
+from tests.runtime.console.stage import Stage, stage
 from tests.runtime.identity.authority import Authority
 
 
@@ -155,3 +157,50 @@ def test_the_command_finds_a_console_with_tls(
             monkeypatch.setenv(f"LIGHTPAGE_CLIENT_{name.upper()}", str(path))
         assert cli_main.run(lightpage, command) == 0
         assert capsys.readouterr().out.strip() == f"{running.url}/"
+
+
+def status_of_host(running: Stage, host: str | None, path: str = "/state.json", method: str = "GET") -> int:
+    connection = http.client.HTTPConnection("127.0.0.1", running.server.port, timeout=20)
+    try:
+        connection.putrequest(method, path, skip_host=True)
+        if host is not None:
+            connection.putheader("Host", host)
+        connection.endheaders()
+        return connection.getresponse().status
+    finally:
+        connection.close()
+
+
+def test_a_name_that_a_stranger_made_resolve_to_this_machine_reads_nothing(toy_zip: Path) -> None:
+    with stage(toy_zip) as running:
+        port = running.server.port
+        for host in (f"127.0.0.1:{port}", f"localhost:{port}", f"[::1]:{port}", socket.gethostname(), None):
+            assert status_of_host(running, host) == 200, host
+        for path in ("/", "/state.json", "/metrics", "/frames/in_phase.png", "/console.js"):
+            assert status_of_host(running, f"rebound.example:{port}", path) == 421
+        for method in ("HEAD", "POST"):
+            assert status_of_host(running, "rebound.example", "/actions", method) == 421
+
+
+def test_names_that_are_configured_are_answered(toy_zip: Path) -> None:
+    with stage(toy_zip) as running, ConsoleServer(running.console, 0, names=("Device.example",)) as named:
+        running.server = named
+        assert status_of_host(running, "device.example") == 200
+        assert status_of_host(running, "other.example") == 421
+
+
+@pytest.mark.parametrize("host", ["::1", "[::1]", "[::]"])
+def test_metrics_are_shown_on_ipv6(host: str, toy_zip: Path) -> None:
+    if not socket.has_ipv6:
+        pytest.skip("no IPv6")
+    with stage(toy_zip) as running, ConsoleServer(running.console, 0, host) as server:
+        assert fetch("metrics", f"[::1]:{server.port}", "metrics").startswith(b"# HELP")
+        if host == "[::]":  # as gRPC's
+            assert fetch("metrics", f"127.0.0.1:{server.port}", "metrics").startswith(b"# HELP")
+
+
+def test_a_host_that_is_none_is_an_error_of_the_system(toy_zip: Path) -> None:
+    with stage(toy_zip) as running:
+        for host in ("no-host.invalid", "a" * 64):
+            with pytest.raises(OSError, match=r"\w"):
+                ConsoleServer(running.console, 0, host)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,14 @@ from lightpage.errors import (
 )
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
+from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import hash_frames
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
+from runtime.errors import UnconfirmedPageError
+from runtime.recalibration.judgement import JudgedPage, judge
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RefitReport, RefitResult
 from runtime.recalibration.recalibration import next_version, recalibrate
@@ -185,8 +189,28 @@ def test_every_page_that_is_judged_by_is_told_of_before_and_after_the_fit(decode
 
     recalibrate(decoder, known(count=5), tmp_path / "n.zip", "toy-1+r1", toy.fit_references, step)
     before, after = told["measure the model in service"], told["judge by the held-back pages"]
-    assert before == pytest.approx([0, 0.0125, 0.025, 0.0375])
-    assert sorted(set(after)) == pytest.approx([0.9, 0.9125, 0.925, 0.9375])
+    assert before == pytest.approx([0, 1 / 29, 2 / 29, 3 / 29])
+    assert sorted(set(after)) == pytest.approx([24 / 29, 25 / 29, 26 / 29, 27 / 29])
+
+
+@pytest.mark.parametrize("count", [2, 40])
+def test_progress_is_in_proportion_to_the_work_however_many_pages_are_judged_by(
+    count: int, decoder: Decoder, tmp_path: Path
+) -> None:
+    """A page is worth the same before and after the fit, and the fit as much as twenty of them."""
+    told = list[tuple[str, float]]()
+
+    def fit(bundle: Bundle, pages: KnownPages, progress: Progress, own: Decoder) -> RefitResult:
+        progress("fit", 0.0)
+        progress("fit", 1.0)
+        return toy.fit_references(bundle, pages, quiet, own)
+
+    recalibrate(decoder, known(count=count), tmp_path / "n.zip", "toy-1+r1", fit, lambda *step: told.append(step))
+    assert [share for _, share in told] == sorted(share for _, share in told)
+    fitted = [share for name, share in told if name == "fit"]
+    (written,) = [share for name, share in told if name == "write the new bundle"]
+    assert fitted[1] - fitted[0] == pytest.approx(20 / (count - 1) * fitted[0])
+    assert written - fitted[1] == pytest.approx(fitted[0])
 
 
 def test_unusable_pages_are_named(decoder: Decoder, tmp_path: Path) -> None:
@@ -284,3 +308,46 @@ def test_the_store_says_why_the_base_is_served_where_its_note_or_bundle_is_lost(
         assert [record.levelname for record in caplog.records] == ["WARNING"]
         assert f"serving the base: model store {store.folder}: " in caplog.text
         assert why in caplog.text
+
+
+def judged(change: float, scatter: float, drifted: bool = True) -> tuple[list[JudgedPage], list[JudgedPage]]:
+    """Two held-back pages before and after; the difference has this mean, and this scatter from symbol to symbol."""
+    rng = np.random.default_rng(4)
+    old = rng.normal(3.0, 1.0, (2, 4000))
+    noise = rng.normal(0.0, scatter, old.shape)
+    new = old + change + noise - noise.mean()
+    return [JudgedPage(page, None, drifted) for page in old], [JudgedPage(page, None, drifted) for page in new]
+
+
+@pytest.mark.parametrize(("change", "taken"), [(-1.1, False), (-0.9, True), (0.0, True), (1.0, True)])
+def test_a_model_may_read_less_by_the_standard_error_of_the_comparison_at_most(change: float, taken: bool) -> None:
+    scatter = 0.3
+    error = scatter / np.sqrt(8000)
+    before, after = judged(change * error, scatter)
+    if not taken:
+        with pytest.raises(RecalibrationRefusedError) as caught:
+            judge(before, after, 256)
+        told = float(caught.value.expected.removeprefix("at least ").partition(":")[0])
+        assert told == pytest.approx(np.mean([page.air for page in before]) - error, abs=2e-4)
+        return
+    verdict = judge(before, after, 256)
+    assert verdict.error == pytest.approx(error, rel=0.05)
+    assert verdict.limit == pytest.approx(verdict.before - verdict.error)
+    assert verdict.after >= verdict.limit
+
+
+@pytest.mark.parametrize(("change", "taken"), [(-5.0, False), (0.0, False), (1.8, False), (2.2, True), (8.0, True)])
+def test_a_model_of_a_device_that_has_not_drifted_stays_unless_something_is_gained(change: float, taken: bool) -> None:
+    before, after = judged(change * 0.3 / np.sqrt(8000), 0.3, drifted=False)
+    if taken:
+        assert judge(before, after, 256).after > np.mean([page.air for page in before])
+        return
+    with pytest.raises(RecalibrationRefusedError):
+        judge(before, after, 256)
+
+
+def test_a_page_that_was_lost_before_counts_with_no_bits_and_as_a_drift() -> None:
+    before, after = judged(0.0, 0.0, drifted=False)
+    lost = UnconfirmedPageError("pilots", "none", "some")
+    verdict = judge([replace(page, lost=lost) for page in before], after, 256)
+    assert (verdict.before, verdict.drifted) == (0.0, True)

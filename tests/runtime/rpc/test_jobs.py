@@ -641,3 +641,16 @@ def test_the_client_refuses_what_it_cannot_send(start: Start) -> None:
     ):
         with pytest.raises(kind):
             send(client, bad)
+
+
+def test_progress_rises_with_every_page_that_is_read_and_ends_with_the_job(start: Start) -> None:
+    service = start()
+    told = list[tuple[str, float]]()
+    service.client.recalibrate(count=6, progress=lambda *step: told.append(step))
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    read = [share for name, share in told if name == "read the pages"]
+    assert len(set(read)) >= 6
+    assert read[0] == 0
+    assert 0.1 < read[-1] < 0.3  # a page is read in about the time of a decode; twelve of these and the fit follow
+    assert shares[-1] == 1

@@ -2,11 +2,44 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import grpc
+import numpy as np
 import pytest
 
-from runtime.errors import NoSourceError
+from lightpage.errors import LightpageError, StorageError, SurroundingsError
+from lightpage.page.pilots import Pilots
+from lightpage.recording.frame_pair import FramePair
+from runtime.acquisition.source import FrameSource, Shot
+from runtime.bundle.bundle import Bundle
+from runtime.decoding.decoder import Decoder
+from runtime.decoding.page import DecodedPage
+from runtime.decoding.tracking import NoTracker
+from runtime.errors import (
+    LostShotError,
+    NoSourceError,
+    OtherModelError,
+    Reason,
+    SlotsTakenError,
+    SourceError,
+    UnconfirmedPageError,
+)
+from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.rpc.call import Call
+from runtime.rpc.page_calls import PageCalls
 from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane
+from runtime.service.monitor import Monitor
+from runtime.service.registry import ModelRegistry, TrackerFactory
 from runtime.service.replays import Replays
+from runtime.wire.status import status_of
+from tests.runtime import toy
 
 
 def test_requests_of_calls_that_failed_take_of_the_room_too() -> None:
@@ -25,3 +58,128 @@ def test_requests_of_calls_that_failed_take_of_the_room_too() -> None:
     ask(0)  # forgotten
     ask(7)  # not yet
     assert tried == [*"01234567", "0"]
+
+
+class Losing(NoTracker):
+    """Believes no page."""
+
+    def decode(self, pair: FramePair, levels: int, pilots: Pilots | None = None) -> DecodedPage:
+        raise UnconfirmedPageError("pilots", "none", "some", Reason.PILOTS_DISAGREE).of(
+            super().decode(pair, levels, pilots)
+        )
+
+
+class Watching(toy.ToySource):
+    """Remembers its frames for as long as somebody else does."""
+
+    def __init__(self) -> None:
+        super().__init__(toy.ToyDevice())
+        self.frames: list[weakref.ref[np.ndarray]] = []
+
+    def shot(self, timeout_s: float = 1.0, page: int | None = None) -> Shot:
+        shot = super().shot(timeout_s, page)
+        self.frames += [weakref.ref(shot.pair.in_phase), weakref.ref(shot.pair.quadrature)]
+        return shot
+
+
+@pytest.fixture
+def collected_by_nobody() -> Iterator[None]:
+    """What a cycle of frames and their errors holds stays: seconds pass before it is looked for."""
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def lost_plane(toy_zip: Path, tracker: TrackerFactory, source: FrameSource) -> DataPlane:
+    return DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1), tracker), source, monitor=Monitor())
+
+
+@pytest.mark.usefixtures("collected_by_nobody")
+@pytest.mark.parametrize("request_id", ["", "shift-1"])
+def test_nothing_holds_the_frames_of_a_lost_page(request_id: str, toy_zip: Path) -> None:
+    source = Watching()
+    plane = lost_plane(toy_zip, Losing, source)
+    calls, request = PageCalls(plane), pb.ReadPageRequest(request_id=request_id)
+    for _ in range(3 if request_id else 1):
+        with suppress(UnconfirmedPageError):  # `pytest.raises` would keep it
+            calls.ReadPage(request, Call("ReadPage", Caller(), ThreadPoolExecutor(1)))
+            raise AssertionError("given out")
+    assert len(source.frames) == 2  # one shot
+    assert not any(frame() is not None for frame in source.frames)
+
+
+FAILURES = [
+    LostShotError("page 1", "no frame", "one", Reason.MISSING_FRAME),
+    UnconfirmedPageError("pilots", "none", "some", Reason.PILOTS_DISAGREE, recalibration_due=True),
+    SourceError("source", "black", "light"),
+    OtherModelError("model in service", "bench-9", "bench-8"),
+    SurroundingsError("service", "too little memory", "more"),
+]
+
+
+@pytest.mark.parametrize("failure", FAILURES, ids=lambda error: type(error).__name__)
+def test_a_failure_that_is_kept_comes_again_as_it_was_and_is_counted(failure: LightpageError) -> None:
+    replays, done = Replays(600, 1 << 20), list[bytes]()
+
+    def work() -> bytes:
+        done.append(bytes(1 << 16))
+        raise failure
+
+    told = list[LightpageError]()
+    for _ in range(3):
+        with pytest.raises(type(failure)) as caught:
+            replays.once("a", b"request", Caller(), work)
+        told.append(caught.value)
+    assert len(done) == 1
+    assert told[1] is not told[2]
+    assert len({str(error) for error in told}) == 1
+    assert all(vars(error).get("reason") == vars(failure).get("reason") for error in told)
+    assert told[2].__context__ is None
+    assert 100 < replays.held_bytes <= 2048
+
+
+def test_an_error_that_nobody_foresaw_is_kept_by_its_class_alone() -> None:
+    replays = Replays(600, 1 << 20)
+    for kind in (ZeroDivisionError, LightpageError):  # whoever asks again
+        with pytest.raises(kind) as caught:
+            replays.once("a", b"", Caller(), lambda: bytes(1 // 0))
+    assert "ZeroDivisionError" in str(caught.value)
+    assert status_of(caught.value) is grpc.StatusCode.INTERNAL
+
+
+@pytest.mark.parametrize(
+    "failure", [StorageError("recording", "EIO", "data"), SlotsTakenError("decodes", "all", "one")]
+)
+def test_what_failed_before_a_shot_is_tried_again(failure: LightpageError) -> None:
+    replays, tries = Replays(600, 1 << 20), iter([failure, None])
+
+    def work() -> bytes:
+        if (error := next(tries)) is not None:
+            raise error
+        return b"page"
+
+    with pytest.raises(type(failure)):
+        replays.once("a", b"", Caller(), work)
+    assert replays.held_bytes == 0
+    assert replays.once("a", b"", Caller(), work) == (b"page", False)
+
+
+def test_the_oldest_go_where_lost_pages_fill_the_budget() -> None:
+    replays = Replays(600, 20_000)
+
+    def lost() -> bytes:
+        raise LostShotError("page 1", "no frame", "one", Reason.MISSING_FRAME)
+
+    for number in range(200):
+        with pytest.raises(LostShotError):
+            replays.once(str(number), b"", Caller(), lost)
+    assert 10_000 < replays.held_bytes <= 22_000
+
+
+def test_answers_go_when_their_time_is_up() -> None:
+    now = [0.0]
+    replays = Replays(600, 1 << 20, lambda: now[0])
+    assert replays.once("a", b"", Caller(), lambda: b"1") == (b"1", False)
+    now[0] = 601
+    assert replays.once("a", b"", Caller(), lambda: b"2") == (b"2", False)

@@ -8,7 +8,11 @@ from pathlib import Path
 import pytest
 
 from lightpage.errors import InvalidInputError
-from runtime.wire.address import check_address, check_free
+from runtime.client.shared_memory import SharedMemory
+from runtime.rpc.health_server import HealthServer, next_port
+from runtime.service.shared_memory import SharedMemory as SharedRegions
+from runtime.wire.address import check_address, check_free, host_and_port, names_machine
+from runtime.wire.shared_memory import memory_path
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:50051", "localhost:1", "[::1]:50051", "unix:/tmp/lightpage.sock"])
@@ -56,3 +60,55 @@ def test_a_socket_that_somebody_listens_at_is_not_taken_away(tmp_path: Path) -> 
         check_free("address", f"unix:{tmp_path / 'file'}")
     with pytest.raises(InvalidInputError, match="no folder"):
         check_free("address", f"unix:{tmp_path / 'none' / 's'}")
+
+
+@pytest.mark.parametrize(("size", "fits"), [(107, True), (108, False), (300, False)])
+def test_a_socket_path_longer_than_the_system_has_room_for_is_named(size: int, fits: bool, tmp_path: Path) -> None:
+    path = f"{tmp_path}/{'s' * (size - len(str(tmp_path)) - 1)}"
+    if fits:
+        check_address("target", f"unix:{path}")
+        check_free("address", f"unix:{path}")
+        return
+    for check in (check_address, check_free):
+        with pytest.raises(InvalidInputError, match=f"{size} bytes.*at most 107"):
+            check("address", f"unix:{path}")
+
+
+def test_sockets_beside_the_services_own_are_looked_at_too(tmp_path: Path) -> None:
+    target = f"unix:{tmp_path}/{'s' * (105 - len(str(tmp_path)) - 1)}"
+    check_address("target", target)
+    with pytest.raises(InvalidInputError, match="112 bytes"):
+        SharedMemory(target, 10)
+    with pytest.raises(InvalidInputError, match="112 bytes"):
+        SharedRegions(memory_path(target), 10, 1, 1.0).__enter__()
+    with pytest.raises(InvalidInputError, match="112 bytes"):
+        HealthServer(next_port(target), dict)
+
+
+@pytest.mark.parametrize(
+    ("host", "known"),
+    [
+        ("127.0.0.1:9100", True),
+        ("[::1]:9100", True),
+        ("[2001:db8::1]", True),
+        ("192.0.2.10", True),
+        ("localhost:9100", True),
+        ("LOCALHOST.", True),
+        ("device.localhost", True),
+        ("device.example:9100", True),
+        ("a.wild.example", True),
+        ("a.b.wild.example", False),
+        ("rebound.example:9100", False),
+        ("127.0.0.1.rebound.example", False),
+        ("localhost.rebound.example", False),
+        ("", False),
+        ("[", False),
+    ],
+)
+def test_names_that_a_stranger_can_choose_name_no_machine(host: str, known: bool) -> None:
+    assert names_machine(host, {"device.example", "*.wild.example"}) == known
+
+
+@pytest.mark.parametrize(("host", "told"), [("::1", "[::1]:5"), ("[::]", "[::]:5"), ("127.0.0.1", "127.0.0.1:5")])
+def test_an_ipv6_address_goes_into_brackets(host: str, told: str) -> None:
+    assert host_and_port(host, 5) == told

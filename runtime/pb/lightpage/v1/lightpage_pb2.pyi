@@ -98,6 +98,8 @@ class ErrorReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ERROR_REASON_INTERNAL: _ClassVar[ErrorReason]
     ERROR_REASON_JOB_CANCELLED: _ClassVar[ErrorReason]
     ERROR_REASON_NOT_ALLOWED: _ClassVar[ErrorReason]
+    ERROR_REASON_STORAGE: _ClassVar[ErrorReason]
+    ERROR_REASON_SURROUNDINGS: _ClassVar[ErrorReason]
 
 class LossReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -183,6 +185,8 @@ ERROR_REASON_REQUEST_ID: ErrorReason
 ERROR_REASON_INTERNAL: ErrorReason
 ERROR_REASON_JOB_CANCELLED: ErrorReason
 ERROR_REASON_NOT_ALLOWED: ErrorReason
+ERROR_REASON_STORAGE: ErrorReason
+ERROR_REASON_SURROUNDINGS: ErrorReason
 LOSS_REASON_UNSPECIFIED: LossReason
 LOSS_REASON_PILOTS_DISAGREE: LossReason
 LOSS_REASON_IMAGE_NOT_FOUND: LossReason
@@ -787,7 +791,7 @@ class Progress(_message.Message):
     def __init__(self, step: _Optional[str] = ..., fraction: _Optional[float] = ...) -> None: ...
 
 class RecalibrationResult(_message.Message):
-    __slots__ = ("model_version", "previous_version", "pages_used", "pages_held_back", "air_before", "air_after", "angle_deg", "coherence_before", "coherence_after", "seconds", "pages_lost_before", "image")
+    __slots__ = ("model_version", "previous_version", "pages_used", "pages_held_back", "air_before", "air_after", "angle_deg", "coherence_before", "coherence_after", "seconds", "pages_lost_before", "image", "air_limit", "air_standard_error")
     MODEL_VERSION_FIELD_NUMBER: _ClassVar[int]
     PREVIOUS_VERSION_FIELD_NUMBER: _ClassVar[int]
     PAGES_USED_FIELD_NUMBER: _ClassVar[int]
@@ -800,6 +804,8 @@ class RecalibrationResult(_message.Message):
     SECONDS_FIELD_NUMBER: _ClassVar[int]
     PAGES_LOST_BEFORE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
+    AIR_LIMIT_FIELD_NUMBER: _ClassVar[int]
+    AIR_STANDARD_ERROR_FIELD_NUMBER: _ClassVar[int]
     model_version: str
     previous_version: str
     pages_used: int
@@ -812,7 +818,9 @@ class RecalibrationResult(_message.Message):
     seconds: float
     pages_lost_before: int
     image: ImagePosition
-    def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ..., pages_used: _Optional[int] = ..., pages_held_back: _Optional[int] = ..., air_before: _Optional[float] = ..., air_after: _Optional[float] = ..., angle_deg: _Optional[float] = ..., coherence_before: _Optional[float] = ..., coherence_after: _Optional[float] = ..., seconds: _Optional[float] = ..., pages_lost_before: _Optional[int] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ...) -> None: ...
+    air_limit: float
+    air_standard_error: float
+    def __init__(self, model_version: _Optional[str] = ..., previous_version: _Optional[str] = ..., pages_used: _Optional[int] = ..., pages_held_back: _Optional[int] = ..., air_before: _Optional[float] = ..., air_after: _Optional[float] = ..., angle_deg: _Optional[float] = ..., coherence_before: _Optional[float] = ..., coherence_after: _Optional[float] = ..., seconds: _Optional[float] = ..., pages_lost_before: _Optional[int] = ..., image: _Optional[_Union[ImagePosition, _Mapping]] = ..., air_limit: _Optional[float] = ..., air_standard_error: _Optional[float] = ...) -> None: ...
 
 class RollbackRequest(_message.Message):
     __slots__ = ("expected_version", "correlation_id")
