@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.device.profile import Profile
-from lightpage.errors import FrameError, InvalidInputError, RecordingError, StorageError
+from lightpage.errors import FrameError, InvalidInputError, RecordingError
 from lightpage.recording.black_level import DarkFrame
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import FrameInfo
@@ -181,12 +181,13 @@ class FrameSource(ABC):
 
 @contextmanager
 def own_fault(subject: str = "") -> Iterator[None]:
-    """Turn what is wrong with a source's file, its storage or frames into the service's fault; no such page stays that.
+    """Turn what is wrong with a source's file or frames into the service's fault; no such page stays that.
 
     Raises:
-        SourceError: in place of a `RecordingError`, `StorageError` or `FrameError`; `subject` goes before its own.
+        SourceError: in place of a `RecordingError` or `FrameError`; `subject` goes before what it names.
+        StorageError: storage fails, which says nothing of the source.
     """
     try:
         yield
-    except (RecordingError, FrameError, StorageError) as error:
+    except (RecordingError, FrameError) as error:
         raise SourceError(subject + error.subject, error.got, error.expected) from error

@@ -33,7 +33,7 @@ def recording(tmp_path: Path) -> tuple[Path, np.ndarray]:
     return tmp_path / "r.h5", toy.write_toy_recording(tmp_path / "r.h5", toy.ToyDevice(), 16, 3)
 
 
-def test_storage_that_fails_is_the_source_s_fault_and_names_the_page(
+def test_storage_that_fails_is_no_fault_of_the_source_and_names_the_page(
     recording: tuple[Path, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
@@ -43,7 +43,7 @@ def test_storage_that_fails_is_the_source_s_fault_and_names_the_page(
     monkeypatch.setattr(Recording, "frames", fail)
     with pytest.raises(StorageError, match="page 1, recording"):
         source.shot(page=1)
-    with pytest.raises(SourceError, match="page 1"), own_fault():
+    with pytest.raises(StorageError, match="page 1"), own_fault():
         source.shot(page=1)
 
 
