@@ -270,7 +270,7 @@ class Dispatcher:
             finally:
                 await reader.close()
 
-    def _no_load(self, task: asyncio.Task[Any]) -> None:
+    def _no_load(self, task: asyncio.Task[Any] | None) -> None:
         """From here on a call counts as one that only watches."""
         if task in self._active:
             self._active.discard(task)
