@@ -13,7 +13,15 @@ from pathlib import Path
 
 from google.protobuf import json_format
 
-from lightpage.errors import BusyError, CalibrationError, InvalidInputError, LightpageError, RecalibrationRefusedError
+from lightpage.errors import (
+    BusyError,
+    CalibrationError,
+    InvalidInputError,
+    LightpageError,
+    RecalibrationRefusedError,
+    StorageError,
+    SurroundingsError,
+)
 from lightpage.files import replace_text
 from runtime.errors import CallerLeft, JobCancelledError, NoSuchJobError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -211,7 +219,7 @@ class Jobs:
         entries = [json_format.MessageToDict(job, preserving_proto_field_name=True) for job in jobs]
         try:
             replace_text(self._path, json.dumps({"format": _FORMAT, "version": _VERSION, "jobs": entries}), "jobs")
-        except InvalidInputError as error:
+        except (InvalidInputError, StorageError, SurroundingsError) as error:
             _log.warning("jobs: a restart will know less of them: %s", error)
 
 

@@ -18,7 +18,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from lightpage.errors import BundleError, InvalidInputError
+from lightpage.errors import BundleError, InvalidInputError, StorageError, SurroundingsError
 from lightpage.files import replace_text
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import sha256
@@ -226,7 +226,7 @@ class ModelStore:
                 replace_text(self.folder / CURRENT, json.dumps(data))
             except OSError as error:
                 raise self.failed(error) from None
-            except InvalidInputError as error:
+            except (InvalidInputError, StorageError, SurroundingsError) as error:
                 cause = error.__context__  # what the system said
                 raise self.failed(cause if isinstance(cause, OSError) else OSError(error.got)) from None
             self.note = note
