@@ -271,8 +271,8 @@ class Dispatcher:
                 await reader.close()
 
     def _no_load(self, task: asyncio.Task[Any] | None) -> None:
-        """From here on a call counts as one that only watches."""
-        if task in self._active:
+        """From here on the call of a task counts as one that only watches."""
+        if task is not None and task in self._active:
             self._active.discard(task)
             self._watching.add(task)
 

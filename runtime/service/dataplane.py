@@ -253,7 +253,7 @@ class DataPlane:
             with observed(self._observers(monitor), seen):
                 with self._optics(user_data):
                     page = self._decode(model, caller, pair, levels, pilots, subject, stages, monitor, sure=sure)
-                found = self._user_data(model, page, stages) if user_data else None
+                found = self._user_data(model, page, stages, monitor) if user_data else None
                 seen.note(page=page, user_data=found)
             self.decodes.took(time.perf_counter() - began)
         return self._answer(page, model, stages, found, monitor)
@@ -307,7 +307,7 @@ class DataPlane:
                     pilots = own.written_pilots(levels) if user_data else own.pilots(source.levels, mask)
                 with own_fault(f"{subject}: "), self._optics(user_data):
                     decoded = self._decode(model, caller, found.pair, levels, pilots, subject, stages, self.monitor)
-                data = self._user_data(model, decoded, stages, expected) if user_data else None
+                data = self._user_data(model, decoded, stages, self.monitor, expected) if user_data else None
                 seen.note(page=decoded, user_data=data)
             self.decodes.took(time.perf_counter() - begun)
         return ReadAnswer(self._answer(decoded, model, stages, data, self.monitor), found, mask)
@@ -317,6 +317,10 @@ class DataPlane:
         if caller.stateless or self._session_monitors is None:
             return None
         return self.monitor if caller.session in self._device_sessions else self._session_monitors.of(caller.session)
+
+    def _shows(self, monitor: Monitor | None) -> bool:
+        """Whether the figures of the last page are to show one that `monitor` follows: with a source, the device's."""
+        return monitor is self.monitor or not self.has_source
 
     def _observers(self, monitor: Monitor | None) -> Sequence[Observer]:
         """Who is told of a page, its monitor first."""
@@ -348,12 +352,19 @@ class DataPlane:
                 self.metrics.no_user_data(Loss.OPTICS)
             raise
 
-    def _user_data(self, model: Model, page: DecodedPage, stages: Stages, expected: Header | None = None) -> PageBytes:
+    def _user_data(
+        self,
+        model: Model,
+        page: DecodedPage,
+        stages: Stages,
+        monitor: Monitor | None,
+        expected: Header | None = None,
+    ) -> PageBytes:
         """The bytes of a page that was decoded, counted."""
         stages.begin(Stage.CODE)
         found = model.decoder.page_codec.decode(page.phase, page.concentration, expected)
         stages.begin(Stage.POST_PROCESSING)
-        self.metrics.user_data(found)
+        self.metrics.user_data(found, shown=self._shows(monitor))
         return found
 
     def adopt(self, decoder: Decoder, expected: Model | None = None, *, actor: Actor = NOBODY) -> Model:
@@ -405,11 +416,11 @@ class DataPlane:
         except LostPageError as error:
             if isinstance(error, UnconfirmedPageError):
                 _inferred(unconfirmed_page(error), stages)
-            self.metrics.lost(error, tells=sure)
+            self.metrics.lost(error, tells=sure and self._shows(monitor))
             error.recalibration_due = (error.recalibration_due and sure) or (monitor is not None and monitor.due)
             raise error.about(subject) from None
         _inferred(page, stages)
-        self.metrics.page(page, model.version)
+        self.metrics.page(page, model.version, shown=self._shows(monitor))
         return page
 
 

@@ -129,12 +129,17 @@ class ServiceMetrics:
         for stage, seconds in stages.seconds().items():
             self.stage_seconds.labels(method, stage.value).observe(seconds)
 
-    def page(self, page: DecodedPage, version: str) -> None:
-        """Count one decoded page. One of a model whose label was removed does not bring it back."""
+    def page(self, page: DecodedPage, version: str, *, shown: bool = True) -> None:
+        """Count one decoded page, and have it `shown` as the last one.
+
+        A page of a model whose label was removed does not bring it back.
+        """
         with self._naming:
             if version in self._versions:
                 self.pages.labels(version).inc()
         self.decode.observe(page.timings.total_s)
+        if not shown:
+            return
         self.confidence.set(float(page.confidence.mean()))
         self.concentration.set(float(page.concentration.mean()))
         self.piston.set(page.piston_rad)
@@ -145,12 +150,13 @@ class ServiceMetrics:
             self.image.labels("x").set(page.image.shift_x_px)
             self.image.labels("y").set(page.image.shift_y_px)
 
-    def user_data(self, found: PageBytes) -> None:
-        """Count a page whose bytes were read, or not."""
+    def user_data(self, found: PageBytes, *, shown: bool = True) -> None:
+        """Count a page whose bytes were read, or not, and have it `shown` as the last one."""
         self.data_pages.labels(_READ if found.loss is None else found.loss.value).inc()
-        self.margin.set(found.margin_bits)
         self.corrected.inc(found.corrected)
-        self.code_iterations.set(found.iterations)
+        if shown:
+            self.margin.set(found.margin_bits)
+            self.code_iterations.set(found.iterations)
 
     def no_user_data(self, loss: Loss) -> None:
         """Count a page whose bytes were asked for and that was not decoded."""

@@ -152,3 +152,17 @@ def test_frames_of_a_session_that_is_due_are_not_kept_as_the_devices(toy_zip: Pa
     send(plane, own(1), "session a")
     plane.read_page(None, None, Caller())
     assert seen == [False, True]
+
+
+def test_figures_of_the_last_page_show_the_device(toy_zip: Path) -> None:
+    plane = plane_of(toy_zip, "session press-1")
+    value = plane.metrics.registry.get_sample_value
+    plane.read_page(None, None, Caller())
+    shown = value("lightpage_confidence_mean")
+    dim = toy.ToyDevice(noise=60.0, seed=9).page(toy.symbols_of(16, 9)[0], 16)
+    send(plane, dim, "session other")
+    send(plane, another_devices(1), "session other")
+    assert (value("lightpage_confidence_mean"), value("lightpage_recalibration_due")) == (shown, 0)
+    assert value("lightpage_pages_total", {"model_version": "toy-1"}) == 2
+    send(plane, dim, "session press-1")
+    assert value("lightpage_confidence_mean") != shown
