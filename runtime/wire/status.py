@@ -16,7 +16,6 @@ from lightpage.errors import (
     BundleError,
     BusyError,
     CalibrationError,
-    Cause,
     FrameError,
     FramesDisagreeError,
     InvalidInputError,
@@ -30,7 +29,7 @@ from lightpage.errors import (
     StorageError,
     SurroundingsError,
 )
-from lightpage.failures import cause_of, os_failure, short_resource
+from lightpage.failures import understood
 from runtime.errors import (
     ERRORS,
     CallerLeft,
@@ -144,13 +143,9 @@ _FOLDERS = re.compile(r"(?<![\w./])(?:/[^\s/:'\"]+)+/(?=[^\s/:'\"])")
 
 def foreseen(error: BaseException) -> BaseException:
     """Our own error for one that a library or the system raised for want of a resource or of storage, else itself."""
-    if isinstance(error, LightpageError | CallerLeft | grpc.RpcError) or not isinstance(error, Exception):
+    if isinstance(error, CallerLeft | grpc.RpcError) or not isinstance(error, Exception):
         return error
-    if (short := short_resource("service", error)) is not None:
-        return short
-    if isinstance(error, OSError) and cause_of(error) is Cause.STORAGE:
-        return os_failure("service", error, "storage that can be read and written; try again")
-    return error
+    return understood("service", error) or error
 
 
 def status_of(error: BaseException) -> grpc.StatusCode:
