@@ -43,11 +43,12 @@ _STORAGE = frozenset(
 )
 """Error numbers of a disk or a share that fails: another try may go well, and nothing is said of a file's content."""
 
+_THREADS = "threads or processes (ulimit -u), or memory for them"
 _SHORT = {
     errno.ENOMEM: "memory",
     errno.EMFILE: "open files of the process (ulimit -n)",
     errno.ENFILE: "open files of the machine",
-    errno.EAGAIN: "threads or processes (ulimit -u)",
+    errno.EAGAIN: _THREADS,
     errno.ENOSPC: "room on the disk",
     errno.EFBIG: "room in a file (ulimit -f, or another file system)",
     errno.EDQUOT: "room in the quota",
@@ -64,9 +65,11 @@ _SHORT_WORDS = {
     "memory allocation failed": "memory",
     "unable to allocate": "memory",
     "cannot allocate memory": "memory",
-    "can't start new thread": "threads (ulimit -u)",
-    "resource temporarily unavailable": "threads (ulimit -u)",
-    "pthread_create": "threads (ulimit -u)",
+    "failed to map segment": "memory",
+    "out of memory": "memory",
+    "can't start new thread": _THREADS,
+    "resource temporarily unavailable": _THREADS,
+    "pthread_create": _THREADS,
     "too many open files": "open files of the process (ulimit -n)",
 }
 """Words of libraries that have no type of their own for a short resource."""
@@ -127,7 +130,12 @@ def os_failure(
         return StorageError(subject, os.strerror(number), expected)
     if number is not None and number in _SHORT:
         return SurroundingsError(subject, os.strerror(number), f"more {_SHORT[number]}")
-    return otherwise(subject, error if number is None else OSError(number, os.strerror(number)), expected)
+    if number == errno.ENOLCK:
+        remedy = "a file system with locks, or HDF5_USE_FILE_LOCKING=FALSE in the environment"
+        return SurroundingsError(subject, os.strerror(number), remedy)
+    if number is None:
+        return short_resource(subject, error) or otherwise(subject, error, expected)
+    return otherwise(subject, OSError(number, os.strerror(number)), expected)
 
 
 def hdf5_failure(

@@ -85,7 +85,8 @@ def lock(descriptor: int, subject: str, *, shared: bool = False) -> bool:
 def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject: str = "file") -> None:
     """Have `write` fill a file, and replace what is at `path` by it in one step.
 
-    Content and name are on the disk when this returns: a power cut leaves the earlier file or the new one, whole.
+    Content and name are on the disk when this returns: a power cut leaves the earlier file or the new one, whole. What
+    is at `path` and is no file, e.g. ``/dev/null``, is written to.
 
     Args:
         path: final name, in a folder that exists.
@@ -98,6 +99,10 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject
     """
     path = Path(path)
     try:
+        if is_special(path):
+            with path.open("wb") as special:
+                write(special)
+            return
         descriptor, made = new_file(path.parent, path.name)
         try:
             with os.fdopen(descriptor, "wb") as file:
@@ -110,13 +115,18 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject
         raise os_failure(f"{subject} {path}", error, "a path that can be written") from None
 
 
+def is_special(path: Path) -> bool:
+    """Whether something is at `path` that is written to and not replaced: a device, a pipe or a socket."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
 def move_into_place(made: str | Path, path: Path) -> None:
     """Give a file that is closed its final name, replacing what has it; both are on the disk when this returns.
 
     Raises:
         OSError: the system does not let it.
     """
-    with open(made, "rb") as file:
+    with open(made, "r+b") as file:  # shares synchronise only what is open for writing
         synchronise(file.fileno())
     os.replace(made, path)
     sync_folder(path.parent)
@@ -129,7 +139,7 @@ def move_to_new_name(made: str | Path, path: Path) -> None:
         FileExistsError: something has it; both files stay as they are.
         OSError: the system does not let it.
     """
-    with open(made, "rb") as file:
+    with open(made, "r+b") as file:
         synchronise(file.fileno())
     try:
         os.link(made, path)  # in one step, unlike a look whether it is there

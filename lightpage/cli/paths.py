@@ -10,7 +10,7 @@ import click
 
 from lightpage.errors import InvalidInputError
 from lightpage.failures import os_failure
-from lightpage.files import STDOUT, new_file
+from lightpage.files import STDOUT, is_special, new_file
 
 
 class NewPath(click.ParamType[Path]):
@@ -115,6 +115,8 @@ def _option(path: Path, param: click.Parameter | None) -> str:
 
 def _check_writable(folder: Path, path: Path, param: click.Parameter | None) -> None:
     try:
+        if is_special(path):
+            return
         descriptor, made = new_file(folder, path.name)
         os.close(descriptor)
         made.unlink()

@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.sampling_table import SamplingTable
-from lightpage.errors import BundleError, FrameError, FramesDisagreeError, InvalidInputError, NoCodeError
+from lightpage.errors import (
+    BundleError,
+    FrameError,
+    FramesDisagreeError,
+    InvalidInputError,
+    NoCodeError,
+    SurroundingsError,
+)
+from lightpage.failures import understood
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
@@ -316,10 +324,10 @@ class Decoder:
         try:
             self.check(golden.pair)
             p = self.infer(golden.pair).p
-        except (BundleError, ProviderError):
+        except (BundleError, ProviderError, SurroundingsError):
             raise
         except Exception as error:  # onnxruntime's errors share no base class
-            raise BundleError(subject, error, "a golden page that decodes") from None
+            raise understood(subject, error) or BundleError(subject, error, "a golden page that decodes") from None
         if golden.p.shape != p.shape:
             raise BundleError(f"{subject}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
         error_norm = float(np.linalg.norm(p - golden.p) / max(float(np.linalg.norm(golden.p)), 1e-30))

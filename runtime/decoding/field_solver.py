@@ -11,7 +11,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import DECODER, FIELD
-from runtime.execution.session import open_session
+from runtime.execution.session import open_session, running
 from runtime.execution.table_graph import TableGraph
 
 OUTPUTS = ("field", "unexplained")
@@ -65,7 +65,8 @@ class BundleFieldSolver:
         feeds = {"in_phase": pair.in_phase, "quadrature": pair.quadrature, **table}
         if not self._alone:
             feeds = {**self._graph.table, **feeds}
-        (real, imaginary), left = self._session.run(OUTPUTS, feeds)
+        with running(self._subject):
+            (real, imaginary), left = self._session.run(OUTPUTS, feeds)
         if real.shape != (wanted := field_grid(self._profile).shape):
             expected = f"{wanted}, or a {FIELD} beside it"
             raise BundleError(f"{self._subject}: output field", f"shape {real.shape}", expected)

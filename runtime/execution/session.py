@@ -19,6 +19,7 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 import onnxruntime  # type: ignore[import-untyped]
 
 from lightpage.errors import BundleError
+from lightpage.failures import short_resource
 from runtime.errors import ProviderError
 from runtime.execution.cpus import available_cpus
 from runtime.execution.providers import ON_CPU, Provider
@@ -93,7 +94,7 @@ class Session(Protocol):
 VERSION: str = onnxruntime.__version__
 _USABLE = "a GPU of that number with room for the model, its driver and its libraries"
 _VERSION_DIGITS = 16
-_ERRORS_ONLY = 3
+_FATAL_ONLY = 4
 _NOWHERE = os.path.join(os.sep, "nonexistent", "lightpage")
 
 
@@ -119,11 +120,12 @@ def open_session(
     Raises:
         BundleError: the bytes are no ONNX model that this onnxruntime can run.
         ProviderError: there is no such provider here.
+        SurroundingsError: memory or threads are short.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = available_cpus() if threads is None else threads
     options.inter_op_num_threads = 1
-    options.log_severity_level = _ERRORS_ONLY
+    options.log_severity_level = _FATAL_ONLY  # errors are raised
     # Between two runs its threads would go on looking for work, on cores that receive frames and recalibrate meanwhile.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     # A plan of its memory saves one run in forty of a page's time, and takes a quarter more of it.
@@ -146,13 +148,40 @@ def open_session(
             model, options, providers=provider.chain(version), enable_fallback=0
         )
     except Exception as error:  # onnxruntime's errors share no base class
-        cause = str(error).splitlines()[0]
         if provider != ON_CPU:
-            raise ProviderError(f"provider {provider}", cause, _USABLE) from None
-        raise BundleError(subject, cause, "an ONNX model of a Lightpage bundle") from None
+            raise _of_provider(provider, error) from None
+        got = short_resource(subject, error)
+        raise got or BundleError(subject, _cause(error), "an ONNX model of a Lightpage bundle") from None
     if (found := session.get_providers()[0]) != provider.runtime_name:
         raise ProviderError(f"provider {provider}", f"{found} in its place", _USABLE)
     return session
+
+
+@contextmanager
+def running(subject: str, provider: Provider = ON_CPU) -> Iterator[None]:
+    """While a session runs: a short resource and a GPU's failures by name; other failures on the CPU are the graph's.
+
+    Raises:
+        ProviderError: a GPU failed, or has no room.
+        SurroundingsError: memory or threads are short.
+    """
+    try:
+        yield
+    except Exception as error:  # onnxruntime's errors share no base class
+        if provider != ON_CPU:
+            raise _of_provider(provider, error) from None
+        if (short := short_resource(subject, error)) is not None:
+            raise short from None
+        raise
+
+
+def _of_provider(provider: Provider, error: Exception) -> ProviderError:
+    return ProviderError(f"provider {provider}", _cause(error), _USABLE)
+
+
+def _cause(error: Exception) -> str:
+    """The first line of what onnxruntime says."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def check_provider(provider: Provider) -> None:
@@ -179,14 +208,22 @@ class BoundSession:
         session: opened with this provider.
         provider: what it runs on.
         constants: by input.
+        subject: what it is, for errors.
 
     Raises:
         ProviderError: a GPU has no room for them.
+        SurroundingsError: memory is short.
     """
 
-    def __init__(self, session: Session, provider: Provider, constants: Mapping[str, NDArray[Any]]) -> None:
-        self.session, self._provider = session, provider
-        with self._told():
+    def __init__(
+        self,
+        session: Session,
+        provider: Provider,
+        constants: Mapping[str, NDArray[Any]],
+        subject: str = "onnxruntime",
+    ) -> None:
+        self.session, self._subject, self._provider = session, subject, provider
+        with running(subject, provider):
             self._constants = {
                 name: onnxruntime.OrtValue.ortvalue_from_numpy(
                     np.asarray(value, order="C"), provider.memory, provider.device
@@ -199,8 +236,9 @@ class BoundSession:
 
         Raises:
             ProviderError: a GPU failed, or has no room.
+            SurroundingsError: memory or threads are short.
         """
-        with self._told():
+        with running(self._subject, self._provider):
             binding = self.session.io_binding()
             for name, value in self._constants.items():
                 if name not in feeds:
@@ -211,14 +249,3 @@ class BoundSession:
                 binding.bind_output(name, "cpu")
             self.session.run_with_iobinding(binding)
             return [np.asarray(value) for value in binding.copy_outputs_to_cpu()]
-
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        """A GPU's failures by name; on the CPU a failure is the graph's."""
-        try:
-            yield
-        except Exception as error:  # onnxruntime's errors share no base class
-            if self._provider == ON_CPU:
-                raise
-            cause = str(error).splitlines()[0]
-            raise ProviderError(f"provider {self._provider}", cause, _USABLE) from None

@@ -13,7 +13,7 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import InvalidInputError
 from runtime.execution.constant_table import GraphFile
 from runtime.execution.providers import ON_CPU, Provider
-from runtime.execution.session import BoundSession, Port, Session, open_session
+from runtime.execution.session import BoundSession, Port, Session, open_session, running
 
 
 class TableGraph:
@@ -54,7 +54,8 @@ class TableGraph:
         between: dict[str, NDArray[Any]] = {}
         if parts.before is not None:  # else nothing follows from the table alone
             before = open_session(parts.before, subject, threads, once=True)
-            between = dict(zip(parts.between, before.run(parts.between, {}), strict=True))
+            with running(subject):
+                between = dict(zip(parts.between, before.run(parts.between, {}), strict=True))
         between |= {name: self.value(name) for name in parts.direct}
         fed_values = {name: self.value(name) for name in self.ports.keys() & set(fed)}
         if like is not None and between:
@@ -64,7 +65,7 @@ class TableGraph:
             self.session = open_session(model, subject, threads, profile=profile, provider=provider)
         held = fed_values | between
         self._held = frozenset(held)
-        self._bound = BoundSession(self.session, provider, held)
+        self._bound = BoundSession(self.session, provider, held, subject)
 
     def with_table(self, table: SamplingTable) -> TableGraph:
         """The graph with other tensors in its table, by name; those left out stay. It raises as the constructor does.

@@ -10,7 +10,7 @@ from lightpage.calibration.parameters import NAMES
 from lightpage.errors import BundleError
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import TWIN
-from runtime.execution.session import open_session
+from runtime.execution.session import open_session, running
 
 Real = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ class OnnxTwin:
     """
 
     def __init__(self, bundle: Bundle, threads: int | None = None) -> None:
-        subject = f"{bundle.subject}: {TWIN}"
+        self._subject = subject = f"{bundle.subject}: {TWIN}"
         self._session = open_session(bundle.files[TWIN], subject, threads)
         inputs = self._session.get_inputs()
         found = {node.name: (node.type, len(node.shape)) for node in inputs}
@@ -56,7 +56,8 @@ class OnnxTwin:
             "anchors": _doubles(points if anchors is None else anchors),
             "camera_places": _doubles(points[:1]),
         }
-        return Rays(*self._session.run(OUTPUTS[:3], feeds))
+        with running(self._subject):
+            return Rays(*self._session.run(OUTPUTS[:3], feeds))
 
     def pixels(self, parameters: Real, places: Real) -> Real:
         """See `lightpage.calibration.interfaces.Twin`."""
@@ -64,7 +65,8 @@ class OnnxTwin:
             return np.stack([self.pixels(one, places) for one in parameters])
         one = _doubles(places[:1])
         feeds = {"parameters": _doubles(parameters), "points": one, "anchors": one, "camera_places": _doubles(places)}
-        pixels: Real = self._session.run(OUTPUTS[3:], feeds)[0]
+        with running(self._subject):
+            pixels: Real = self._session.run(OUTPUTS[3:], feeds)[0]
         return pixels
 
 

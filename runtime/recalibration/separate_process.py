@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO
 
 from lightpage.errors import BundleError
+from lightpage.failures import short_resource
 from lightpage.progress import Progress
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import Tracker
@@ -111,7 +112,8 @@ def _private_folder(scratch: Path | None) -> Iterator[Path]:
     try:
         folder = tempfile.TemporaryDirectory(prefix=SCRATCH, dir=scratch, ignore_cleanup_errors=True)
     except OSError as error:
-        raise WorkerError(f"{_SUBJECT}, its folder", error, "a temporary folder that can be written") from error
+        expected = "a temporary folder that can be written: name one in the variable TMPDIR"
+        raise WorkerError(f"{_SUBJECT}, its folder", error, expected) from error
     with folder as name:
         yield Path(name)
 
@@ -126,7 +128,8 @@ def _run(command: Sequence[str], log: IO[bytes], progress: Progress, check: Call
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=same_packages(THREADS)
         )
     except OSError as error:
-        raise WorkerError(_SUBJECT, error, "one that can be started") from error
+        short = short_resource(_SUBJECT, error)
+        raise WorkerError(_SUBJECT, error, "one that can be started" if short is None else short.expected) from error
     try:
         assert process.stdout is not None  # asked for
         threading.Thread(target=_listen, args=(process.stdout, lines), name="lightpage-worker", daemon=True).start()

@@ -9,6 +9,7 @@ from collections.abc import Generator, Iterable, Sized
 
 from pydantic import TypeAdapter
 
+from lightpage.failures import short_resource
 from lightpage.progress import note
 from runtime.errors import WorkerError
 from runtime.execution.cpus import available_cpus
@@ -98,7 +99,8 @@ class LocalEngine:
                 self._module, str(self.threads), subject="a worker", environment=same_packages(self.threads)
             )
         except OSError as error:
-            raise WorkerError("a worker", error, "a process that can be started") from error
+            short = short_resource("a worker", error)
+            raise short or WorkerError("a worker", error, "a process that can be started") from error
 
     @staticmethod
     def _hand_over(worker: HelperProcess, attempt: Attempt) -> None:

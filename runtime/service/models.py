@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
-from lightpage.errors import BundleError, InvalidInputError, LimitError
+from lightpage.errors import BundleError, InvalidInputError, LightpageError, LimitError, StorageError, SurroundingsError
 from lightpage.files import new_file, sync_folder, synchronise
 from runtime.bundle.bundle import read_manifest
 from runtime.bundle.manifest import Manifest, check_version
@@ -197,12 +197,14 @@ class Models:
         gone = dict.fromkeys(place for place in places if place != base and not place.path.exists())
         history = History(tuple(places), note.cursor).without(gone)
         gone.pop(history.current, None)  # an attempt to load it says so
-        errors = [BundleError(f"bundle {place.path}", "nothing", "a bundle that was in service") for place in gone]
+        errors: list[LightpageError] = [
+            BundleError(f"bundle {place.path}", "nothing", "a bundle that was in service") for place in gone
+        ]
         for cursor in range(history.cursor, -1, -1):
             try:
                 self.registry.resume(History(history.places, cursor))
                 break
-            except BundleError as error:
+            except (BundleError, StorageError, SurroundingsError) as error:
                 errors.append(error)
         model = self.registry.current
         for lost in errors:
@@ -400,7 +402,7 @@ class Models:
         for version in stored:
             try:
                 found.append(self._manifest(self._place(version)))
-            except BundleError as error:
+            except (BundleError, StorageError, SurroundingsError) as error:
                 _log.warning("model %s is not listed: %s", version, error)
         yield from sorted(found, key=lambda manifest: manifest.created)
 

@@ -301,7 +301,7 @@ class ModelStore:
             return None
         return None if name is None else self.folder / name
 
-    def damaged(self, reason: Reason, error: BundleError) -> None:
+    def damaged(self, reason: Reason, error: LightpageError) -> None:
         """Say that the note or the bundle that was in service is lost; so it stays until `settled`."""
         with self._guard:
             self._damage = Trouble(reason, str(error))

@@ -178,3 +178,13 @@ def test_another_encoding_is_named(content: bytes, told: str, tmp_path: Path) ->
     (tmp_path / "F").write_bytes(content)
     with pytest.raises(InvalidInputError, match=told):
         read_text(tmp_path / "F", "file F", "text")
+
+
+def test_what_is_no_file_is_written_to_and_not_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    replace_text(pipe, "text")
+    assert os.read(reader, 10) == b"text"
+    os.close(reader)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)

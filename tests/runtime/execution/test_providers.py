@@ -11,7 +11,7 @@ import pytest
 from onnx import parser
 
 from lightpage.cli.main import lightpage, run
-from lightpage.errors import InvalidInputError
+from lightpage.errors import InvalidInputError, SurroundingsError
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.errors import ProviderError
@@ -135,3 +135,26 @@ def test_a_command_refuses_a_provider_before_it_opens_a_recording(
 ) -> None:
     assert run(lightpage, ["evaluate", "--provider", "gpu", "--recording", str(tmp_path / "none.h5")]) == 2
     assert "provider: got 'gpu', wanted cpu, cuda or tensorrt" in capsys.readouterr().err
+
+
+SHORT = [
+    "[ONNXRuntimeError] : 6 : RUNTIME_EXCEPTION : Exception during initialization: std::bad_alloc",
+    "[ONNXRuntimeError] : 1 : FAIL : bfc_arena.cc:360 AllocateRawInternal\nFailed to allocate memory for 3 MB",
+    "PosixThread pthread_create failed, error code: 11 error msg: Resource temporarily unavailable",
+]
+
+
+@pytest.mark.parametrize("said", SHORT)
+def test_a_resource_that_is_short_is_no_fault_of_the_bundle(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def short(*_: object, **__: object) -> None:
+        raise RuntimeError(said)
+
+    session = open_session(toy.decoder_onnx(), "toy", 1)
+    bound = BoundSession(session, ON_CPU, {}, "toy")
+    with monkeypatch.context() as patch:
+        patch.setattr("onnxruntime.InferenceSession.run_with_iobinding", short)
+        with pytest.raises(SurroundingsError, match=r"toy: got .*, wanted more (memory|threads)"):
+            bound.run(["p"], {name: np.zeros(toy.SHAPE, np.uint8) for name in ("in_phase", "quadrature")})
+    monkeypatch.setattr("onnxruntime.InferenceSession", short)
+    with pytest.raises(SurroundingsError, match=r"toy: got .*, wanted more (memory|threads)"):
+        open_session(toy.decoder_onnx(), "toy", 1)
