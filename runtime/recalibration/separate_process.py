@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import logging
 import os
 import queue
@@ -182,5 +183,5 @@ def _remove_new(out: Path) -> None:
     """Remove what a worker that was cut off has written of the new bundle."""
     with suppress(OSError):
         out.unlink(missing_ok=True)
-        for unfinished in out.parent.glob(f".{out.name}-*"):
+        for unfinished in out.parent.glob(f".{glob.escape(out.name)}-*"):
             shutil.rmtree(unfinished, ignore_errors=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import os
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -291,18 +292,30 @@ def _told_by(bundle: Path) -> Path:
     return bundle / MANIFEST if bundle.is_dir() else bundle
 
 
-def found_recordings(patterns: Sequence[str]) -> list[Path]:
+def found_recordings(patterns: Sequence[str], folder: Path | None = None) -> list[Path]:
     """Files that the patterns name, each once, sorted within a pattern.
+
+    A file that has a pattern for its name, brackets and all, is meant by it.
+
+    Args:
+        patterns: names, or patterns of `glob`; ``~`` is the home folder where nothing has that name.
+        folder: that they are relative to; by default the working folder.
 
     Raises:
         InvalidInputError: a pattern that names none.
     """
     found: dict[Path, None] = {}
+    base = Path.cwd() if folder is None else folder.absolute()
     for pattern in patterns:
-        names = sorted(glob.glob(pattern, recursive=True)) or ([pattern] if not glob.has_magic(pattern) else [])
+        if os.path.lexists(base / pattern):
+            names = [pattern]
+        else:
+            asked = os.path.expanduser(pattern)
+            names = sorted(glob.glob(asked, root_dir=base, recursive=True))
+            names = names or ([asked] if not glob.has_magic(asked) else [])
         if not names:
             raise InvalidInputError(f"--recordings {pattern}", "no file", "a pattern of files that are there")
-        found |= dict.fromkeys(Path(name).absolute() for name in names)
+        found |= dict.fromkeys(base / name for name in names)
     return list(found)
 
 
@@ -408,13 +421,13 @@ def _recordings_of(device: _Device, folder: Path, known: Mapping[tuple[str, Path
     """
     found: dict[Path, None] = {}
     begun = any(name == device.name for name, _ in known)
-    for pattern in (str(folder / each) for each in device.recordings):
-        itself = Path(pattern).absolute()
+    for pattern in device.recordings:
+        itself = (folder / pattern).absolute()
         if (device.name, itself) in known:
             found[itself] = None
             continue
         try:
-            found |= dict.fromkeys(found_recordings([pattern]))
+            found |= dict.fromkeys(found_recordings([pattern], folder))
         except InvalidInputError:
             found |= {} if begun else {itself: None}
     return list(found)

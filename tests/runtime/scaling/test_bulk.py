@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import glob
 import json
 import os
 import re
@@ -27,6 +28,7 @@ from runtime.decoding.tracking import NoTracker
 from runtime.scaling import ledger as ledger_module
 from runtime.scaling.engine import Engine
 from runtime.scaling.inline import InlineEngine
+from runtime.scaling.job import found_recordings
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.part import Part
 from runtime.scaling.shard import ShardRecord
@@ -542,3 +544,24 @@ def test_errors_keep_their_parts() -> None:
 
     error = InvalidInputError("a", "b", "c")
     assert str(Problem.of(error)) == str(LightpageError("a", "b", "c"))
+
+
+@pytest.mark.parametrize("name", ["a[1].h5", "what?.h5", "all*.h5", "-dash.h5", " space .h5", "line\nbreak.h5", "ü.h5"])
+def test_a_file_that_exists_under_exactly_that_name_is_meant(name: str, archive: Archive) -> None:
+    folder = archive.folder / "[shelf]"
+    folder.mkdir()
+    (archive.folder / "a.h5").rename(folder / name)
+    for asked in (str(folder / name), glob.escape(str(folder)) + "/*.h5"):
+        words = ["--recordings", asked, "--bundle", str(archive.bundle), "--no-symbols"]
+        assert archive.run("decode", *words, asked=False)[0] == 0
+        assert {task.recording for task in archive.tasks} == {folder / name}
+        shutil.rmtree(archive.out)
+    (archive.folder / "[shelf]" / "fleet.toml").write_text(
+        f'[[device]]\nname = "one"\nbundle = "../toy.zip"\nrecordings = [{json.dumps(name, ensure_ascii=False)}]\n'
+    )
+    assert archive.run("decode", "--fleet", str(folder / "fleet.toml"), asked=False)[0] == 0
+
+
+def test_a_home_folder_may_be_named(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(archive.folder))
+    assert [path.name for path in found_recordings(["~/?.h5"])] == ["a.h5", "b.h5"]
