@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import fcntl
+import errno
 import os
 import shutil
 import time
@@ -12,12 +12,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from lightpage.errors import InvalidInputError, TakenError
+from lightpage.errors import InvalidInputError, LightpageError, SurroundingsError, TakenError
 from lightpage.failures import os_failure
+from lightpage.files import lock
 from runtime.scaling.job import Job, Source
 from runtime.scaling.part import WHOLE, Part
 from runtime.scaling.shard import RECORD, PageRecord, ShardRecord, holds_losses
 from runtime.scaling.task import Operation, RecordedFile, Task
+
+_LOCKING = "HDF5_USE_FILE_LOCKING"
+"""Variable of the environment by which HDF5, and this, are told to go without locks."""
 
 _LOCK, _QUESTION, _SHARDS = "lock", "lock-job", "shards"
 
@@ -52,10 +56,10 @@ class Ledger:
             raise self._not_writable(error) from None
         with ExitStack() as stack:
             if self.part == WHOLE:
-                stack.callback(os.close, self._locked(_LOCK, fcntl.LOCK_EX))
+                stack.callback(os.close, self._locked(_LOCK))
             else:
-                stack.callback(os.close, self._locked(_LOCK, fcntl.LOCK_SH))
-                stack.callback(os.close, self._locked(f"{_LOCK}-{self.part.index}", fcntl.LOCK_EX))
+                stack.callback(os.close, self._locked(_LOCK, shared=True))
+                stack.callback(os.close, self._locked(f"{_LOCK}-{self.part.index}"))
             self._locks = stack.pop_all()
         return self
 
@@ -71,40 +75,46 @@ class Ledger:
         Raises:
             TakenError: another one has not ended with it in time.
         """
-        lock = self._question_lock(time.monotonic() + _QUESTION_S)
+        asking = self._question_lock(time.monotonic() + _QUESTION_S)
         try:
             yield
         finally:
-            os.close(lock)
+            os.close(asking)
 
     def _question_lock(self, until: float) -> int:
         while True:
             try:
-                return self._locked(_QUESTION, fcntl.LOCK_EX)
+                return self._locked(_QUESTION)
             except TakenError:
                 if time.monotonic() > until:
                     raise
                 time.sleep(_AGAIN_S)
 
-    def _locked(self, name: str, kind: int) -> int:
-        """A descriptor that holds a lock until it is closed."""
+    def _locked(self, name: str, *, shared: bool = False) -> int:
+        """A descriptor that holds a lock until it is closed.
+
+        Raises:
+            TakenError: another run holds it.
+            SurroundingsError: the storage has no locks, and nobody has said that this does not matter.
+        """
+        subject = f"lock {self.folder / name}"
         try:
-            lock = os.open(self.folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            descriptor = os.open(self.folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise self._not_writable(error) from None
         try:
-            fcntl.flock(lock, kind | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(lock)
-            raise TakenError(self._subject, "another run at work there", "its end, or another folder") from None
-        except OSError as error:
-            os.close(lock)
-            expected = "storage that has locks, without which two runs could be at work there"
-            raise InvalidInputError(f"lock {self.folder / name}", error, expected) from None
-        return lock
+            if not lock(descriptor, subject, shared=shared) and os.environ.get(_LOCKING) not in ("FALSE", "0"):
+                expected = f"storage that has locks, or {_LOCKING}=FALSE where no other run is at work there"
+                raise SurroundingsError(subject, os.strerror(errno.ENOLCK), expected)
+        except BaseException as error:
+            os.close(descriptor)
+            if isinstance(error, BlockingIOError):
+                raise TakenError(self._subject, "another run at work there", "its end, or another folder") from None
+            raise
+        return descriptor
 
-    def _not_writable(self, error: OSError) -> InvalidInputError:
-        return InvalidInputError(self._subject, error, "a folder that can be written")
+    def _not_writable(self, error: OSError) -> LightpageError:
+        return os_failure(self._subject, error, "a folder that can be written")
 
     def sources(self, job: Job) -> Iterator[tuple[int, Source]]:
         """Recordings of the part, each with its place among the run's."""
