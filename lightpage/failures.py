@@ -133,8 +133,10 @@ def os_failure(
     if number == errno.ENOLCK:
         remedy = "a file system with locks, or HDF5_USE_FILE_LOCKING=FALSE in the environment"
         return SurroundingsError(subject, os.strerror(number), remedy)
+    if (short := short_resource(subject, error)) is not None:
+        return short
     if number is None:
-        return short_resource(subject, error) or otherwise(subject, error, expected)
+        return otherwise(subject, error, expected)
     return otherwise(subject, OSError(number, os.strerror(number)), expected)
 
 
@@ -157,6 +159,9 @@ def short_resource(subject: str, error: BaseException) -> SurroundingsError | No
         return SurroundingsError(subject, error, f"more {what}")
     if isinstance(error, MemoryError):
         return SurroundingsError(subject, text or "too little memory", "more memory")
+    if "no usable temporary directory" in text.lower():
+        got = "no folder for temporary files that can be written"
+        return SurroundingsError(subject, got, "one: name it in the variable TMPDIR")
     for words, what in _SHORT_WORDS.items():
         if words in text.lower():
             return SurroundingsError(subject, text, f"more {what}")

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.temporary import settle_matplotlib
+
 SIDE_PX = 900
 """Longest side of a picture of a frame."""
 _SATURATED = (230, 60, 30)
@@ -33,6 +35,7 @@ def frame_png(frame: NDArray[np.integer[Any]], bit_depth: int) -> bytes:
 
 def confidence_png(confidence: NDArray[np.floating[Any]]) -> bytes:
     """Confidences [ny, nx] from 0, dark, to 1, bright, a block of pixels for each symbol."""
+    settle_matplotlib()
     from matplotlib import colormaps  # takes long to import
 
     colours = (255 * colormaps["viridis"](np.clip(np.nan_to_num(confidence), 0, 1))[..., :3]).astype(np.uint8)

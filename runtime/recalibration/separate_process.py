@@ -9,7 +9,6 @@ import queue
 import shutil
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -17,9 +16,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from lightpage.errors import BundleError
+from lightpage.errors import BundleError, SurroundingsError
 from lightpage.failures import short_resource
 from lightpage.progress import Progress
+from lightpage.temporary import temporary_folder
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import Tracker
 from runtime.errors import WorkerError
@@ -111,10 +111,9 @@ def recalibrate_apart(
 @contextmanager
 def _private_folder(scratch: Path | None) -> Iterator[Path]:
     try:
-        folder = tempfile.TemporaryDirectory(prefix=SCRATCH, dir=scratch, ignore_cleanup_errors=True)
-    except OSError as error:
-        expected = "a temporary folder that can be written: name one in the variable TMPDIR"
-        raise WorkerError(f"{_SUBJECT}, its folder", error, expected) from error
+        folder = temporary_folder(f"{_SUBJECT}, its folder", SCRATCH, scratch)
+    except SurroundingsError as error:
+        raise WorkerError(error.subject, error.got, error.expected) from error
     with folder as name:
         yield Path(name)
 

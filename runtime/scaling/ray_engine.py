@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
-import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -14,6 +12,8 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from lightpage.errors import InvalidInputError
+from lightpage.failures import short_resource
+from lightpage.temporary import SOCKET_BYTES, short_folder
 from runtime.errors import WorkerError
 from runtime.execution.cpus import available_cpus
 from runtime.execution.memory import SHARED
@@ -29,6 +29,9 @@ AHEAD = 2
 
 _STORE_BYTES = 128 << 20
 """Of the object store of a cluster that is started here; tasks and outcomes are a few kilobytes."""
+
+_BELOW_FOLDER = len("/session_2026-01-01_00-00-00_123456_1234567/sockets/plasma_store_0")
+"""Bytes of the longest path of a socket that Ray makes in its folder."""
 
 _LOOPBACK = "127.0.0.1"
 
@@ -169,29 +172,34 @@ def connected(address: str | None) -> Iterator[Any]:
     if ray.is_initialized():
         yield ray
         return
-    settings: dict[str, Any] = {"address": address} if address else {}
+    subject = f"Ray cluster {address or 'of this machine'}"
+    settings: dict[str, Any] = {"address": address}
+    expected = "one that answers"
     folder = None
     if address is None:
-        folder = tempfile.mkdtemp(prefix="ray-")  # a socket's path must be short
+        folder = short_folder(subject, "ray-", SOCKET_BYTES - _BELOW_FOLDER)
         settings = {
+            "address": "local",  # whatever RAY_ADDRESS says
             "num_cpus": available_cpus(),
             "include_dashboard": False,
             "object_store_memory": _STORE_BYTES,
-            "_temp_dir": folder,
+            "_temp_dir": folder.name,
             "_node_ip_address": _LOOPBACK,
         }
+        expected = "one that starts: Ray writes to the folders that the variables TMPDIR and HOME name"
     # Ray's process has many threads before a task comes: then it is too late to tell the C library of memory.
     packages = {"env_vars": {"PYTHONPATH": same_packages(1)["PYTHONPATH"], **SHARED}}
     try:
         try:
             ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=packages, **settings)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            raise WorkerError(f"Ray cluster {address or 'of this machine'}", error, "one that answers") from error
+        except (OSError, RuntimeError, ValueError) as error:
+            short = short_resource(subject, error)
+            raise short or WorkerError(subject, f"{error}", expected) from error
         yield ray
     finally:
         ray.shutdown()
         if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
+            folder.cleanup()
 
 
 def _told(error: Exception) -> str:

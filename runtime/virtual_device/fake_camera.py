@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import socket
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, LightpageError
+from lightpage.temporary import temporary_folder
 from runtime.cameras.aravis_library import FILL, AravisLibrary, aravis
 from runtime.cameras.gige_network import PORT
 from runtime.cameras.pixel_formats import pack, pixel_format, pixel_format_of
@@ -83,7 +83,7 @@ class FakeCamera:
         if self._camera is not None:
             return
         _check_free(self.address)
-        with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
+        with temporary_folder(f"fake camera {self.serial}") as folder:
             description = Path(folder) / "camera.xml"
             description.write_text(_description(self._library), "utf-8")
             camera = self._library(

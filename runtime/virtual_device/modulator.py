@@ -14,6 +14,7 @@ import numpy as np
 
 from lightpage.device.state import parse_device
 from lightpage.errors import LightpageError, PageError
+from lightpage.temporary import SOCKET_BYTES
 from runtime.virtual_device.light import Light
 
 _log = logging.getLogger(__name__)
@@ -39,7 +40,8 @@ class ModulatorSocket:
         try:
             self._listener = Listener(str(address), "AF_UNIX")
         except OSError as error:
-            raise LightpageError(f"modulator socket {address}", error, "a path for a new socket") from None
+            expected = f"a path of at most {SOCKET_BYTES} bytes for a new socket, where the file system has sockets"
+            raise LightpageError(f"modulator socket {address}", error, expected) from None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="virtual-modulator", daemon=True)
         self._thread.start()

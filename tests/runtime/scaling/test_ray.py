@@ -6,6 +6,7 @@ import math
 import os
 import signal
 import sys
+import tempfile
 import uuid
 from collections import Counter
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from typing import Any
 import pytest
 
 from lightpage.cli.main import run as run_command
+from lightpage.errors import SurroundingsError
 from runtime.commands import bulk as command
 from runtime.errors import WorkerError
 from runtime.scaling import ray_engine
@@ -221,3 +223,55 @@ def working(mark: str) -> list[int]:
         if b"ray::_work" in name and mark.encode() in environment:
             found.append(int(folder.name))
     return found
+
+
+class UnstartedRay:
+    """Takes note of how a cluster is started, or fails to start it."""
+
+    def __init__(self, error: Exception | None = None) -> None:
+        self.error = error
+        self.settings: dict[str, Any] = {}
+
+    def is_initialized(self) -> bool:
+        return False
+
+    def init(self, **settings: Any) -> None:
+        self.settings = settings
+        if self.error is not None:
+            raise self.error
+
+    def shutdown(self) -> None:
+        pass
+
+
+def test_a_cluster_of_this_machine_is_started_whatever_the_surroundings_say(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (long := tmp_path / ("x" * 100)).mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(long))
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    monkeypatch.setitem(sys.modules, "ray", ray := UnstartedRay())
+    with ray_engine.connected(None):
+        assert ray.settings["address"] == "local"
+        folder = Path(ray.settings["_temp_dir"])
+        assert folder.is_dir()
+        assert len(f"{folder}/session_2026-01-01_00-00-00_123456_1234567/sockets/plasma_store") <= 107
+    assert not folder.exists()
+    with ray_engine.connected("auto"):
+        assert ray.settings["address"] == "auto"
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "said"),
+    [
+        (FileNotFoundError(2, "No such file or directory", "/nowhere"), WorkerError, "HOME"),
+        (RuntimeError("Could not determine home directory."), WorkerError, "HOME"),
+        (OSError(24, "Too many open files"), SurroundingsError, "ulimit -n"),
+    ],
+)
+def test_a_cluster_that_does_not_start_says_what_it_needs(
+    error: Exception, kind: type[Exception], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", UnstartedRay(error))
+    with pytest.raises(kind, match=f"Ray cluster of this machine: got .*{said}"), ray_engine.connected(None):
+        pass
