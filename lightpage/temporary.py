@@ -14,7 +14,7 @@ _MEMORY = "/dev/shm"
 """A container that is read-only has this at least."""
 
 SOCKET_BYTES = 107
-"""Longest path of a Unix socket."""
+"""Longest path of a Unix socket: the system keeps it in 108 bytes, the last of which is 0."""
 
 _RANDOM = 8
 """Characters that are added to the prefix of a temporary folder's name."""

@@ -11,12 +11,11 @@ from collections.abc import Collection
 from pathlib import Path
 
 from lightpage.errors import InvalidInputError
+from lightpage.temporary import SOCKET_BYTES
 
 _HOST_PORT = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
 _UNIX = "unix:"
 _LARGEST_PORT = 65535
-SOCKET_BYTES = 107
-"""Of a Unix socket's path: the system keeps it in 108 bytes, the last of which is 0."""
 _ANSWER_S = 1.0
 
 
