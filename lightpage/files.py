@@ -31,6 +31,9 @@ _NAME_BYTES = 255
 _LACKING = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM, errno.EACCES})
 """Error numbers of a file system that lacks what was asked of it, e.g. locks or synchronisation."""
 
+_without_locks = set[int]()
+"""Devices that have no locks, of which a warning was given."""
+
 _ENCODINGS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 
 
@@ -56,7 +59,7 @@ def new_file(folder: Path, name: str) -> tuple[int, Path]:
 
 
 def lock(descriptor: int, subject: str, *, shared: bool = False) -> bool:
-    """Lock a file until its descriptor is closed; where its file system has no locks, warn and go without.
+    """Lock a file until its descriptor is closed; where its file system has no locks, warn once and go without.
 
     Args:
         descriptor: of the file.
@@ -77,7 +80,9 @@ def lock(descriptor: int, subject: str, *, shared: bool = False) -> bool:
     except OSError as error:
         if error.errno not in _LACKING:
             raise
-        warn(f"{subject}: no lock ({error.strerror}); see to it that no other process writes it")
+        if (device := os.fstat(descriptor).st_dev) not in _without_locks:
+            _without_locks.add(device)
+            warn(f"{subject}: no lock ({error.strerror}); see to it that no other process writes on this file system")
         return False
     return True
 

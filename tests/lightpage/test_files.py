@@ -127,6 +127,7 @@ def test_what_a_file_system_lacks_is_gone_without(
     for name in ("fsync", "link", "chmod", "fchmod"):
         monkeypatch.setattr(os, name, lacking)
     monkeypatch.setattr(fcntl, "flock", lacking)
+    monkeypatch.setattr("lightpage.files._without_locks", set())
     replace_text(tmp_path / "F", "text")
     move_to_new_name(tmp_path / "F", tmp_path / "G")
     assert (tmp_path / "G").read_text() == "text"
