@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import errno
 import fcntl
+import glob
 import json
 import math
 import os
@@ -213,9 +214,37 @@ def read_text(path: str | Path, subject: str, expected: str, failure: type[Light
         raise failure(subject, got, f"{expected}, in UTF-8") from None
 
 
+def matching(pattern: str) -> list[str]:
+    """Names that a pattern matches, sorted; what exists under exactly that name, or a folder on its way, is no pattern.
+
+    Names come as they do from `glob.glob`; there are none where nothing matches.
+    """
+    path = Path(pattern)
+    there = next((part for part in (path, *path.parents) if os.path.lexists(part)), Path())
+    if there == path:
+        return [pattern]
+    return sorted(glob.glob(os.path.join(glob.escape(str(there)), path.relative_to(there)), recursive=True))
+
+
+def check_utf8(path: str | Path, subject: str) -> None:
+    """Check that a path is text, which JSON and messages between processes can hold.
+
+    Raises:
+        InvalidInputError: its bytes are not UTF-8.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        told = ascii(os.fsencode(path))[2:-1]
+        raise InvalidInputError(subject, f"the name {told}, which is not UTF-8", "another name, or a link") from None
+
+
 def replace_text(path: str | Path, text: str, subject: str = "file") -> None:
-    """Write `text` to `path` as UTF-8, replacing what is there in one step; see `replace_file`."""
-    replace_file(path, lambda file: file.write(text.encode()), subject)
+    """Write `text` to `path` as UTF-8, replacing what is there in one step; see `replace_file`.
+
+    Bytes of a name that are no text are escaped.
+    """
+    replace_file(path, lambda file: file.write(text.encode(errors="backslashreplace")), subject)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError
 from lightpage.codec.code import Code
 from lightpage.errors import BundleError, InvalidInputError, LightpageError, RecordingError
 from lightpage.failures import os_failure
-from lightpage.files import read_text, replace_text
+from lightpage.files import check_utf8, matching, read_text, replace_text
 from lightpage.recording.reader import Recording
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.manifest import MANIFEST
@@ -255,8 +255,11 @@ def named_bundle(name_or_path: str) -> NamedBundle:
 
     Raises:
         BundleError: it is none.
+        InvalidInputError: its name is not UTF-8.
     """
-    return _named(bundle_path(name_or_path).absolute())
+    path = bundle_path(name_or_path).absolute()
+    check_utf8(path, "--bundle")
+    return _named(path)
 
 
 def bundle_as_it_is(path: Path, known: Mapping[Path, NamedBundle] | None = None) -> tuple[NamedBundle, Problem | None]:
@@ -302,20 +305,18 @@ def found_recordings(patterns: Sequence[str], folder: Path | None = None) -> lis
         folder: that they are relative to; by default the working folder.
 
     Raises:
-        InvalidInputError: a pattern that names none.
+        InvalidInputError: a pattern that names none, or a name that is not UTF-8.
     """
     found: dict[Path, None] = {}
     base = Path.cwd() if folder is None else folder.absolute()
     for pattern in patterns:
-        if os.path.lexists(base / pattern):
-            names = [pattern]
-        else:
-            asked = os.path.expanduser(pattern)
-            names = sorted(glob.glob(asked, root_dir=base, recursive=True))
-            names = names or ([asked] if not glob.has_magic(asked) else [])
+        asked = pattern if os.path.lexists(base / pattern) else os.path.expanduser(pattern)
+        names = matching(str(base / asked)) or ([asked] if not glob.has_magic(asked) else [])
         if not names:
             raise InvalidInputError(f"--recordings {pattern}", "no file", "a pattern of files that are there")
         found |= dict.fromkeys(base / name for name in names)
+    for path in found:
+        check_utf8(path, "--recordings")
     return list(found)
 
 

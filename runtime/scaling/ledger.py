@@ -14,7 +14,7 @@ from typing import Self
 
 from lightpage.errors import InvalidInputError, LightpageError, SurroundingsError, TakenError
 from lightpage.failures import os_failure
-from lightpage.files import lock
+from lightpage.files import check_utf8, lock
 from runtime.scaling.job import Job, Source
 from runtime.scaling.part import WHOLE, Part
 from runtime.scaling.shard import RECORD, PageRecord, ShardRecord, holds_losses
@@ -41,12 +41,13 @@ class Ledger:
 
     Raises:
         TakenError: another run is at work there, or on this part of it.
-        InvalidInputError: the folder cannot be written.
+        InvalidInputError: the folder cannot be written, or its name is not UTF-8.
     """
 
     def __init__(self, folder: Path, part: Part = WHOLE) -> None:
         self.folder, self.part = folder.absolute(), part
         self.doubted: set[Path] = set()
+        check_utf8(self.folder, "bulk run")
         self._subject = f"bulk run {self.folder}"
 
     def __enter__(self) -> Self:
