@@ -18,8 +18,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("lightpage", "train", "runtime", "export", "analysis")
 ROOMS = (
     "lightpage.errors",
-    "lightpage.files",
+    "lightpage.failures",
     "lightpage.progress",
+    "lightpage.files",
+    "lightpage.temporary",
     "lightpage.words",
     "lightpage.von_mises",
     "lightpage.device",
