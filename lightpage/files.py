@@ -173,6 +173,22 @@ def synchronise(descriptor: int) -> None:
             raise
 
 
+def reserve(path: Path) -> None:
+    """Have room on the disk for all of a file, where its file system can.
+
+    Whoever writes to a hole of a file that is mapped into memory, on a disk that is full, is killed.
+
+    Raises:
+        OSError: there is no room.
+    """
+    with path.open("r+b") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
+        except OSError as error:
+            if error.errno not in _LACKING:
+                raise
+
+
 def sync_folder(folder: Path) -> None:
     """Write the names in `folder` to the disk where its file system can; the files themselves are whole without."""
     with suppress(OSError):

@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.lib.format import open_memmap
+from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from lightpage.files import replace_text
+from lightpage.failures import os_failure
+from lightpage.files import replace_text, reserve
 from lightpage.progress import track
 from train.data.features import PageFeatures, PageState
 from train.data.pages import Page
@@ -42,9 +45,10 @@ class FeatureStore(Dataset[Page]):
     """
 
     def __init__(self, folder: Path, pages: range | None = None) -> None:
-        names = [name for name in _FILES.values() if (folder / f"{name}.npy").exists()]
-        self._arrays = [np.load(folder / f"{name}.npy", mmap_mode="r") for name in names]
-        self._states = np.load(folder / f"{_PAGE_STATE}.npy", mmap_mode="r")
+        with _told(folder):
+            names = [name for name in _FILES.values() if (folder / f"{name}.npy").exists()]
+            self._arrays = [np.load(folder / f"{name}.npy", mmap_mode="r") for name in names]
+            self._states = np.load(folder / f"{_PAGE_STATE}.npy", mmap_mode="r")
         self._pages = range(len(self._states)) if pages is None else pages
 
     def __len__(self) -> int:
@@ -83,10 +87,12 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
         what: for the progress bar.
 
     Raises:
-        LightpageError: the first process has made no page for half an hour.
+        LightpageError: the folder cannot be written or has no room, or the first process has made no page for half an
+            hour.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     key = f"{count} pages {key}"
+    with _told(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     if not is_first_process():
         wait_for_first(lambda: _kept(folder, key)[0], count, f"features in {folder}")
     done, shift, before = _kept(folder, key)
@@ -107,18 +113,32 @@ def fill(folder: Path, key: str, count: int, make: Maker, what: str) -> float:
                 if value is None:
                     continue
                 if name not in arrays:
-                    path = folder / f"{name}.npy"
-                    arrays[name] = (
-                        open_memmap(path, "r+")
-                        if number
-                        else open_memmap(path, "w+", dtype=value.dtype, shape=(count, *value.shape))
-                    )
+                    with _told(folder):
+                        arrays[name] = _opened(folder / f"{name}.npy", None if number else (count, *value.shape), value)
                 arrays[name][number] = value
                 arrays[name].flush()
             seconds = time.monotonic() - start
             state = {"key": key, "done": number + 1, "shift_px": page.state.shift_px, "seconds": seconds}
             replace_text(folder / _STATE, json.dumps(state), "state of the features")
     return seconds
+
+
+def _opened(path: Path, new: tuple[int, ...] | None, like: NDArray[Any]) -> np.memmap[Any, Any]:
+    """An array in a file that is mapped: the one that is there, or a `new` one of this shape and the type of `like`."""
+    if new is None:
+        return open_memmap(path, "r+")
+    array = open_memmap(path, "w+", dtype=like.dtype, shape=new)
+    reserve(path)
+    return array
+
+
+@contextmanager
+def _told(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        expected = "a folder that can be written, on a file system that maps files into memory"
+        raise os_failure(f"features in {folder}", error, expected) from None
 
 
 def _kept(folder: Path, key: str) -> tuple[int, tuple[float, float], float]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from lightpage.errors import LightpageError
+from lightpage.errors import LightpageError, SurroundingsError
 from train import processes
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import PageFeatures, PageState
@@ -98,3 +101,24 @@ def test_a_part_of_the_pages_is_numbered_from_zero(tmp_path: Path) -> None:
     part = FeatureStore(tmp_path, range(3, 5))
     assert len(part) == 2
     assert torch.all(part[0][2] == 3)
+
+
+@pytest.mark.parametrize(("number", "kind"), [(errno.ENOSPC, SurroundingsError), (errno.EOPNOTSUPP, None)])
+def test_room_is_taken_before_pages_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, kind: type[Exception] | None
+) -> None:
+    def lacking(*_: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "posix_fallocate", lacking)
+    with pytest.raises(kind, match="features in .*more room") if kind else nullcontext():
+        fill(tmp_path, "device", 2, Pages(), "pages")
+
+
+def test_a_file_system_that_maps_no_files_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lacking(*_: object, **__: object) -> None:
+        raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+
+    monkeypatch.setattr("train.data.feature_store.open_memmap", lacking)
+    with pytest.raises(LightpageError, match="maps files into memory"):
+        fill(tmp_path, "device", 2, Pages(), "pages")
