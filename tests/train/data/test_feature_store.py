@@ -111,7 +111,7 @@ def test_room_is_taken_before_pages_are_made(
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "posix_fallocate", lacking)
-    with pytest.raises(kind, match="features in .*more room") if kind else nullcontext():
+    with pytest.raises(kind, match=r"features in .*more room") if kind else nullcontext():
         fill(tmp_path, "device", 2, Pages(), "pages")
 
 
