@@ -1,4 +1,4 @@
-"""What the service keeps of lost pages with request ids: bytes a page, as the interpreter counts them.
+"""Memory that the service keeps of lost pages with request ids: bytes a page, as the interpreter counts them.
 
     python -m analysis.service.replay_memory --json FILE
 

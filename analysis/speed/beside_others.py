@@ -30,7 +30,7 @@ _BUSY = "import os, sys\nwhile os.getppid() == int(sys.argv[1]):\n    sum(range(
 
 @contextmanager
 def busy_cores() -> Iterator[None]:
-    """One process that never rests for each core, while the `with` statement lasts."""
+    """Keep every core busy with a process of its own while the `with` statement lasts."""
     with ExitStack() as stack:
         for _ in range(len(os.sched_getaffinity(0))):
             process = stack.enter_context(subprocess.Popen([sys.executable, "-c", _BUSY, str(os.getpid())]))
@@ -39,7 +39,7 @@ def busy_cores() -> Iterator[None]:
 
 
 def timed(words: list[str], environment: dict[str, str]) -> tuple[float, float]:
-    """Seconds of a command, and of its processes on all cores.
+    """Time a command: seconds, and seconds of CPU time.
 
     Raises:
         subprocess.CalledProcessError: it fails.
@@ -59,7 +59,7 @@ def timed(words: list[str], environment: dict[str, str]) -> tuple[float, float]:
 
 
 def commands(folder: Path, pages: int, recording: Path | None) -> dict[str, list[str]]:
-    """What is timed, by name."""
+    """Commands that are timed, by name."""
     made = {"simulate": f"simulate --profile bench --pages {pages} --force --out {folder}/S.h5".split()}
     if recording is not None:
         known = f"--profile bench --recording {recording}"

@@ -238,7 +238,7 @@ def check_found(coherence: float, significant: float, symbols: int, reflected: M
 
 
 def _significant(found: Sequence[Measurement]) -> int:
-    """How many patches were found."""
+    """Count the patches that were found."""
     return sum(each.significance > SIGNIFICANT for each in found)
 
 
