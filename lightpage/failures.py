@@ -30,14 +30,12 @@ _STORAGE = frozenset(
         "EPROTO",
         "EBADMSG",
         "EUCLEAN",
-        "EBUSY",
         "EINTR",
         "EKEYEXPIRED",
         "EKEYREVOKED",
         "ENOKEY",
         "ENOMEDIUM",
         "ESHUTDOWN",
-        "EPIPE",
     )
     if hasattr(errno, name)
 )

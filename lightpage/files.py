@@ -10,6 +10,7 @@ import json
 import math
 import os
 import secrets
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
@@ -29,13 +30,19 @@ _results: ContextVar[TextIO | None] = ContextVar("results", default=None)
 _NAME_BYTES = 255
 """Longest name of a file on the file systems of Linux."""
 
-_LACKING = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM, errno.EACCES})
+_LACKING = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM})
 """Error numbers of a file system that lacks what was asked of it, e.g. locks or synchronisation."""
 
 _without_locks = set[int]()
 """Devices that have no locks, of which a warning was given."""
 
-_ENCODINGS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
+_ENCODINGS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF32_LE, "utf-32"),  # which begins as the next one does
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+)
 
 
 def new_file(folder: Path, name: str) -> tuple[int, Path]:
@@ -79,6 +86,8 @@ def lock(descriptor: int, subject: str, *, shared: bool = False) -> bool:
     except BlockingIOError:
         raise
     except OSError as error:
+        if error.errno == errno.EACCES:  # so some shares say that another has it
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from None
         if error.errno not in _LACKING:
             raise
         if (device := os.fstat(descriptor).st_dev) not in _without_locks:
@@ -113,7 +122,13 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject
         try:
             with os.fdopen(descriptor, "wb") as file:
                 write(file)
-            move_into_place(made, path)
+            try:
+                move_into_place(made, path)
+            except OSError as error:
+                if error.errno != errno.EBUSY:
+                    raise
+                shutil.copyfile(made, path)  # a file that is mounted by itself, as into a container, cannot be replaced
+                made.unlink()
         except BaseException:
             made.unlink(missing_ok=True)
             raise
@@ -122,7 +137,11 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object], subject
 
 
 def is_special(path: Path) -> bool:
-    """Whether something is at `path` that is written to and not replaced: a device, a pipe or a socket."""
+    """Whether something is at `path` that is written to and not replaced: a device, a pipe or a socket.
+
+    Raises:
+        OSError: the system does not say, e.g. since the name is too long.
+    """
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
@@ -200,7 +219,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def read_text(path: str | Path, subject: str, expected: str, failure: type[LightpageError] = InvalidInputError) -> str:
-    """The text of a file in UTF-8, or in UTF-16 with a byte order mark; a mark is left out.
+    """The text of a file in UTF-8, or in UTF-16 or UTF-32 with a byte order mark; its lines end with LF alone.
 
     Args:
         path: of the file.
@@ -220,7 +239,7 @@ def read_text(path: str | Path, subject: str, expected: str, failure: type[Light
         raise failure(subject, error, expected) from None
     encoding = next((encoding for mark, encoding in _ENCODINGS if data.startswith(mark)), "utf-8")
     try:
-        return data.decode(encoding)
+        return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         line, column = data.count(b"\n", 0, error.start) + 1, error.start - data.rfind(b"\n", 0, error.start)
         if b"\0" in data[:64]:

@@ -220,7 +220,7 @@ def run(command: click.Command, arguments: Sequence[str] | None = None, name: st
 
 
 class _Termination:
-    """While its block runs in the main thread, the first SIGTERM or SIGHUP interrupts it; a second ends the process.
+    """While its block runs in the main thread, the first SIGTERM or SIGHUP interrupts it, a later SIGTERM ends it.
 
     A signal that the process was told to ignore, as `nohup` tells it of SIGHUP, stays ignored.
 
@@ -244,7 +244,8 @@ class _Termination:
 
     def _interrupt(self, number: int, _: FrameType | None) -> NoReturn:
         self.came = number
-        signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # it may come with SIGTERM, and is not impatience
         raise KeyboardInterrupt
 
 

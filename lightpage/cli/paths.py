@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +27,11 @@ class NewPath(click.ParamType[Path]):
             InvalidInputError: its folder cannot be written.
         """
         path = _file(value, param)
-        folder = path.absolute().parent
-        while not folder.exists():
-            folder = folder.parent
-        _check_writable(folder, path, param)
+        with _told(path, param):
+            folder = path.absolute().parent
+            while not folder.exists():
+                folder = folder.parent
+            _check_writable(folder, path)
         return path
 
 
@@ -49,9 +52,10 @@ class OutputFile(click.ParamType[Path]):
         path = _file(value, param)
         if path == STDOUT:
             return path
-        if path.is_dir():
-            raise InvalidInputError(_option(path, param), "a folder", "a file")
-        _check_writable(path.absolute().parent, path, param)
+        with _told(path, param):
+            if path.is_dir():
+                raise InvalidInputError(_option(path, param), "a folder", "a file")
+            _check_writable(path.absolute().parent, path)
         return path
 
 
@@ -69,8 +73,9 @@ class OutputFolder(click.ParamType[Path]):
         path = Path(value)
         if not str(value):
             raise InvalidInputError(param.opts[0] if param is not None else "path", "an empty name", "a folder")
-        if path.exists() and not path.is_dir():
-            raise InvalidInputError(_option(path, param), "a file", "a folder")
+        with _told(path, param):
+            if path.exists() and not path.is_dir():
+                raise InvalidInputError(_option(path, param), "a file", "a folder")
         return path
 
 
@@ -113,12 +118,23 @@ def _option(path: Path, param: click.Parameter | None) -> str:
     return f"{param.opts[0]} {path}" if param is not None else str(path)
 
 
-def _check_writable(folder: Path, path: Path, param: click.Parameter | None) -> None:
+@contextmanager
+def _told(path: Path, param: click.Parameter | None) -> Iterator[None]:
+    """Name the option in failures of the system, e.g. of a name that is too long."""
     try:
-        if is_special(path):
-            return
-        descriptor, made = new_file(folder, path.name)
-        os.close(descriptor)
-        made.unlink()
+        yield
     except OSError as error:
         raise os_failure(_option(path, param), error, "a path that can be written") from None
+
+
+def _check_writable(folder: Path, path: Path) -> None:
+    """Check that a file can be made in `folder`, and be called as `path` is.
+
+    Raises:
+        OSError: it cannot.
+    """
+    if is_special(path):
+        return
+    descriptor, made = new_file(folder, path.name)
+    os.close(descriptor)
+    made.unlink()

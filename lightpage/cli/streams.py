@@ -64,6 +64,8 @@ def take_streams() -> tuple[LastingStream, LastingStream]:
             os.fstat(descriptor)
         except OSError:
             missing.append(os.open(os.devnull, os.O_RDWR))  # the lowest number that is free
+    if sys.stdin is None:
+        sys.stdin = os.fdopen(0, closefd=False)
     for name, descriptor in (("stdout", 1), ("stderr", 2)):
         stream = getattr(sys, name)
         if stream is None or descriptor in missing:

@@ -147,7 +147,7 @@ class VolumeFile:
             move_into_place(self._partial, self.path)
             self._file.close()
         except OSError as error:
-            raise InvalidInputError(f"file {self.path}", error, "a file that can be completed") from None
+            raise os_failure(f"file {self.path}", error, "a file that can be completed") from None
 
     def _checksum(self) -> int:
         check = Checksum()
@@ -165,8 +165,11 @@ class VolumeFile:
         return (self.volume.file_pages + parity) * self.volume.page_bytes
 
     def _read(self, number: int) -> bytes:
-        self._file.seek(self._place(number))
-        return self._file.read(self.volume.page_bytes)
+        try:
+            self._file.seek(self._place(number))
+            return self._file.read(self.volume.page_bytes)
+        except OSError as error:
+            raise os_failure(f"file {self._partial}", error, "a file that can be read") from None
 
     def _write(self, number: int, data: bytes) -> None:
         try:
@@ -174,7 +177,7 @@ class VolumeFile:
             self._file.write(data)
             self._file.flush()
         except OSError as error:
-            raise InvalidInputError(f"file {self._partial}", error, "room for it on the disk") from None
+            raise os_failure(f"file {self._partial}", error, "room for it on the disk") from None
 
 
 class VolumeFiles:

@@ -152,7 +152,9 @@ def _linked(group: Any, part: str, subject: str) -> Any:
     link = patiently(lambda: group.get(part, getlink=True), subject)
     try:
         return patiently(lambda: group[part], subject)
-    except StorageError:
+    except StorageError as error:
+        if error.__context__ is not None and cause_of(error.__context__) is Cause.STORAGE:
+            raise  # that says nothing of the link
         if isinstance(link, hdf.ExternalLink):
             path = resolved(link.filename, Path(group.file.filename), os.environ.get("HDF5_EXT_PREFIX", ""))
             open_named(path, f"{subject}: linked file {path}", "HDF5_EXT_PREFIX").close()

@@ -263,8 +263,7 @@ class StoredArray:
         """The array from `start` to `stop` along its first axis.
 
         Raises:
-            RecordingError: a source has gone, or has changed.
-            StorageError, SurroundingsError: the data cannot be read.
+            StorageError, SurroundingsError: the data cannot be read, or a source has gone since it was opened.
             OSError, KeyError, RuntimeError: what HDF5 says; see `lightpage.recording.hdf5.patiently`.
         """
         if not self._parts:
@@ -290,7 +289,11 @@ class StoredArray:
         return rows
 
     def _rows_of(self, part: _Part, start: int, stop: int) -> NDArray[Any]:
-        return self._source(part).rows(start, stop)
+        try:
+            source = self._source(part)
+        except RecordingError as error:  # it was there and whole when the recording was opened
+            raise StorageError(error.subject, error.got, error.expected) from None
+        return source.rows(start, stop)
 
     def _source(self, part: _Part) -> StoredArray:
         return self._sources.array(part.path, part.name, self.subject, self._chain)

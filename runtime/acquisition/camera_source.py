@@ -133,8 +133,10 @@ class CameraSource(FrameSource):
         self._dark: tuple[DarkFrame, DarkFrame] | None = None
         self._repairs: tuple[PixelRepair, ...] = ()
         self._wanted = _OPEN
-        self._moved: tuple[bool, bool] | None = _OPEN
-        """What was last asked of the beams, signal and reference, None where they may be otherwise."""
+        self._moved: tuple[bool, bool] | None = None
+        """How the beams are, signal and reference; None where that is not known, as at the start."""
+        self._stuck = False
+        """Whether they could not be moved, last time."""
         self._outcomes: Counter[str] = Counter()
         self._saturated: dict[str, float] = {}
 
@@ -268,8 +270,8 @@ class CameraSource(FrameSource):
 
     def trouble(self) -> str:
         """See `FrameSource.trouble`."""
-        is_open = self._wanted != _OPEN or self._moved == _OPEN  # while they are blocked on purpose, all is well
-        return "" if is_open else f"{self.beams.name}: a beam may be blocked, since it could not be let through"
+        blocked = self._stuck and self._wanted == _OPEN  # while they are blocked on purpose, all is well
+        return f"{self.beams.name}: a beam may be blocked, since it could not be let through" if blocked else ""
 
     def mend(self) -> None:
         """See `FrameSource.mend`."""
@@ -388,6 +390,9 @@ class CameraSource(FrameSource):
         """
         if self._moved != self._wanted:
             signal, reference = self._wanted
-            self._moved = None
-            self.beams.let_through(signal=signal, reference=reference)
-            self._moved = signal, reference
+            self._moved, stuck = None, True
+            try:
+                self.beams.let_through(signal=signal, reference=reference)
+                self._moved, stuck = (signal, reference), False
+            finally:
+                self._stuck = stuck

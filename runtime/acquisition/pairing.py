@@ -320,12 +320,14 @@ class Pairing:
         """Wait until no frame has come for a while; what came before is not known any more."""
         quiet = self.settings.quiet_s
         end = time.monotonic() + quiet
-        give_up = min(deadline, end + _MOST_QUIET * quiet)
+        give_up, dropped = min(deadline, end + _MOST_QUIET * quiet), False
         while (now := time.monotonic()) < end:
+            if now > deadline and not dropped:
+                raise LostShotError("shot", "no time left", "a longer wait", Reason.MISSING_FRAME)
             if now > give_up:
                 raise LostShotError("cameras", "frames without end", f"silence for {quiet:g} s", Reason.STRAY_FRAME)
             if self._drain():
-                end = time.monotonic() + quiet
+                end, dropped = time.monotonic() + quiet, True
             time.sleep(0.005)
         for channel in self._channels:
             channel.last_id = None

@@ -21,8 +21,19 @@ MAX_FILES = 32
 MAX_BYTES = 1 << 30
 """All files together, unpacked: a full-scale decoder with two float32 reference frames needs about 200 MB."""
 
-_LITTER = frozenset({"__MACOSX", "thumbs.db", "desktop.ini", "lost+found"})
-"""Names that systems put beside files, in lower case but for the first; names that begin with a dot are litter too."""
+_LITTER = frozenset(
+    {
+        "__macosx",
+        "icon\r",
+        "thumbs.db",
+        "desktop.ini",
+        "$recycle.bin",
+        "system volume information",
+        "@eadir",
+        "lost+found",
+    }
+)
+"""Names that systems put beside files, in lower case; names that begin with a dot are litter too."""
 
 _MAX_LITTER = 4 * MAX_FILES
 
@@ -75,7 +86,7 @@ def check_name(name: str, subject: str) -> None:
 def is_litter(name: str) -> bool:
     """Whether a name is one that systems put beside files, e.g. `.DS_Store`, or `..data` of a mounted ConfigMap."""
     hidden = name.startswith(".") and name not in (".", "..") and not any(mark in name for mark in "\\:\0")
-    return hidden or name in _LITTER or name.lower() in _LITTER
+    return hidden or name.lower() in _LITTER
 
 
 def _read_folder(path: Path, max_bytes: int) -> dict[str, bytes]:

@@ -7,6 +7,7 @@ import stat
 from pathlib import Path
 
 from lightpage.errors import BundleError
+from lightpage.failures import os_failure
 
 SUFFIX = ".sig"
 """Behind the name of a bundle, the name of its signature."""
@@ -37,4 +38,4 @@ def read_signature(bundle: Path) -> bytes:
     except FileNotFoundError:
         return b""
     except OSError as error:
-        raise BundleError(f"signature {path}", error, expected) from None
+        raise os_failure(f"signature {path}", error, expected, BundleError) from None

@@ -198,7 +198,7 @@ def _bulk(
             provider = Provider.parse(choices.provider)
             job = _job(ledger.folder, before, choices, recordings, fleet, bundle, retry_lost)
             if give_up:
-                job = job.unopened_given_up()
+                job = job.unopened_given_up(place for place, _ in ledger.sources(job))
             if choices.fine_tuning is not None:
                 check = partial(_check_device, ledger, choices.known_pages)
                 job = job.checked(ledger.devices(job), check)
@@ -440,6 +440,9 @@ def failure(
     if made.failed:
         return MissingResultsError(subject, got, f"{expected}; the same command tries again what is missing")
     if job.choices.operation is Operation.RECOVER:
+        if unwritten := [file for file in files if file.passes]:
+            got = f"no file of volumes {ranges([file.volume.id for file in unwritten])} ({unwritten[0].error})"
+            return MissingResultsError(subject, got, "room and storage for them; the same command tries again")
         broken = ranges([file.volume.id for file in files if file.error is not None])
         if broken or ((lost or made.given_up) and not files and part == WHOLE):
             what = f"volumes {broken} without a file" if broken else "no file"

@@ -331,7 +331,7 @@ def _take_dark_frames(source: FrameSource) -> None:
 
 @contextmanager
 def stop_signals() -> Iterator[Callable[[], None]]:
-    """Yields what waits for SIGTERM, SIGINT or SIGHUP; a second one of them ends the process the usual way.
+    """Yields what waits for SIGTERM, SIGINT or SIGHUP; a second SIGTERM or SIGINT ends the process as usual.
 
     SIGHUP comes when a terminal is closed. Where it was to be ignored, as under nohup, it is.
     It waits for the byte that the interpreter's own handler writes. Waiting for a lock that a Python handler releases
@@ -342,8 +342,8 @@ def stop_signals() -> Iterator[Callable[[], None]]:
     sender.setblocking(False)
 
     def no_more(number: int, _: object) -> None:
-        for kind in before:
-            signal.signal(kind, signal.SIG_DFL)
+        for kind in before:  # a hangup may come with the first signal, and is not impatience
+            signal.signal(kind, signal.SIG_IGN if kind == _HANGUP else signal.SIG_DFL)
 
     def wait() -> None:
         while receiver.recv(1)[0] not in before:

@@ -152,7 +152,7 @@ def run(
                 continue
             total = todo if number else whole
             what = f"{job.choices.operation} again" if number else str(job.choices.operation)
-            failed: list[Failed] = []
+            failed, counted = list[Failed](), list[Failed]()
             for turn in _turns(give_up):
                 again = [each for each in failed if turn.takes(each)]
                 if turn.pause_s is not None and not again:
@@ -160,13 +160,13 @@ def run(
                 failed = [each for each in failed if not turn.takes(each)]
                 tasks: Iterable[Task] = missing()
                 if turn.pause_s is not None:
-                    tasks = list(_of_failures(tasks, again, failed, turn.give_up))
+                    tasks = list(_of_failures(tasks, again, [*failed, *counted], turn.give_up))
                     todo = sum(task.weight for task in tasks)
                     note(f"{again[0].problem}; {todo} {unit}s are tried again in {turn.pause_s:g} s")
                     sleep(turn.pause_s)
                 works = engine()
                 watch.begin(works)
-                steps = _steps(works, tasks, ledger, made, watch, turn.later, failed)
+                steps = _steps(works, tasks, ledger, made, watch, turn.later, failed, counted)
                 with closing(steps):
                     for _ in track(steps, what, unit=unit, total=total, done=total - todo, state=made.state):
                         pass
@@ -214,7 +214,9 @@ def _of_failures(
     tasks: Iterable[Task], again: Iterable[Failed], settled: Iterable[Failed], give_up: bool
 ) -> Iterator[Task]:
     """Tasks of the recordings that failures `again` are of, but for those that are `settled`."""
+    settled = list(settled)
     recordings = {(failed.task.device, failed.task.recording) for failed in again}
+    recordings -= {(failed.task.device, failed.task.recording) for failed in settled if failed.whole_recording}
     shards = {failed.task.shard for failed in settled}
     for task in tasks:
         if (task.device, task.recording) in recordings and task.shard not in shards:
@@ -229,6 +231,7 @@ def _steps(
     watch: Watch,
     later: Callable[[Failed], bool],
     failed: list[Failed],
+    counted: list[Failed],
 ) -> Generator[None, None, None]:
     """Do tasks; once for every page that is behind.
 
@@ -238,7 +241,8 @@ def _steps(
         ledger: of the run.
         made, watch: count what becomes of them.
         later: whether a failure is added to `failed`, in place of being counted.
-        failed: failures that are tried again.
+        failed: takes failures that are tried again.
+        counted: takes those that are not.
     """
     given_up: set[tuple[str, Path]] = set()
     died = made.restarts
@@ -262,6 +266,7 @@ def _steps(
                 if later(outcome):
                     failed.append(outcome)
                     continue
+                counted.append(outcome)
             else:
                 ledger.doubted.discard(outcome.task.shard)
             watch.count(outcome)

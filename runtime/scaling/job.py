@@ -165,15 +165,21 @@ class Job(Plain):
 
     def passing(self) -> bool:
         """Whether a recording or bundle could not be opened for a reason that may pass."""
-        return any(source.problem is not None and source.problem.passes for source in self.sources)
+        tried = (source.problem for source in self.sources if not source.given_up)
+        return any(problem is not None and problem.passes for problem in tried)
 
-    def unopened_given_up(self) -> Job:
-        """The same; recordings that could not be opened are given up, unless it is their bundle that is lacking."""
-        again = (
-            s.model_copy(update={"given_up": s.problem is not None and bool(self.bundles[s.bundle].sha256)})
-            for s in self.sources
-        )
-        return self.model_copy(update={"sources": tuple(again)})
+    def unopened_given_up(self, places: Iterable[int]) -> Job:
+        """The same; recordings that could not be opened are given up, unless it is their bundle that is lacking.
+
+        Args:
+            places: of the recordings that are meant.
+        """
+        sources = list(self.sources)
+        for place in places:
+            source = sources[place]
+            if source.problem is not None and self.bundles[source.bundle].sha256:
+                sources[place] = source.model_copy(update={"given_up": True})
+        return self.model_copy(update={"sources": tuple(sources)})
 
     @property
     def devices(self) -> dict[int, tuple[Source, ...]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from lightpage.errors import InvalidInputError, LightpageError, SurroundingsError, TakenError
+from lightpage.errors import LightpageError, SurroundingsError, TakenError
 from lightpage.failures import os_failure
 from lightpage.files import check_utf8, lock
 from runtime.scaling.job import Job, Source
@@ -24,6 +24,9 @@ _LOCKING = "HDF5_USE_FILE_LOCKING"
 """Variable of the environment by which HDF5, and this, are told to go without locks."""
 
 _LOCK, _QUESTION, _SHARDS = "lock", "lock-job", "shards"
+
+_AGAIN = ".again-"
+"""In the names of shards of later rounds."""
 
 _QUESTION_S, _AGAIN_S = 600.0, 0.1
 """Longest wait for another part that writes down what is asked, and the time between two tries."""
@@ -139,7 +142,7 @@ class Ledger:
             first: the range's first page.
             number: of the round, 0 for the first reading.
         """
-        again = f".again-{number}" if number else ""
+        again = f"{_AGAIN}{number}" if number else ""
         return self.folder / _SHARDS / f"{source:06d}" / f"{first:08d}{again}"
 
     def missing(self, job: Job) -> Iterator[Task]:
@@ -254,7 +257,7 @@ class Ledger:
         for index, _ in self.sources(job):
             folder = self.shard(index, 0).parent
             for name in self.results(index):
-                if holds_losses(folder / name, misfiled_only=not every_loss):
+                if _AGAIN not in name and holds_losses(folder / name, misfiled_only=not every_loss):
                     self.doubted.add(folder / name)
 
     def recalibrated(self, place: int) -> bool:
@@ -277,4 +280,4 @@ def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InvalidInputError(f"folder {folder}", error, "a folder that can be written") from None
+        raise os_failure(f"folder {folder}", error, "a folder that can be written") from None

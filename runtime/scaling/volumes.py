@@ -9,7 +9,8 @@ from typing import Any
 
 from lightpage.codec.volume import Volume
 from lightpage.codec.volume_file import PARTIAL, Restored, VolumeFile, ranges
-from lightpage.errors import InvalidInputError, LostDataError
+from lightpage.errors import InvalidInputError, LostDataError, StorageError, SurroundingsError
+from lightpage.failures import may_pass, os_failure
 from lightpage.files import write_json
 from runtime.scaling.job import Job
 from runtime.scaling.ledger import Ledger
@@ -54,6 +55,7 @@ class RecoveredFile:
         restored, lost: see `lightpage.codec.volume_file.Restored`.
         error: why there is no whole file; None where there is.
         holes: the file with zeros where data are lost; None where none was made.
+        passes: whether another try to write it may go well.
     """
 
     volume: Volume
@@ -63,6 +65,7 @@ class RecoveredFile:
     lost: tuple[int, ...] = ()
     error: str | None = None
     holes: Path | None = None
+    passes: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """The figures under the names that other programs read."""
@@ -145,7 +148,7 @@ def _file(
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise InvalidInputError(f"folder {folder}", error, "a folder that can be written") from None
+        raise os_failure(f"folder {folder}", error, "a folder that can be written") from None
     try:
         done = _written(path, volume, shards, despite_losses=False)
         # under a name of its own: whoever finds the other one may take it for whole
@@ -158,8 +161,8 @@ def _file(
             made = f"zeros in {beside}"
         told = f"data pages {ranges(done.lost)} lost, {made}; at most {volume.parity_pages} lost pages a group"
         return RecoveredFile(volume, path, read, done.restored, done.lost, told, beside if beside.exists() else None)
-    except (LostDataError, InvalidInputError) as error:
-        return RecoveredFile(volume, path, read, error=str(error))
+    except (LostDataError, InvalidInputError, StorageError, SurroundingsError) as error:
+        return RecoveredFile(volume, path, read, error=str(error), passes=may_pass(error))
 
 
 def _written(path: Path, volume: Volume, shards: dict[Path, int], *, despite_losses: bool) -> Restored:

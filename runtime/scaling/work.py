@@ -103,13 +103,14 @@ class Worker:
         Errors that nobody foresaw are raised: they end the worker, and the range goes to another one.
         """
         start = time.perf_counter()
-        opened = read = False
+        opened = read = opening = False
         try:
-            _check_stamp(task)
             warm = self._opened(task.bundle, task.provider)
+            opening = True
+            _check_stamp(task)
             with _recording_of(task) as recording:
                 check_recording(warm.decoder, recording)
-                opened = True
+                opened, opening = True, False
                 record = self._record(task, recording, warm)
                 read_bytes = round(recording.stored_page_bytes * min(len(task.pages), recording.pages))
             read = True
@@ -120,7 +121,7 @@ class Worker:
             failure = understood(task.name, error)
             if failure is None:
                 raise
-            if read or not (task.give_up and isinstance(failure, StorageError | RecordingError)):
+            if not (task.give_up and opening and isinstance(failure, StorageError | RecordingError)):
                 whole = not read and not (opened and may_pass(failure))
                 return Failed(task=task, problem=Problem.of(failure), whole_recording=whole)
             lost = tuple(lost_page(page, failure) for page in task.pages)

@@ -67,7 +67,7 @@ class LineTimes:
     @property
     def longest_s(self) -> float:
         """Bound of one query: pyserial connects within 5 s, the line may have to be synchronised twice."""
-        return 6.0 + 2 * self.synchronise_s + 3 * self.answer_s
+        return 6.0 + 2 * self.synchronise_s + 3 * (self.answer_s + self.late_s)
 
 
 class ScpiPort:
@@ -242,7 +242,7 @@ class ScpiPort:
         Raises:
             LostShotError: that cannot be had in time; the port is closed.
         """
-        self._synchronised, self._latency_s = False, 0.0
+        self._synchronised, self._latency_s, self._bare_cr = False, 0.0, False
         self._heard.clear()
         end = time.monotonic() + self._times.synchronise_s
         rounds = 0

@@ -165,10 +165,11 @@ def test_the_longest_name_can_be_written(tmp_path: Path) -> None:
         (tmp_path / name).unlink()
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32"])
 def test_text_is_read_in_the_encodings_that_editors_write(encoding: str, tmp_path: Path) -> None:
-    (tmp_path / "F").write_bytes('name = "ä"\r\n'.encode(encoding))
-    assert read_text(tmp_path / "F", "file F", "text") == 'name = "ä"\r\n'
+    for end in ("\n", "\r\n", "\r"):
+        (tmp_path / "F").write_bytes(f'name = "ä"{end}'.encode(encoding))
+        assert read_text(tmp_path / "F", "file F", "text") == 'name = "ä"\n'
 
 
 @pytest.mark.parametrize(

@@ -143,3 +143,18 @@ def test_libraries_of_linear_algebra_do_not_spin_unless_they_are_told_to(tmp_pat
         kept = {name: value for name, value in os.environ.items() if name not in (*THREADS, "OMP_NUM_THREADS")}
         done = subprocess.run([sys.executable, "-c", code], env=kept | own, capture_output=True, text=True, timeout=60)
         assert done.stdout == f"{seen}\n"
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        "evaluate --recording R.h5 --json {long}",
+        "bulk decode {long} --recordings R.h5",
+        "encode F --bundle bench --out {long}",
+        "encode - --bundle bench --out P.h5 <&-",
+    ],
+)
+def test_names_that_are_too_long_and_absent_streams_are_named(asked: str, tmp_path: Path) -> None:
+    done = shell(f"lightpage {asked.format(long='n' * 300)}", tmp_path)
+    assert done.returncode in (0, 2)
+    assert done.stderr.startswith("lightpage: ") or done.returncode == 0

@@ -396,3 +396,11 @@ def test_counts_in_the_high_bits_are_named(tmp_path: Path) -> None:
         modulator.show = shown  # type: ignore[method-assign, assignment]
         with pytest.raises(SourceError, match="multiples of 16"):
             source.shot()
+
+
+def test_a_beam_that_an_earlier_process_left_blocked_is_opened_before_the_first_shot(tmp_path: Path) -> None:
+    source, beams = with_beams(Lab(), tmp_path)
+    beams.open["signal"] = False
+    with source:
+        source.shot()
+    assert beams.open == {"signal": True, "reference": True}

@@ -216,7 +216,7 @@ class TestBadInput:
 
         monkeypatch.setattr("lightpage.codec.volume_file.move_into_place", full)
         result, _ = recovered(bundle, recording)
-        assert isinstance(result.exception, InvalidInputError)
+        assert isinstance(result.exception, SurroundingsError)
         assert "got No space left on device" in str(result.exception)
         monkeypatch.setattr("lightpage.recording.pages.move_into_place", full)
         with pytest.raises(SurroundingsError, match="No space left"):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from lightpage.errors import StorageError, SurroundingsError
+from lightpage.errors import InvalidInputError, StorageError, SurroundingsError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from runtime.scaling import driver
@@ -227,3 +227,45 @@ def test_the_ledger_counts_what_is_doubted_as_missing(archive: Archive) -> None:
         there = ledger.results(0)
         ledger.doubted.add(ledger.shard(0, RANGE))
         assert there - ledger.results(0) == {f"{RANGE:08d}"}
+
+
+def test_a_file_that_storage_does_not_take_is_not_lost(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = asked("recover", archive)
+    with monkeypatch.context() as patch:
+        for number in (errno.EIO, errno.ENOSPC):
+
+            def failing(*_: object, number: int = number) -> None:
+                raise OSError(number, "")
+
+            patch.setattr("lightpage.codec.volume_file.move_into_place", failing)
+            assert archive.run("recover", *options)[0] == 75
+    status, figures = archive.run("recover", *options)
+    assert (status, archive.tasks, len(figures["files"])) == (0, [], 1)
+
+
+def test_what_storage_does_not_take_makes_no_page_lost(
+    archive: Archive, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object) -> None:
+        raise StorageError("shard", "Input/output error", "a file that can be written")
+
+    options = asked("recover", archive)
+    monkeypatch.setattr("runtime.scaling.work.write_user_bytes", failing)
+    status, figures = archive.run("recover", *options, "--give-up")
+    assert (status, figures["pages_lost"]) == (75, 0)
+
+
+def test_what_cannot_pass_is_counted_once_beside_what_may(
+    archive: Archive, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = ShardRecord.write
+
+    def refused(record: ShardRecord, shard: Path) -> None:
+        if shard.parent.name == "000000" and shard.name.startswith("00000000"):
+            raise InvalidInputError("shard", "refused", "another")
+        write(record, shard)
+
+    monkeypatch.setattr(ShardRecord, "write", refused)
+    disk.failures = len(driver.AGAIN_S)
+    status, figures = archive.run("decode")
+    assert (status, figures["this_run"]["failed"], figures["pages_missing"]) == (75, 1, RANGE)
