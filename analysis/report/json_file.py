@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json
 
 from lightpage.errors import InvalidInputError
+from lightpage.files import read_text
 from lightpage.page.levels import MAX_LEVELS
 
 EVALUATE, RECOVER = "evaluate", "recover"
@@ -66,10 +67,8 @@ class JsonFile:
             InvalidInputError: it cannot be read, or is no JSON.
         """
         try:
-            text = path.read_bytes()
+            text = read_text(path, f"{path}", EXPECTED).encode()
             content = from_json(text)
-        except OSError as error:
-            raise InvalidInputError(f"{path}", error, EXPECTED) from None
         except ValueError as error:
             raise InvalidInputError(f"{path}", f"text that is no JSON ({error})", EXPECTED) from None
         if not isinstance(content, dict):
