@@ -4,6 +4,8 @@ An SCPI device numbers neither messages nor answers, but answers in order: once 
 come of a message from before. After anything unexpected the port is therefore synchronised before the next message:
 wait for silence, send `*IDN?`, and want exactly one identification for every `*IDN?` sent so far, then silence again;
 and all of it twice. Identifications that are still due are counted, so that a late one is not taken for a newer one.
+
+A line ends with CR, with LF or with both: devices and serial servers differ. NULs between lines are noise.
 """
 
 from __future__ import annotations
@@ -41,6 +43,11 @@ _REFUSED = re.compile(r"\?([1-8])")
 _POLL_S = 0.02
 """Longest wait inside pyserial."""
 _LONGEST_LINE = 512
+_END = re.compile(rb"[\r\n]")
+_NO_LINE = b"\r\n"
+"""What is no line by itself: the rest of an end."""
+_QUOTED = 80
+"""Most characters of what came that an error quotes."""
 _ROUNDS = 2
 """Identifications in a row, each with silence after, that make a port synchronised."""
 
@@ -87,6 +94,12 @@ class ScpiPort:
         self._path, self._baud, self._times = port, baud, times
         self._port: Serial | None = None
         self._buffer = bytearray()
+        self._heard = ""
+        """What came last and was no answer, while the port is synchronised."""
+        self._slowest_s = 0.0
+        """How long the identification took, at most, while the port is synchronised."""
+        self._asked: list[float] = []
+        """When identifications were asked for, while the port is synchronised."""
         self._synchronised = self._echo = False
         self._known = False
         """Whether `identity` has come often enough, since the port was opened, to be relied on."""
@@ -149,7 +162,10 @@ class ScpiPort:
         port = self._port
         if port is not None and self._synchronised:
             try:
-                self._synchronised = not (self._buffer or port.in_waiting)  # nothing was asked: whose answer is that?
+                reads = iter(range(_LONGEST_LINE))  # of a socket a byte each
+                while port.in_waiting and not self._buffer.strip(_NO_LINE) and next(reads, None) is not None:
+                    self._read(port)
+                self._synchronised = not self._buffer.strip(_NO_LINE)  # nothing was asked: whose answer is that?
             except GONE:
                 self.close()
         if port is not None and self._synchronised and session in (None, self.session):
@@ -208,7 +224,7 @@ class ScpiPort:
         elif self._echo and line is not None:
             self._synchronised = False
             self._identified(line)
-            raise self._gone(f"{line!r} before the echo of {message}", "the echo first")
+            raise self._gone(f"{_quoted(line)} before the echo of {message}", "the echo first")
         if line is not None and (refused := _REFUSED.fullmatch(line)):
             meaning = REFUSALS[int(refused[1])]
             raise LostShotError(self.name, f"{line} ({meaning}) to {message}", "no refusal", Reason.TRIGGER_REFUSED)
@@ -216,9 +232,12 @@ class ScpiPort:
             return line
         self._synchronised = False
         if line is None:
-            raise self._gone(f"no answer to {message} within {self._times.answer_s:g} s", "an answer")
+            told = f"no answer to {message} within answer_s = {self._times.answer_s:g} s"
+            if self._buffer:
+                raise self._gone(f"{told}, but {_quoted(bytes(self._buffer))} without an end", "a line with CR or LF")
+            raise self._gone(told, "an answer")
         self._identified(line)
-        raise self._gone(f"{line!r} to {message}", f"an answer like {answer.pattern}")
+        raise self._gone(f"{_quoted(line)} to {message}", f"an answer like {answer.pattern}")
 
     def _synchronise(self, port: Serial) -> None:
         """Make sure that nothing is on its way any more; see the module.
@@ -227,17 +246,16 @@ class ScpiPort:
             LostShotError: that cannot be had in time; the port is closed.
         """
         self._synchronised = False
+        self._heard, self._slowest_s, self._asked = "", 0.0, []
         end = time.monotonic() + self._times.synchronise_s
         rounds = 0
         while rounds < _ROUNDS:
             if time.monotonic() > end:
                 self.close()
-                raise self._gone(
-                    f"no clear answer to {_IDENTIFY} within {self._times.synchronise_s:g} s", "its identification"
-                )
+                raise self._unclear()
             if not self._quiet(port, end):
                 continue
-            self._send(port, _IDENTIFY)
+            self._asked.append(self._send(port, _IDENTIFY)[0])
             self._due += 1
             rounds = rounds + 1 if self._one_round(port, end) else 0
         self._synchronised = self._known = True
@@ -250,6 +268,7 @@ class ScpiPort:
         while self._due:
             line = self._line(port, until)
             if line is None:
+                self._heard = _quoted(bytes(self._buffer)) + " without an end" if self._buffer else self._heard
                 if came:  # a later one answers all that came before: those that are missing were lost, or are very late
                     self._given_up, self._due = self._given_up + self._due, 0
                 return False
@@ -257,14 +276,31 @@ class ScpiPort:
                 echo = True
             elif self._identified(line):
                 came, until = True, min(end, time.monotonic() + self._times.late_s)
+            else:
+                self._heard = _quoted(line)
         self._echo = echo
         return self._quiet(port, end) and self.identity == known
+
+    def _unclear(self) -> LostShotError:
+        """The error of a port that cannot be synchronised: it quotes what came."""
+        times = self._times
+        told = f"no clear answer to {_IDENTIFY} within {times.synchronise_s:g} s"
+        if self._slowest_s > times.answer_s:
+            told = f"{told}: {_quoted(self.identity or '')} came after {self._slowest_s:.2f} s"
+            return self._gone(told, f"it within answer_s = {times.answer_s:g} s: raise answer_s")
+        if self._heard:
+            return self._gone(
+                f"{told}, but {self._heard}", "its identification: is it this device, and this baud rate?"
+            )
+        return self._gone(f"{told}: nothing came", "its identification: look at its power, its cable and the baud rate")
 
     def _identified(self, line: str) -> bool:
         """Whether a line is the identification, and one fewer is due then."""
         if not (line == self.identity if self._known else _IDENTIFICATION.fullmatch(line)):
             return False
         self.identity = line
+        if 0 < self._due <= len(self._asked):
+            self._slowest_s = max(self._slowest_s, time.monotonic() - self._asked[-self._due])
         if not self._due:
             self._due, self._given_up = self._given_up, 0  # none is lost, they are late
         self._due = max(0, self._due - 1)
@@ -277,30 +313,34 @@ class ScpiPort:
             if self._read(port):
                 nothing, since = False, time.monotonic()
             while (line := self._next_line()) is not None:
-                self._identified(line)
-        nothing = nothing and not self._buffer
+                if not self._identified(line) and line != _IDENTIFY:
+                    self._heard = _quoted(line)
+        nothing = nothing and not self._buffer.strip(_NO_LINE)
         self._buffer.clear()
         return nothing
 
     def _line(self, port: Serial, until: float) -> str | None:
-        """The next line without its CR and LF, or None where it does not end in time; a damaged one keeps its LF."""
+        """The next line without its end, or None where it does not end in time."""
         while (line := self._next_line()) is None and time.monotonic() < until:
             self._read(port)
         return line
 
     def _next_line(self) -> str | None:
-        end = self._buffer.find(b"\n") + 1
-        if not end and len(self._buffer) < _LONGEST_LINE:
+        """The next line that is not empty; between CR and LF there is an empty one."""
+        del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(_NO_LINE))]
+        end = _END.search(self._buffer)
+        length = _LONGEST_LINE if end is None else min(end.start(), _LONGEST_LINE)
+        if len(self._buffer) < length:
             return None
-        end = end or len(self._buffer)
-        line = bytes(self._buffer[:end])
-        del self._buffer[:end]
-        return line.removesuffix(b"\r\n").decode("latin-1") if end < _LONGEST_LINE else repr(line)
+        line = bytes(self._buffer[:length])
+        del self._buffer[:length]
+        return line.decode("latin-1")
 
-    def _read(self, port: Serial) -> int:
-        found = port.read(max(1, port.in_waiting))
+    def _read(self, port: Serial) -> bool:
+        """Whether something came that belongs to a line."""
+        found = port.read(max(1, port.in_waiting)).replace(b"\0", b"")
         self._buffer += found
-        return len(found)
+        return bool(found.strip(_NO_LINE))
 
     def _gone(self, got: object, expected: object) -> LostShotError:
         return LostShotError(self.name, got, expected, Reason.TRIGGER_GONE)
@@ -309,3 +349,9 @@ class ScpiPort:
 def _words(error: BaseException) -> str:
     """What an exception of pyserial says, with its kind: some say little else."""
     return f"{type(error).__name__} ({error})"
+
+
+def _quoted(what: str | bytes) -> str:
+    """What came, as an error quotes it."""
+    text = what if isinstance(what, str) else what.decode("latin-1")
+    return repr(text) if len(text) <= _QUOTED else f"{text[:_QUOTED]!r} and {len(text) - _QUOTED} characters more"

@@ -279,3 +279,104 @@ def test_no_such_port(tmp_path: Path) -> None:
 def test_messages_are_one_line_of_ascii(message: str) -> None:
     with pytest.raises(InvalidInputError, match="ASCII"):
         ScpiLine("socket://127.0.0.1:1").send(message)
+
+
+@pytest.mark.parametrize(
+    ("line_end", "before", "echo"),
+    [(b"\n", b"", False), (b"\r", b"\0\0", False), (b"\r", b"", True), (b"\n\r", b"\0", True)],
+)
+def test_a_line_ends_as_its_device_ends_it(any_lab: Lab, line_end: bytes, before: bytes, echo: bool) -> None:
+    any_lab.port.line_end, any_lab.port.before_line, any_lab.port.echo = line_end, before, echo
+    line = any_lab.line
+    line.close()
+    for _ in range(3):
+        assert (any_lab.width(1), any_lab.width(2)) == (1e-5, 2e-5)
+    line.send(":PULSE1:STATE ON")
+    session = line.session
+    for _ in range(20):
+        line.send(":PULSE1:STATE OFF", session)
+    assert line.identity == IDENTITY
+
+
+def test_a_rest_of_an_end_that_comes_later_is_no_answer(lab: Lab) -> None:
+    lab.port.line_end = b"\r"
+    lab.width(1)
+    session = lab.line.session
+    for late in (b"\n", b"\0", b"\0\r\n"):
+        lab.port._write(late)
+        serial = lab.line._port._port
+        assert serial is not None
+        until(lambda serial=serial: serial.in_waiting > 0)  # type: ignore[misc]
+        lab.line.send(":PULSE1:STATE ON", session)
+
+
+def test_a_device_that_sends_nuls_all_the_time_is_understood(lab: Lab) -> None:
+    lab.line.close()
+    stop = threading.Event()
+
+    def fill() -> None:
+        while not stop.wait(0.005):
+            lab.port._write(b"\0")
+
+    filler = threading.Thread(target=fill)
+    filler.start()
+    try:
+        assert lab.width(2) == 2e-5
+    finally:
+        stop.set()
+        filler.join(5)
+
+
+@pytest.mark.parametrize(
+    ("answer", "line_end", "quoted"),
+    [
+        ("login:", b"", r"'login:' without an end"),
+        ("ERROR 7", b"\n", r"'ERROR 7'"),
+        ("\x80\xfe\x80", b"\r\n", r"'\\x80þ\\x80'"),
+        ("x" * 300, b"\r", r"'x{80}' and 220 characters more"),
+    ],
+)
+def test_what_came_in_place_of_an_identification_is_quoted(
+    answer: str, line_end: bytes, quoted: str, tmp_path: Path
+) -> None:
+    with Pty(lambda message: answer, tmp_path / "tty") as port:
+        port.line_end = line_end
+        line = ScpiLine(port.address, times=TIMES)
+        with pytest.raises(LostShotError, match=rf"\*IDN\? .*{quoted}") as raised:
+            line.send("*RST")
+        assert raised.value.reason is Reason.TRIGGER_GONE
+        line.close()
+
+
+def test_an_answer_without_an_end_is_quoted(lab: Lab) -> None:
+    lab.port.line_end = b""
+    with pytest.raises(LostShotError, match=r"'0\.00001000000' without an end"):
+        lab.width(1)
+
+
+def test_a_device_that_is_slow_is_named_as_slow_and_with_more_time_is_understood(lab: Lab) -> None:
+    lab.line.close()
+    lab.port.late_s = (0.2, 0.2)
+    lab.port.fault = lambda message: Fault.LATE
+    with pytest.raises(LostShotError, match=rf"'{IDENTITY}' came after 0\.2.* s, wanted it within answer_s"):
+        lab.width(1)
+    lab.port.unplug()  # what is still on its way is lost
+    lab.port.plug()
+    patient = ScpiLine(lab.port.address, times=LineTimes(answer_s=0.5, quiet_s=0.03, late_s=1.0, synchronise_s=4.0))
+    assert float(patient.query(":PULSE1:WIDT?", NUMBER)) == 1e-5
+    patient.close()
+
+
+def test_a_banner_is_no_answer(lab: Lab) -> None:
+    lab.line.close()
+    lab.port.before_line = b"BNC 575 ready, firmware 2.4, good morning\n"
+    with pytest.raises(LostShotError, match="BNC 575 ready"):
+        lab.width(1)
+    first = [b"BNC 575 ready, firmware 2.4, good morning\n"]
+    answer = lab.device.answer
+
+    def greeting(message: str) -> str:
+        return (first.pop().decode() if first else "") + answer(message)
+
+    lab.port.before_line, lab.port._answer = b"", greeting
+    assert (lab.width(1), lab.line.identity) == (1e-5, IDENTITY)
