@@ -6,8 +6,8 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -23,6 +23,7 @@ from lightpage.recording.black_level import DarkFrame, PixelRepair, without_blac
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
+from runtime.acquisition.beam_keeper import BeamKeeper
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.pairing import Pairing, PairingSettings
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
@@ -36,6 +37,8 @@ Counts = NDArray[np.unsignedinteger[Any]]
 _log = logging.getLogger(__name__)
 
 _GONE = frozenset({Reason.CAMERA_GONE, Reason.TRIGGER_GONE})
+_AWAITED = _GONE | {Reason.BEAM_CONTROL_FAILED}
+"""What mends itself, or somebody does: it is waited for until the shot's time is up."""
 _MOST_REPEATS = 20
 """Of a shot of reference or dark frames."""
 _AGAIN_S = 0.5
@@ -126,6 +129,7 @@ class CameraSource(FrameSource):
         self._pairing = Pairing(cameras, trigger, pairing or PairingSettings())
         self._lock = threading.RLock()
         """Held while the devices are used: one shot at a time."""
+        self._keeper = BeamKeeper(beams, self._lock, name)
         self._armed = self._was_armed = False
         self._next = 0
         self._dark: tuple[DarkFrame, DarkFrame] | None = None
@@ -197,21 +201,30 @@ class CameraSource(FrameSource):
 
     def close(self) -> None:
         """See `FrameSource.close`."""
-        with self._lock:
+        with self._lock, ExitStack() as stack:  # each is closed, whatever becomes of the others; the beams first
             self._armed = False
-            for device in (self._trigger, *self._cameras, self.modulator, self.beams):
+            self._keeper.close()
+            stack.callback(self.pages.close)
+            for device in (self.modulator, *self._cameras, self._trigger, self.beams):
                 if device is not None:
-                    device.close()
-            self.pages.close()
+                    stack.callback(device.close)
+
+    def trouble(self) -> str:
+        """See `FrameSource.trouble`: a beam may be blocked."""
+        return self._keeper.trouble
 
     def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         """See `FrameSource.shot`."""
         deadline = time.monotonic() + timeout_s
         with self._lock:
             index, symbols = self._page(page)
-            frames = self._persistent(
-                f"page {index}", index, deadline, self._attempt(index, symbols, deadline), self._exposures.repeats
-            )
+            take = self._attempt(index, symbols, deadline)
+
+            def attempt() -> tuple[Frame, ...]:
+                self._keeper.ensure_open()
+                return take()
+
+            frames = self._persistent(f"page {index}", index, deadline, attempt, self._exposures.repeats)
             pair = FramePair(*(self._cleaned(one, frame) for one, frame in enumerate(frames)))
             first, second = (frame.info for frame in frames)
             assert first is not None  # of complete frames
@@ -225,7 +238,7 @@ class CameraSource(FrameSource):
             LostShotError: they could not be taken.
             SourceError: they are dark or saturated, or this device cannot block its signal beam.
         """
-        with self._lock, self._beams_as(signal=False, reference=True):
+        with self._lock, self._keeper.blocked(signal=False, reference=True):
             stacks = self._stacks(self._exposures.reference_frames)
             means = [np.rint(stack.mean(axis=0)).astype(stack.dtype) for stack in stacks]
         pair = FramePair(means[0], means[1])
@@ -242,7 +255,7 @@ class CameraSource(FrameSource):
             LostShotError: they could not be taken.
             SourceError: there was light, or this device cannot block its beams.
         """
-        with self._lock, self._beams_as(signal=False, reference=False):
+        with self._lock, self._keeper.blocked(signal=False, reference=False):
             before, self._dark = self._dark, None
             try:
                 stacks = self._stacks(self._exposures.dark_frames)
@@ -301,7 +314,7 @@ class CameraSource(FrameSource):
                 self.on_lost(index, error)
                 # a camera that was switched off and on for a moment answers, and waits for no trigger
                 self._armed = self._armed and error.reason not in (*_GONE, Reason.MISSING_FRAME)
-                if error.reason in _GONE:
+                if error.reason in _AWAITED:
                     if time.monotonic() + _AGAIN_S < deadline:
                         time.sleep(_AGAIN_S)
                         continue
@@ -340,11 +353,3 @@ class CameraSource(FrameSource):
             taken = self._persistent("frames without a page", -1, deadline, attempt, _MOST_REPEATS)
             shots.append(taken)
         return [np.stack([self._cleaned(one, frames[one]) for frames in shots]) for one in (0, 1)]
-
-    @contextmanager
-    def _beams_as(self, *, signal: bool, reference: bool) -> Iterator[None]:
-        self.beams.let_through(signal=signal, reference=reference)
-        try:
-            yield
-        finally:
-            self.beams.let_through(signal=True, reference=True)

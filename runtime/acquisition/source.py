@@ -152,11 +152,19 @@ class FrameSource(ABC):
         """Share of pixels at full scale in each camera's last frame; empty where nobody looks."""
         return {}
 
+    def trouble(self) -> str:
+        """Why no page of it can be read now, empty where one can; it must not wait for a device."""
+        return ""
+
     def close(self) -> None:  # noqa: B027 — a source without a device needs none
         """Let go of files and devices."""
 
     def __enter__(self) -> Self:
-        self.arm()
+        try:
+            self.arm()
+        except BaseException:
+            self.close()
+            raise
         return self
 
     def __exit__(

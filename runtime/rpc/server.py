@@ -171,7 +171,7 @@ class LightpageServer:
         reflection.enable_server_reflection(names, self._server)
         self.port = add_port(self._server, self._address, self._credentials)
         await self._server.start()
-        await self._say(True)
+        await self._say(not self._plane.trouble())
         self._started = True
 
     async def _say(self, serving: bool) -> None:
@@ -179,7 +179,7 @@ class LightpageServer:
         await self._health.tell({**dict.fromkeys(self._names, serving), STORE_HEALTH: self._store.is_well()})
 
     async def _look(self) -> dict[str, bool]:
-        trouble = self._plane.heart.trouble()
+        trouble = self._plane.trouble()
         if bool(trouble) == self._serving and not self._stopping:
             if trouble:
                 _log.error("not serving: %s", trouble)

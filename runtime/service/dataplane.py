@@ -342,6 +342,10 @@ class DataPlane:
         """Go back to the model before; see `Models.rollback`."""
         return self.models.rollback(expected_version, actor)
 
+    def trouble(self) -> str:
+        """Why the service cannot be said to serve, empty where it can: a decode hangs, or its source cannot be read."""
+        return self.heart.trouble() or (self._source.trouble() if self._source is not None else "")
+
     def store_trouble(self) -> str:
         """What is wrong with the store, empty where nothing is, or where there is none; see `Models.trouble`."""
         trouble = self.models.trouble()

@@ -229,6 +229,8 @@ class _SourceFigures(Collector):
         for camera, value in self._source.saturated_shares().items():
             share.add_metric([camera], value)
         yield share
+        about = "1 where pages of the source can be read, 0 where a beam may be blocked."
+        yield GaugeMetricFamily("lightpage_source_ok", about, value=float(not self._source.trouble()))
 
 
 class _StoreFigures(Collector):

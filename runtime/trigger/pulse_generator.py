@@ -99,15 +99,20 @@ class PulseGenerator:
         self._ready: int | None = None
         """Session of the line in which the device was set up."""
         self._switched: dict[int, bool] = {}
-        """Other channels, as they were last asked to be."""
+        """Other channels, as the next `arm` switches them."""
 
     @property
     def identity(self) -> str | None:
         """Maker, model, serial number and versions, once connected."""
         return self._line.identity
 
+    @property
+    def reached(self) -> bool:
+        """Whether it has ever answered: before, nothing but a question for its identity was sent."""
+        return self._line.session > 0
+
     def arm(self) -> None:
-        """See `Trigger`. Channels that `set_channel` switched are switched again: the device may have forgotten.
+        """See `Trigger`. Other channels are switched again as they were: the device may have forgotten.
 
         Raises:
             SourceError: no such line, no device that answers on it, or it does not take a setting.
@@ -115,7 +120,7 @@ class PulseGenerator:
         """
         with self._lock:
             self._ready = None
-            reached = self._line.session > 0
+            reached = self.reached
             try:
                 self._ready = self._set_up()
             except LostShotError as error:
@@ -176,9 +181,14 @@ class PulseGenerator:
                 f"one of 1 to {CHANNELS} and none of the cameras' ({cameras})",
             )
         with self._lock:
-            self._switched[channel] = on
             self._line.send(f":PULSE{channel}:POL INV")
             self._switch(channel, on, self._line.session)
+            self._switched[channel] = on
+
+    def remember_channel(self, channel: int, on: bool) -> None:
+        """Have the next `arm` switch a channel so; nothing is sent now."""
+        with self._lock:
+            self._switched[channel] = on
 
     def channel_state(self, channel: int) -> bool:
         """Whether a channel is on, as the device says; connects if needed.
