@@ -39,6 +39,8 @@ _log = logging.getLogger(__name__)
 _GONE = frozenset({Reason.CAMERA_GONE, Reason.TRIGGER_GONE})
 _AWAITED = _GONE | {Reason.BEAM_CONTROL_FAILED}
 """What mends itself, or somebody does: it is waited for until the shot's time is up."""
+_DISARMING = _GONE | {Reason.MISSING_FRAME, Reason.TRIGGER_REFUSED}
+"""A device is set up again: one that was switched off and on for a moment answers, and waits for no trigger."""
 _MOST_REPEATS = 20
 """Of a shot of reference or dark frames."""
 _AGAIN_S = 0.5
@@ -312,8 +314,8 @@ class CameraSource(FrameSource):
             except LostShotError as error:
                 self._outcomes[error.reason.value] += 1
                 self.on_lost(index, error)
-                # a camera that was switched off and on for a moment answers, and waits for no trigger
-                self._armed = self._armed and error.reason not in (*_GONE, Reason.MISSING_FRAME)
+                if error.reason in _DISARMING or self._pairing.distrusted:
+                    self._armed = False
                 if error.reason in _AWAITED:
                     if time.monotonic() + _AGAIN_S < deadline:
                         time.sleep(_AGAIN_S)

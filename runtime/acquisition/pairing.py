@@ -15,6 +15,9 @@ where every one of these rules holds:
 A frame of another shot is off by at least the distance of two shots, which is more than twice the tolerance: rule 4
 excludes it. A trigger edge that is late by so much that it looks like the next shot's still exposes the page that is on
 display then: rule 5. The other rules say what went wrong.
+
+Three lost shots in a row that these rules refuse are no accident: a camera's counter or clock has begun anew, or has
+stepped. What is remembered is dropped then, and learnt again before the next shot.
 """
 
 from __future__ import annotations
@@ -43,6 +46,15 @@ _SILENT_TRIES = 3
 """The same where a camera has sent no frame since the start: its trigger does not arrive, and waiting mends nothing."""
 _MOST_QUIET = 20
 """A line that is never silent is given up after so many times the silence that is waited for."""
+_MOST_DRAINED = 512
+"""Frames that are dropped at a time; no camera keeps so many. One that sends faster than that is never silent."""
+CONTRADICTIONS = 3
+"""Lost shots in a row after which what is remembered of the devices is dropped."""
+_CONTRADICTING = frozenset(
+    {Reason.MISSING_FRAME, Reason.INCOMPLETE_FRAME, Reason.SKIPPED_FRAME, Reason.STRAY_FRAME, Reason.OTHER_SHOT}
+)
+_WRAPS = frozenset({2**16 - 1, 2**32 - 1})
+"""Last numbers of counters; some go on with 0 and some with 1, whatever their driver says."""
 _FOLLOWING = 0.1
 """Share of an accepted shot's deviation by which the reference follows."""
 
@@ -134,6 +146,12 @@ class Pairing:
         self._referenced_at = -float("inf")
         self._next_at = -float("inf")
         self._settled = False
+        self._contradictions = 0
+
+    @property
+    def distrusted(self) -> bool:
+        """Whether so many shots in a row contradict what is remembered that the devices may not be set up any more."""
+        return self._contradictions >= CONTRADICTIONS
 
     @property
     def synchronised(self) -> bool:
@@ -151,6 +169,7 @@ class Pairing:
     def forget(self) -> None:
         """Synchronise before the next shot: a device that was set up anew may be slower, or another one."""
         self._referenced_at = -float("inf")
+        self._contradictions = 0
 
     def shot(
         self, deadline: float, display: Callable[[], None] | None = None, displayed: Callable[[], bool] | None = None
@@ -171,6 +190,8 @@ class Pairing:
             self._displayed_at = time.monotonic()
             if not self._settled:
                 self._settle(deadline)
+            if self.distrusted:
+                self.forget()
             if not self.synchronised:
                 self._synchronise(deadline)
             taken = self._take(deadline)
@@ -181,9 +202,12 @@ class Pairing:
                 )
         except BaseException as error:
             self._settled = False
-            if isinstance(error, LostShotError) and error.reason in (Reason.CAMERA_GONE, Reason.TRIGGER_GONE):
-                self.forget()
+            if isinstance(error, LostShotError):
+                self._contradictions += error.reason in _CONTRADICTING
+                if error.reason in (Reason.CAMERA_GONE, Reason.TRIGGER_GONE):
+                    self.forget()
             raise
+        self._contradictions = 0
         return taken.frames
 
     def _check_times(self, taken: _Taken) -> None:
@@ -284,17 +308,20 @@ class Pairing:
             raise LostShotError(f"{name}: frame", frame.detail or "parts of it", "all of it", Reason.INCOMPLETE_FRAME)
         if channel.last_id is not None:
             expected = channel.last_id % channel.camera.frame_numbers + 1
-            if frame.info.frame_id != expected:
+            wraps = channel.last_id in _WRAPS and frame.info.frame_id in (0, 1)
+            if frame.info.frame_id != expected and not wraps:
                 raise LostShotError(f"{name}: frame number", frame.info.frame_id, expected, Reason.SKIPPED_FRAME)
         return frame
 
     def _drain(self) -> int:
-        """Drop the frames that wait; returns how many."""
-        dropped = 0
+        """Drop the frames that wait, so many and for so long at most; returns how many there were."""
+        dropped, end = 0, time.monotonic() + self.settings.quiet_s
         for channel in self._channels:
-            while channel.frame(0.0) is not None:
+            while dropped < _MOST_DRAINED and channel.frame(0.0) is not None:
                 dropped += 1
                 channel.last_id = None
+                if time.monotonic() > end:
+                    return dropped
         return dropped
 
     def _settle(self, deadline: float) -> None:

@@ -219,11 +219,20 @@ class PulseGenerator:
         for channel in settings.channels:
             prefix = f":PULSE{channel}"
             self._set_words({f"{prefix}:POL": _POLARITIES[settings.polarity]}, session)
+            self._pulse_at_each_shot(prefix, session)
             self._set_times({f"{prefix}:WIDT": settings.width_s, f"{prefix}:DELAY": settings.delay_s}, session)
             self._set_states({f"{prefix}:STATE": True}, session)
         for channel, on in self._switched.items():
             self._switch(channel, on, session)
         return session
+
+    def _pulse_at_each_shot(self, prefix: str, session: int) -> None:
+        """Take back a divider or a burst of a channel; a device that knows neither refuses, and has none."""
+        try:
+            self._set_words({f"{prefix}:CMOD": "NORM"}, session)
+        except LostShotError as error:
+            if error.reason is not Reason.TRIGGER_REFUSED:
+                raise
 
     def _set_words(self, values: dict[str, str], session: int) -> None:
         """Keywords, of which the device may answer the long form or the short one."""

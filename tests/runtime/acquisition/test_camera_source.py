@@ -16,6 +16,7 @@ from lightpage.recording.pages import Pages, PagesWriter
 from runtime.acquisition.camera_source import CameraSource, Exposures, View
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.pairing import PairingSettings
+from runtime.cameras.camera import FrameStatus
 from runtime.errors import LostShotError, Reason, SourceError
 from tests.runtime import toy
 from tests.runtime.acquisition.lab import Lab
@@ -288,3 +289,50 @@ def test_a_modulator_is_opened_for_its_pages_before_the_cameras(tmp_path: Path) 
     with pytest.raises(SourceError, match="no window"):
         other.arm()
     assert not any(camera.opened for camera in other._cameras)
+
+
+def test_devices_are_set_up_again_after_three_lost_shots_in_a_row(tmp_path: Path) -> None:
+    """As a camera that has come back with another pixel format: all that it sends is whole, and no frame."""
+    lab = Lab()
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))), repeats=0)
+    camera = lab.cameras[0]
+    spoilt: list[bool] = []
+    edge, arm = camera.edge, camera.arm
+
+    def sent(*given: float, **how: float) -> None:
+        edge(*given, **{**how, **({"status": FrameStatus.INCOMPLETE} if spoilt else {})})  # type: ignore[arg-type]
+
+    def armed() -> None:
+        spoilt.clear()
+        arm()
+
+    camera.edge, camera.arm = sent, armed  # type: ignore[method-assign]
+    with source:
+        source.shot(page=0)
+        spoilt.append(True)
+        for _ in range(3):
+            with pytest.raises(LostShotError) as raised:
+                source.shot(page=0)
+            assert raised.value.reason is Reason.INCOMPLETE_FRAME
+        assert source.shot(page=0).page_index == 0
+
+
+def test_a_trigger_that_refuses_is_set_up_again(tmp_path: Path) -> None:
+    lab = Lab()
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    fire, arm, refuses = lab.fire, lab.arm, [False]
+
+    def fired() -> float:
+        if refuses[0]:
+            raise LostShotError(lab.name, "?8", "no refusal", Reason.TRIGGER_REFUSED)
+        return fire()
+
+    def armed() -> None:
+        refuses[0] = False
+        arm()
+
+    lab.fire, lab.arm = fired, armed  # type: ignore[method-assign]
+    with source:
+        source.shot(page=0)
+        refuses[0] = True
+        assert source.shot(page=1).page_index == 1
