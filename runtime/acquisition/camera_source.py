@@ -19,6 +19,8 @@ from pydantic import ConfigDict, Field
 from lightpage.device.profile import Profile, TomlTable
 from lightpage.errors import FrameError
 from lightpage.page.levels import MAX_LEVELS
+from lightpage.progress import warn
+from lightpage.recording.alignment import describe, greatest_count, unused_low_bits
 from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
@@ -138,6 +140,8 @@ class CameraSource(FrameSource):
         self._repairs: tuple[PixelRepair, ...] = ()
         self._outcomes: Counter[str] = Counter()
         self._saturated: dict[str, float] = {}
+        self._unused = [0, 0]
+        """Lowest bits that each camera's counts leave unused, as its frames have shown."""
 
     @property
     def levels(self) -> int:  # type: ignore[override]  # uploads may settle it
@@ -338,12 +342,26 @@ class CameraSource(FrameSource):
         camera, full_scale = self._cameras[one], 2**self.bit_depth - 1
         if pixels.shape != self.frame_shape:
             raise SourceError(f"{camera.name}: frame", f"{pixels.shape}", f"{self.frame_shape}")
+        pixels = self._to_full_scale(one, pixels.astype(frame_type(self.bit_depth), copy=False))
         self._saturated[camera.name] = float(np.count_nonzero(pixels >= full_scale) / pixels.size)
-        pixels = pixels.astype(frame_type(self.bit_depth), copy=False)
         pixels = self._views[one].upright(pixels)
         if self._dark is None:
             return pixels
         return without_black(self._repairs[one](pixels), self._dark[one].black_level, self.bit_depth)
+
+    def _to_full_scale(self, one: int, pixels: Counts) -> Counts:
+        """The counts of a camera that leaves low bits unused, with its greatest one at full scale; it is told once."""
+        found = unused_low_bits(pixels, self.bit_depth)
+        if found and not self._unused[one]:
+            warn(
+                f"{self._cameras[one].name}: {describe(self.bit_depth, found)}. The greatest of them is taken for full "
+                f"scale; better a pixel_format of {self.bit_depth - found} bits, or less digital gain"
+            )
+        self._unused[one] = found or self._unused[one]
+        if found == 0 or not self._unused[one]:
+            return pixels
+        clipped = pixels >= greatest_count(self.bit_depth, self._unused[one])
+        return np.where(clipped, pixels.dtype.type(2**self.bit_depth - 1), pixels) if clipped.any() else pixels
 
     def _stacks(self, count: int) -> list[Counts]:
         """Frames of both cameras [exposure, row, column], whatever is on display."""

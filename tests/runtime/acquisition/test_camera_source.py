@@ -336,3 +336,33 @@ def test_a_trigger_that_refuses_is_set_up_again(tmp_path: Path) -> None:
         source.shot(page=0)
         refuses[0] = True
         assert source.shot(page=1).page_index == 1
+
+
+@pytest.mark.parametrize(("bits", "told"), [(12, True), (10, True), (14, True), (16, False)])
+def test_left_aligned_counts_are_told_once_and_saturate(tmp_path: Path, bits: int, told: bool) -> None:
+    lab, heard = Lab(), Told()
+    for camera in lab.cameras:
+        camera.bit_depth = 16  # type: ignore[misc]
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    rng = np.random.default_rng(0)
+    plain = np.minimum(rng.integers(0, 2**bits, toy.SHAPE), int(0.7 * 2**bits)).astype(np.uint16)
+    clipped = np.where(plain > 0.5 * 2**bits, 2**bits - 1, plain).astype(np.uint16)
+    seen = [plain << (16 - bits)]
+    for camera in lab.cameras:
+        camera._scene = lambda: seen[0]
+    with source, reporting(heard):
+        for _ in range(2):
+            shot = source.shot(page=0)
+        assert (shot.pair.in_phase == seen[0]).all()
+        warned = [note for note in heard.notes if "left-aligned" in note]
+        assert len(warned) == (2 if told else 0)  # of two cameras
+        assert all(f"pixel_format of {bits} bits" in note for note in warned)
+        seen[0] = clipped << (16 - bits)
+        shot = source.shot(page=0)
+        share = float((clipped == 2**bits - 1).mean())
+        assert list(source.saturated_shares().values()) == [share, share]
+        assert ((shot.pair.in_phase == 65535) == (clipped == 2**bits - 1)).all()
+        seen[0] = np.full(toy.SHAPE, 65535 >> (16 - bits) << (16 - bits), np.uint16)  # too few counts to tell by
+        source.shot(page=0)
+        assert list(source.saturated_shares().values()) == [1.0, 1.0]
+        assert len([note for note in heard.notes if "left-aligned" in note]) == len(warned)
