@@ -1,7 +1,7 @@
 """Notices counts that lie at the upper end of their bits, as 12 bits do in `Mono16` of many cameras.
 
-Such counts are multiples, of 16 for 12 bits in 16. They are as good as others, but their greatest one, 4095 * 16 = 65520,
-is not full scale, so that saturation would go unseen.
+Such counts are multiples, of 16 for 12 bits in 16. They are as good as others, but their greatest one, 4095 * 16, is
+not full scale, so that saturation would go unseen.
 """
 
 from __future__ import annotations

@@ -9,8 +9,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+import numpy as np
+
+from lightpage.errors import FrameError
 from runtime.cameras.gentl_link import Arrived, Ready, Task
-from runtime.cameras.pixel_formats import pixel_format
+from runtime.cameras.pixel_formats import pixel_format, without_padding
 from runtime.cameras.sfnc import (
     AUTOMATIC,
     BLACK_LEVEL_TOLERANCE,
@@ -132,7 +135,7 @@ class GenTLDevice:
             self._set("Gain", settings.gain_db, GAIN_TOLERANCE_DB, "gain_db")
         if settings.black_level_counts is not None:
             self._set("BlackLevel", settings.black_level_counts, BLACK_LEVEL_TOLERANCE, "black_level_counts")
-        self._check("PayloadSize", pixel_format(settings.pixel_format).nbytes(rows * columns))
+        self._check_payload(pixel_format(settings.pixel_format).nbytes(rows * columns))
         self._set_trigger()
         with self._setting("buffers", settings.buffers):
             self._acquirer.num_buffers = max(settings.buffers, self._acquirer.min_num_buffers)
@@ -200,11 +203,17 @@ class GenTLDevice:
         if got != (columns, rows, known.code):
             told = f"{got[0]} x {got[1]} pixels in format {got[2]:#010x}"
             return Arrived(fault=f"{told} in place of {columns} x {rows} in {known.code:#010x}")
-        size, start = known.nbytes(rows * columns), buffer.image_offset
-        data = buffer.raw_buffer
-        if len(data) < start + size:
-            return Arrived(fault=f"{len(data) - start} bytes in place of {size}")
-        memory[:size] = data[start : start + size]
+        size, padding = known.nbytes(rows * columns), 0
+        with suppress(*self._errors):
+            padding = buffer.padding_x
+        sent = np.frombuffer(buffer.raw_buffer, np.uint8)[buffer.image_offset :]
+        try:
+            pixels = without_padding(sent, self._shape, known.name, padding)
+        except FrameError as error:
+            return Arrived(fault=f"{error.got} in place of {error.expected}")
+        if pixels.size < size:
+            return Arrived(fault=f"{pixels.size} bytes in place of {size}")
+        memory[:size] = pixels[:size].tobytes()
         return Arrived(frame_id=buffer.frame_id, device_time_s=self._device_time_s(buffer), host_time_s=arrived_s)
 
     def _device_time_s(self, buffer: Any) -> float:
@@ -280,6 +289,13 @@ class GenTLDevice:
         if (abs(got - value) > tolerance) if tolerance else got != value:
             raise self._refused(setting or feature, value, feature, got, "")
         return got
+
+    def _check_payload(self, least: int) -> None:
+        """See that a frame holds its pixels; what the camera adds to them is left out."""
+        with self._setting("PayloadSize", least):
+            got = self._nodes.PayloadSize.get_value(False, True)
+        if got < least:
+            raise self._refused("PayloadSize", f"{least} or more", "PayloadSize", got, "")
 
     @contextmanager
     def _setting(self, setting: str, expected: object, feature: str = "") -> Iterator[None]:
