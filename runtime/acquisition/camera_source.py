@@ -6,8 +6,8 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -222,7 +222,7 @@ class CameraSource(FrameSource):
     def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         """See `FrameSource.shot`."""
         deadline = time.monotonic() + timeout_s
-        with self._lock:
+        with self._in_turn(timeout_s):
             index, symbols = self._page(page)
             take = self._attempt(index, symbols, deadline)
 
@@ -236,6 +236,17 @@ class CameraSource(FrameSource):
             assert first is not None  # of complete frames
             assert second is not None
             return Shot(pair, index, symbols, None, (first, second))
+
+    @contextmanager
+    def _in_turn(self, timeout_s: float) -> Iterator[None]:
+        """Hold the devices, unless others use them for too long."""
+        if not self._lock.acquire(timeout=timeout_s):
+            wanted = f"their end within {timeout_s:g} s"
+            raise LostShotError(self.name, "other shots", wanted, Reason.MISSING_FRAME)
+        try:
+            yield
+        finally:
+            self._lock.release()
 
     def references(self) -> FramePair:
         """Mean of reference-only frames, taken now: the signal beam is blocked for them.
@@ -328,6 +339,9 @@ class CameraSource(FrameSource):
                     repeats -= 1
                     continue
                 raise error.about(f"{subject} of {self.name}") from None
+            except SourceError:
+                self._armed = False  # whatever refuses is set up again before the next shot
+                raise
             self._outcomes["TAKEN"] += 1
             return frames
 

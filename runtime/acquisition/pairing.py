@@ -16,8 +16,8 @@ A frame of another shot is off by at least the distance of two shots, which is m
 excludes it. A trigger edge that is late by so much that it looks like the next shot's still exposes the page that is on
 display then: rule 5. The other rules say what went wrong.
 
-Three lost shots in a row that these rules refuse are no accident: a camera's counter or clock has begun anew, or has
-stepped. What is remembered is dropped then, and learnt again before the next shot.
+Three shots in a row that are lost to rules 1, 3 or 4 are no accident: a camera's counter or clock has begun anew or
+stepped, or its trigger is off. What is remembered is dropped then, and learnt again before the next shot.
 """
 
 from __future__ import annotations
@@ -50,9 +50,7 @@ _MOST_DRAINED = 512
 """Frames that are dropped at a time; no camera keeps so many. One that sends faster than that is never silent."""
 CONTRADICTIONS = 3
 """Lost shots in a row after which what is remembered of the devices is dropped."""
-_CONTRADICTING = frozenset(
-    {Reason.MISSING_FRAME, Reason.INCOMPLETE_FRAME, Reason.SKIPPED_FRAME, Reason.STRAY_FRAME, Reason.OTHER_SHOT}
-)
+_CONTRADICTING = frozenset({Reason.SKIPPED_FRAME, Reason.STRAY_FRAME, Reason.OTHER_SHOT})
 _WRAPS = frozenset({2**16 - 1, 2**32 - 1})
 """Last numbers of counters; some go on with 0 and some with 1, whatever their driver says."""
 _FOLLOWING = 0.1

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lightpage.errors import FrameError
 from lightpage.recording.layout import FrameInfo
 from runtime.cameras.aravis_connection import AravisConnection, says_gone
-from runtime.cameras.aravis_library import BUFFER_STATUS, SUCCESS, AravisError, AravisLibrary, aravis
+from runtime.cameras.aravis_library import BUFFER_STATUS, SIZE_MISMATCH, SUCCESS, AravisError, AravisLibrary, aravis
 from runtime.cameras.aravis_setup import AravisSetup
 from runtime.cameras.camera import Frame, FrameStatus
 from runtime.cameras.gige_network import receive_buffer_problem
@@ -211,16 +211,22 @@ class AravisCamera:
             library("arv_stream_push_buffer", self._stream, buffer)
 
     def _read(self, library: AravisLibrary, buffer: int) -> Frame:
-        """The frame in a buffer. Of one that is not whole, number and time may be those of an earlier frame."""
+        """The frame in a buffer. Of one that is not whole, number and time may be those of an earlier frame.
+
+        Raises:
+            LostShotError: `Reason.CAMERA_GONE`: it is not as this camera was set up, which is to be done again.
+        """
         status = library("arv_buffer_get_status", buffer)
+        if status == SIZE_MISMATCH:
+            raise self._changed(BUFFER_STATUS[status], "no more than its PayloadSize")
         if status != SUCCESS:
             return Frame(FrameStatus.INCOMPLETE, detail=self._explained(BUFFER_STATUS.get(status, f"status {status}")))
         rows, columns = self._shape
         expected = (columns, rows, pixel_format(self._settings.pixel_format).code)
         got = tuple(library(f"arv_buffer_get_image_{what}", buffer) for what in ("width", "height", "pixel_format"))
         if got != expected:
-            told = f"{got[0]} x {got[1]} pixels in format {got[2]:#010x}"
-            return Frame(FrameStatus.INCOMPLETE, detail=f"{told} in place of {columns} x {rows} in {expected[2]:#010x}")
+            told, wanted = (f"{each[0]} x {each[1]} pixels in format {each[2]:#010x}" for each in (got, expected))
+            raise self._changed(told, wanted)
         name = self._settings.pixel_format
         try:
             raw = without_padding(_bytes(library, buffer), self._shape, name, _padding(library, buffer))
@@ -263,6 +269,10 @@ class AravisCamera:
             if says_gone(error):
                 raise self._lose(error.message) from None
             raise SourceError(self.name, error.message, "no error") from None
+
+    def _changed(self, got: str, expected: str) -> LostShotError:
+        """The error of a camera that is not set up any more as it was."""
+        return LostShotError(f"{self.name}: frame, as after a change of settings", got, expected, Reason.CAMERA_GONE)
 
     def _lose(self, got: str) -> LostShotError:
         self._release(gone=True)

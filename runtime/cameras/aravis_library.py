@@ -21,7 +21,7 @@ ENVIRONMENT = "LIGHTPAGE_ARAVIS"
 LIBRARY = "libaravis-0.8.so.0"
 PACKAGE = "libaravis-0.8-0"
 
-SUCCESS = 0
+SUCCESS, SIZE_MISMATCH = 0, 5
 BUFFER_STATUS = {
     -1: "unknown",
     1: "cleared",

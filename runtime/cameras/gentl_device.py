@@ -195,14 +195,18 @@ class GenTLDevice:
         self._incomplete += 1
 
     def _read(self, buffer: Any, memory: mmap.mmap) -> Arrived:
-        """What is in a complete buffer."""
+        """What is in a complete buffer.
+
+        Raises:
+            CameraGoneError: something else than it was set up for; it is to be opened again.
+        """
         arrived_s = time.time()
         known = pixel_format(self._settings.pixel_format)
         rows, columns = self._shape
         got = (buffer.width, buffer.height, buffer.pixel_format)
         if got != (columns, rows, known.code):
             told = f"{got[0]} x {got[1]} pixels in format {got[2]:#010x}"
-            return Arrived(fault=f"{told} in place of {columns} x {rows} in {known.code:#010x}")
+            raise CameraGoneError(f"{told} in place of {columns} x {rows} in {known.code:#010x}")
         size, padding = known.nbytes(rows * columns), 0
         with suppress(*self._errors):
             padding = buffer.padding_x

@@ -10,9 +10,11 @@ A line ends with CR, with LF or with both: devices and serial servers differ. NU
 
 from __future__ import annotations
 
+import os
 import re
 import termios
 import time
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -93,6 +95,8 @@ class ScpiPort:
         self.identity: str | None = None
         self._path, self._baud, self._times = port, baud, times
         self._port: Serial | None = None
+        self._adapter: tuple[object, ...] | None = None
+        """The USB adapter behind the port, where it is one: plugged in again, it may have another path."""
         self._buffer = bytearray()
         self._heard = ""
         """What came last and was no answer, while the port is synchronised."""
@@ -190,9 +194,11 @@ class ScpiPort:
         import serial  # takes a while, and most have no such device
 
         alone = None if "://" in self._path else True
+        adapters = {} if alone is None else _usb_adapters()
+        path = next((path for path, adapter in adapters.items() if adapter == self._adapter), self._path)
         try:
             self._port = serial.serial_for_url(
-                self._path,
+                path,
                 baudrate=self._baud,
                 timeout=_POLL_S,
                 write_timeout=self._times.answer_s,
@@ -203,6 +209,7 @@ class ScpiPort:
         except GONE as error:
             raise self._gone(_words(error), "a serial port that can be opened") from None
         self._known = False
+        self._adapter = self._adapter or adapters.get(os.path.realpath(path))
         return self._port
 
     def _send(self, port: Serial, message: str) -> tuple[float, float]:
@@ -344,6 +351,19 @@ class ScpiPort:
 
     def _gone(self, got: object, expected: object) -> LostShotError:
         return LostShotError(self.name, got, expected, Reason.TRIGGER_GONE)
+
+
+def _usb_adapters() -> dict[str, tuple[object, ...]]:
+    """What tells the USB adapters apart that are plugged in, by the paths of their ports; none that are alike in it."""
+    from serial.tools import list_ports
+
+    found = {
+        port.device: (port.vid, port.pid, port.serial_number or port.location)
+        for port in list_ports.comports()
+        if port.vid is not None
+    }
+    alike = Counter(found.values())
+    return {path: adapter for path, adapter in found.items() if alike[adapter] == 1}
 
 
 def _words(error: BaseException) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from lightpage.recording.pages import Pages, PagesWriter
 from runtime.acquisition.camera_source import CameraSource, Exposures, View
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.pairing import PairingSettings
-from runtime.cameras.camera import FrameStatus
 from runtime.errors import LostShotError, Reason, SourceError
 from tests.runtime import toy
 from tests.runtime.acquisition.lab import Lab
@@ -291,29 +291,30 @@ def test_a_modulator_is_opened_for_its_pages_before_the_cameras(tmp_path: Path) 
     assert not any(camera.opened for camera in other._cameras)
 
 
-def test_devices_are_set_up_again_after_three_lost_shots_in_a_row(tmp_path: Path) -> None:
-    """As a camera that has come back with another pixel format: all that it sends is whole, and no frame."""
+def test_devices_are_set_up_again_after_three_contradictions_in_a_row(tmp_path: Path) -> None:
+    """As a camera whose trigger somebody has switched off: it sends frames that nobody asked for."""
     lab = Lab()
     source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))), repeats=0)
     camera = lab.cameras[0]
-    spoilt: list[bool] = []
+    free: list[bool] = []
     edge, arm = camera.edge, camera.arm
 
     def sent(*given: float, **how: float) -> None:
-        edge(*given, **{**how, **({"status": FrameStatus.INCOMPLETE} if spoilt else {})})  # type: ignore[arg-type]
+        for _ in range(1 + len(free)):
+            edge(*given, **how)  # type: ignore[arg-type]
 
     def armed() -> None:
-        spoilt.clear()
+        free.clear()
         arm()
 
     camera.edge, camera.arm = sent, armed  # type: ignore[method-assign]
     with source:
         source.shot(page=0)
-        spoilt.append(True)
+        free.append(True)
         for _ in range(3):
             with pytest.raises(LostShotError) as raised:
                 source.shot(page=0)
-            assert raised.value.reason is Reason.INCOMPLETE_FRAME
+            assert raised.value.reason is Reason.STRAY_FRAME
         assert source.shot(page=0).page_index == 0
 
 
@@ -366,3 +367,47 @@ def test_left_aligned_counts_are_told_once_and_saturate(tmp_path: Path, bits: in
         source.shot(page=0)
         assert list(source.saturated_shares().values()) == [1.0, 1.0]
         assert len([note for note in heard.notes if "left-aligned" in note]) == len(warned)
+
+
+def test_what_refuses_is_set_up_again_before_the_next_shot(tmp_path: Path) -> None:
+    lab = Lab()
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    camera = lab.cameras[1]
+    arm = camera.arm
+
+    def refusing(timeout_s: float) -> None:
+        raise SourceError("Q", "a refusal", "none")
+
+    def armed() -> None:
+        camera.__dict__.pop("frame", None)
+        arm()
+
+    camera.arm = armed  # type: ignore[method-assign]
+    with source:
+        source.shot(page=0)
+        camera.frame = refusing  # type: ignore[assignment,method-assign]
+        with pytest.raises(SourceError, match="a refusal"):
+            source.shot(page=0)
+        assert source.shot(page=0).page_index == 0
+
+
+def test_nobody_waits_for_others_longer_than_it_wants(tmp_path: Path) -> None:
+    source, modulator = source_of(Lab(), PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    held, leave = threading.Event(), threading.Event()
+    show = modulator.show
+
+    def slow(*given: Any) -> None:
+        held.set()
+        assert leave.wait(20)
+        show(*given)
+
+    modulator.show = slow  # type: ignore[method-assign]
+    with source:
+        other = threading.Thread(target=source.shot)
+        other.start()
+        assert held.wait(20)
+        with pytest.raises(LostShotError) as raised:
+            source.shot(0.05, page=1)
+        assert raised.value.reason is Reason.MISSING_FRAME
+        leave.set()
+        other.join(20)

@@ -229,8 +229,8 @@ def test_single_contradictions_change_nothing() -> None:
     shoot(pairing, lab)
     for _ in range(3):
         for _ in range(2):
-            lab.plan = faults(lab)["missed by one"][0]
-            assert tried(pairing, lab) is not None
+            lab.plan = faults(lab)["both late"][0]
+            assert tried(pairing, lab) is Reason.OTHER_SHOT
         before = lab.fired
         assert tried(pairing, lab) is None
         assert lab.fired == before + 1  # and no synchronisation

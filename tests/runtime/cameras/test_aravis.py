@@ -12,6 +12,7 @@ from runtime.cameras import aravis_setup
 from runtime.cameras.aravis import AravisCamera
 from runtime.cameras.aravis_library import aravis
 from runtime.cameras.camera import Camera, FrameStatus
+from runtime.cameras.pixel_formats import pixel_format as format_of
 from runtime.cameras.settings import CameraSettings
 from runtime.errors import LostShotError, Reason, SourceError
 from runtime.virtual_device.fake_camera import FakeCamera
@@ -320,3 +321,18 @@ def test_a_frame_that_ends_too_soon_is_incomplete(monkeypatch: pytest.MonkeyPatc
         frame = stage.take()
         assert frame.status is FrameStatus.INCOMPLETE
         assert "12288 bytes" in frame.detail
+
+
+@pytest.mark.parametrize(("own", "other"), [("Mono8", "Mono16"), ("Mono16", "Mono8")])
+def test_a_camera_whose_pixel_format_somebody_changes_is_set_up_again(own: str, other: str) -> None:
+    with scene(pixel_format=own) as stage:
+        stage.seen[0] = noise("Mono8", 3)
+        stage.camera.arm()
+        stage.fake._write(0x128, format_of(other).code)  # behind its user's back
+        assert stage.fake.edge()
+        with pytest.raises(LostShotError, match="settings") as raised:
+            stage.camera.frame(WAIT_S)
+        assert raised.value.reason is Reason.CAMERA_GONE
+        stage.camera.arm()
+        assert stage.camera.opened == 1
+        info_of(stage.take())

@@ -9,8 +9,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from serial.tools import list_ports
 
 from lightpage.errors import InvalidInputError
 from runtime.errors import LostShotError, Reason, SourceError
@@ -380,3 +382,33 @@ def test_a_banner_is_no_answer(lab: Lab) -> None:
 
     lab.port.before_line, lab.port._answer = b"", greeting
     assert (lab.width(1), lab.line.identity) == (1e-5, IDENTITY)
+
+
+def test_an_adapter_that_comes_back_under_another_name_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = PulseGeneratorEmulator()
+    first, second = (Pty(device.answer, tmp_path / name) for name in ("ttyUSB0", "ttyUSB1"))
+    plugged: dict[Path, tuple[int, int, str | None, str]] = {}
+
+    def comports() -> list[SimpleNamespace]:
+        names = ("vid", "pid", "serial_number", "location")
+        known = [(link, dict(zip(names, told, strict=True))) for link, told in plugged.items()]
+        return [SimpleNamespace(device=str(link.resolve()), **told) for link, told in known] + [
+            SimpleNamespace(device="/dev/ttyS0", vid=None, pid=None, serial_number=None, location=None)
+        ]
+
+    monkeypatch.setattr(list_ports, "comports", comports)
+    with first:
+        plugged[tmp_path / "ttyUSB0"] = (0x403, 0x6001, "A50", "1-1")
+        line = ScpiLine(first.address, times=TIMES)
+        line.send(":PULSE1:WIDT 0.00001")
+    del plugged[tmp_path / "ttyUSB0"]
+    with second:
+        plugged[tmp_path / "ttyUSB1"] = (0x403, 0x6001, "B77", "1-2")  # another one
+        with pytest.raises(LostShotError, match="ttyUSB0"):
+            line.send(":PULSE1:STATE ON")
+        plugged[tmp_path / "ttyUSB1"] = (0x403, 0x6001, "A50", "1-2")
+        line.send(":PULSE1:STATE ON")
+        assert line.session == 2
+        line.close()
