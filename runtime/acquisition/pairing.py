@@ -6,7 +6,8 @@ where every one of these rules holds:
 
 1. No frame waits before the trigger, and none is left over after both frames are in.
 2. Both frames are complete. Number and time of any other may be those of an earlier frame.
-3. Both numbers follow their camera's last one; after a fault they are not known, and anything may follow.
+3. Both numbers follow their camera's last one by the step that the synchronisation saw, mostly 1. After a fault they
+   are not known, and anything may follow.
 4. For each camera, device time less the time of the trigger is within a tolerance of the camera's reference. This
    reference comes from three shots at unequal distances that agree, follows accepted shots, and expires before the
    clocks can have drifted apart by a quarter of the tolerance.
@@ -53,6 +54,8 @@ CONTRADICTIONS = 3
 _CONTRADICTING = frozenset({Reason.SKIPPED_FRAME, Reason.STRAY_FRAME, Reason.OTHER_SHOT})
 _WRAPS = frozenset({2**16 - 1, 2**32 - 1})
 """Last numbers of counters; some go on with 0 and some with 1, whatever their driver says."""
+_MOST_STEP = 16
+"""A camera whose numbers grow by more from shot to shot is lost track of."""
 _FOLLOWING = 0.1
 """Share of an accepted shot's deviation by which the reference follows."""
 
@@ -95,6 +98,7 @@ class _Channel:
 
     Attributes:
         last_id: number of its last frame, None where it is not known.
+        step: by which its numbers grow from shot to shot, None where it is not known.
         reference_s: device time less trigger time of a good shot, None before a synchronisation.
         opened: how often the camera was opened when that was learnt.
         came: frames so far, whole or not.
@@ -102,6 +106,7 @@ class _Channel:
 
     camera: Camera
     last_id: int | None = None
+    step: int | None = None
     reference_s: float | None = None
     opened: int = -1
     came: int = 0
@@ -114,7 +119,8 @@ class _Channel:
 
     def forget(self) -> None:
         """Know nothing any more."""
-        self.last_id, self.reference_s, self.opened = None, None, self.camera.opened
+        self.last_id = self.step = self.reference_s = None
+        self.opened = self.camera.opened
 
 
 @dataclass(frozen=True)
@@ -144,12 +150,13 @@ class Pairing:
         self._referenced_at = -float("inf")
         self._next_at = -float("inf")
         self._settled = False
-        self._contradictions = 0
+        self._contradictions = self._skips = 0
+        """Lost shots in a row, and those that numbers contradict among shots whose numbers could be expected."""
 
     @property
     def distrusted(self) -> bool:
         """Whether so many shots in a row contradict what is remembered that the devices may not be set up any more."""
-        return self._contradictions >= CONTRADICTIONS
+        return max(self._contradictions, self._skips) >= CONTRADICTIONS
 
     @property
     def synchronised(self) -> bool:
@@ -167,7 +174,7 @@ class Pairing:
     def forget(self) -> None:
         """Synchronise before the next shot: a device that was set up anew may be slower, or another one."""
         self._referenced_at = -float("inf")
-        self._contradictions = 0
+        self._contradictions = self._skips = 0
 
     def shot(
         self, deadline: float, display: Callable[[], None] | None = None, displayed: Callable[[], bool] | None = None
@@ -192,6 +199,7 @@ class Pairing:
                 self.forget()
             if not self.synchronised:
                 self._synchronise(deadline)
+            numbered = all(channel.last_id is not None for channel in self._channels)
             taken = self._take(deadline)
             self._check_times(taken)
             if displayed is not None and not displayed():
@@ -202,10 +210,13 @@ class Pairing:
             self._settled = False
             if isinstance(error, LostShotError):
                 self._contradictions += error.reason in _CONTRADICTING
+                self._skips += error.reason is Reason.SKIPPED_FRAME
                 if error.reason in (Reason.CAMERA_GONE, Reason.TRIGGER_GONE):
                     self.forget()
             raise
         self._contradictions = 0
+        if numbered:
+            self._skips = 0
         return taken.frames
 
     def _check_times(self, taken: _Taken) -> None:
@@ -305,10 +316,13 @@ class Pairing:
         if frame.status is not FrameStatus.COMPLETE or frame.info is None or frame.pixels is None:
             raise LostShotError(f"{name}: frame", frame.detail or "parts of it", "all of it", Reason.INCOMPLETE_FRAME)
         if channel.last_id is not None:
-            expected = channel.last_id % channel.camera.frame_numbers + 1
-            wraps = channel.last_id in _WRAPS and frame.info.frame_id in (0, 1)
-            if frame.info.frame_id != expected and not wraps:
-                raise LostShotError(f"{name}: frame number", frame.info.frame_id, expected, Reason.SKIPPED_FRAME)
+            number, last = frame.info.frame_id, channel.last_id
+            step = (number - last) % channel.camera.frame_numbers
+            if channel.step is None and 1 <= step <= _MOST_STEP:
+                channel.step = step
+            if step != channel.step and not (last in _WRAPS and number in (0, 1)):
+                expected = f"{channel.step or 1} after {last}"
+                raise LostShotError(f"{name}: frame number", number, expected, Reason.SKIPPED_FRAME)
         return frame
 
     def _drain(self) -> int:

@@ -242,7 +242,7 @@ def test_a_counter_may_wrap_sooner_than_its_driver_says(last: int, then: int) ->
     for camera in lab.cameras:
         camera.frame_numbers = 2**64 - 1
     channel = pairing_of(lab)._channels[0]
-    channel.last_id = last
+    channel.last_id, channel.step = last, 1
     pairing_of(lab)._checked(channel, frame_of(then))
     for other in (2, last, last - 1):
         with pytest.raises(LostShotError):
@@ -280,6 +280,37 @@ def test_a_flood_that_begins_behind_a_trigger_ends_the_shot() -> None:
         shoot(pairing, lab, seconds=0.3)
     del lab.cameras[0].frame
     assert shoot(pairing, lab) == (lab.page, lab.page)
+
+
+def counting_by(camera: LabCamera, step: int) -> None:
+    poll = camera.poll
+
+    def polled() -> None:
+        before = camera.id
+        poll()
+        if camera.id != before:
+            camera.id = (camera.id + step - 2) % 65535 + 1
+
+    camera.poll = polled  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("step", [2, 3])
+def test_numbers_may_grow_by_more_than_one(step: int) -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    counting_by(lab.cameras[1], step)
+    assert [tried(pairing, lab) for _ in range(6)] == 6 * [None]
+    assert lab.fired == 6 + 3
+
+
+def test_a_step_of_numbers_that_changes_is_learnt_anew() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    shoot(pairing, lab)
+    counting_by(lab.cameras[0], 2)
+    outcomes = [tried(pairing, lab) for _ in range(10)]
+    assert outcomes.count(Reason.SKIPPED_FRAME) == 3
+    assert outcomes[-4:] == 4 * [None]
 
 
 def frame_of(number: int) -> Frame:
