@@ -44,7 +44,7 @@ def unused_low_bits(frame: Counts, bit_depth: int) -> int | None:
 
 def greatest_count(bit_depth: int, unused: int) -> int:
     """The greatest count of so many bits, whose lowest `unused` ones are not used."""
-    return (2**bit_depth - 1) >> unused << unused
+    return ((1 << bit_depth) - 1) >> unused << unused
 
 
 def describe(bit_depth: int, unused: int) -> str:

@@ -57,8 +57,14 @@ class ShutterBeams:
 
     def let_through(self, *, signal: bool, reference: bool) -> None:
         """See `Beams`. Where it fails, both shutters are opened when the generator is next set up."""
+        wanted = (self._signal, signal), (self._reference, reference)
         try:
-            self._move(((self._signal, signal), (self._reference, reference)))
+            try:
+                self._move(wanted)
+            except LostShotError as error:
+                if error.reason is not Reason.TRIGGER_GONE:
+                    raise
+                self._move(wanted)  # which puts the line in order first
         except BaseException as error:
             for shutter in (self._signal, self._reference):
                 self._generator.remember_channel(shutter.channel, shutter.level(is_open=True))

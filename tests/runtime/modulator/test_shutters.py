@@ -132,3 +132,12 @@ def test_a_shutter_that_refuses_to_open_does_not_keep_the_other_one_closed(lab: 
     lab.port._answer = answer
     lab.beams.close()
     assert lab.open() == (True, True)
+
+
+def test_one_answer_that_is_lost_on_the_line_costs_nothing(lab: Lab) -> None:
+    lab.beams.let_through(signal=True, reference=True)
+    left = [":PULSE4:STATE ON"]
+    lab.port.fault = lambda message: Fault.SILENCE if message in left and not left.remove(message) else None  # type: ignore[func-returns-value]
+    lab.beams.let_through(signal=False, reference=False)
+    assert not left
+    assert lab.open() == (False, False)
