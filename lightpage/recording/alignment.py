@@ -1,4 +1,8 @@
-"""Counts that lie in the high bits of their type, as many cameras send them, where the low bits are wanted."""
+"""Notices counts that lie at the upper end of their bits, as 12 bits do in `Mono16` of many cameras.
+
+Such counts are multiples, of 16 for 12 bits in 16. They are as good as others, but their greatest one, 4095 * 16, is
+not full scale, so that saturation would go unseen.
+"""
 
 from __future__ import annotations
 
@@ -7,42 +11,42 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.errors import FrameError, LightpageError
+from lightpage.recording.layout import MIN_BIT_DEPTH
 
-_FEWEST_BITS = 2
-"""Low bits that are zero in every count: one may be a camera's gain."""
-_FEWEST_VALUES = 32
-"""Different counts of a frame of which its low bits can be told; a flat or coarse picture has fewer."""
+Counts = NDArray[np.integer[Any]]
+
+_LEAST_DISTINCT = 32
+"""Different counts that tell: by chance none of so many is odd in one of 2**32 frames. A dark frame has fewer."""
+_SAMPLE = 1 << 16
 
 
-def empty_low_bits(frame: NDArray[np.integer[Any]]) -> int:
-    """How many of the lowest bits are zero in all counts of a frame, 0 where that may be chance.
+def unused_low_bits(frame: Counts, bit_depth: int) -> int | None:
+    """How many of the lowest bits no count of a frame uses.
 
     Args:
         frame: counts [row, column].
+        bit_depth: bits of a count.
+
+    Returns:
+        0 where the lowest bit is used, and so many that 8 bits are left at most; None where the different counts are
+        too few to tell, as of a dark frame.
     """
-    used = int(np.bitwise_or.reduce(frame, axis=None))
-    empty = (used & -used).bit_length() - 1
-    if empty < _FEWEST_BITS or len(np.unique(frame)) < _FEWEST_VALUES:
+    flat = frame.reshape(-1)
+    sample = flat[:: max(1, flat.size // _SAMPLE)]
+    if bit_depth <= MIN_BIT_DEPTH or int(np.bitwise_or.reduce(sample, initial=0)) & 1:
         return 0
-    return empty
+    used = int(np.bitwise_or.reduce(flat, initial=0))
+    if used & 1:
+        return 0
+    unused = min((used & -used).bit_length() - 1, bit_depth - MIN_BIT_DEPTH) if used else 0
+    return unused if len(np.unique(sample)) >= _LEAST_DISTINCT else None
 
 
-def check_alignment(
-    name: str, frame: NDArray[np.integer[Any]], bit_depth: int, failure: type[LightpageError] = FrameError
-) -> None:
-    """Check that the counts of a frame are right-aligned.
+def greatest_count(bit_depth: int, unused: int) -> int:
+    """The greatest count of so many bits, whose lowest `unused` ones are not used."""
+    return ((1 << bit_depth) - 1) >> unused << unused
 
-    Args:
-        name: of the frame, for the error.
-        frame: counts [row, column].
-        bit_depth: bits of a count, as the frame is said to have.
-        failure: class of the error.
 
-    Raises:
-        LightpageError: of class `failure`: their low bits are empty, so that full scale is never reached.
-    """
-    if bit_depth > 8 and (empty := empty_low_bits(frame)):
-        got = f"counts that are all multiples of {1 << empty}: {bit_depth - empty} bits, left-aligned in {bit_depth}"
-        expected = f"right-aligned counts: divide them by {1 << empty}, or have Mono{bit_depth - empty} sent"
-        raise failure(name, got, f"{expected}, and a bit depth of {bit_depth - empty}")
+def describe(bit_depth: int, unused: int) -> str:
+    """For people, what counts are whose lowest bits are not used."""
+    return f"counts that are multiples of {2**unused}: {bit_depth - unused} bits left-aligned in {bit_depth}"

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.errors import BlackFrameError, FrameError, SaturatedFrameError
+from lightpage.recording.alignment import describe, greatest_count, unused_low_bits
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import MIN_BIT_DEPTH
 
 BLACK_FRACTION = 0.02
 """A frame whose brightest pixel is below this share of full scale is dark: its laser or its shutter is off."""
@@ -44,9 +46,12 @@ def check_light(name: str, frame: NDArray[np.integer[Any]], bit_depth: int) -> N
         raise FrameError(name, f"a count of {peak}", f"at most {full_scale} ({bit_depth} bits)")
     if peak <= BLACK_FRACTION * full_scale:
         raise BlackFrameError(name, f"black: no count above {peak}", f"counts above {BLACK_FRACTION * full_scale:.0f}")
-    if peak == full_scale:
-        clipped = np.count_nonzero(frame == full_scale) / frame.size
-        if clipped > SATURATED_FRACTION:
-            raise SaturatedFrameError(
-                name, f"saturated: {clipped:.1%} at full scale", f"at most {SATURATED_FRACTION:.0%}"
-            )
+    if peak < greatest_count(bit_depth, bit_depth - MIN_BIT_DEPTH):
+        return
+    unused = 0 if peak == full_scale else unused_low_bits(frame, bit_depth) or 0
+    clipped = np.count_nonzero(frame >= greatest_count(bit_depth, unused)) / frame.size
+    if clipped > SATURATED_FRACTION:
+        of = f" of {describe(bit_depth, unused)}" if unused else ""
+        raise SaturatedFrameError(
+            name, f"saturated: {clipped:.1%} at full scale{of}", f"at most {SATURATED_FRACTION:.0%}"
+        )

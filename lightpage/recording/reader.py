@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import ProfileError, RecordingError
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
-from lightpage.recording.alignment import check_alignment
+from lightpage.progress import warn
+from lightpage.recording.alignment import describe, unused_low_bits
 from lightpage.recording.black_level import without_black
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.hdf5 import open_hdf5
@@ -64,6 +65,7 @@ class Recording:
             RecordingError: the file is not a recording, or it is inconsistent.
         """
         self.path = path
+        self._alignment_told = False
         self._file = ArrayFile(file, f"recording {path}")
         try:
             self._check_header()
@@ -445,7 +447,9 @@ class Recording:
                 f"a count of {frame.max()}",
                 f"at most {full_scale}, since camera_bit_depth = {self._bit_depth}",
             )
-        check_alignment(self._subject(f"dataset '{name}'{where}"), frame, self._bit_depth, RecordingError)
+        if not self._alignment_told and (unused := unused_low_bits(frame, self._bit_depth)):
+            self._alignment_told = True
+            warn(f"{self._subject(name)}: {describe(self._bit_depth, unused)}; right-aligned counts are wanted")
 
 
 def _size(shape: tuple[int, int] | None) -> str:

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -19,11 +19,13 @@ from pydantic import ConfigDict, Field
 from lightpage.device.profile import Profile, TomlTable
 from lightpage.errors import FrameError
 from lightpage.page.levels import MAX_LEVELS
-from lightpage.recording.alignment import check_alignment
+from lightpage.progress import warn
+from lightpage.recording.alignment import describe, greatest_count, unused_low_bits
 from lightpage.recording.black_level import DarkFrame, PixelRepair, without_black
 from lightpage.recording.exposure import check_pair_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import frame_type
+from runtime.acquisition.beam_keeper import BeamKeeper
 from runtime.acquisition.page_store import PageStore
 from runtime.acquisition.pairing import Pairing, PairingSettings
 from runtime.acquisition.source import SHOT_S, FrameSource, Shot
@@ -36,8 +38,11 @@ Counts = NDArray[np.unsignedinteger[Any]]
 
 _log = logging.getLogger(__name__)
 
-_OPEN = (True, True)
 _GONE = frozenset({Reason.CAMERA_GONE, Reason.TRIGGER_GONE})
+_AWAITED = _GONE | {Reason.BEAM_CONTROL_FAILED}
+"""What mends itself, or somebody does: it is waited for until the shot's time is up."""
+_DISARMING = _GONE | {Reason.MISSING_FRAME, Reason.TRIGGER_REFUSED}
+"""A device is set up again: one that was switched off and on for a moment answers, and waits for no trigger."""
 _MOST_REPEATS = 20
 """Of a shot of reference or dark frames."""
 _AGAIN_S = 0.5
@@ -128,17 +133,15 @@ class CameraSource(FrameSource):
         self._pairing = Pairing(cameras, trigger, pairing or PairingSettings())
         self._lock = threading.RLock()
         """Held while the devices are used: one shot at a time."""
+        self._keeper = BeamKeeper(beams, self._lock, name)
         self._armed = self._was_armed = False
         self._next = 0
         self._dark: tuple[DarkFrame, DarkFrame] | None = None
         self._repairs: tuple[PixelRepair, ...] = ()
-        self._wanted = _OPEN
-        self._moved: tuple[bool, bool] | None = None
-        """How the beams are, signal and reference; None where that is not known, as at the start."""
-        self._stuck = False
-        """Whether they could not be moved, last time."""
         self._outcomes: Counter[str] = Counter()
         self._saturated: dict[str, float] = {}
+        self._unused = [0, 0]
+        """Lowest bits that each camera's counts leave unused, as its frames have shown."""
 
     @property
     def levels(self) -> int:  # type: ignore[override]  # uploads may settle it
@@ -204,26 +207,46 @@ class CameraSource(FrameSource):
 
     def close(self) -> None:
         """See `FrameSource.close`."""
-        with self._lock:
+        with self._lock, ExitStack() as stack:  # each is closed, whatever becomes of the others; the beams first
             self._armed = False
-            for device in (self._trigger, *self._cameras, self.modulator, self.beams):
+            self._keeper.close()
+            stack.callback(self.pages.close)
+            for device in (self.modulator, *self._cameras, self._trigger, self.beams):
                 if device is not None:
-                    device.close()
-            self.pages.close()
+                    stack.callback(device.close)
+
+    def trouble(self) -> str:
+        """See `FrameSource.trouble`: a beam may be blocked."""
+        return self._keeper.trouble
 
     def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         """See `FrameSource.shot`."""
         deadline = time.monotonic() + timeout_s
-        with self._lock:
+        with self._in_turn(timeout_s):
             index, symbols = self._page(page)
-            frames = self._persistent(
-                f"page {index}", index, deadline, self._attempt(index, symbols, deadline), self._exposures.repeats
-            )
+            take = self._attempt(index, symbols, deadline)
+
+            def attempt() -> tuple[Frame, ...]:
+                self._keeper.ensure_open()
+                return take()
+
+            frames = self._persistent(f"page {index}", index, deadline, attempt, self._exposures.repeats)
             pair = FramePair(*(self._cleaned(one, frame) for one, frame in enumerate(frames)))
             first, second = (frame.info for frame in frames)
             assert first is not None  # of complete frames
             assert second is not None
             return Shot(pair, index, symbols, None, (first, second))
+
+    @contextmanager
+    def _in_turn(self, timeout_s: float) -> Iterator[None]:
+        """Hold the devices, unless others use them for too long."""
+        if not self._lock.acquire(timeout=timeout_s):
+            wanted = f"their end within {timeout_s:g} s"
+            raise LostShotError(self.name, "other shots", wanted, Reason.MISSING_FRAME)
+        try:
+            yield
+        finally:
+            self._lock.release()
 
     def references(self) -> FramePair:
         """Mean of reference-only frames, taken now: the signal beam is blocked for them.
@@ -232,7 +255,7 @@ class CameraSource(FrameSource):
             LostShotError: they could not be taken.
             SourceError: they are dark or saturated, or this device cannot block its signal beam.
         """
-        with self._lock, self._beams_as(signal=False, reference=True):
+        with self._lock, self._keeper.blocked(signal=False, reference=True):
             stacks = self._stacks(self._exposures.reference_frames)
             means = [np.rint(stack.mean(axis=0)).astype(stack.dtype) for stack in stacks]
         pair = FramePair(means[0], means[1])
@@ -249,7 +272,7 @@ class CameraSource(FrameSource):
             LostShotError: they could not be taken.
             SourceError: there was light, or this device cannot block its beams.
         """
-        with self._lock, self._beams_as(signal=False, reference=False):
+        with self._lock, self._keeper.blocked(signal=False, reference=False):
             before, self._dark = self._dark, None
             try:
                 stacks = self._stacks(self._exposures.dark_frames)
@@ -267,16 +290,6 @@ class CameraSource(FrameSource):
             for camera, dark in zip(self._cameras, self._dark, strict=True):
                 _log.info("%s: black level %d, %d hot pixels", camera.name, dark.black_level, len(dark.hot))
             return self._dark
-
-    def trouble(self) -> str:
-        """See `FrameSource.trouble`."""
-        blocked = self._stuck and self._wanted == _OPEN  # while they are blocked on purpose, all is well
-        return f"{self.beams.name}: a beam may be blocked, since it could not be let through" if blocked else ""
-
-    def mend(self) -> None:
-        """See `FrameSource.mend`."""
-        with self._lock:
-            self._move_beams()
 
     def _page(self, page: int | None) -> tuple[int, NDArray[np.uint8] | None]:
         """Number and symbols of page `page`, or of the next one; without pages of its own the number only counts."""
@@ -312,16 +325,13 @@ class CameraSource(FrameSource):
         while True:
             try:
                 self.arm()
-                self._move_beams()
                 frames = attempt()
             except LostShotError as error:
                 self._outcomes[error.reason.value] += 1
                 self.on_lost(index, error)
-                # a camera that was switched off and on for a moment answers, and waits for no trigger; devices that
-                # contradict what they said before may have been set otherwise
-                anew = error.reason in (*_GONE, Reason.MISSING_FRAME) or self._pairing.contradicted
-                self._armed = self._armed and not anew
-                if error.reason in _GONE:
+                if error.reason in _DISARMING or self._pairing.distrusted:
+                    self._armed = False
+                if error.reason in _AWAITED:
                     if time.monotonic() + _AGAIN_S < deadline:
                         time.sleep(_AGAIN_S)
                         continue
@@ -329,6 +339,9 @@ class CameraSource(FrameSource):
                     repeats -= 1
                     continue
                 raise error.about(f"{subject} of {self.name}") from None
+            except SourceError:
+                self._armed = False  # whatever refuses is set up again before the next shot
+                raise
             self._outcomes["TAKEN"] += 1
             return frames
 
@@ -343,13 +356,26 @@ class CameraSource(FrameSource):
         camera, full_scale = self._cameras[one], 2**self.bit_depth - 1
         if pixels.shape != self.frame_shape:
             raise SourceError(f"{camera.name}: frame", f"{pixels.shape}", f"{self.frame_shape}")
-        check_alignment(f"{camera.name}: frame", pixels, self.bit_depth, SourceError)
+        pixels = self._to_full_scale(one, pixels.astype(frame_type(self.bit_depth), copy=False))
         self._saturated[camera.name] = float(np.count_nonzero(pixels >= full_scale) / pixels.size)
-        pixels = pixels.astype(frame_type(self.bit_depth), copy=False)
         pixels = self._views[one].upright(pixels)
         if self._dark is None:
             return pixels
         return without_black(self._repairs[one](pixels), self._dark[one].black_level, self.bit_depth)
+
+    def _to_full_scale(self, one: int, pixels: Counts) -> Counts:
+        """The counts of a camera that leaves low bits unused, with its greatest one at full scale; it is told once."""
+        found = unused_low_bits(pixels, self.bit_depth)
+        if found and not self._unused[one]:
+            warn(
+                f"{self._cameras[one].name}: {describe(self.bit_depth, found)}. The greatest of them is taken for full "
+                f"scale; better a pixel_format of {self.bit_depth - found} bits, or less digital gain"
+            )
+        self._unused[one] = found or self._unused[one]
+        if found == 0 or not self._unused[one]:
+            return pixels
+        clipped = pixels >= greatest_count(self.bit_depth, self._unused[one])
+        return np.where(clipped, pixels.dtype.type(2**self.bit_depth - 1), pixels) if clipped.any() else pixels
 
     def _stacks(self, count: int) -> list[Counts]:
         """Frames of both cameras [exposure, row, column], whatever is on display."""
@@ -361,38 +387,3 @@ class CameraSource(FrameSource):
             taken = self._persistent("frames without a page", -1, deadline, attempt, _MOST_REPEATS)
             shots.append(taken)
         return [np.stack([self._cleaned(one, frames[one]) for frames in shots]) for one in (0, 1)]
-
-    @contextmanager
-    def _beams_as(self, *, signal: bool, reference: bool) -> Iterator[None]:
-        """Let through what is asked for, and both beams after it, however it ends.
-
-        Where they cannot be opened, every later shot tries it first; until then there is `trouble`.
-        """
-        self._wanted = signal, reference
-        try:
-            self._move_beams()
-            yield
-        except BaseException:
-            self._wanted = _OPEN
-            try:
-                self._move_beams()
-            except Exception as error:  # what came first is what is told
-                _log.error("%s; tried again before the next shot: %s", self.trouble(), error)
-            raise
-        self._wanted = _OPEN
-        self._move_beams()
-
-    def _move_beams(self) -> None:
-        """Have the beams as they are wanted, unless they are so.
-
-        Raises:
-            LostShotError, SourceError: see `Beams.let_through`.
-        """
-        if self._moved != self._wanted:
-            signal, reference = self._wanted
-            self._moved, stuck = None, True
-            try:
-                self.beams.let_through(signal=signal, reference=reference)
-                self._moved, stuck = (signal, reference), False
-            finally:
-                self._stuck = stuck

@@ -6,7 +6,8 @@ where every one of these rules holds:
 
 1. No frame waits before the trigger, and none is left over after both frames are in.
 2. Both frames are complete. Number and time of any other may be those of an earlier frame.
-3. Both numbers follow their camera's last one; after a fault they are not known, and anything may follow.
+3. Both numbers follow their camera's last one by the step that the synchronisation saw, mostly 1. After a fault they
+   are not known, and anything may follow.
 4. For each camera, device time less the time of the trigger is within a tolerance of the camera's reference. This
    reference comes from three shots at unequal distances that agree, follows accepted shots, and expires before the
    clocks can have drifted apart by a quarter of the tolerance.
@@ -15,6 +16,9 @@ where every one of these rules holds:
 A frame of another shot is off by at least the distance of two shots, which is more than twice the tolerance: rule 4
 excludes it. A trigger edge that is late by so much that it looks like the next shot's still exposes the page that is on
 display then: rule 5. The other rules say what went wrong.
+
+Three shots in a row that are lost to rules 1, 3 or 4 are no accident: a camera's counter or clock has begun anew or
+stepped, or its trigger is off. What is remembered is dropped then, and learnt again before the next shot.
 """
 
 from __future__ import annotations
@@ -43,11 +47,15 @@ _SILENT_TRIES = 3
 """The same where a camera has sent no frame since the start: its trigger does not arrive, and waiting mends nothing."""
 _MOST_QUIET = 20
 """A line that is never silent is given up after so many times the silence that is waited for."""
-_MOST_WAITING = 64
-"""Frames of a camera that are dropped at once: more than any driver keeps."""
-_CONTRADICTIONS = frozenset({Reason.OTHER_SHOT, Reason.SKIPPED_FRAME, Reason.STRAY_FRAME})
-_MOST_CONTRADICTIONS = 3
-"""Shots in a row that contradict what is remembered of the devices, after which it is forgotten."""
+_MOST_DRAINED = 512
+"""Frames that are dropped at a time; no camera keeps so many. One that sends faster than that is never silent."""
+CONTRADICTIONS = 3
+"""Lost shots in a row after which what is remembered of the devices is dropped."""
+_CONTRADICTING = frozenset({Reason.SKIPPED_FRAME, Reason.STRAY_FRAME, Reason.OTHER_SHOT})
+_WRAPS = frozenset({2**16 - 1, 2**32 - 1})
+"""Last numbers of counters; some go on with 0 and some with 1, whatever their driver says."""
+_MOST_STEP = 16
+"""A camera whose numbers grow by more from shot to shot is lost track of."""
 _FOLLOWING = 0.1
 """Share of an accepted shot's deviation by which the reference follows."""
 
@@ -90,6 +98,7 @@ class _Channel:
 
     Attributes:
         last_id: number of its last frame, None where it is not known.
+        step: by which its numbers grow from shot to shot, None where it is not known.
         reference_s: device time less trigger time of a good shot, None before a synchronisation.
         opened: how often the camera was opened when that was learnt.
         came: frames so far, whole or not.
@@ -97,6 +106,7 @@ class _Channel:
 
     camera: Camera
     last_id: int | None = None
+    step: int | None = None
     reference_s: float | None = None
     opened: int = -1
     came: int = 0
@@ -109,7 +119,8 @@ class _Channel:
 
     def forget(self) -> None:
         """Know nothing any more."""
-        self.last_id, self.reference_s, self.opened = None, None, self.camera.opened
+        self.last_id = self.step = self.reference_s = None
+        self.opened = self.camera.opened
 
 
 @dataclass(frozen=True)
@@ -139,12 +150,13 @@ class Pairing:
         self._referenced_at = -float("inf")
         self._next_at = -float("inf")
         self._settled = False
-        self._contradicted = 0
+        self._contradictions = self._skips = 0
+        """Lost shots in a row, and those that numbers contradict among shots whose numbers could be expected."""
 
     @property
-    def contradicted(self) -> bool:
-        """Whether so many shots in a row contradict what is remembered that the devices are no longer as they were."""
-        return self._contradicted >= _MOST_CONTRADICTIONS
+    def distrusted(self) -> bool:
+        """Whether so many shots in a row contradict what is remembered that the devices may not be set up any more."""
+        return max(self._contradictions, self._skips) >= CONTRADICTIONS
 
     @property
     def synchronised(self) -> bool:
@@ -162,7 +174,7 @@ class Pairing:
     def forget(self) -> None:
         """Synchronise before the next shot: a device that was set up anew may be slower, or another one."""
         self._referenced_at = -float("inf")
-        self._contradicted = 0
+        self._contradictions = self._skips = 0
 
     def shot(
         self, deadline: float, display: Callable[[], None] | None = None, displayed: Callable[[], bool] | None = None
@@ -183,8 +195,11 @@ class Pairing:
             self._displayed_at = time.monotonic()
             if not self._settled:
                 self._settle(deadline)
+            if self.distrusted:
+                self.forget()
             if not self.synchronised:
                 self._synchronise(deadline)
+            numbered = all(channel.last_id is not None for channel in self._channels)
             taken = self._take(deadline)
             self._check_times(taken)
             if displayed is not None and not displayed():
@@ -194,13 +209,14 @@ class Pairing:
         except BaseException as error:
             self._settled = False
             if isinstance(error, LostShotError):
-                self._contradicted += error.reason in _CONTRADICTIONS
+                self._contradictions += error.reason in _CONTRADICTING
+                self._skips += error.reason is Reason.SKIPPED_FRAME
                 if error.reason in (Reason.CAMERA_GONE, Reason.TRIGGER_GONE):
                     self.forget()
-                elif self.contradicted:
-                    self._referenced_at = -float("inf")
             raise
-        self._contradicted = 0
+        self._contradictions = 0
+        if numbered:
+            self._skips = 0
         return taken.frames
 
     def _check_times(self, taken: _Taken) -> None:
@@ -300,34 +316,36 @@ class Pairing:
         if frame.status is not FrameStatus.COMPLETE or frame.info is None or frame.pixels is None:
             raise LostShotError(f"{name}: frame", frame.detail or "parts of it", "all of it", Reason.INCOMPLETE_FRAME)
         if channel.last_id is not None:
-            expected = channel.last_id % channel.camera.frame_numbers + 1
-            if frame.info.frame_id != expected:
-                raise LostShotError(f"{name}: frame number", frame.info.frame_id, expected, Reason.SKIPPED_FRAME)
+            number, last = frame.info.frame_id, channel.last_id
+            step = (number - last) % channel.camera.frame_numbers
+            if channel.step is None and 1 <= step <= _MOST_STEP:
+                channel.step = step
+            if step != channel.step and not (last in _WRAPS and number in (0, 1)):
+                expected = f"{channel.step or 1} after {last}"
+                raise LostShotError(f"{name}: frame number", number, expected, Reason.SKIPPED_FRAME)
         return frame
 
     def _drain(self) -> int:
-        """Drop the frames that wait, of a camera that never ends some of them; returns how many."""
-        dropped = 0
+        """Drop the frames that wait, so many and for so long at most; returns how many there were."""
+        dropped, end = 0, time.monotonic() + self.settings.quiet_s
         for channel in self._channels:
-            for _ in range(_MOST_WAITING):
-                if channel.frame(0.0) is None:
-                    break
+            while dropped < _MOST_DRAINED and channel.frame(0.0) is not None:
                 dropped += 1
                 channel.last_id = None
+                if time.monotonic() > end:
+                    return dropped
         return dropped
 
     def _settle(self, deadline: float) -> None:
         """Wait until no frame has come for a while; what came before is not known any more."""
         quiet = self.settings.quiet_s
         end = time.monotonic() + quiet
-        give_up, dropped = min(deadline, end + _MOST_QUIET * quiet), False
+        give_up = min(deadline, end + _MOST_QUIET * quiet)
         while (now := time.monotonic()) < end:
-            if now > deadline and not dropped:
-                raise LostShotError("shot", "no time left", "a longer wait", Reason.MISSING_FRAME)
             if now > give_up:
                 raise LostShotError("cameras", "frames without end", f"silence for {quiet:g} s", Reason.STRAY_FRAME)
             if self._drain():
-                end, dropped = time.monotonic() + quiet, True
+                end = time.monotonic() + quiet
             time.sleep(0.005)
         for channel in self._channels:
             channel.last_id = None

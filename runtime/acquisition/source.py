@@ -153,21 +153,18 @@ class FrameSource(ABC):
         return {}
 
     def trouble(self) -> str:
-        """Why no page can be photographed until `mend` has gone well; empty where one can."""
+        """Why no page of it can be read now, empty where one can; it must not wait for a device."""
         return ""
-
-    def mend(self) -> None:  # noqa: B027 — a source without a device has nothing to mend
-        """Try to end the trouble.
-
-        Raises:
-            LostShotError, SourceError: it stays.
-        """
 
     def close(self) -> None:  # noqa: B027 — a source without a device needs none
         """Let go of files and devices."""
 
     def __enter__(self) -> Self:
-        self.arm()
+        try:
+            self.arm()
+        except BaseException:
+            self.close()
+            raise
         return self
 
     def __exit__(

@@ -10,14 +10,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from lightpage.errors import FrameError
 from lightpage.recording.layout import FrameInfo
 from runtime.cameras.aravis_connection import AravisConnection, says_gone
-from runtime.cameras.aravis_library import BUFFER_STATUS, SUCCESS, AravisError, AravisLibrary, aravis
+from runtime.cameras.aravis_library import BUFFER_STATUS, SIZE_MISMATCH, SUCCESS, AravisError, AravisLibrary, aravis
 from runtime.cameras.aravis_setup import AravisSetup
 from runtime.cameras.camera import Frame, FrameStatus
 from runtime.cameras.gige_network import receive_buffer_problem
-from runtime.cameras.pixel_formats import bit_depth, pixel_format, unpack
+from runtime.cameras.pixel_formats import bit_depth, pixel_format, unpack, without_padding
 from runtime.cameras.settings import CameraSettings
 from runtime.cameras.sfnc import MOST_DRAINING_S, QUIET_S, SIGN_OF_LIFE_S
 from runtime.errors import LostShotError, Reason, SourceError
@@ -209,28 +211,37 @@ class AravisCamera:
             library("arv_stream_push_buffer", self._stream, buffer)
 
     def _read(self, library: AravisLibrary, buffer: int) -> Frame:
-        """The frame in a buffer. Of one that is not whole, number and time may be those of an earlier frame."""
+        """The frame in a buffer. Of one that is not whole, number and time may be those of an earlier frame.
+
+        Raises:
+            LostShotError: `Reason.CAMERA_GONE`: it is not as this camera was set up, which is to be done again.
+        """
         status = library("arv_buffer_get_status", buffer)
+        if status == SIZE_MISMATCH:
+            raise self._changed(BUFFER_STATUS[status], "no more than its PayloadSize")
         if status != SUCCESS:
             return Frame(FrameStatus.INCOMPLETE, detail=self._explained(BUFFER_STATUS.get(status, f"status {status}")))
         rows, columns = self._shape
         expected = (columns, rows, pixel_format(self._settings.pixel_format).code)
         got = tuple(library(f"arv_buffer_get_image_{what}", buffer) for what in ("width", "height", "pixel_format"))
         if got != expected:
-            told = f"{got[0]} x {got[1]} pixels in format {got[2]:#010x}"
-            return Frame(FrameStatus.INCOMPLETE, detail=f"{told} in place of {columns} x {rows} in {expected[2]:#010x}")
-        size = ctypes.c_size_t()
-        place = library("arv_buffer_get_data", buffer, ctypes.byref(size))
-        raw = np.ctypeslib.as_array((ctypes.c_uint8 * size.value).from_address(place))
+            told, wanted = (f"{each[0]} x {each[1]} pixels in format {each[2]:#010x}" for each in (got, expected))
+            raise self._changed(told, wanted)
+        name = self._settings.pixel_format
+        try:
+            raw = without_padding(_bytes(library, buffer), self._shape, name, _padding(library, buffer))
+            pixels = unpack(raw, self._shape, name)
+        except FrameError as error:
+            return Frame(FrameStatus.INCOMPLETE, detail=f"{error.got} in place of {error.expected}")
         info = FrameInfo(
             serial=self._serial,
             frame_id=library("arv_buffer_get_frame_id", buffer),
             device_time_s=1e-9 * library("arv_buffer_get_timestamp", buffer),
             host_time_s=1e-9 * library("arv_buffer_get_system_timestamp", buffer),
-            pixel_format=self._settings.pixel_format,
+            pixel_format=name,
             exposure_s=self._exposure_s,
         )
-        return Frame(FrameStatus.COMPLETE, unpack(raw, self._shape, self._settings.pixel_format), info)
+        return Frame(FrameStatus.COMPLETE, pixels, info)
 
     def _explained(self, detail: str) -> str:
         if self._hint:
@@ -259,6 +270,10 @@ class AravisCamera:
                 raise self._lose(error.message) from None
             raise SourceError(self.name, error.message, "no error") from None
 
+    def _changed(self, got: str, expected: str) -> LostShotError:
+        """The error of a camera that is not set up any more as it was."""
+        return LostShotError(f"{self.name}: frame, as after a change of settings", got, expected, Reason.CAMERA_GONE)
+
     def _lose(self, got: str) -> LostShotError:
         self._release(gone=True)
         return LostShotError(self.name, got, "a camera that answers", Reason.CAMERA_GONE)
@@ -279,3 +294,18 @@ class AravisCamera:
         self._earlier = self.statistics
         stream, self._stream = self._stream, None
         return stream
+
+
+def _bytes(library: AravisLibrary, buffer: int) -> NDArray[np.uint8]:
+    """All that came into a buffer, in place."""
+    size = ctypes.c_size_t()
+    place = library("arv_buffer_get_data", buffer, ctypes.byref(size))
+    return np.ctypeslib.as_array((ctypes.c_uint8 * size.value).from_address(place))
+
+
+def _padding(library: AravisLibrary, buffer: int) -> int:
+    """Bytes behind each line of pixels; earlier versions of the library do not tell, and take them for none."""
+    columns, rows = ctypes.c_int(), ctypes.c_int()
+    if library.knows("arv_buffer_get_image_padding"):
+        library("arv_buffer_get_image_padding", buffer, ctypes.byref(columns), ctypes.byref(rows))
+    return columns.value

@@ -21,7 +21,7 @@ ENVIRONMENT = "LIGHTPAGE_ARAVIS"
 LIBRARY = "libaravis-0.8.so.0"
 PACKAGE = "libaravis-0.8-0"
 
-SUCCESS = 0
+SUCCESS, SIZE_MISMATCH = 0, 5
 BUFFER_STATUS = {
     -1: "unknown",
     1: "cleared",
@@ -120,6 +120,10 @@ _PLAIN: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_gv_fake_camera_is_running": (c_int, (c_void_p,)),
     "arv_gv_fake_camera_get_fake_camera": (c_void_p, (c_void_p,)),
 }
+_OPTIONAL: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "arv_buffer_get_image_padding": (None, (c_void_p, POINTER(c_int), POINTER(c_int))),
+}
+"""What earlier versions lack."""
 
 
 class AravisError(Exception):
@@ -152,6 +156,11 @@ class AravisLibrary:
             self._functions: dict[str, Callable[..., Any]] = {
                 name: _typed(library, name, result, arguments) for name, (result, arguments) in _PLAIN.items()
             }
+            self._functions |= {
+                name: _typed(library, name, result, arguments)
+                for name, (result, arguments) in _OPTIONAL.items()
+                if hasattr(library, name)
+            }
             for name, (result, arguments) in _FALLIBLE.items():
                 function = _typed(library, name, result, (*arguments, _ERROR))
                 self._functions[name] = functools.partial(self._checked, function)
@@ -180,6 +189,10 @@ class AravisLibrary:
             AravisError: what it reports.
         """
         return self._functions[name](*arguments)
+
+    def knows(self, name: str) -> bool:
+        """Whether this version of it has a function."""
+        return name in self._functions
 
     def set_property(self, instance: int, name: str, value: int | float) -> None:
         """Set a property: a float where it is a double, an int where it is an integer or an enumeration."""

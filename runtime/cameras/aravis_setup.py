@@ -115,13 +115,13 @@ class AravisSetup:
         return stream
 
     def payload(self) -> int:
-        """Bytes that the camera sends for a frame: its pixels, and what else it puts behind them."""
+        """Bytes of a frame: its pixels, and whatever the camera adds to them."""
         rows, columns = self.frame_shape
-        least = pixel_format(self.settings.pixel_format).nbytes(rows * columns)
-        with self._setting("PayloadSize", least):
+        expected = pixel_format(self.settings.pixel_format).nbytes(rows * columns)
+        with self._setting("PayloadSize", expected):
             payload: int = self._do("get_payload")
-        if payload < least:
-            self._compare("PayloadSize", payload, f"at least {least}")
+        if payload < expected:
+            self._compare("PayloadSize", payload, f"{expected} or more")
         return payload
 
     def set_trigger(self) -> None:

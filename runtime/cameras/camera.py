@@ -79,7 +79,7 @@ class Camera(Protocol):
         """The next frame, or None where none comes within `timeout_s`; 0 takes what is there already.
 
         Raises:
-            LostShotError: `Reason.CAMERA_GONE`.
+            LostShotError: `Reason.CAMERA_GONE`; also where the frame is not as the camera was set up, until `arm`.
         """
 
     def disarm(self) -> None:

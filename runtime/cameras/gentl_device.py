@@ -9,8 +9,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+import numpy as np
+
+from lightpage.errors import FrameError
 from runtime.cameras.gentl_link import Arrived, Ready, Task
-from runtime.cameras.pixel_formats import pixel_format
+from runtime.cameras.pixel_formats import pixel_format, without_padding
 from runtime.cameras.sfnc import (
     AUTOMATIC,
     BLACK_LEVEL_TOLERANCE,
@@ -192,19 +195,29 @@ class GenTLDevice:
         self._incomplete += 1
 
     def _read(self, buffer: Any, memory: mmap.mmap) -> Arrived:
-        """What is in a complete buffer."""
+        """What is in a complete buffer.
+
+        Raises:
+            CameraGoneError: something else than it was set up for; it is to be opened again.
+        """
         arrived_s = time.time()
         known = pixel_format(self._settings.pixel_format)
         rows, columns = self._shape
         got = (buffer.width, buffer.height, buffer.pixel_format)
         if got != (columns, rows, known.code):
             told = f"{got[0]} x {got[1]} pixels in format {got[2]:#010x}"
-            return Arrived(fault=f"{told} in place of {columns} x {rows} in {known.code:#010x}")
-        size, start = known.nbytes(rows * columns), buffer.image_offset
-        data = buffer.raw_buffer
-        if len(data) < start + size:
-            return Arrived(fault=f"{len(data) - start} bytes in place of {size}")
-        memory[:size] = data[start : start + size]
+            raise CameraGoneError(f"{told} in place of {columns} x {rows} in {known.code:#010x}")
+        size, padding = known.nbytes(rows * columns), 0
+        with suppress(*self._errors):
+            padding = buffer.padding_x
+        sent = np.frombuffer(buffer.raw_buffer, np.uint8)[buffer.image_offset :]
+        try:
+            pixels = without_padding(sent, self._shape, known.name, padding)
+        except FrameError as error:
+            return Arrived(fault=f"{error.got} in place of {error.expected}")
+        if pixels.size < size:
+            return Arrived(fault=f"{pixels.size} bytes in place of {size}")
+        memory[:size] = pixels[:size].tobytes()
         return Arrived(frame_id=buffer.frame_id, device_time_s=self._device_time_s(buffer), host_time_s=arrived_s)
 
     def _device_time_s(self, buffer: Any) -> float:
@@ -282,11 +295,11 @@ class GenTLDevice:
         return got
 
     def _check_payload(self, least: int) -> None:
-        """Check that a frame has room for its pixels; some cameras send more behind them."""
+        """See that a frame holds its pixels; what the camera adds to them is left out."""
         with self._setting("PayloadSize", least):
             got = self._nodes.PayloadSize.get_value(False, True)
         if got < least:
-            raise self._refused("PayloadSize", f"at least {least}", "PayloadSize", got, "")
+            raise self._refused("PayloadSize", f"{least} or more", "PayloadSize", got, "")
 
     @contextmanager
     def _setting(self, setting: str, expected: object, feature: str = "") -> Iterator[None]:

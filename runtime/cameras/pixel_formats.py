@@ -150,6 +150,31 @@ def bit_depth(name: str) -> int:
     return pixel_format(name).bit_depth
 
 
+def without_padding(raw: NDArray[np.uint8], shape: tuple[int, int], name: str, padding: int) -> NDArray[np.uint8]:
+    """The bytes of a frame whose lines have `padding` bytes behind their pixels, without these.
+
+    Args:
+        raw: bytes of one frame; the last line need not be padded.
+        shape: (rows, columns).
+        name: of the pixel format.
+        padding: bytes behind each line.
+
+    Raises:
+        InvalidInputError: see `pixel_format`.
+        FrameError: too few bytes, or lines that do not end with a byte.
+    """
+    if not padding:
+        return raw
+    known, (rows, columns) = pixel_format(name), shape
+    line = known.nbytes(columns)
+    size = rows * (line + padding) - padding
+    if raw.size < size or rows * line != known.nbytes(rows * columns):
+        expected = f"{size} of {rows} lines of {columns} pixels, each of whole bytes and {padding} more"
+        raise FrameError(f"frame in {name}", f"{raw.size} bytes", expected)
+    raw = np.ascontiguousarray(raw[:size])
+    return np.ndarray((rows, line), np.uint8, raw, strides=(line + padding, 1)).reshape(-1)
+
+
 def unpack(raw: NDArray[np.uint8], shape: tuple[int, int], name: str) -> Counts:
     """Counts from what a camera sent, always a copy.
 

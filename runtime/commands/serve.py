@@ -47,7 +47,6 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.flight_recorder import PAGES, FlightRecorder
 from runtime.service.incoming import Incoming
 from runtime.service.logs import PageLog, logging_to_stderr
-from runtime.service.mender import Mender
 from runtime.service.metrics import ServiceMetrics
 from runtime.service.monitor import Monitor
 from runtime.service.observation import Observer
@@ -266,8 +265,6 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
             health = stack.enter_context(HealthServer(address, server.health, None if plain else files))
             click.echo(f"health checks at {health.target}")
         stack.enter_context(server)
-        if pages is not None:
-            stack.enter_context(Mender(pages))
         if service.incoming is not None:
             stack.enter_context(Incoming(plane, service.incoming))
         if settings.self_calibrates:

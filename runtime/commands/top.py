@@ -132,6 +132,8 @@ def _device(change: Change) -> Table:
     for result, count in now.by("lightpage_recalibrations_total", "result").items():
         if count:
             table.add_row(f"recalibrations {result}", f"{count:.0f}")
+    if now.value("lightpage_source_ok") == 0:
+        table.add_row("source", Text("a beam may be blocked", "red"))
     if now.value("lightpage_store_ok") == 0:
         trouble = [dict(own)["reason"] for own, value in now.values("lightpage_store_trouble").items() if value == 1]
         table.add_row("store", Text(", ".join(trouble) or "in trouble", "red"))

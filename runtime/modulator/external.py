@@ -22,12 +22,20 @@ class Announcement(Generic[T]):
         self._wanted: T | None = None
         self._announced: T | None = None
         self._changes = 0
+        self._asked = False
 
     def wanted(self, timeout_s: float = 0.0) -> T | None:
         """What is being waited for, or None where nothing is, nor comes to be within `timeout_s`."""
         with self._changed:
             self._changed.wait_for(lambda: self._wanted is not None, timeout_s)
+            self._asked = self._asked or self._wanted is not None
             return self._wanted
+
+    @property
+    def heard_of(self) -> bool:
+        """Whether anybody has ever heard what was wanted, or said what there is."""
+        with self._changed:
+            return self._asked or self._changes > 0
 
     def announced(self) -> T | None:
         """What there is by the last word; None for nothing, or before the first one."""
@@ -143,13 +151,17 @@ class ExternalBeams:
         self._states.announce(BeamState(signal, reference))
 
     def let_through(self, *, signal: bool, reference: bool) -> None:
-        """Wait until the controller says that the beams are so; see `Beams`."""
+        """Wait until the controller says that the beams are so; see `Beams`.
+
+        Beams that nobody has heard an order for are open.
+        """
         wanted = BeamState(signal, reference)
-        if wanted == BOTH and self._states.announced() is None:  # it has blocked none
-            self._states.want(BOTH)
+        if wanted == BOTH and not self._states.heard_of:
             return
         there, _ = self._states.wait(wanted, self._timeout_s)
         if there != wanted:
+            if self._states.heard_of:
+                self._states.want(BOTH)
             raise LostShotError(
                 self.name,
                 f"{there or 'nothing'} announced after {self._timeout_s:g} s",
@@ -159,5 +171,5 @@ class ExternalBeams:
 
     def close(self) -> None:
         """Ask for both beams if the controller has blocked one; nobody waits for it."""
-        if self._states.announced() not in (None, BOTH):
+        if self._states.heard_of and self._states.announced() != BOTH:
             self._states.want(BOTH)

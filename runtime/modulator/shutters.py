@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
 from lightpage.device.profile import TomlTable
 from lightpage.errors import InvalidInputError, LightpageError
-from runtime.errors import LostShotError, Reason
+from runtime.errors import LostShotError, Reason, SourceError
 from runtime.trigger.pulse_generator import Channel, PulseGenerator
 
 _log = logging.getLogger(__name__)
@@ -30,6 +31,10 @@ class Shutter(TomlTable):
     channel: Channel
     open_when: Literal["high", "low"] = "high"
     settle_s: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.05
+
+    def level(self, is_open: bool) -> bool:
+        """Whether its channel is on while it is open, or closed."""
+        return is_open == (self.open_when == "high")
 
 
 class ShutterBeams:
@@ -51,16 +56,39 @@ class ShutterBeams:
         self.name = f"shutters on channels {signal.channel} and {reference.channel} of {generator.name}"
 
     def let_through(self, *, signal: bool, reference: bool) -> None:
-        """See `Beams`."""
+        """See `Beams`. Where it fails, both shutters are opened when the generator is next set up."""
+        wanted = (self._signal, signal), (self._reference, reference)
         try:
-            for shutter, is_open in ((self._signal, signal), (self._reference, reference)):
-                self._generator.set_channel(shutter.channel, is_open == (shutter.open_when == "high"))
-                self._moved = True
-        except LostShotError as error:
-            raise LostShotError(
-                f"{self.name}: {error.subject}", error.got, error.expected, Reason.BEAM_CONTROL_FAILED
-            ) from None
+            try:
+                self._move(wanted)
+            except LostShotError as error:
+                if error.reason is not Reason.TRIGGER_GONE:
+                    raise
+                self._move(wanted)  # which puts the line in order first
+        except BaseException as error:
+            for shutter in (self._signal, self._reference):
+                self._generator.remember_channel(shutter.channel, shutter.level(is_open=True))
+            self._moved = self._moved or self._generator.reached
+            if isinstance(error, LostShotError):
+                raise LostShotError(
+                    f"{self.name}: {error.subject}", error.got, error.expected, Reason.BEAM_CONTROL_FAILED
+                ) from None
+            raise
         time.sleep(max(self._signal.settle_s, self._reference.settle_s))
+
+    def _move(self, wanted: Sequence[tuple[Shutter, bool]]) -> None:
+        """Move the shutters, one after another. One that cannot be opened does not keep the other one closed."""
+        failed: LightpageError | None = None
+        for shutter, is_open in wanted:
+            try:
+                self._generator.set_channel(shutter.channel, shutter.level(is_open))
+                self._moved = True
+            except (LostShotError, SourceError) as error:
+                if not is_open or (isinstance(error, LostShotError) and error.reason is Reason.TRIGGER_GONE):
+                    raise
+                failed = failed or error
+        if failed is not None:
+            raise failed
 
     def close(self) -> None:
         """See `Beams`; the pulse generator is let go of as well, and connects again when it is used."""

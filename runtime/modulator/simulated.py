@@ -8,6 +8,7 @@ the page is on display or the shutters have moved; an answer with `error` says w
 from __future__ import annotations
 
 import json
+import logging
 from multiprocessing.connection import Client, Connection
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,10 @@ from numpy.typing import NDArray
 
 from lightpage.device.profile import to_toml
 from lightpage.device.state import Device
+from lightpage.errors import LightpageError
 from runtime.errors import LostShotError, Reason, SourceError
+
+_log = logging.getLogger(__name__)
 
 ANSWER_S = 30.0
 """Longest wait for shutters. A full-size page takes minutes to simulate, but it has the wait of its shot."""
@@ -34,6 +38,7 @@ class SimulatedModulator:
         self._address = address
         self._connection: Connection[Any, Any] | None = None
         self._was_there = False
+        self._blocks = False
         self.name = f"simulated modulator {address.name}"
 
     def open(self, timeout_s: float, levels: int | None = None) -> None:
@@ -51,7 +56,9 @@ class SimulatedModulator:
 
     def let_through(self, *, signal: bool, reference: bool) -> None:
         """See `Beams`."""
+        self._blocks = True
         self._ask({"signal": signal, "reference": reference}, b"", ANSWER_S, Reason.BEAM_CONTROL_FAILED)
+        self._blocks = not (signal and reference)
 
     def drift(self, device: Device, timeout_s: float = ANSWER_S) -> None:
         """Let the simulated device drift to another true state; the next page that is shown shows it.
@@ -63,7 +70,15 @@ class SimulatedModulator:
         self._ask({"device": to_toml(device)}, b"", timeout_s, Reason.NOT_ON_DISPLAY)
 
     def close(self) -> None:
-        """See `Modulator`."""
+        """See `Modulator` and `Beams`."""
+        if self._blocks and self._was_there:
+            try:
+                self.let_through(signal=True, reference=True)
+            except LightpageError as error:
+                _log.warning("beams may still be blocked: %s", error)
+        self._hang_up()
+
+    def _hang_up(self) -> None:
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
@@ -76,10 +91,10 @@ class SimulatedModulator:
                 raise LostShotError(self.name, f"no answer within {timeout_s:.1f} s", "an answer", reason)
             answer = json.loads(connection.recv_bytes(1 << 16))
         except (OSError, EOFError, ValueError) as error:
-            self.close()
+            self._hang_up()
             raise LostShotError(self.name, error or "no connection", "a simulated device", reason) from None
         except LostShotError:
-            self.close()  # what comes later is no answer to anything else
+            self._hang_up()  # what comes later is no answer to anything else
             raise
         if "error" in answer:
             raise LostShotError(self.name, answer["error"], "a page on display, and shutters that moved", reason)

@@ -159,7 +159,7 @@ class InferenceCalls:
 
     @property
     def _ready(self) -> bool:
-        return not self._plane.heart.trouble()
+        return not self._plane.trouble()
 
     def _versions(self) -> list[str]:
         return [entry.manifest.version for entry in self._plane.models.entries(stored=True)]

@@ -169,7 +169,7 @@ class LightpageServer:
         reflection.enable_server_reflection(names, self._server)
         self.port = add_port(self._server, self._address, self._credentials)
         await self._server.start()
-        await self._say(True)
+        await self._say(not self._plane.trouble())
         self._started = True
 
     async def _say(self, serving: bool) -> None:

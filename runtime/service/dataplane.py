@@ -159,10 +159,6 @@ class DataPlane:
         """Whether `read_page` can work."""
         return self._source is not None
 
-    def trouble(self) -> str:
-        """Why the service cannot be said to serve; empty where it can."""
-        return self.heart.trouble() or ("" if self._source is None else self._source.trouble())
-
     @property
     def default_levels(self) -> int:
         """The level count where a caller names none: that of the source's pages, or 256."""
@@ -374,6 +370,10 @@ class DataPlane:
     def rollback(self, expected_version: str = "", *, actor: Actor = NOBODY) -> tuple[Model, Model]:
         """Go back to the model before; see `Models.rollback`."""
         return self.models.rollback(expected_version, actor)
+
+    def trouble(self) -> str:
+        """Why the service cannot be said to serve, empty where it can: a decode hangs, or its source cannot be read."""
+        return self.heart.trouble() or (self._source.trouble() if self._source is not None else "")
 
     def store_trouble(self) -> str:
         """What is wrong with the store, empty where nothing is, or where there is none; see `Models.trouble`."""

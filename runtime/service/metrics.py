@@ -236,7 +236,7 @@ class _SourceFigures(Collector):
         for camera, value in self._source.saturated_shares().items():
             share.add_metric([camera], value)
         yield share
-        about = "1 where pages can be photographed; 0 e.g. while a beam may be blocked."
+        about = "1 where pages of the source can be read, 0 where a beam may be blocked."
         yield GaugeMetricFamily("lightpage_source_ok", about, value=float(not self._source.trouble()))
 
 

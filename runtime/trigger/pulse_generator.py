@@ -99,15 +99,20 @@ class PulseGenerator:
         self._ready: int | None = None
         """Session of the line in which the device was set up."""
         self._switched: dict[int, bool] = {}
-        """Other channels, as they were last switched."""
+        """Other channels, as the next `arm` switches them."""
 
     @property
     def identity(self) -> str | None:
         """Maker, model, serial number and versions, once connected."""
         return self._line.identity
 
+    @property
+    def reached(self) -> bool:
+        """Whether it has ever answered: before, nothing but a question for its identity was sent."""
+        return self._line.session > 0
+
     def arm(self) -> None:
-        """See `Trigger`. Channels that `set_channel` switched are switched again: the device may have forgotten.
+        """See `Trigger`. Other channels are switched again as they were: the device may have forgotten.
 
         Raises:
             SourceError: no such line, no device that answers on it, or it does not take a setting.
@@ -115,7 +120,7 @@ class PulseGenerator:
         """
         with self._lock:
             self._ready = None
-            reached = self._line.session > 0
+            reached = self.reached
             try:
                 self._ready = self._set_up()
             except LostShotError as error:
@@ -176,14 +181,13 @@ class PulseGenerator:
                 f"one of 1 to {CHANNELS} and none of the cameras' ({cameras})",
             )
         with self._lock:
-            before = self._switched.pop(channel, None)
-            try:
-                self._line.send(f":PULSE{channel}:POL INV")
-                self._switch(channel, on, self._line.session)
-            except BaseException:
-                if before is not None:  # what was not done is not to be done again by `arm`, unasked
-                    self._switched[channel] = before
-                raise
+            self._line.send(f":PULSE{channel}:POL INV")
+            self._switch(channel, on, self._line.session)
+            self._switched[channel] = on
+
+    def remember_channel(self, channel: int, on: bool) -> None:
+        """Have the next `arm` switch a channel so; nothing is sent now."""
+        with self._lock:
             self._switched[channel] = on
 
     def channel_state(self, channel: int) -> bool:
@@ -215,11 +219,20 @@ class PulseGenerator:
         for channel in settings.channels:
             prefix = f":PULSE{channel}"
             self._set_words({f"{prefix}:POL": _POLARITIES[settings.polarity]}, session)
+            self._pulse_at_each_shot(prefix, session)
             self._set_times({f"{prefix}:WIDT": settings.width_s, f"{prefix}:DELAY": settings.delay_s}, session)
             self._set_states({f"{prefix}:STATE": True}, session)
         for channel, on in self._switched.items():
             self._switch(channel, on, session)
         return session
+
+    def _pulse_at_each_shot(self, prefix: str, session: int) -> None:
+        """Take back a divider or a burst of a channel; a device that knows neither refuses, and has none."""
+        try:
+            self._set_words({f"{prefix}:CMOD": "NORM"}, session)
+        except LostShotError as error:
+            if error.reason is not Reason.TRIGGER_REFUSED:
+                raise
 
     def _set_words(self, values: dict[str, str], session: int) -> None:
         """Keywords, of which the device may answer the long form or the short one."""

@@ -4,13 +4,17 @@ An SCPI device numbers neither messages nor answers, but answers in order: once 
 come of a message from before. After anything unexpected the port is therefore synchronised before the next message:
 wait for silence, send `*IDN?`, and want exactly one identification for every `*IDN?` sent so far, then silence again;
 and all of it twice. Identifications that are still due are counted, so that a late one is not taken for a newer one.
+
+A line ends with CR, with LF or with both: devices and serial servers differ. NULs between lines are noise.
 """
 
 from __future__ import annotations
 
+import os
 import re
 import termios
 import time
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -37,13 +41,15 @@ REFUSALS = {
 _IDENTIFY = "*IDN?"
 _IDENTIFICATION = re.compile(r"[!-~][ -~]*,[ -~]+,[ -~]+")
 """Maker, model, serial number, and mostly versions."""
-_END = re.compile(rb"\r\n|\r|\n")
 _REFUSED = re.compile(r"\?([1-8])")
 _POLL_S = 0.02
 """Longest wait inside pyserial."""
 _LONGEST_LINE = 512
-_QUOTED = 60
-"""Last bytes that came which an error quotes."""
+_END = re.compile(rb"[\r\n]")
+_NO_LINE = b"\r\n"
+"""What is no line by itself: the rest of an end."""
+_QUOTED = 80
+"""Most characters of what came that an error quotes."""
 _ROUNDS = 2
 """Identifications in a row, each with silence after, that make a port synchronised."""
 
@@ -67,7 +73,7 @@ class LineTimes:
     @property
     def longest_s(self) -> float:
         """Bound of one query: pyserial connects within 5 s, the line may have to be synchronised twice."""
-        return 6.0 + 2 * self.synchronise_s + 3 * (self.answer_s + self.late_s)
+        return 6.0 + 2 * self.synchronise_s + 3 * self.answer_s
 
 
 class ScpiPort:
@@ -89,13 +95,15 @@ class ScpiPort:
         self.identity: str | None = None
         self._path, self._baud, self._times = port, baud, times
         self._port: Serial | None = None
+        self._adapter: tuple[object, ...] | None = None
+        """The USB adapter behind the port, where it is one: plugged in again, it may have another path."""
         self._buffer = bytearray()
-        self._heard = bytearray()
-        """The last bytes that came since the port was synchronised last."""
-        self._bare_cr = False
-        """Whether lines end with CR alone."""
-        self._latency_s = 0.0
-        """How long the device has taken for its identification."""
+        self._heard = ""
+        """What came last and was no answer, while the port is synchronised."""
+        self._slowest_s = 0.0
+        """How long the identification took, at most, while the port is synchronised."""
+        self._asked: list[float] = []
+        """When identifications were asked for, while the port is synchronised."""
         self._synchronised = self._echo = False
         self._known = False
         """Whether `identity` has come often enough, since the port was opened, to be relied on."""
@@ -158,12 +166,10 @@ class ScpiPort:
         port = self._port
         if port is not None and self._synchronised:
             try:
-                if port.in_waiting:
+                reads = iter(range(_LONGEST_LINE))  # of a socket a byte each
+                while port.in_waiting and not self._buffer.strip(_NO_LINE) and next(reads, None) is not None:
                     self._read(port)
-                if self._buffer.strip(b"\r\n"):  # nothing was asked: whose answer is that?
-                    self._synchronised = False
-                else:
-                    self._buffer.clear()
+                self._synchronised = not self._buffer.strip(_NO_LINE)  # nothing was asked: whose answer is that?
             except GONE:
                 self.close()
         if port is not None and self._synchronised and session in (None, self.session):
@@ -188,9 +194,11 @@ class ScpiPort:
         import serial  # takes a while, and most have no such device
 
         alone = None if "://" in self._path else True
+        adapters = {} if alone is None else _usb_adapters()
+        path = next((path for path, adapter in adapters.items() if adapter == self._adapter), self._path)
         try:
             self._port = serial.serial_for_url(
-                self._path,
+                path,
                 baudrate=self._baud,
                 timeout=_POLL_S,
                 write_timeout=self._times.answer_s,
@@ -201,6 +209,7 @@ class ScpiPort:
         except GONE as error:
             raise self._gone(_words(error), "a serial port that can be opened") from None
         self._known = False
+        self._adapter = self._adapter or adapters.get(os.path.realpath(path))
         return self._port
 
     def _send(self, port: Serial, message: str) -> tuple[float, float]:
@@ -214,8 +223,7 @@ class ScpiPort:
         return begin, end
 
     def _answer(self, port: Serial, message: str, answer: re.Pattern[str]) -> str:
-        answer_s = max(self._times.answer_s, min(2 * self._latency_s, self._times.answer_s + self._times.late_s))
-        until = time.monotonic() + answer_s
+        until = time.monotonic() + self._times.answer_s
         line = self._line(port, until)
         if line == message:  # the port echoes
             self._echo = True
@@ -223,7 +231,7 @@ class ScpiPort:
         elif self._echo and line is not None:
             self._synchronised = False
             self._identified(line)
-            raise self._gone(f"{line!r} before the echo of {message}", "the echo first")
+            raise self._gone(f"{_quoted(line)} before the echo of {message}", "the echo first")
         if line is not None and (refused := _REFUSED.fullmatch(line)):
             meaning = REFUSALS[int(refused[1])]
             raise LostShotError(self.name, f"{line} ({meaning}) to {message}", "no refusal", Reason.TRIGGER_REFUSED)
@@ -231,10 +239,12 @@ class ScpiPort:
             return line
         self._synchronised = False
         if line is None:
-            told = f", but {self._quoted()}" if self._buffer else ""
-            raise self._gone(f"no answer to {message} within {answer_s:.3g} s{told}", "an answer")
+            told = f"no answer to {message} within answer_s = {self._times.answer_s:g} s"
+            if self._buffer:
+                raise self._gone(f"{told}, but {_quoted(bytes(self._buffer))} without an end", "a line with CR or LF")
+            raise self._gone(told, "an answer")
         self._identified(line)
-        raise self._gone(f"{line!r} to {message}", f"an answer like {answer.pattern}")
+        raise self._gone(f"{_quoted(line)} to {message}", f"an answer like {answer.pattern}")
 
     def _synchronise(self, port: Serial) -> None:
         """Make sure that nothing is on its way any more; see the module.
@@ -242,19 +252,17 @@ class ScpiPort:
         Raises:
             LostShotError: that cannot be had in time; the port is closed.
         """
-        self._synchronised, self._latency_s, self._bare_cr = False, 0.0, False
-        self._heard.clear()
+        self._synchronised = False
+        self._heard, self._slowest_s, self._asked = "", 0.0, []
         end = time.monotonic() + self._times.synchronise_s
         rounds = 0
         while rounds < _ROUNDS:
             if time.monotonic() > end:
-                told = self._quoted()
                 self.close()
-                got = f"no clear answer to {_IDENTIFY} within {self._times.synchronise_s:g} s: {told} came"
-                raise self._gone(got, "maker, model, serial number and versions in a line; the right port and baud")
+                raise self._unclear()
             if not self._quiet(port, end):
                 continue
-            self._send(port, _IDENTIFY)
+            self._asked.append(self._send(port, _IDENTIFY)[0])
             self._due += 1
             rounds = rounds + 1 if self._one_round(port, end) else 0
         self._synchronised = self._known = True
@@ -262,12 +270,12 @@ class ScpiPort:
 
     def _one_round(self, port: Serial, end: float) -> bool:
         """Whether every identification that was due has come and nothing after it."""
-        asked = time.monotonic()
-        until = min(end, asked + max(self._times.answer_s, self._times.late_s))
+        until = min(end, time.monotonic() + self._times.answer_s)
         known, came, echo = self.identity, False, False
         while self._due:
             line = self._line(port, until)
             if line is None:
+                self._heard = _quoted(bytes(self._buffer)) + " without an end" if self._buffer else self._heard
                 if came:  # a later one answers all that came before: those that are missing were lost, or are very late
                     self._given_up, self._due = self._given_up + self._due, 0
                 return False
@@ -275,15 +283,31 @@ class ScpiPort:
                 echo = True
             elif self._identified(line):
                 came, until = True, min(end, time.monotonic() + self._times.late_s)
-                self._latency_s = max(self._latency_s, time.monotonic() - asked)
+            else:
+                self._heard = _quoted(line)
         self._echo = echo
         return self._quiet(port, end) and self.identity == known
+
+    def _unclear(self) -> LostShotError:
+        """The error of a port that cannot be synchronised: it quotes what came."""
+        times = self._times
+        told = f"no clear answer to {_IDENTIFY} within {times.synchronise_s:g} s"
+        if self._slowest_s > times.answer_s:
+            told = f"{told}: {_quoted(self.identity or '')} came after {self._slowest_s:.2f} s"
+            return self._gone(told, f"it within answer_s = {times.answer_s:g} s: raise answer_s")
+        if self._heard:
+            return self._gone(
+                f"{told}, but {self._heard}", "its identification: is it this device, and this baud rate?"
+            )
+        return self._gone(f"{told}: nothing came", "its identification: look at its power, its cable and the baud rate")
 
     def _identified(self, line: str) -> bool:
         """Whether a line is the identification, and one fewer is due then."""
         if not (line == self.identity if self._known else _IDENTIFICATION.fullmatch(line)):
             return False
         self.identity = line
+        if 0 < self._due <= len(self._asked):
+            self._slowest_s = max(self._slowest_s, time.monotonic() - self._asked[-self._due])
         if not self._due:
             self._due, self._given_up = self._given_up, 0  # none is lost, they are late
         self._due = max(0, self._due - 1)
@@ -296,45 +320,58 @@ class ScpiPort:
             if self._read(port):
                 nothing, since = False, time.monotonic()
             while (line := self._next_line()) is not None:
-                self._identified(line)
-        nothing = nothing and not self._buffer
+                if not self._identified(line) and line != _IDENTIFY:
+                    self._heard = _quoted(line)
+        nothing = nothing and not self._buffer.strip(_NO_LINE)
         self._buffer.clear()
         return nothing
 
     def _line(self, port: Serial, until: float) -> str | None:
-        """The next line that says something, without its end of CR, LF or both; None where it does not end in time."""
+        """The next line without its end, or None where it does not end in time."""
         while (line := self._next_line()) is None and time.monotonic() < until:
-            if not self._read(port) and self._buffer.endswith(b"\r"):
-                self._bare_cr = True  # no LF has followed
+            self._read(port)
         return line
 
     def _next_line(self) -> str | None:
-        del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(b"\r\n"))]
-        found = _END.search(self._buffer)
-        if found is not None and found[0] == b"\r" and found.end() == len(self._buffer) and not self._bare_cr:
-            found = None  # its LF is on its way
-        if found is None and len(self._buffer) < _LONGEST_LINE:
+        """The next line that is not empty; between CR and LF there is an empty one."""
+        del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(_NO_LINE))]
+        end = _END.search(self._buffer)
+        length = _LONGEST_LINE if end is None else min(end.start(), _LONGEST_LINE)
+        if len(self._buffer) < length:
             return None
-        end, after = found.span() if found is not None else (len(self._buffer),) * 2
-        line = bytes(self._buffer[:end])
-        del self._buffer[:after]
-        return line.decode("latin-1") if end < _LONGEST_LINE else repr(line)
+        line = bytes(self._buffer[:length])
+        del self._buffer[:length]
+        return line.decode("latin-1")
 
-    def _read(self, port: Serial) -> int:
-        """Take what has come; returns its length without NULs, which some devices send between lines."""
+    def _read(self, port: Serial) -> bool:
+        """Whether something came that belongs to a line."""
         found = port.read(max(1, port.in_waiting)).replace(b"\0", b"")
         self._buffer += found
-        self._heard = (self._heard + found)[-_QUOTED:]
-        return len(found)
-
-    def _quoted(self) -> str:
-        """The last bytes that came, for an error."""
-        return f"{bytes(self._heard)!r}" if self._heard else "nothing"
+        return bool(found.strip(_NO_LINE))
 
     def _gone(self, got: object, expected: object) -> LostShotError:
         return LostShotError(self.name, got, expected, Reason.TRIGGER_GONE)
 
 
+def _usb_adapters() -> dict[str, tuple[object, ...]]:
+    """What tells the USB adapters apart that are plugged in, by the paths of their ports; none that are alike in it."""
+    from serial.tools import list_ports
+
+    found = {
+        port.device: (port.vid, port.pid, port.serial_number or port.location)
+        for port in list_ports.comports()
+        if port.vid is not None
+    }
+    alike = Counter(found.values())
+    return {path: adapter for path, adapter in found.items() if alike[adapter] == 1}
+
+
 def _words(error: BaseException) -> str:
     """What an exception of pyserial says, with its kind: some say little else."""
     return f"{type(error).__name__} ({error})"
+
+
+def _quoted(what: str | bytes) -> str:
+    """What came, as an error quotes it."""
+    text = what if isinstance(what, str) else what.decode("latin-1")
+    return repr(text) if len(text) <= _QUOTED else f"{text[:_QUOTED]!r} and {len(text) - _QUOTED} characters more"

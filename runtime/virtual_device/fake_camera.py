@@ -35,6 +35,8 @@ _TRIGGER_SOURCE = 0x3F4
 says ``Software``, and it would read that back whatever was chosen."""
 _SOFTWARE = 1
 _LINES = {"Line0": 0, "Line1": 2}
+_PAYLOAD = "WIDTH * HEIGHT * ((PIXELFORMAT>>16)&amp;0xFF) / 8"
+"""Formula of its PayloadSize."""
 _POLLS_HZ = 250.0
 """How often a waiting camera looks for a trigger."""
 
@@ -50,16 +52,22 @@ class FakeCamera:
         serial: its number.
         picture: the whole sensor [row, column], called by the camera's own thread; the region that is set is sent.
         sensor_shape: (rows, columns).
+        more_bytes: by how much its PayloadSize is larger than the pixels that it sends.
 
     Raises:
         SourceError: no library, or the address cannot be listened on.
     """
 
     def __init__(
-        self, address: str, serial: str, picture: Picture, sensor_shape: tuple[int, int] = (2048, 2048)
+        self,
+        address: str,
+        serial: str,
+        picture: Picture,
+        sensor_shape: tuple[int, int] = (2048, 2048),
+        more_bytes: int = 0,
     ) -> None:
         self.address, self.serial = address, serial
-        self._picture, self._shape = picture, sensor_shape
+        self._picture, self._shape, self._more_bytes = picture, sensor_shape, more_bytes
         self._library = aravis()
         self._fill = FILL(self._filled)  # must outlive the camera
         self._camera: int | None = None
@@ -85,7 +93,7 @@ class FakeCamera:
         _check_free(self.address)
         with temporary_folder(f"fake camera {self.serial}") as folder:
             description = Path(folder) / "camera.xml"
-            description.write_text(_description(self._library), "utf-8")
+            description.write_text(_description(self._library, self._more_bytes), "utf-8")
             camera = self._library(
                 "arv_gv_fake_camera_new_full", self.address.encode(), self.serial.encode(), str(description).encode()
             )
@@ -176,7 +184,7 @@ def _check_free(address: str) -> None:
             raise SourceError(f"fake camera on {address}", error, "an own address on this machine, free") from None
 
 
-def _description(library: AravisLibrary) -> str:
+def _description(library: AravisLibrary, more_bytes: int = 0) -> str:
     """The GenICam description of the library's fake, and in it more pixel formats, a second line and its register."""
     plain = library("arv_fake_camera_new", b"description")
     try:
@@ -187,6 +195,7 @@ def _description(library: AravisLibrary) -> str:
     entries = "".join(_entry(name, pixel_format(name).code) for name in _ADDED_FORMATS)
     edited = text.rstrip(b"\0").decode("utf-8")
     edited = _before(edited, '<EnumEntry Name="Mono16"', entries)
+    edited = _replaced(edited, _PAYLOAD, f"{_PAYLOAD} + {more_bytes}")
     edited = _before(edited, '<EnumEntry Name="Software"', _entry("Line1", _LINES["Line1"]))
     return _replaced(
         edited, f"<Address>{_LIBRARY_TRIGGER_SOURCE:#x}</Address>", f"<Address>{_TRIGGER_SOURCE:#x}</Address>"

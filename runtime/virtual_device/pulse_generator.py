@@ -72,6 +72,7 @@ _SETTINGS_OF_CHANNEL: dict[str, _Setting] = {
     "STATe": _Switch(),
     "WIDTh": _Times(1e-8, 999.99999999975, 1e-3),
     "DELay": _Times(0.0, 999.99999999975, 0.0),
+    "CMODe": _Words(("NORMal", "SINGle", "BURSt", "DCYCle")),
     "POLarity": _Words(("NORMal", "COMPlement", "INVerted")),
     "SYNC": _Words(("T0", "CHA", "CHB", "CHC", "CHD", "CHE", "CHF", "CHG", "CHH")),
 }
@@ -187,7 +188,8 @@ class PulseGeneratorEmulator:
     def _shoot(self) -> None:
         self.shots += 1
         for channel, fire in self._cables.items():
-            if self._values[channel, "STATe"] == "1":
+            divides = self._values[channel, "CMODe"] == "DCYC"  # as it is set by default: every other shot
+            if self._values[channel, "STATe"] == "1" and not (divides and self.shots % 2):
                 fire()
 
     def _is(self, name: str, value: str) -> bool:

@@ -51,6 +51,8 @@ class VirtualSerialPort(ABC):
         fault: chosen for each message; None for a sound one.
         echo: whether the port sends back what it receives.
         late_s: least and longest delay of a late answer.
+        line_end: what ends the device's lines.
+        before_line: what comes before each of them.
         faults: how many there were of each.
     """
 
@@ -60,6 +62,7 @@ class VirtualSerialPort(ABC):
         self.fault: Callable[[str], Fault | None] = lambda message: None
         self.echo = False
         self.late_s = (0.05, 0.3)
+        self.line_end, self.before_line = b"\r\n", b""
         self.faults = dict.fromkeys(Fault, 0)
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -146,7 +149,7 @@ class VirtualSerialPort(ABC):
                 received[:0] = left  # the next message goes on where this one breaks off
                 return
             message = left[:-2].decode("latin-1")
-        content = self._answer(message).encode("latin-1") + b"\r\n"
+        content = self.before_line + self._answer(message).encode("latin-1") + self.line_end
         if fault is Fault.SILENCE:
             return
         if fault is Fault.LATE:

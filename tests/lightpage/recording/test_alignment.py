@@ -1,39 +1,60 @@
-"""Counts in the high bits are told from counts in the low ones, and from pictures that happen to look so."""
+"""Counts at the upper end of their bits are noticed, and nothing else is taken for them."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from lightpage.errors import FrameError
-from lightpage.recording.alignment import check_alignment, empty_low_bits
-
-RNG = np.random.default_rng(1)
-COUNTS = RNG.integers(0, 1 << 10, (40, 50)).astype(np.uint16)
+from lightpage.errors import SaturatedFrameError
+from lightpage.recording.alignment import greatest_count, unused_low_bits
+from lightpage.recording.exposure import check_light
 
 
-@pytest.mark.parametrize("shift", [2, 4, 6])
-def test_left_aligned_counts_are_named_with_their_bits(shift: int) -> None:
-    assert empty_low_bits(COUNTS << shift) == shift
-    with pytest.raises(FrameError, match=f"multiples of {1 << shift}: {16 - shift} bits"):
-        check_alignment("frame", COUNTS << shift, 16)
+def counts(bits: int, seed: int = 0, top: float = 0.9) -> np.ndarray:
+    """A frame of right-aligned counts of so many bits."""
+    return np.random.default_rng(seed).integers(0, int(top * 2**bits), (96, 128), dtype=np.uint16)
+
+
+@pytest.mark.parametrize(("bits", "depth"), [(8, 16), (10, 16), (12, 16), (14, 16), (10, 12), (8, 12), (10, 14)])
+def test_left_aligned_counts_are_noticed(bits: int, depth: int) -> None:
+    assert unused_low_bits(counts(bits) << (depth - bits), depth) == depth - bits
+
+
+@pytest.mark.parametrize("depth", [8, 10, 12, 14, 16])
+def test_right_aligned_counts_are_not(depth: int) -> None:
+    assert unused_low_bits(counts(depth), depth) == 0
+    assert unused_low_bits(counts(8), depth) == 0
 
 
 @pytest.mark.parametrize(
     "frame",
     [
-        COUNTS,
-        COUNTS * 2,
-        np.zeros((8, 8), np.uint16),
-        np.full((8, 8), 4096, np.uint16),
-        (COUNTS & 7) << 8,
-        np.where(COUNTS > 500, COUNTS << 4, COUNTS),
+        np.zeros((96, 128), np.uint16),
+        np.full((96, 128), 65520, np.uint16),
+        np.where(np.arange(128) % 2, 4096, 0).astype(np.uint16) * np.ones((96, 1), np.uint16),
+        counts(3) << 4,  # a dark frame
     ],
-    ids=["right", "gain of two", "black", "flat", "coarse", "some"],
 )
-def test_other_counts_are_taken(frame: np.ndarray) -> None:
-    check_alignment("frame", frame, 12)
+def test_few_counts_do_not_tell(frame: np.ndarray) -> None:
+    assert unused_low_bits(frame, 16) is None
 
 
-def test_eight_bits_have_no_other_place() -> None:
-    check_alignment("frame", (COUNTS << 2).astype(np.uint8), 8)
+def test_one_odd_pixel_tells() -> None:
+    frame = counts(12) << 4
+    frame[3, 5] = 65535  # as of a digital gain, which ends at full scale
+    assert unused_low_bits(frame, 16) == 0
+
+
+def test_a_gain_that_the_lower_counts_need_leaves_eight_bits() -> None:
+    assert unused_low_bits(counts(6) << 10, 16) == 8
+
+
+def test_saturation_of_left_aligned_counts_is_seen() -> None:
+    frame = np.minimum(counts(12, top=1.0).astype(int) + 2300, 4095).astype(np.uint16) << 4
+    share = (frame == 65520).mean()
+    assert share > 0.5
+    assert greatest_count(16, 4) == 65520
+    with pytest.raises(SaturatedFrameError, match="multiples of 16: 12 bits left-aligned in 16"):
+        check_light("frame", frame, 16)
+    check_light("frame", counts(12) << 4, 16)
+    check_light("frame", counts(16), 16)

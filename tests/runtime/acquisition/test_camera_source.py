@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -290,117 +291,123 @@ def test_a_modulator_is_opened_for_its_pages_before_the_cameras(tmp_path: Path) 
     assert not any(camera.opened for camera in other._cameras)
 
 
-class StuckBeams:
-    """Shutters of which one does not answer."""
-
-    name = "stuck shutters"
-
-    def __init__(self) -> None:
-        self.open, self.stuck = {"signal": True, "reference": True}, set[str]()
-
-    def let_through(self, *, signal: bool, reference: bool) -> None:
-        for beam, wanted in (("signal", signal), ("reference", reference)):
-            if beam in self.stuck:
-                raise LostShotError(self.name, f"no answer of {beam}", "an answer", Reason.BEAM_CONTROL_FAILED)
-            self.open[beam] = wanted
-
-    def close(self) -> None:
-        self.stuck.clear()
-
-
-def with_beams(lab: Lab, tmp_path: Path, **exposures: int) -> tuple[CameraSource, StuckBeams]:
-    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))), **exposures)
-    source.beams = beams = StuckBeams()
-    return source, beams
-
-
-def test_a_shutter_that_fails_leaves_no_beam_blocked(tmp_path: Path) -> None:
-    source, beams = with_beams(Lab(), tmp_path)
-    with source:
-        beams.stuck = {"reference"}  # the signal beam is blocked first, and opened again
-        for take in (source.references, source.dark_frames):
-            with pytest.raises(LostShotError):
-                take()
-            assert beams.open["signal"]
-
-
-def test_while_a_beam_stays_blocked_pages_are_lost_by_that_name_and_then_no_more(tmp_path: Path) -> None:
+def test_devices_are_set_up_again_after_three_contradictions_in_a_row(tmp_path: Path) -> None:
+    """As a camera whose trigger somebody has switched off: it sends frames that nobody asked for."""
     lab = Lab()
-    source, beams = with_beams(lab, tmp_path, repeats=0)
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))), repeats=0)
+    camera = lab.cameras[0]
+    free: list[bool] = []
+    edge, arm = camera.edge, camera.arm
+
+    def sent(*given: float, **how: float) -> None:
+        for _ in range(1 + len(free)):
+            edge(*given, **how)  # type: ignore[arg-type]
+
+    def armed() -> None:
+        free.clear()
+        arm()
+
+    camera.edge, camera.arm = sent, armed  # type: ignore[method-assign]
     with source:
-        source.shot()
-
-        def fails() -> None:
-            beams.stuck = {"signal"}
-            raise KeyboardInterrupt
-
-        lab.plan = fails  # type: ignore[assignment]
-        with pytest.raises(KeyboardInterrupt):
-            source.references()
-        assert not beams.open["signal"]
-        assert "stuck shutters" in source.trouble()
-        with pytest.raises(LostShotError) as raised:
-            source.shot()
-        assert raised.value.reason is Reason.BEAM_CONTROL_FAILED
-        with pytest.raises(LostShotError):
-            source.mend()
-        beams.stuck.clear()
-        source.mend()
-        assert source.trouble() == ""
-        assert beams.open == {"signal": True, "reference": True}
-        source.shot()
+        source.shot(page=0)
+        free.append(True)
+        for _ in range(3):
+            with pytest.raises(LostShotError) as raised:
+                source.shot(page=0)
+            assert raised.value.reason is Reason.STRAY_FRAME
+        assert source.shot(page=0).page_index == 0
 
 
-def test_beams_that_are_blocked_on_purpose_are_no_trouble(tmp_path: Path) -> None:
+def test_a_trigger_that_refuses_is_set_up_again(tmp_path: Path) -> None:
     lab = Lab()
-    source, _ = with_beams(lab, tmp_path, reference_frames=1)
-    told: list[str] = []
-    fire = lab.fire
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    fire, arm, refuses = lab.fire, lab.arm, [False]
 
-    def watched() -> float:
-        told.append(source.trouble())
+    def fired() -> float:
+        if refuses[0]:
+            raise LostShotError(lab.name, "?8", "no refusal", Reason.TRIGGER_REFUSED)
         return fire()
 
-    lab.fire = watched  # type: ignore[method-assign]
+    def armed() -> None:
+        refuses[0] = False
+        arm()
+
+    lab.fire, lab.arm = fired, armed  # type: ignore[method-assign]
     with source:
-        source.references()
-    assert set(told) == {""}
+        source.shot(page=0)
+        refuses[0] = True
+        assert source.shot(page=1).page_index == 1
 
 
-def test_clocks_that_jump_are_learnt_anew_after_three_shots(tmp_path: Path) -> None:
-    lab = Lab()
-    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))), repeats=5)
-    with source:
-        source.shot()
-        for camera in lab.cameras:
-            camera.clock_s += 100.0
-        assert source.shot(10.0).page_index == 1
-        assert source.shots_by_outcome() == {"TAKEN": 2, "OTHER_SHOT": 3}
-
-
-def test_counts_in_the_high_bits_are_named(tmp_path: Path) -> None:
-    lab = Lab()
+@pytest.mark.parametrize(("bits", "told"), [(12, True), (10, True), (14, True), (16, False)])
+def test_left_aligned_counts_are_told_once_and_saturate(tmp_path: Path, bits: int, told: bool) -> None:
+    lab, heard = Lab(), Told()
     for camera in lab.cameras:
-        camera.bit_depth = 12
-    source, modulator = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+        camera.bit_depth = 16  # type: ignore[misc]
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    rng = np.random.default_rng(0)
+    plain = np.minimum(rng.integers(0, 2**bits, toy.SHAPE), int(0.7 * 2**bits)).astype(np.uint16)
+    clipped = np.where(plain > 0.5 * 2**bits, 2**bits - 1, plain).astype(np.uint16)
+    seen = [plain << (16 - bits)]
+    for camera in lab.cameras:
+        camera._scene = lambda: seen[0]
+    with source, reporting(heard):
+        for _ in range(2):
+            shot = source.shot(page=0)
+        assert (shot.pair.in_phase == seen[0]).all()
+        warned = [note for note in heard.notes if "left-aligned" in note]
+        assert len(warned) == (2 if told else 0)  # of two cameras
+        assert all(f"pixel_format of {bits} bits" in note for note in warned)
+        seen[0] = clipped << (16 - bits)
+        shot = source.shot(page=0)
+        share = float((clipped == 2**bits - 1).mean())
+        assert list(source.saturated_shares().values()) == [share, share]
+        assert ((shot.pair.in_phase == 65535) == (clipped == 2**bits - 1)).all()
+        seen[0] = np.full(toy.SHAPE, 65535 >> (16 - bits) << (16 - bits), np.uint16)  # too few counts to tell by
+        source.shot(page=0)
+        assert list(source.saturated_shares().values()) == [1.0, 1.0]
+        assert len([note for note in heard.notes if "left-aligned" in note]) == len(warned)
+
+
+def test_what_refuses_is_set_up_again_before_the_next_shot(tmp_path: Path) -> None:
+    lab = Lab()
+    source, _ = source_of(lab, PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    camera = lab.cameras[1]
+    arm = camera.arm
+
+    def refusing(timeout_s: float) -> None:
+        raise SourceError("Q", "a refusal", "none")
+
+    def armed() -> None:
+        camera.__dict__.pop("frame", None)
+        arm()
+
+    camera.arm = armed  # type: ignore[method-assign]
     with source:
-        source.shot()
-        show = modulator.show
-
-        def shown(*asked: object) -> None:
-            show(*asked)  # type: ignore[arg-type]
-            modulator.pair = type(modulator.pair)(
-                *(16 * frame.astype(np.uint16) for frame in (modulator.pair.in_phase, modulator.pair.quadrature))
-            )
-
-        modulator.show = shown  # type: ignore[method-assign, assignment]
-        with pytest.raises(SourceError, match="multiples of 16"):
-            source.shot()
+        source.shot(page=0)
+        camera.frame = refusing  # type: ignore[assignment,method-assign]
+        with pytest.raises(SourceError, match="a refusal"):
+            source.shot(page=0)
+        assert source.shot(page=0).page_index == 0
 
 
-def test_a_beam_that_an_earlier_process_left_blocked_is_opened_before_the_first_shot(tmp_path: Path) -> None:
-    source, beams = with_beams(Lab(), tmp_path)
-    beams.open["signal"] = False
+def test_nobody_waits_for_others_longer_than_it_wants(tmp_path: Path) -> None:
+    source, modulator = source_of(Lab(), PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    held, leave = threading.Event(), threading.Event()
+    show = modulator.show
+
+    def slow(*given: Any) -> None:
+        held.set()
+        assert leave.wait(20)
+        show(*given)
+
+    modulator.show = slow  # type: ignore[method-assign]
     with source:
-        source.shot()
-    assert beams.open == {"signal": True, "reference": True}
+        other = threading.Thread(target=source.shot)
+        other.start()
+        assert held.wait(20)
+        with pytest.raises(LostShotError) as raised:
+            source.shot(0.05, page=1)
+        assert raised.value.reason is Reason.MISSING_FRAME
+        leave.set()
+        other.join(20)

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from lightpage.recording.layout import FrameInfo
 from runtime.acquisition.pairing import Pairing, PairingSettings
-from runtime.cameras.camera import FrameStatus
+from runtime.cameras.camera import Frame, FrameStatus
 from runtime.errors import LostShotError, Reason
 from tests.runtime.acquisition.lab import Lab, LabCamera
 
@@ -197,15 +198,121 @@ def test_the_lab_itself_shows_what_is_on_display() -> None:
     assert frame.pixels[0, 0] == 7
 
 
-def test_a_camera_that_never_stops_sending_hangs_nobody() -> None:
+def clock_steps_back(camera: LabCamera) -> None:
+    camera.clock_s -= 3.0
+
+
+def clock_begins_anew(camera: LabCamera) -> None:
+    camera.id, camera.clock_s = 0, 5.0
+
+
+def clock_steps_by_a_little(camera: LabCamera) -> None:
+    camera.clock_s += 0.05
+
+
+@pytest.mark.parametrize("change", [clock_steps_back, clock_begins_anew, clock_steps_by_a_little])
+@pytest.mark.parametrize("both", [False, True])
+def test_what_three_shots_contradict_is_learnt_anew(change: Callable[[LabCamera], None], both: bool) -> None:
     lab = Lab()
     pairing = pairing_of(lab)
     shoot(pairing, lab)
-    camera = lab.cameras[0]
-    camera.edge()
-    frame = camera.frame(1.0)
-    camera.frame = lambda timeout_s: frame  # type: ignore[method-assign]
-    for _ in range(2):
-        assert tried(pairing, lab) is Reason.STRAY_FRAME
-    del camera.frame  # type: ignore[method-assign]
-    assert tried(pairing, lab) is None
+    for camera in lab.cameras[: 1 + both]:
+        change(camera)
+    outcomes = [tried(pairing, lab) for _ in range(5)]
+    assert set(outcomes[:3]) <= {Reason.OTHER_SHOT, Reason.SKIPPED_FRAME}
+    assert outcomes[3:] == [None, None]
+
+
+def test_single_contradictions_change_nothing() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    shoot(pairing, lab)
+    for _ in range(3):
+        for _ in range(2):
+            lab.plan = faults(lab)["both late"][0]
+            assert tried(pairing, lab) is Reason.OTHER_SHOT
+        before = lab.fired
+        assert tried(pairing, lab) is None
+        assert lab.fired == before + 1  # and no synchronisation
+
+
+@pytest.mark.parametrize(("last", "then"), [(65535, 0), (65535, 1), (2**32 - 1, 0), (2**32 - 1, 1)])
+def test_a_counter_may_wrap_sooner_than_its_driver_says(last: int, then: int) -> None:
+    lab = Lab()
+    for camera in lab.cameras:
+        camera.frame_numbers = 2**64 - 1
+    channel = pairing_of(lab)._channels[0]
+    channel.last_id, channel.step = last, 1
+    pairing_of(lab)._checked(channel, frame_of(then))
+    for other in (2, last, last - 1):
+        with pytest.raises(LostShotError):
+            pairing_of(lab)._checked(channel, frame_of(other))
+
+
+@pytest.mark.parametrize("frames_s", [0.0, 0.001])
+def test_frames_without_end_end_the_shot(frames_s: float) -> None:
+    """A frame is there whenever one is asked for, as of a camera that runs faster than its frames are fetched."""
+    lab = Lab()
+    pairing = pairing_of(lab)
+    asked: list[float] = []
+
+    def flooding(timeout_s: float) -> Frame:
+        asked.append(timeout_s)
+        time.sleep(frames_s)
+        return frame_of(len(asked))
+
+    lab.cameras[1].frame = flooding  # type: ignore[method-assign]
+    with pytest.raises(LostShotError) as raised:
+        shoot(pairing, lab, seconds=0.3)
+    assert raised.value.reason in (Reason.STRAY_FRAME, Reason.NOT_SYNCHRONISED)
+    assert lab.fired == 0
+    del lab.cameras[1].frame
+    assert shoot(pairing, lab) == (lab.page, lab.page)
+
+
+def test_a_flood_that_begins_behind_a_trigger_ends_the_shot() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    shoot(pairing, lab)
+    lab.plan = lambda: setattr(lab.cameras[0], "frame", lambda timeout_s: frame_of(lab.cameras[0].id))
+    assert tried(pairing, lab) in (Reason.STRAY_FRAME, Reason.SKIPPED_FRAME, Reason.MISSING_FRAME)
+    with pytest.raises(LostShotError):
+        shoot(pairing, lab, seconds=0.3)
+    del lab.cameras[0].frame
+    assert shoot(pairing, lab) == (lab.page, lab.page)
+
+
+def counting_by(camera: LabCamera, step: int) -> None:
+    poll = camera.poll
+
+    def polled() -> None:
+        before = camera.id
+        poll()
+        if camera.id != before:
+            camera.id = (camera.id + step - 2) % 65535 + 1
+
+    camera.poll = polled  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("step", [2, 3])
+def test_numbers_may_grow_by_more_than_one(step: int) -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    counting_by(lab.cameras[1], step)
+    assert [tried(pairing, lab) for _ in range(6)] == 6 * [None]
+    assert lab.fired == 6 + 3
+
+
+def test_a_step_of_numbers_that_changes_is_learnt_anew() -> None:
+    lab = Lab()
+    pairing = pairing_of(lab)
+    shoot(pairing, lab)
+    counting_by(lab.cameras[0], 2)
+    outcomes = [tried(pairing, lab) for _ in range(10)]
+    assert outcomes.count(Reason.SKIPPED_FRAME) == 3
+    assert outcomes[-4:] == 4 * [None]
+
+
+def frame_of(number: int) -> Frame:
+    info = FrameInfo("I", number, time.monotonic(), time.time(), "Mono8")
+    return Frame(FrameStatus.COMPLETE, np.zeros((4, 4), np.uint8), info)

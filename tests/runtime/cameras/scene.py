@@ -50,12 +50,12 @@ class Scene:
 
 
 @contextmanager
-def scene(shape: tuple[int, int] = SENSOR, **settings: Any) -> Iterator[Scene]:
+def scene(shape: tuple[int, int] = SENSOR, more_bytes: int = 0, **settings: Any) -> Iterator[Scene]:
     """A fake camera at ADDRESS, and a driver that is not armed yet."""
     given = {"address": ADDRESS, "trigger_source": "Line1", **settings}
     camera = AravisCamera(CameraSettings.model_validate(given), shape, "in-phase camera")
     seen = [noise(camera._settings.pixel_format, 0)]
-    with FakeCamera(ADDRESS, SERIAL, lambda: seen[0], SENSOR) as fake:
+    with FakeCamera(ADDRESS, SERIAL, lambda: seen[0], SENSOR, more_bytes) as fake:
         try:
             yield Scene(fake, camera, seen)
             fake.check()

@@ -12,6 +12,7 @@ from runtime.cameras import aravis_setup
 from runtime.cameras.aravis import AravisCamera
 from runtime.cameras.aravis_library import aravis
 from runtime.cameras.camera import Camera, FrameStatus
+from runtime.cameras.pixel_formats import pixel_format as format_of
 from runtime.cameras.settings import CameraSettings
 from runtime.errors import LostShotError, Reason, SourceError
 from runtime.virtual_device.fake_camera import FakeCamera
@@ -271,4 +272,67 @@ def test_what_it_takes_and_then_forgets_is_named(monkeypatch: pytest.MonkeyPatch
 def test_gain_is_taken() -> None:
     with scene(gain_db=3) as stage:
         stage.camera.arm()
+        info_of(stage.take())
+
+
+@pytest.mark.parametrize("pixel_format", ["Mono8", "Mono12p"])
+@pytest.mark.parametrize("more", [1, 312, 5000])
+def test_a_payload_that_is_larger_than_the_pixels_is_taken(pixel_format: str, more: int) -> None:
+    with scene(more_bytes=more, pixel_format=pixel_format, packet_bytes=1400) as stage:
+        stage.camera.arm()
+        for seed in range(3):
+            stage.seen[0] = noise(pixel_format, seed)
+            frame = stage.take()
+            info_of(frame)
+            assert frame.pixels is not None
+            assert (frame.pixels == stage.seen[0]).all()
+
+
+def test_a_payload_that_is_smaller_than_the_pixels_is_refused() -> None:
+    with (
+        scene(more_bytes=-1) as stage,
+        pytest.raises(SourceError, match="PayloadSize: got 12287, wanted 12288"),
+    ):
+        stage.camera.arm()
+
+
+def test_padding_behind_each_line_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fake camera pads nothing: its library is made to say that the last columns are padding."""
+    rows, columns = SENSOR
+
+    def padding(buffer: int, x: Any, y: Any) -> None:
+        x._obj.value = 8
+
+    with scene((rows, columns)) as stage:
+        stage.camera.arm()
+        monkeypatch.setitem(aravis()._functions, "arv_buffer_get_image_padding", padding)
+        monkeypatch.setitem(aravis()._functions, "arv_buffer_get_image_width", lambda buffer: columns - 8)
+        stage.camera._shape = (rows, columns - 8)
+        pixels = stage.take().pixels
+        assert pixels is not None
+        assert (pixels == stage.seen[0][:, : columns - 8]).all()
+
+
+def test_a_frame_that_ends_too_soon_is_incomplete(monkeypatch: pytest.MonkeyPatch) -> None:
+    with scene() as stage:
+        stage.camera.arm()
+        monkeypatch.setitem(aravis()._functions, "arv_buffer_get_image_height", lambda buffer: SENSOR[0] + 1)
+        stage.camera._shape = (SENSOR[0] + 1, SENSOR[1])
+        frame = stage.take()
+        assert frame.status is FrameStatus.INCOMPLETE
+        assert "12288 bytes" in frame.detail
+
+
+@pytest.mark.parametrize(("own", "other"), [("Mono8", "Mono16"), ("Mono16", "Mono8")])
+def test_a_camera_whose_pixel_format_somebody_changes_is_set_up_again(own: str, other: str) -> None:
+    with scene(pixel_format=own) as stage:
+        stage.seen[0] = noise("Mono8", 3)
+        stage.camera.arm()
+        stage.fake._write(0x128, format_of(other).code)  # behind its user's back
+        assert stage.fake.edge()
+        with pytest.raises(LostShotError, match="settings") as raised:
+            stage.camera.frame(WAIT_S)
+        assert raised.value.reason is Reason.CAMERA_GONE
+        stage.camera.arm()
+        assert stage.camera.opened == 1
         info_of(stage.take())

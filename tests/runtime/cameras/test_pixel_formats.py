@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, InvalidInputError
-from runtime.cameras.pixel_formats import bit_depth, pack, pixel_format, pixel_format_of, unpack
+from runtime.cameras.pixel_formats import bit_depth, pack, pixel_format, pixel_format_of, unpack, without_padding
 
 DEPTHS = {
     "Mono8": 8,
@@ -104,3 +104,21 @@ def test_bad_input_is_named() -> None:
 
 def test_codes_lead_back_to_names() -> None:
     assert {pixel_format_of(pixel_format(name).code).name for name in DEPTHS} == set(DEPTHS)
+
+
+@pytest.mark.parametrize("name", DEPTHS)
+@pytest.mark.parametrize("padding", [0, 1, 4, 60])
+def test_padding_is_left_out(name: str, padding: int) -> None:
+    frame = np.random.default_rng(2).integers(0, 2 ** DEPTHS[name], (5, 16), dtype=np.uint16)
+    frame = frame.astype(np.uint8) if DEPTHS[name] == 8 else frame
+    lines = pack(frame, name).reshape(5, -1)
+    sent = np.concatenate([lines, np.full((5, padding), 0xA5, np.uint8)], axis=1).reshape(-1)
+    for raw in (sent, sent[: sent.size - padding], np.append(sent, np.zeros(300, np.uint8))):
+        assert (unpack(without_padding(raw, frame.shape, name, padding), frame.shape, name) == frame).all()
+
+
+def test_padded_lines_that_cannot_be_told_apart_are_refused() -> None:
+    with pytest.raises(FrameError, match="70 bytes"):
+        without_padding(np.zeros(70, np.uint8), (5, 16), "Mono8", 4)
+    with pytest.raises(FrameError, match="whole bytes"):
+        without_padding(np.zeros(1000, np.uint8), (5, 15), "Mono12p", 4)

@@ -122,3 +122,26 @@ def test_beams_that_nobody_sets_are_named() -> None:
     assert lost.value.reason is Reason.BEAM_CONTROL_FAILED
     beams.close()
     assert beams.wanted() is None
+
+
+def test_beams_that_nobody_heard_of_are_open() -> None:
+    beams = ExternalBeams(0.01)
+    with pytest.raises(LostShotError):
+        beams.let_through(signal=False, reference=True)
+    beams.let_through(signal=True, reference=True)
+    assert beams.wanted() is None
+
+
+def test_a_controller_that_may_have_blocked_a_beam_is_asked_to_open_it(start: Start) -> None:
+    beams = ExternalBeams(0.2)
+    moved = start(beams.let_through, signal=False, reference=True)
+    assert beams.wanted(WAIT_S) == BeamState(signal=False, reference=True)
+    with pytest.raises(LostShotError):
+        moved.result(WAIT_S)
+    assert beams.wanted() == BeamState(signal=True, reference=True)
+    with pytest.raises(LostShotError):
+        beams.let_through(signal=True, reference=True)
+    assert beams.wanted() == BeamState(signal=True, reference=True)
+    beams.beams_set(signal=True, reference=True)
+    beams.let_through(signal=True, reference=True)
+    assert beams.wanted() is None

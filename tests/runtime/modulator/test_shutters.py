@@ -14,7 +14,7 @@ from runtime.modulator.modulator import Beams
 from runtime.modulator.shutters import Shutter, ShutterBeams
 from runtime.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
 from runtime.virtual_device.pulse_generator import PulseGeneratorEmulator
-from runtime.virtual_device.serial_port import Pty
+from runtime.virtual_device.serial_port import Fault, Pty
 
 SIGNAL, REFERENCE = Shutter(channel=3, settle_s=0.01), Shutter(channel=4, open_when="low", settle_s=0.0)
 
@@ -107,3 +107,37 @@ def test_what_makes_no_sense(lab: Lab) -> None:
         Shutter(channel=3, open_when="up")  # type: ignore[arg-type]
     with pytest.raises(InvalidInputError, match="cameras"):
         ShutterBeams(lab.generator, Shutter(channel=1), REFERENCE).let_through(signal=True, reference=True)
+
+
+@pytest.mark.parametrize("failing", [":PULSE3", ":PULSE4"])
+@pytest.mark.parametrize("fault", [Fault.SILENCE, Fault.CUT_MESSAGE])
+def test_an_order_that_fails_is_not_given_again(lab: Lab, failing: str, fault: Fault) -> None:
+    lab.beams.let_through(signal=True, reference=True)
+    lab.port.fault = lambda message: fault if message.startswith(f"{failing}:STATE") else None
+    with pytest.raises(LostShotError):
+        lab.beams.let_through(signal=False, reference=False)
+    lab.port.fault = lambda message: None
+    lab.generator.arm()
+    assert lab.open() == (True, True)
+
+
+def test_a_shutter_that_refuses_to_open_does_not_keep_the_other_one_closed(lab: Lab) -> None:
+    lab.beams.let_through(signal=False, reference=False)
+    answer = lab.device.answer
+    lab.port._answer = lambda message: "?8" if message.startswith(":PULSE3:STATE O") else answer(message)
+    with pytest.raises(LostShotError) as raised:
+        lab.beams.let_through(signal=True, reference=True)
+    assert raised.value.reason is Reason.BEAM_CONTROL_FAILED
+    assert lab.open() == (False, True)
+    lab.port._answer = answer
+    lab.beams.close()
+    assert lab.open() == (True, True)
+
+
+def test_one_answer_that_is_lost_on_the_line_costs_nothing(lab: Lab) -> None:
+    lab.beams.let_through(signal=True, reference=True)
+    left = [":PULSE4:STATE ON"]
+    lab.port.fault = lambda message: Fault.SILENCE if message in left and not left.remove(message) else None  # type: ignore[func-returns-value]
+    lab.beams.let_through(signal=False, reference=False)
+    assert not left
+    assert lab.open() == (False, False)

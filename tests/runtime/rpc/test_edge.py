@@ -23,6 +23,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from lightpage.recording.frame_pair import FramePair
+from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
 from runtime.errors import OverloadedError, SlotsTakenError
@@ -30,8 +31,12 @@ from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import SERVICE, Call
 from runtime.rpc.health_server import HealthServer
 from runtime.rpc.inference_calls import INFERENCE
+from runtime.rpc.server import LightpageServer
 from runtime.service.caller import Caller
+from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits
+from runtime.service.recalibrator import Recalibrator
+from runtime.service.registry import ModelRegistry
 from runtime.service.slots import Slots
 from runtime.wire.status import STATUS_KEY
 from tests.runtime import toy
@@ -594,6 +599,32 @@ def test_the_health_of_all_services_is_told_by_both_servers(start: Start) -> Non
                     assert ask.Check(health_pb2.HealthCheckRequest(service=name), timeout=5).status == wanted[name]
         service.server.stop(0.5)
         assert not any(service.server.health().values())
+
+
+def test_a_source_in_trouble_is_told_by_health_and_metrics_until_it_is_well(start: Start) -> None:
+    service, trouble = start(), ["a beam may be blocked"]
+    assert service.count("lightpage_source_ok") == 1
+    service.source.trouble = lambda: "".join(trouble)  # type: ignore[method-assign]
+    states = service.server.health()
+    assert {name for name, serves in states.items() if not serves} == {*states} - {"lightpage.store"}
+    assert service.count("lightpage_source_ok") == 0
+    with grpc.insecure_channel(service.server.target) as channel:
+        ask, request = health_pb2_grpc.HealthStub(channel), health_pb2.HealthCheckRequest()
+        assert ask.Check(request, timeout=5).status == health_pb2.HealthCheckResponse.NOT_SERVING
+        trouble.clear()
+        assert all(service.server.health().values())
+        assert ask.Check(request, timeout=5).status == health_pb2.HealthCheckResponse.SERVING
+    assert service.count("lightpage_source_ok") == 1
+
+
+def test_a_service_that_starts_with_its_source_in_trouble_does_not_say_that_it_serves(toy_zip: Path) -> None:
+    source = toy.ToySource(toy.ToyDevice())
+    source.trouble = lambda: "a beam may be blocked"  # type: ignore[method-assign]
+    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), source)
+    server = LightpageServer(plane, Recalibrator(plane, toy.fit_references))
+    with server, grpc.insecure_channel(server.target) as channel:
+        status = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=5).status
+        assert status == health_pb2.HealthCheckResponse.NOT_SERVING
 
 
 def test_the_service_describes_its_contract_to_strangers(start: Start) -> None:

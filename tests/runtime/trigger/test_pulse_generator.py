@@ -220,3 +220,24 @@ def test_camera_channels_and_unknown_ones_are_not_switched(lab: Lab, channel: in
 def test_settings_have_bounds(settings: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=next(iter(settings))):
         PulseGeneratorSettings(**{"port": "/dev/ttyUSB0"} | settings)
+
+
+def test_a_divider_that_somebody_has_set_is_taken_back(lab: Lab) -> None:
+    generator = lab.generator()
+    generator.arm()
+    lab.device.answer(":PULSE2:CMOD DCYC")
+    generator.fire()
+    assert lab.fired == [1]
+    generator.arm()
+    for _ in range(2):
+        generator.fire()
+    assert lab.fired[1:] == [1, 2, 1, 2]
+
+
+def test_a_device_without_dividers_is_set_up_all_the_same(lab: Lab) -> None:
+    answer: Callable[[str], str] = lab.device.answer
+    lab.port._answer = lambda message: "?3" if ":CMOD" in message else answer(message)
+    generator = lab.generator()
+    generator.arm()
+    generator.fire()
+    assert lab.fired == [1, 2]

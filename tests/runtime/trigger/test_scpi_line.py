@@ -6,11 +6,13 @@ import re
 import termios
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from serial.tools import list_ports
 
 from lightpage.errors import InvalidInputError
 from runtime.errors import LostShotError, Reason, SourceError
@@ -130,7 +132,7 @@ def test_late_identifications_are_waited_for(lab: Lab) -> None:
     with pytest.raises(LostShotError):
         lab.width(1)
     lab.port.late_s = (0.2, 0.22)
-    left = [Fault.LATE, Fault.LATE]
+    left = [Fault.LATE, Fault.LATE, Fault.LATE]
     lab.port.fault = lambda message: left.pop(0) if left and message == "*IDN?" else None
     assert (lab.width(2), lab.width(1)) == (2e-5, 1e-5)
     assert not left
@@ -281,48 +283,132 @@ def test_messages_are_one_line_of_ascii(message: str) -> None:
         ScpiLine("socket://127.0.0.1:1").send(message)
 
 
-class Styled(Pty):
-    """A port that writes otherwise than the family does."""
+@pytest.mark.parametrize(
+    ("line_end", "before", "echo"),
+    [(b"\n", b"", False), (b"\r", b"\0\0", False), (b"\r", b"", True), (b"\n\r", b"\0", True)],
+)
+def test_a_line_ends_as_its_device_ends_it(any_lab: Lab, line_end: bytes, before: bytes, echo: bool) -> None:
+    any_lab.port.line_end, any_lab.port.before_line, any_lab.port.echo = line_end, before, echo
+    line = any_lab.line
+    line.close()
+    for _ in range(3):
+        assert (any_lab.width(1), any_lab.width(2)) == (1e-5, 2e-5)
+    line.send(":PULSE1:STATE ON")
+    session = line.session
+    for _ in range(20):
+        line.send(":PULSE1:STATE OFF", session)
+    assert line.identity == IDENTITY
 
-    def __init__(self, answer: Callable[[str], str], link: Path, style: Callable[[bytes], bytes]) -> None:
-        super().__init__(answer, link)
-        self._style = style
 
-    def _write(self, content: bytes) -> None:
-        super()._write(self._style(content))
+def test_a_rest_of_an_end_that_comes_later_is_no_answer(lab: Lab) -> None:
+    lab.port.line_end = b"\r"
+    lab.width(1)
+    session = lab.line.session
+    for late in (b"\n", b"\0", b"\0\r\n"):
+        lab.port._write(late)
+        serial = lab.line._port._port
+        assert serial is not None
+        until(lambda serial=serial: serial.in_waiting > 0)  # type: ignore[misc]
+        lab.line.send(":PULSE1:STATE ON", session)
+
+
+def test_a_device_that_sends_nuls_all_the_time_is_understood(lab: Lab) -> None:
+    lab.line.close()
+    stop = threading.Event()
+
+    def fill() -> None:
+        while not stop.wait(0.005):
+            lab.port._write(b"\0")
+
+    filler = threading.Thread(target=fill)
+    filler.start()
+    try:
+        assert lab.width(2) == 2e-5
+    finally:
+        stop.set()
+        filler.join(5)
 
 
 @pytest.mark.parametrize(
-    "style",
+    ("answer", "line_end", "quoted"),
     [
-        lambda answer: answer.replace(b"\r\n", b"\n"),
-        lambda answer: answer.replace(b"\r\n", b"\r"),
-        lambda answer: answer.replace(b"\r\n", b"\r\n\0\0"),
-        lambda answer: b"\0" + answer,
-        lambda answer: b"\r\n" + answer,
+        ("login:", b"", r"'login:' without an end"),
+        ("ERROR 7", b"\n", r"'ERROR 7'"),
+        ("\x80\xfe\x80", b"\r\n", r"'\\x80þ\\x80'"),
+        ("x" * 300, b"\r", r"'x{80}' and 220 characters more"),
     ],
-    ids=["LF", "CR", "NULs behind", "NUL before", "empty line before"],
 )
-def test_lines_may_end_otherwise(style: Callable[[bytes], bytes], tmp_path: Path) -> None:
-    device = PulseGeneratorEmulator()
-    with plugged(Styled(device.answer, tmp_path / "tty", style), device) as lab:
-        session = lab.line.session
-        assert [lab.width(channel) for channel in (1, 2, 1)] == [1e-5, 2e-5, 1e-5]
-        assert lab.line.session == session  # no answer was taken for one of another message
-
-
-def test_a_slow_device_is_given_the_time_that_it_takes(tmp_path: Path) -> None:
-    device = PulseGeneratorEmulator()
-    port = Pty(device.answer, tmp_path / "tty")
-    port.fault, port.late_s = lambda message: Fault.LATE, (0.2, 0.22)  # an answer is waited for 0.15 s
-    with plugged(port, device) as lab:
-        assert [lab.width(channel) for channel in (1, 2, 1)] == [1e-5, 2e-5, 1e-5]
-
-
-def test_answers_that_are_not_understood_are_quoted(tmp_path: Path) -> None:
-    with Pty(lambda message: "ERROR 113 ready>", tmp_path / "tty") as port:
+def test_what_came_in_place_of_an_identification_is_quoted(
+    answer: str, line_end: bytes, quoted: str, tmp_path: Path
+) -> None:
+    with Pty(lambda message: answer, tmp_path / "tty") as port:
+        port.line_end = line_end
         line = ScpiLine(port.address, times=TIMES)
-        with pytest.raises(LostShotError, match=r"ERROR 113 ready>") as caught:
+        with pytest.raises(LostShotError, match=rf"\*IDN\? .*{quoted}") as raised:
+            line.send("*RST")
+        assert raised.value.reason is Reason.TRIGGER_GONE
+        line.close()
+
+
+def test_an_answer_without_an_end_is_quoted(lab: Lab) -> None:
+    lab.port.line_end = b""
+    with pytest.raises(LostShotError, match=r"'0\.00001000000' without an end"):
+        lab.width(1)
+
+
+def test_a_device_that_is_slow_is_named_as_slow_and_with_more_time_is_understood(lab: Lab) -> None:
+    lab.line.close()
+    lab.port.late_s = (0.2, 0.2)
+    lab.port.fault = lambda message: Fault.LATE
+    with pytest.raises(LostShotError, match=rf"'{IDENTITY}' came after 0\.2.* s, wanted it within answer_s"):
+        lab.width(1)
+    lab.port.unplug()  # what is still on its way is lost
+    lab.port.plug()
+    patient = ScpiLine(lab.port.address, times=LineTimes(answer_s=0.5, quiet_s=0.03, late_s=1.0, synchronise_s=4.0))
+    assert float(patient.query(":PULSE1:WIDT?", NUMBER)) == 1e-5
+    patient.close()
+
+
+def test_a_banner_is_no_answer(lab: Lab) -> None:
+    lab.line.close()
+    lab.port.before_line = b"BNC 575 ready, firmware 2.4, good morning\n"
+    with pytest.raises(LostShotError, match="BNC 575 ready"):
+        lab.width(1)
+    first = [b"BNC 575 ready, firmware 2.4, good morning\n"]
+    answer = lab.device.answer
+
+    def greeting(message: str) -> str:
+        return (first.pop().decode() if first else "") + answer(message)
+
+    lab.port.before_line, lab.port._answer = b"", greeting
+    assert (lab.width(1), lab.line.identity) == (1e-5, IDENTITY)
+
+
+def test_an_adapter_that_comes_back_under_another_name_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = PulseGeneratorEmulator()
+    first, second = (Pty(device.answer, tmp_path / name) for name in ("ttyUSB0", "ttyUSB1"))
+    plugged: dict[Path, tuple[int, int, str | None, str]] = {}
+
+    def comports() -> list[SimpleNamespace]:
+        names = ("vid", "pid", "serial_number", "location")
+        known = [(link, dict(zip(names, told, strict=True))) for link, told in plugged.items()]
+        return [SimpleNamespace(device=str(link.resolve()), **told) for link, told in known] + [
+            SimpleNamespace(device="/dev/ttyS0", vid=None, pid=None, serial_number=None, location=None)
+        ]
+
+    monkeypatch.setattr(list_ports, "comports", comports)
+    with first:
+        plugged[tmp_path / "ttyUSB0"] = (0x403, 0x6001, "A50", "1-1")
+        line = ScpiLine(first.address, times=TIMES)
+        line.send(":PULSE1:WIDT 0.00001")
+    del plugged[tmp_path / "ttyUSB0"]
+    with second:
+        plugged[tmp_path / "ttyUSB1"] = (0x403, 0x6001, "B77", "1-2")  # another one
+        with pytest.raises(LostShotError, match="ttyUSB0"):
             line.send(":PULSE1:STATE ON")
-        assert caught.value.reason is Reason.TRIGGER_GONE
+        plugged[tmp_path / "ttyUSB1"] = (0x403, 0x6001, "A50", "1-2")
+        line.send(":PULSE1:STATE ON")
+        assert line.session == 2
         line.close()
