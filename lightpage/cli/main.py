@@ -33,6 +33,7 @@ from lightpage.errors import (
 from lightpage.failures import understood
 from lightpage.files import results_on_stdout
 from lightpage.progress import reporting
+from lightpage.temporary import settle_matplotlib
 
 GROUP = "lightpage.commands"
 
@@ -259,6 +260,7 @@ def _fail(error: LightpageError) -> int:
 def main() -> NoReturn:
     """The console script."""
     streams = take_streams()
+    settle_matplotlib()
     if os.environ.keys().isdisjoint(_OWN_CHOICE):
         os.environ.update(THREADS)
     if instruction := os.environ.get(COMPLETE):

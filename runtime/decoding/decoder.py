@@ -22,7 +22,7 @@ from lightpage.errors import (
     NoCodeError,
     SurroundingsError,
 )
-from lightpage.failures import understood
+from lightpage.failures import short_resource
 from lightpage.metrics.information import decide_with_confidence
 from lightpage.page.levels import MAX_LEVELS
 from lightpage.page.pilots import Pilots, read_pilots, remove_piston
@@ -327,7 +327,7 @@ class Decoder:
         except (BundleError, ProviderError, SurroundingsError):
             raise
         except Exception as error:  # onnxruntime's errors share no base class
-            raise understood(subject, error) or BundleError(subject, error, "a golden page that decodes") from None
+            raise short_resource(subject, error) or BundleError(subject, error, "a golden page that decodes") from None
         if golden.p.shape != p.shape:
             raise BundleError(f"{subject}: p", f"shape {golden.p.shape}", f"shape {p.shape}")
         error_norm = float(np.linalg.norm(p - golden.p) / max(float(np.linalg.norm(golden.p)), 1e-30))

@@ -360,6 +360,8 @@ class Recalibrator:
                     self._temporary = tempfile.TemporaryDirectory(prefix="lightpage-models-")
                 except OSError as error:
                     subject = "temporary folder of recalibrated models"
+                    if isinstance(error, FileNotFoundError):
+                        raise StoreError(subject, error, _ROOM) from None
                     raise os_failure(subject, error, _ROOM, StoreError) from None
         return ModelStore(Path(self._temporary.name), self._plane.registry.current.decoder.bundle, kept=0)
 

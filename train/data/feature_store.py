@@ -45,10 +45,9 @@ class FeatureStore(Dataset[Page]):
     """
 
     def __init__(self, folder: Path, pages: range | None = None) -> None:
-        with _told(folder):
-            names = [name for name in _FILES.values() if (folder / f"{name}.npy").exists()]
-            self._arrays = [np.load(folder / f"{name}.npy", mmap_mode="r") for name in names]
-            self._states = np.load(folder / f"{_PAGE_STATE}.npy", mmap_mode="r")
+        names = [name for name in _FILES.values() if (folder / f"{name}.npy").exists()]
+        self._arrays = [np.load(folder / f"{name}.npy", mmap_mode="r") for name in names]
+        self._states = np.load(folder / f"{_PAGE_STATE}.npy", mmap_mode="r")
         self._pages = range(len(self._states)) if pages is None else pages
 
     def __len__(self) -> int:
