@@ -188,3 +188,24 @@ def test_shutters_open_when_their_generator_answers_again(tmp_path: Path) -> Non
         until(lambda: not source.trouble())
         assert (level[3], level[4]) == (True, True)
         source.close()
+
+
+def test_whoever_waits_while_the_beams_are_opened_hears_of_them(tmp_path: Path) -> None:
+    source, modulator = source_of(Lab(), PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    begun, leave = threading.Event(), threading.Event()
+
+    def slow(*, signal: bool, reference: bool) -> None:
+        begun.set()
+        leave.wait(20)
+
+    with source:
+        source._keeper._trouble = "a beam may be blocked"
+        modulator.let_through = slow  # type: ignore[method-assign]
+        opening = threading.Thread(target=source._keeper.open)
+        opening.start()
+        assert begun.wait(20)
+        with pytest.raises(LostShotError) as raised:
+            source.shot(0.05, page=0)
+        assert raised.value.reason is Reason.BEAM_CONTROL_FAILED
+        leave.set()
+        opening.join(20)
