@@ -140,10 +140,11 @@ def test_no_page_is_taken_while_a_beam_may_be_blocked(tmp_path: Path) -> None:
         assert source.trouble() == ""
         _take_dark_frames(source)  # as the service does when it starts
         assert "blocked" in source.trouble()
+        fired = lab.fired
         with pytest.raises(LostShotError) as raised:
             source.shot(0.05, page=0)
         assert raised.value.reason is Reason.BEAM_CONTROL_FAILED
-        assert lab.fired == 3 + 1  # no page was photographed
+        assert lab.fired == fired
         fails.clear()
         assert source.shot(5.0, page=0).page_index == 0
         assert source.trouble() == ""
