@@ -82,7 +82,7 @@ class BeamKeeper:
             except BaseException as error:
                 self._trouble = f"a beam may be blocked: {str(error) or type(error).__name__}"
                 if not before:
-                    _log.error("%s: %s; opening them is tried again until they are open", self._name, self._trouble)
+                    _log.error("%s: no page is read until both beams are open: %s", self._name, self._trouble)
                     self._start()
                 if isinstance(error, LightpageError):
                     told = error.subject, error.got, error.expected

@@ -240,9 +240,10 @@ class CameraSource(FrameSource):
     @contextmanager
     def _in_turn(self, timeout_s: float) -> Iterator[None]:
         """Hold the devices, unless others use them for too long."""
-        if not self._lock.acquire(timeout=timeout_s):
-            wanted = f"their end within {timeout_s:g} s"
-            raise LostShotError(self.name, "other shots", wanted, Reason.MISSING_FRAME)
+        if not self._lock.acquire(timeout=min(max(0.0, timeout_s), threading.TIMEOUT_MAX)):
+            if trouble := self._keeper.trouble:
+                raise LostShotError(self.name, trouble, "both beams open", Reason.BEAM_CONTROL_FAILED)
+            raise LostShotError(self.name, "other shots", f"their end within {timeout_s:g} s", Reason.MISSING_FRAME)
         try:
             yield
         finally:

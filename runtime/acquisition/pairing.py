@@ -289,7 +289,7 @@ class Pairing:
         settings = self.settings
         earliest = max(self._next_at, self._displayed_at + settings.tolerance_s)
         if earliest > deadline or time.monotonic() > deadline:
-            raise LostShotError("shot", "no time left", "a longer wait", Reason.MISSING_FRAME)
+            raise _no_time_left()
         time.sleep(max(0.0, earliest - time.monotonic()))
         if self._drain():
             raise LostShotError("frame", "one before the trigger", "none", Reason.STRAY_FRAME)
@@ -340,17 +340,23 @@ class Pairing:
         """Wait until no frame has come for a while; what came before is not known any more."""
         quiet = self.settings.quiet_s
         end = time.monotonic() + quiet
-        give_up = min(deadline, end + _MOST_QUIET * quiet)
+        give_up, came = min(deadline, end + _MOST_QUIET * quiet), 0
         while (now := time.monotonic()) < end:
-            if now > give_up:
+            if now > give_up and came:
                 raise LostShotError("cameras", "frames without end", f"silence for {quiet:g} s", Reason.STRAY_FRAME)
-            if self._drain():
-                end = time.monotonic() + quiet
+            if now > give_up:
+                raise _no_time_left()
+            if dropped := self._drain():
+                came, end = came + dropped, time.monotonic() + quiet
             time.sleep(0.005)
         for channel in self._channels:
             channel.last_id = None
         self._next_at = max(self._next_at, time.monotonic())
         self._settled = True
+
+
+def _no_time_left() -> LostShotError:
+    return LostShotError("shot", "no time left", "a longer wait", Reason.MISSING_FRAME)
 
 
 def _info(frame: Frame) -> FrameInfo:

@@ -207,10 +207,12 @@ class GenTLDevice:
         if got != (columns, rows, known.code):
             told = f"{got[0]} x {got[1]} pixels in format {got[2]:#010x}"
             raise CameraGoneError(f"{told} in place of {columns} x {rows} in {known.code:#010x}")
-        size, padding = known.nbytes(rows * columns), 0
+        size, offset, padding = known.nbytes(rows * columns), 0, 0
+        with suppress(*self._errors):
+            offset = buffer.image_offset
         with suppress(*self._errors):
             padding = buffer.padding_x
-        sent = np.frombuffer(buffer.raw_buffer, np.uint8)[buffer.image_offset :]
+        sent = np.frombuffer(buffer.raw_buffer, np.uint8)[offset:]
         try:
             pixels = without_padding(sent, self._shape, known.name, padding)
         except FrameError as error:

@@ -411,3 +411,13 @@ def test_nobody_waits_for_others_longer_than_it_wants(tmp_path: Path) -> None:
         assert raised.value.reason is Reason.MISSING_FRAME
         leave.set()
         other.join(20)
+
+
+@pytest.mark.parametrize("seconds", [-1.0, 0.0])
+def test_a_shot_without_time_is_lost(tmp_path: Path, seconds: float) -> None:
+    source, _ = source_of(Lab(), PageStore(toy.PROFILE, Pages.open(pages_of(tmp_path))))
+    with source:
+        with pytest.raises(LostShotError) as raised:
+            source.shot(seconds, page=0)
+        assert raised.value.reason in (Reason.MISSING_FRAME, Reason.NOT_SYNCHRONISED)
+        assert source.shot(float("inf"), page=0).page_index == 0

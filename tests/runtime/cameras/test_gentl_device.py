@@ -53,16 +53,21 @@ def test_what_surrounds_the_pixels_is_left_out(name: str, padding: int, offset: 
         assert memory[:] == packed.tobytes()
 
 
-def test_a_producer_that_tells_no_padding_has_none() -> None:
+def test_a_producer_that_tells_no_padding_and_no_offset_has_none() -> None:
     class Buffer(SimpleNamespace):
         @property
         def padding_x(self) -> int:
             raise ProducerError("not available")
 
+        @property
+        def image_offset(self) -> int:
+            raise ProducerError("not available")
+
     packed = pack(counts("Mono8"), "Mono8")
-    plain = buffer_of("Mono8", packed.tobytes())
+    plain = vars(buffer_of("Mono8", packed.tobytes()))
+    del plain["image_offset"]
     with mmap.mmap(-1, packed.size) as memory:
-        assert device_of()._read(Buffer(**vars(plain)), memory).fault == ""
+        assert device_of()._read(Buffer(**plain), memory).fault == ""
         assert memory[:] == packed.tobytes()
 
 
