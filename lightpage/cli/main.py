@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from copy import copy
 from functools import wraps
 from importlib.metadata import EntryPoint, entry_points
@@ -260,7 +260,8 @@ def _fail(error: LightpageError) -> int:
 def main() -> NoReturn:
     """The console script."""
     streams = take_streams()
-    settle_matplotlib()
+    with suppress(LightpageError):  # a command that draws says what it lacks
+        settle_matplotlib()
     if os.environ.keys().isdisjoint(_OWN_CHOICE):
         os.environ.update(THREADS)
     if instruction := os.environ.get(COMPLETE):
