@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from lightpage.errors import SaturatedFrameError
 from lightpage.recording.alignment import greatest_count, unused_low_bits
 from lightpage.recording.exposure import check_light
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.reader import Recording, RecordingWriter
+from tests.lightpage.small import small_profile
 
 
 def counts(bits: int, seed: int = 0, top: float = 0.9) -> np.ndarray:
@@ -58,3 +63,18 @@ def test_saturation_of_left_aligned_counts_is_seen() -> None:
         check_light("frame", frame, 16)
     check_light("frame", counts(12) << 4, 16)
     check_light("frame", counts(16), 16)
+
+
+def test_a_recording_of_left_aligned_counts_tells_of_them_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    profile = small_profile()
+    frames = [np.random.default_rng(n).integers(0, 4096, profile.frame_shape).astype(np.uint16) << 4 for n in (1, 2)]
+    pair = FramePair(frames[0], frames[1])
+    symbols = np.zeros(profile.page_shape, np.uint8)
+    with RecordingWriter(tmp_path / "R.h5", profile, 16, 16, pair) as writer:
+        writer.append(symbols, pair)
+    with Recording.open(tmp_path / "R.h5") as recording:
+        recording.references()
+        recording.frames(0)
+    assert [record.message.count("multiples of 16") for record in caplog.records] == [1]

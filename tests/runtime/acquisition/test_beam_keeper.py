@@ -210,3 +210,13 @@ def test_whoever_waits_while_the_beams_are_opened_hears_of_them(tmp_path: Path) 
         assert raised.value.reason is Reason.BEAM_CONTROL_FAILED
         leave.set()
         opening.join(20)
+
+
+def test_beams_that_an_earlier_process_left_blocked_are_opened_before_the_first_shot() -> None:
+    beams = Beams()
+    beams.open["signal"] = False
+    keeper = BeamKeeper(beams, threading.RLock(), "source")
+    for _ in range(2):
+        keeper.ensure_open()
+    assert beams.open == {"signal": True, "reference": True}
+    assert beams.orders == [(True, True)]
