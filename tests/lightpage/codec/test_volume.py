@@ -15,7 +15,7 @@ from lightpage.codec.header import MOST_BYTES
 from lightpage.codec.page_bytes import PageBytes
 from lightpage.codec.volume import Volume, encode_volume, restore_group
 from lightpage.codec.volume_file import MOST_VOLUMES, VolumeFile, VolumeFiles, ranges
-from lightpage.errors import InvalidInputError, LostDataError
+from lightpage.errors import InvalidInputError, LostDataError, SurroundingsError
 from tests.lightpage.codec.light import codec_of, noisy
 from tests.lightpage.full_disk import full_disk
 
@@ -366,13 +366,13 @@ class TestFullDisk:
 
     @pytest.mark.parametrize("room", [0, SIZE, 2 * SIZE + 10])
     def test_pages_that_find_no_room_leave_nothing(self, written: Written, tmp_path: Path, room: int) -> None:
-        with pytest.raises(InvalidInputError, match=r"file .*file\..*partial: got .*wanted room for it on the disk"):
+        with pytest.raises(SurroundingsError, match=r"file .*file\..*partial: got .*wanted more room"):
             make_file(tmp_path / "file", list(written.pages.values()), room, self.ENOUGH)
         assert list(tmp_path.iterdir()) == []
 
     def test_restored_pages_that_find_no_room_leave_nothing(self, written: Written, tmp_path: Path) -> None:
         pages = [page for number, page in written.pages.items() if number not in (8, 9)]
-        with pytest.raises(InvalidInputError, match=r"file .*file\..*partial: got .*wanted room for it on the disk"):
+        with pytest.raises(SurroundingsError, match=r"file .*file\..*partial: got .*wanted more room"):
             make_file(tmp_path / "file", pages, self.ENOUGH, 5 * SIZE)
         assert list(tmp_path.iterdir()) == []
 
