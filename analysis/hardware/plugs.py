@@ -32,6 +32,8 @@ _AWAY_S = 1.0
 _PATIENCE_S = 30.0
 _ATTEMPTS = 10
 TOLERANCE_S = 0.03
+_REPEATS = 3
+"""Further shots of a page: a busy machine delays an edge now and then, which is not what is counted."""
 
 
 def steady(source: CameraSource, page: int) -> None:
@@ -94,7 +96,7 @@ def main(times: int, json_path: Path | None) -> None:
     with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
         stage = Stage(small_cameras(), Path(folder))
         try:
-            with source_of(stage, TOLERANCE_S, 1) as source:
+            with source_of(stage, TOLERANCE_S, _REPEATS) as source:
                 camera = stage.fakes[1]
                 for what, unplug, plug in (
                     ("camera", camera.close, camera.start),
