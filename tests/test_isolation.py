@@ -17,6 +17,7 @@ from tests.skips import NO_FILTERS
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("lightpage", "train", "runtime", "export", "analysis")
 ROOMS = (
+    "lightpage.clock",
     "lightpage.errors",
     "lightpage.failures",
     "lightpage.progress",
