@@ -12,6 +12,7 @@ from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.recalibration.outcome import Refit
 from runtime.rpc.server import LightpageServer
+from runtime.service.audit import AuditLog
 from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits
 from runtime.service.monitor import Monitor
@@ -32,12 +33,13 @@ def begun(
     tracker: TrackerFactory = no_tracker,
     source: Any = "toy",
     monitor: Monitor | None = None,
+    audit: AuditLog | None = None,
     **server: Any,
 ) -> Running:
     """A service, as `lightpage serve` starts one; further arguments are of `LightpageServer`."""
     shown = toy.ToySource(toy.ToyDevice()) if source == "toy" else source
     models = ModelStore(store, decoder.bundle) if store is not None else None
-    plane = DataPlane(ModelRegistry(decoder, tracker), shown, models, limits, monitor=monitor)
+    plane = DataPlane(ModelRegistry(decoder, tracker), shown, models, limits, monitor=monitor, audit=audit)
     plane.models.resume()
     recalibrator = Recalibrator(plane, fit, recordings)
     running = LightpageServer(plane, recalibrator, **server).start()
@@ -65,5 +67,3 @@ def service(decoder: Decoder) -> Iterator[Running]:
     running = begun(decoder)
     yield running
     running.end()
-
-

@@ -10,7 +10,6 @@ from typing import Any
 
 import grpc
 import numpy as np
-import pytest
 from google.protobuf.message import Message
 from google.rpc import error_details_pb2, status_pb2
 
@@ -109,7 +108,8 @@ def a_page(levels: int = 16, seed: int = 3) -> tuple[np.ndarray, FramePair]:
 
 def raised(pair: FramePair, counts: int) -> FramePair:
     """The pair of a camera whose black level is so many counts higher."""
-    return FramePair(*(np.minimum(frame, 255 - counts) + np.uint8(counts) for frame in (pair.in_phase, pair.quadrature)))
+    frames = (pair.in_phase, pair.quadrature)
+    return FramePair(*(np.minimum(frame, 255 - counts) + np.uint8(counts) for frame in frames))
 
 
 def header(**changes: Any) -> pb.DecodeHeader:
@@ -169,11 +169,13 @@ def refused_as(error: Any) -> Refused:
 
 def refused(call: Callable[[], Any]) -> Refused:
     """How a call fails, or a stream of replies on its way."""
-    with pytest.raises(grpc.RpcError) as error:
+    try:
         answer = call()
         if hasattr(answer, "__next__"):
             list(answer)
-    return refused_as(error.value)
+    except grpc.RpcError as error:
+        return refused_as(error)
+    raise AssertionError("the call was answered")
 
 
 class Remembering(NoTracker):

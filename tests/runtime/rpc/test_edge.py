@@ -223,8 +223,8 @@ def test_a_page_that_is_read_on_though_its_caller_left_has_the_services_own_dead
         raise CallerLeft
 
     monkeypatch.setattr(running.plane, "read_page", read_page)
-    with ThreadPoolExecutor(1) as pool, pytest.raises(CallerLeft):
-        call = Call("ReadPage", Caller(lambda: 1.0), pool)
+    call = Call("ReadPage", Caller(lambda: 1.0), ThreadPoolExecutor(1))
+    with pytest.raises(CallerLeft):
         PageCalls(running.plane, clock.now).ReadPage(pb.ReadPageRequest(request_id="a"), call)
     running.end()
     assert left == [7.0, 5.0]
@@ -389,5 +389,3 @@ def test_clients_at_one_unix_socket_are_followed_apart(start: Start, tmp_path: P
     assert [decode(parts(pair), timeout=20).piston_rad for _ in range(2)] == [1, 1]
     named = pb.DecodeOptions(levels=16, session="mine")
     assert [decode(parts(pair, options=named), timeout=20).piston_rad for _ in range(2)] == [1, 2]
-
-

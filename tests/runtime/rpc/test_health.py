@@ -23,7 +23,7 @@ SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.Health
 
 
 async def answers(heard: dict[str, bool], *, silence_s: float = 60.0) -> list[int]:
-    """What a watcher of "one" hears from the process: before its service says something, then, and when it is silent."""
+    """What a watcher of "one" hears: before the service says something, then, and when it is silent."""
     ours, its = socket.socketpair()
     reader, writer = await asyncio.open_connection(sock=ours)
     serving = asyncio.ensure_future(serve("127.0.0.1:0", its, silence_s=silence_s))
@@ -125,4 +125,3 @@ def test_a_port_that_is_taken_is_named(health: HealthServer) -> None:
 )
 def test_where_health_is_asked_by_default(address: str, expected: str) -> None:
     assert next_port(address) == expected
-

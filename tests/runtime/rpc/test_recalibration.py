@@ -146,7 +146,8 @@ def test_a_re_fit_is_judged_against_what_the_tracker_makes_of_the_old_model(star
 def test_a_re_fit_is_not_judged_by_the_page_that_it_was_fitted_on(start: Start, tmp_path: Path) -> None:
     recorded(path := tmp_path / "source.h5", 2)
     client = start(source=open_source(f"recording:{path}")).client
-    for twice, subject in (({"pages": [1, 1]}, "known page 1"), ({"count": 3}, "known page 2")):  # the source begins anew
+    # Of two pages the third one is the first.
+    for twice, subject in (({"pages": [1, 1]}, "known page 1"), ({"count": 3}, "known page 2")):
         with pytest.raises(InvalidInputError) as error:
             client.recalibrate(**twice)  # type: ignore[arg-type]
         assert error.value.subject == subject
