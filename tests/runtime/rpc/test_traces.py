@@ -6,42 +6,31 @@ import socket
 import sys
 import threading
 import time
-import tracemalloc
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import grpc
 import pytest
+from opentelemetry.exporter.otlp.proto.grpc.trace_exporter import OTLPSpanExporter
 from opentelemetry.proto.collector.trace.v1 import trace_service_pb2, trace_service_pb2_grpc
 from opentelemetry.proto.trace.v1.trace_pb2 import Span, Status
 
 from lightpage.errors import InvalidInputError
-from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.pb.inference import open_inference_pb2 as oip
-from runtime.pb.inference import open_inference_pb2_grpc as oip_grpc
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.inference_calls import INFERENCE
-from runtime.rpc.server import LightpageServer
-from runtime.service.dataplane import DataPlane
 from runtime.service.logs import MOST_TEXT
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
 from runtime.service.traces import MOST_PAGES, Traces
-from tests.runtime import toy
-from tests.runtime.rpc.stage import a_page
-from tests.runtime.rpc.test_edge import parts
+from tests.runtime.rpc.conftest import begun
+from tests.runtime.rpc.stage import Running, a_page, parts, refused
+from tests.runtime.rpc.test_inference import stub_of
 
 TRACE, CALLER = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
 SAMPLED, UNSAMPLED = (f"00-{TRACE}-{CALLER}-0{flag}" for flag in (1, 0))
-
-
-Stubs = tuple[pb_grpc.LightpageStub, oip_grpc.GRPCInferenceServiceStub]
 
 
 class Receiver(trace_service_pb2_grpc.TraceServiceServicer):
@@ -71,15 +60,12 @@ def receiving() -> Iterator[tuple[Receiver, str]]:
 
 
 @contextmanager
-def traced(bundle: Path, endpoint: str, share: float = 1.0) -> Iterator[Stubs]:
+def traced(decoder: Decoder, endpoint: str, share: float = 1.0) -> Iterator[Running]:
     """A service whose spans have been sent once the block has ended."""
-    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(bundle), threads=1)), toy.ToySource(toy.ToyDevice()))
-    with (
-        Traces(endpoint, share) as traces,
-        LightpageServer(plane, Recalibrator(plane, toy.fit_references), traces=traces) as server,
-        grpc.insecure_channel(server.target) as channel,
-    ):
-        yield pb_grpc.LightpageStub(channel), oip_grpc.GRPCInferenceServiceStub(channel)
+    with Traces(endpoint, share) as traces:
+        service = begun(decoder, traces=traces)
+        yield service
+        service.end()
 
 
 def attributes(span: Span) -> dict[str, Any]:
@@ -92,15 +78,14 @@ def inside(spans: list[Span], parent: Span) -> list[Span]:
     )
 
 
-def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(toy_zip: Path) -> None:
+def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(decoder: Decoder) -> None:
     with receiving() as (receiver, endpoint):
         before = time.time_ns()
-        with traced(toy_zip, endpoint) as (stub, other):
+        with traced(decoder, endpoint) as service:
             header = (("traceparent", SAMPLED),)
-            stub.DecodeFrames(parts(a_page()[1], correlation_id="order-7"), timeout=20, metadata=header)
-            with pytest.raises(grpc.RpcError):
-                stub.GetJob(pb.GetJobRequest(id="none"), timeout=20)
-            other.ServerLive(oip.ServerLiveRequest(), timeout=20)
+            service.stub.DecodeFrames(parts(a_page()[1], correlation_id="order-7"), timeout=20, metadata=header)
+            refused(lambda: service.stub.GetJob(pb.GetJobRequest(id="none"), timeout=20))
+            stub_of(service).ServerLive(oip.ServerLiveRequest(), timeout=20)
         after = time.time_ns()
     call = next(span for span in receiver.spans if span.name == "lightpage.v1.Lightpage/DecodeFrames")
     assert receiver.services == {"lightpage"}
@@ -131,31 +116,18 @@ def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(toy_zip: Pa
     assert (attributes(live)["rpc.service"], attributes(live)["rpc.method"]) == (INFERENCE.full_name, "ServerLive")
 
 
-def test_a_callers_text_is_cut_before_it_waits_to_be_sent(toy_zip: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))  # nobody listens there
-        with traced(toy_zip, f"http://127.0.0.1:{taken.getsockname()[1]}") as (stub, _):
-            stub.ReadPage(pb.ReadPageRequest(correlation_id="a"), timeout=20)
-            size, count = 2 << 20, 20
-            tracemalloc.start()
-            try:
-                for _ in range(count):
-                    stub.ReadPage(pb.ReadPageRequest(correlation_id=size * "a"), timeout=60)
-                held, _ = tracemalloc.get_traced_memory()
-            finally:
-                tracemalloc.stop()
-            assert held < count * size / 4
-    with receiving() as (receiver, endpoint), traced(toy_zip, endpoint) as (stub, _):
-        stub.ReadPage(pb.ReadPageRequest(correlation_id=2 * MOST_TEXT * "a"), timeout=20)
+def test_a_callers_text_is_cut_before_it_waits_to_be_sent(decoder: Decoder, caplog: pytest.LogCaptureFixture) -> None:
+    with receiving() as (receiver, endpoint), traced(decoder, endpoint) as service:
+        service.stub.ReadPage(pb.ReadPageRequest(correlation_id=2 * MOST_TEXT * "a"), timeout=20)
     [call] = (span for span in receiver.spans if span.kind == Span.SPAN_KIND_SERVER)
     assert attributes(call)["lightpage.correlation_id"] == MOST_TEXT * "a"
     assert "truncating" not in caplog.text  # a line of the library's for each call
 
 
-def test_a_call_of_many_pages_has_a_span_of_each_up_to_a_number(toy_zip: Path) -> None:
+def test_a_call_of_many_pages_has_a_span_of_each_up_to_a_number(decoder: Decoder) -> None:
     count = MOST_PAGES + 2
-    with receiving() as (receiver, endpoint), traced(toy_zip, endpoint) as (stub, _):
-        assert len(list(stub.ReadPages(pb.ReadPagesRequest(count=count), timeout=60))) == count
+    with receiving() as (receiver, endpoint), traced(decoder, endpoint) as service:
+        assert len(list(service.stub.ReadPages(pb.ReadPagesRequest(count=count), timeout=60))) == count
     call = next(span for span in receiver.spans if span.name.endswith("/ReadPages"))
     assert attributes(call)["lightpage.pages"] == count
     pages = inside(receiver.spans, call)
@@ -165,11 +137,12 @@ def test_a_call_of_many_pages_has_a_span_of_each_up_to_a_number(toy_zip: Path) -
         assert names == ["queue", "receive", "inference", "post_processing", "respond"]
 
 
-def test_a_caller_that_has_decided_for_its_trace_has_decided_for_its_calls(toy_zip: Path) -> None:
+def test_a_caller_that_has_decided_for_its_trace_has_decided_for_its_calls(decoder: Decoder) -> None:
     with receiving() as (receiver, endpoint):
         for share, wanted in ((0.0, ["ReadPage"]), (1.0, ["Describe", "ReadPage"])):
             receiver.spans.clear()
-            with traced(toy_zip, endpoint, share) as (stub, _):
+            with traced(decoder, endpoint, share) as service:
+                stub = service.stub
                 stub.ReadPage(pb.ReadPageRequest(), timeout=20, metadata=(("traceparent", SAMPLED),))
                 stub.ListModels(pb.ListModelsRequest(), timeout=20, metadata=(("traceparent", UNSAMPLED),))
                 stub.Describe(pb.DescribeRequest(), timeout=20, metadata=(("traceparent", "nonsense"),))
@@ -177,36 +150,34 @@ def test_a_caller_that_has_decided_for_its_trace_has_decided_for_its_calls(toy_z
             assert sorted(calls) == wanted
 
 
-def test_where_nobody_takes_spans_no_page_is_lost_and_nothing_waits(toy_zip: Path) -> None:
+def test_where_nobody_takes_spans_no_page_is_lost_and_nothing_waits(
+    decoder: Decoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # nobody listens there, and nobody else will
-        traces = Traces(f"http://127.0.0.1:{taken.getsockname()[1]}")
+        endpoint = f"http://127.0.0.1:{taken.getsockname()[1]}"
         held, release = threading.Event(), threading.Event()
+        export = OTLPSpanExporter.export
 
-        def export(*_: Any, export: Any = traces._exporter.export) -> Any:
+        def waits(exporter: OTLPSpanExporter, spans: Any) -> Any:
             held.set()
-            release.wait(20)
-            return export(*_)
+            release.wait(60)
+            return export(exporter, spans)
 
-        traces._exporter.export = export
-        plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), toy.ToySource(toy.ToyDevice()))
-        recalibrator = Recalibrator(plane, toy.fit_references)
-        server = LightpageServer(plane, recalibrator, traces=traces)
-        with server, grpc.insecure_channel(server.target) as channel:
-            stub = pb_grpc.LightpageStub(channel)
+        monkeypatch.setattr(OTLPSpanExporter, "export", waits)
+        with Traces(endpoint) as traces:
+            service = begun(decoder, traces=traces)
             count = 120  # makes more spans than a batch has
-            replies = list(stub.ReadPages(pb.ReadPagesRequest(count=count), timeout=60))
-            replies += [stub.ReadPage(pb.ReadPageRequest(), timeout=20) for _ in range(count)]
-            assert held.wait(20)
-            replies += [stub.ReadPage(pb.ReadPageRequest(), timeout=20) for _ in range(count)]
-        assert len(replies) == 3 * count
-        release.set()
-        begun = time.monotonic()
-        traces.close()
-        assert time.monotonic() - begun < 10
+            assert len(list(service.client.read_pages(count=count))) == count
+            assert all(service.client.read_page(1).page == 1 for _ in range(count))
+            assert held.wait(60)
+            assert all(service.client.read_page(1).page == 1 for _ in range(count))
+            service.end()
+            release.set()
 
 
 def test_without_the_extra_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
-    with pytest.raises(InvalidInputError, match=r"traces.endpoint.*pip install 'lightpage\[traces\]'"):
+    with pytest.raises(InvalidInputError) as error:
         Traces("http://127.0.0.1:4317")
+    assert "lightpage[traces]" in error.value.expected
