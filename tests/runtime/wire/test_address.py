@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,12 @@ from runtime.wire.address import check_address, check_free, host_and_port, names
 from runtime.wire.shared_memory import memory_path
 
 
+def refused(check: Callable[..., object], *given: object, **options: object) -> InvalidInputError:
+    with pytest.raises(InvalidInputError) as error:
+        check(*given, **options)
+    return error.value
+
+
 @pytest.mark.parametrize("address", ["127.0.0.1:50051", "localhost:1", "[::1]:50051", "unix:/tmp/lightpage.sock"])
 def test_host_and_port_are_taken(address: str) -> None:
     check_address("--address", address)
@@ -24,8 +31,7 @@ def test_host_and_port_are_taken(address: str) -> None:
     "address", ["127.0.0.1", "127.0.0.1:", "127.0.0.1:99999", "::1:50051", ":50051", "a b:1", "h:0", "h:５０", "unix:"]
 )
 def test_anything_else_is_named(address: str) -> None:
-    with pytest.raises(InvalidInputError, match=r"--address.*HOST:PORT"):
-        check_address("--address", address)
+    assert refused(check_address, "--address", address).subject == "--address"
 
 
 def test_a_server_may_ask_for_any_free_port() -> None:
@@ -37,13 +43,11 @@ def test_why_an_address_cannot_be_listened_at_is_said() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         address = f"127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(InvalidInputError, match=rf"address {address}: got Address already in use"):
-            check_free("address", address)
+        error = refused(check_free, "address", address)
+        assert (error.subject, error.got) == (f"address {address}", "Address already in use")
     check_free("address", address)
-    with pytest.raises(InvalidInputError, match=r"address nohost\.invalid:50: got .*(known|resolution)"):
-        check_free("address", "nohost.invalid:50")
-    with pytest.raises(InvalidInputError, match=r"address a+:50: got .*label"):
-        check_free("address", f"{'a' * 64}:50")
+    for unknown in ("nohost.invalid:50", f"{'a' * 64}:50"):
+        assert refused(check_free, "address", unknown).subject == f"address {unknown}"
 
 
 def test_a_socket_that_somebody_listens_at_is_not_taken_away(tmp_path: Path) -> None:
@@ -52,37 +56,32 @@ def test_a_socket_that_somebody_listens_at_is_not_taken_away(tmp_path: Path) -> 
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(str(path))
         listening.listen()
-        with pytest.raises(InvalidInputError, match="a process that listens there"):
-            check_free("address", f"unix:{path}")
+        refused(check_free, "address", f"unix:{path}")
     check_free("address", f"unix:{path}")  # left behind
     (tmp_path / "file").touch()
-    with pytest.raises(InvalidInputError, match="no socket"):
-        check_free("address", f"unix:{tmp_path / 'file'}")
-    with pytest.raises(InvalidInputError, match="no folder"):
-        check_free("address", f"unix:{tmp_path / 'none' / 's'}")
+    for place in ("file", "none/s"):
+        refused(check_free, "address", f"unix:{tmp_path / place}")
+    assert (tmp_path / "file").exists()
 
 
-@pytest.mark.parametrize(("size", "fits"), [(107, True), (108, False), (300, False)])
-def test_a_socket_path_longer_than_the_system_has_room_for_is_named(size: int, fits: bool, tmp_path: Path) -> None:
-    path = f"{tmp_path}/{'s' * (size - len(str(tmp_path)) - 1)}"
-    if fits:
-        check_address("target", f"unix:{path}")
-        check_free("address", f"unix:{path}")
-        return
-    for check in (check_address, check_free):
-        with pytest.raises(InvalidInputError, match=f"{size} bytes.*at most 107"):
-            check("address", f"unix:{path}")
+def test_a_socket_path_longer_than_the_system_has_room_for_is_named(tmp_path: Path) -> None:
+    def path(size: int) -> str:
+        return f"unix:{tmp_path}/{'s' * (size - len(str(tmp_path)) - 1)}"
 
-
-def test_sockets_beside_the_services_own_are_looked_at_too(tmp_path: Path) -> None:
-    target = f"unix:{tmp_path}/{'s' * (105 - len(str(tmp_path)) - 1)}"
+    check_address("target", path(107))
+    check_free("address", path(107))
+    for size in (108, 300):
+        for check in (check_address, check_free):
+            assert f"{size} bytes" in refused(check, "address", path(size)).got
+    # sockets beside the service's own are looked at too
+    target = path(105)
     check_address("target", target)
-    with pytest.raises(InvalidInputError, match="112 bytes"):
-        SharedMemory(target, 10)
-    with pytest.raises(InvalidInputError, match="112 bytes"):
-        SharedRegions(memory_path(target), 10, 1, 1.0).__enter__()
-    with pytest.raises(InvalidInputError, match="112 bytes"):
-        HealthServer(next_port(target), dict)
+    for make in (
+        lambda: SharedMemory(target, 10),
+        lambda: SharedRegions(memory_path(target), 10, 1, 1.0).__enter__(),
+        lambda: HealthServer(next_port(target), dict),
+    ):
+        assert "112 bytes" in refused(make).got  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
