@@ -295,29 +295,6 @@ def test_a_model_that_changes_meanwhile_makes_its_result_out_of_date(start: Star
     assert service.version == "toy-1"
 
 
-def test_a_change_of_model_that_cannot_be_noted_is_not_made(
-    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    service = start(store=tmp_path / "store")
-    assert service.client.recalibrate(count=2).model_version == "toy-1+r1"
-
-    def full(*_: object) -> None:
-        raise OSError("disk full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("os.replace", full)
-        for change in (service.client.rollback, lambda: service.client.recalibrate(count=2)):
-            with pytest.raises(BundleError):
-                change()  # type: ignore[operator]
-            assert service.version == "toy-1+r1"
-    assert service.count("lightpage_model_info", version="toy-1+r1") == 1
-    store = service.store
-    assert sorted(path.name for path in store.folder.iterdir()) == ["current.json", "jobs.json", "toy-1+r1.zip"]
-    assert store.last() == store.path_of("toy-1+r1")
-    assert service.client.rollback()[0] == "toy-1"
-    assert store.last() is None
-
-
 def test_a_swap_under_load_loses_no_request(start: Start) -> None:
     service, stop = start(), threading.Event()
     answers, errors = list[Any](), list[LightpageError]()
