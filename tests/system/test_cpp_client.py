@@ -163,7 +163,7 @@ def test_a_wrong_command_line_is_explained_and_no_service_is_an_error_at_the_dea
 
 
 class Told(pb_grpc.LightpageServicer):
-    """One job, which breaks off or goes on until it is cancelled, and pages whose first two answers are lost or late."""
+    """One job that breaks off or goes on until it is cancelled, and pages whose first two answers are lost or late."""
 
     def __init__(self, *, steps: int | None = 3, refusals: int = 0, breaks: int = 0, late: bool = False) -> None:
         self.steps, self.refusals, self.breaks, self.late = steps, refusals, breaks, late
