@@ -14,7 +14,6 @@ from google.protobuf.message import DecodeError
 from lightpage.errors import LightpageError, LimitError
 from runtime.errors import MalformedError, OverloadedError, StalledError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.rpc import message_gate
 from runtime.rpc.message_gate import MessageGate
 from runtime.service.limits import Limits
 from runtime.wire.status import DETAIL_KEY, error_from, status_of
@@ -63,12 +62,8 @@ async def refusal(gate: MessageGate, data: AsyncIterator[bytes], method: str = S
     return error.value
 
 
-@pytest.fixture
-def narrow(monkeypatch: pytest.MonkeyPatch) -> Limits:
-    """Limits with which there is one place for a message, and one for streams."""
-    monkeypatch.setattr(message_gate, "_LEAST_PLACES", 1)
-    monkeypatch.setattr(message_gate, "_STREAM_PLACES", 1)
-    return Limits(message_bytes=4, receive_bytes=1, pair_bytes=1, stall_s=0.05, receive_s=60)
+NARROW = Limits(message_bytes=4, receive_bytes=1, pair_bytes=1, stall_s=0.05, receive_s=60, concurrent_calls=1)
+"""With which there are eight places for messages, and twice as many for streams."""
 
 
 def test_there_are_places_for_what_fits_into_the_budget() -> None:
@@ -96,8 +91,8 @@ def test_each_method_has_its_limit() -> None:
     asyncio.run(all_of_it())
 
 
-def test_no_more_are_on_their_way_than_there_are_places(narrow: Limits) -> None:
-    gate = MessageGate(narrow, {LARGE: 10})
+def test_no_more_are_on_their_way_than_there_are_places() -> None:
+    gate = MessageGate(NARROW, {LARGE: 10})
 
     async def all_of_it() -> None:
         more, begun = asyncio.Event(), list[int]()
@@ -107,27 +102,28 @@ def test_no_more_are_on_their_way_than_there_are_places(narrow: Limits) -> None:
             await more.wait()
             yield b"late"
 
-        held = asyncio.ensure_future(answer(gate, waiting(0), LARGE))
-        while not begun:
+        held = [asyncio.ensure_future(answer(gate, waiting(number), LARGE)) for number in range(gate.places)]
+        while len(begun) < gate.places:
             await asyncio.sleep(0)
-        error = await refusal(gate, waiting(1))
+        error = await refusal(gate, waiting(99))
         assert (type(error), error.subject) == (OverloadedError, "messages")
-        assert begun == [0]  # the second was not read at all
+        assert begun == list(range(8))  # the ninth was not read at all
         assert await answer(gate, messages(b"ab"), "/another.Service/Small") == b"AB"
         late = asyncio.ensure_future(answer(gate, messages(b"abc")))
         await asyncio.sleep(0)
         more.set()
-        assert await asyncio.gather(held, late) == [b"LATE", b"ABC"]
+        assert await asyncio.gather(*held, late) == [b"LATE"] * 8 + [b"ABC"]
 
     asyncio.run(all_of_it())
 
 
-def test_a_sender_that_pauses_is_ended_and_gives_its_place_back(narrow: Limits) -> None:
-    gate = MessageGate(narrow, {LARGE: 10})
+def test_a_sender_that_pauses_is_ended_and_gives_its_place_back() -> None:
+    gate = MessageGate(NARROW, {LARGE: 10})
 
     async def all_of_it() -> None:
-        error = await refusal(gate, messages(then=asyncio.Event().wait()))
-        assert (type(error), error.subject) == (StalledError, "stream of Small")
+        for _ in range(gate.places + 1):
+            error = await refusal(gate, messages(then=asyncio.Event().wait()))
+            assert (type(error), error.subject) == (StalledError, "stream of Small")
         assert await answer(gate, messages(b"ab")) == b"AB"
 
         async def slow() -> AsyncIterator[bytes]:
@@ -139,15 +135,18 @@ def test_a_sender_that_pauses_is_ended_and_gives_its_place_back(narrow: Limits) 
     asyncio.run(all_of_it())
 
 
-def test_senders_who_pause_keep_no_short_call_waiting(narrow: Limits) -> None:
-    gate = MessageGate(narrow, {LARGE: 10}, [LARGE])
+def test_senders_who_pause_keep_no_short_call_waiting() -> None:
+    gate = MessageGate(NARROW, {LARGE: 10}, [LARGE])
 
     async def both() -> None:
-        pausing = asyncio.ensure_future(answer(gate, messages(then=asyncio.Event().wait()), LARGE))
+        pauses = [messages(then=asyncio.Event().wait()) for _ in range(gate.stream_places)]
+        pausing = [asyncio.ensure_future(answer(gate, each, LARGE)) for each in pauses]
         await asyncio.sleep(0)
         assert await answer(gate, messages(b"abcd")) == b"ABCD"
         assert type(await refusal(gate, messages(b"abcd"), LARGE)) is OverloadedError
-        pausing.cancel()
+        for each in pausing:
+            each.cancel()
+        await asyncio.gather(*pausing, return_exceptions=True)
 
     asyncio.run(both())
 

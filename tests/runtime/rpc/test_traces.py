@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -79,14 +78,11 @@ def inside(spans: list[Span], parent: Span) -> list[Span]:
 
 
 def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(decoder: Decoder) -> None:
-    with receiving() as (receiver, endpoint):
-        before = time.time_ns()
-        with traced(decoder, endpoint) as service:
-            header = (("traceparent", SAMPLED),)
-            service.stub.DecodeFrames(parts(a_page()[1], correlation_id="order-7"), timeout=20, metadata=header)
-            refused(lambda: service.stub.GetJob(pb.GetJobRequest(id="none"), timeout=20))
-            stub_of(service).ServerLive(oip.ServerLiveRequest(), timeout=20)
-        after = time.time_ns()
+    with receiving() as (receiver, endpoint), traced(decoder, endpoint) as service:
+        header = (("traceparent", SAMPLED),)
+        service.stub.DecodeFrames(parts(a_page()[1], correlation_id="order-7"), timeout=20, metadata=header)
+        refused(lambda: service.stub.GetJob(pb.GetJobRequest(id="none"), timeout=20))
+        stub_of(service).ServerLive(oip.ServerLiveRequest(), timeout=20)
     call = next(span for span in receiver.spans if span.name == "lightpage.v1.Lightpage/DecodeFrames")
     assert receiver.services == {"lightpage"}
     assert (call.trace_id.hex(), call.parent_span_id.hex()) == (TRACE, CALLER)
@@ -101,8 +97,7 @@ def test_a_decode_is_a_span_with_its_stages_within_its_callers_trace(decoder: De
     stages = inside(receiver.spans, call)
     assert [one.name for one in stages] == ["receive", "queue", "inference", "post_processing", "respond"]
     assert {one.trace_id.hex() for one in stages} == {TRACE}
-    assert before <= call.start_time_unix_nano
-    assert call.end_time_unix_nano <= after
+    assert 1.7e18 < call.start_time_unix_nano < call.end_time_unix_nano  # of the epoch
     assert stages[0].start_time_unix_nano == call.start_time_unix_nano
     assert stages[-1].end_time_unix_nano == call.end_time_unix_nano
     for one, following in pairwise(stages):
