@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 import tracemalloc
 from collections.abc import Iterator
@@ -21,7 +22,7 @@ from lightpage.recording.frame_pair import FramePair
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
-from runtime.errors import CallerLeft
+from runtime.errors import CallerLeft, StalledError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.call import SERVICE, Call
@@ -389,3 +390,78 @@ def test_clients_at_one_unix_socket_are_followed_apart(start: Start, tmp_path: P
     assert [decode(parts(pair), timeout=20).piston_rad for _ in range(2)] == [1, 1]
     named = pb.DecodeOptions(levels=16, session="mine")
     assert [decode(parts(pair, options=named), timeout=20).piston_rad for _ in range(2)] == [1, 2]
+
+
+AGE_S = 0.2
+
+
+def test_a_client_connects_anew_and_the_calls_of_the_old_connection_end_well(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG, "runtime.rpc.call_log")
+    service = start(limits=Limits(concurrent_decodes=1, connection_age_s=AGE_S))
+
+    def peers() -> set[str]:
+        """Where a call came from by now: each connection has a port of its own."""
+        service.client.describe()  # no call may fail
+        return {record.told["peer"] for record in caplog.records if hasattr(record, "told")}
+
+    with ThreadPoolExecutor(1) as pool:
+        with service.plane.decodes.held(Caller()):  # so that the call below is in flight all the time
+            waiting = pool.submit(service.client.read_page)
+            eventually(lambda: service.count("lightpage_calls_in_flight") == 1)
+            eventually(lambda: len(peers()) > 1)
+            assert not waiting.done()
+        assert waiting.result(60).levels == 16
+
+
+def test_calls_that_outlive_the_grace_are_ended(start: Start) -> None:
+    service = start(limits=Limits(concurrent_decodes=1, connection_age_s=AGE_S, connection_grace_s=AGE_S))
+    with service.plane.decodes.held(Caller()):
+        answer = refused(lambda: service.stub.ReadPage(pb.ReadPageRequest(), timeout=60))
+    assert answer.code is grpc.StatusCode.UNAVAILABLE
+
+
+SMALL_WINDOW = (("grpc.http2.bdp_probe", 0), ("grpc.http2.lookahead_bytes", 1024))
+"""So that few replies fill what the network holds."""
+UNREAD = pb.ReadPagesRequest(count=4096, options=pb.DecodeOptions(want_phase=True, want_concentration=True))
+
+
+def unread(service: Running, count: int) -> list[grpc.Call]:
+    """Streams of replies that nobody takes."""
+    service.channels.append(grpc.insecure_channel(service.server.target, SMALL_WINDOW))
+    read = service.channels[-1].unary_stream("/lightpage.v1.Lightpage/ReadPages", pb.ReadPagesRequest.SerializeToString)
+    return [read(UNREAD, timeout=600) for _ in range(count)]
+
+
+def test_ranges_that_nobody_reads_keep_no_place(start: Start) -> None:
+    service = start(limits=Limits(concurrent_ranges=2))
+    calls = unread(service, 3)
+    eventually(lambda: service.count("lightpage_calls_in_flight") == 3)
+    eventually(lambda: service.plane.ranges.busy == 0)
+    assert len(list(service.client.read_pages([1, 2, 3]))) == 3
+    for call in calls:
+        call.cancel()
+
+
+def test_a_range_that_is_not_read_is_ended(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+    service = start(limits=Limits(reader_s=0.2, concurrent_calls=1))
+    (call,) = unread(service, 1)
+    eventually(lambda: service.count("lightpage_calls_in_flight") == 1)
+    eventually(lambda: is_answered(service))  # it counts as no load any more
+    with pytest.raises(grpc.RpcError) as caught:
+        list(call)  # type: ignore[call-overload]
+    told = refused_as(caught.value)
+    assert (told.code, type(told.error)) == (grpc.StatusCode.CANCELLED, StalledError)
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
+
+
+def is_answered(service: Running) -> bool:
+    try:
+        return service.client.describe().model.current
+    except Exception:
+        return False
+
+
+def test_a_reader_that_pauses_for_less_than_that_gets_all(start: Start) -> None:
+    assert sum(1 for _ in start().client.read_pages(count=100)) == 100

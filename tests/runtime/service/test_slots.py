@@ -1,4 +1,4 @@
-"""Slots: first come, first served; who could not finish in time is turned away before anything is spent on it."""
+"""Whom the service lets in: slots for which callers queue, sessions that are bounded, a heart that notices a hang."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import pytest
 
 from runtime.errors import CallerLeft, OverloadedError, SlotsTakenError
 from runtime.service.caller import Caller
+from runtime.service.heart import Heart
+from runtime.service.sessions import Sessions, named_session, own_name
 from runtime.service.slots import FORGET_S, Slots
 from tests.clock import HandClock
 from tests.waiting import eventually
@@ -177,3 +179,35 @@ def test_under_overload_nothing_is_begun_that_cannot_be_finished() -> None:
     assert len(done) == 4
     assert max(done) <= until
     assert all(error.retry_s is not None and error.retry_s > 0 for error in turned_away)
+
+
+def test_many_sessions_are_bounded() -> None:
+    made = list[object]()
+    sessions = Sessions(lambda: made.append(object()) or made[-1], most=3)  # type: ignore[arg-type,return-value,func-returns-value]
+    first = sessions.tracker("0")
+    for number in range(1, 3):
+        sessions.tracker(str(number))
+    assert sessions.tracker("0") is first
+    sessions.tracker("3")
+    assert sessions.tracker("0") is first
+    sessions.tracker("1")
+    assert len(made) == 5
+
+
+def test_names_of_different_callers_are_different() -> None:
+    assert own_name("7/job", "line") != own_name("job", "line/7")
+    assert own_name("job", "") == "job"
+    assert named_session("job", "line") == f"session {own_name('job', 'line')}"
+
+
+def test_a_decode_that_does_not_end_is_trouble() -> None:
+    now = 0.0
+    heart = Heart(10.0, lambda: now)
+    assert heart.trouble() == ""
+    with heart.at_work():
+        now = 9.0
+        assert heart.trouble() == ""
+        with heart.at_work():
+            now = 12.0
+            assert "12 s" in heart.trouble()
+    assert heart.trouble() == ""
