@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import socket
-from collections.abc import Iterator
 
 import grpc
 import pytest
@@ -53,61 +52,20 @@ def test_the_process_says_what_it_hears_and_that_silence_is_no_service() -> None
     assert asyncio.run(answers({"": True, "one": True}, silence_s=0.2)) == [unknown, SERVING, NOT_SERVING]
 
 
-class States:
-    """What a service says of itself, or that it fails to."""
-
-    def __init__(self) -> None:
-        self.said: dict[str, bool] | None = {"": True, "one": True, "other": False}
-
-    def __call__(self) -> dict[str, bool]:
-        if self.said is None:
-            raise RuntimeError("broken")
-        return self.said
-
-
-@pytest.fixture(scope="module")
-def states() -> States:
-    return States()
-
-
-@pytest.fixture(scope="module")
-def health(states: States) -> Iterator[HealthServer]:
-    with HealthServer("127.0.0.1:0", states) as running:
-        eventually(lambda: is_serving(running.target)[0])
-        yield running
-
-
-def test_each_service_is_told_by_name_and_watchers_hear_of_changes(health: HealthServer, states: States) -> None:
-    assert is_serving(health.target, service="one")[0]
-    assert not is_serving(health.target, service="other")[0]
-    assert "NOT_FOUND" in is_serving(health.target, service="none")[1]
-    with grpc.insecure_channel(health.target) as channel:
-        watch = health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest(service="one"), timeout=60)
-        assert next(watch).status == SERVING
-        states.said = {"": True, "one": False, "other": False}
-        assert next(watch).status == NOT_SERVING
-        watch.cancel()
-    assert is_serving(health.target)[0]
-    states.said = {"": True}
-
-
-def test_one_that_fails_to_say_does_not_serve_and_a_killed_process_is_started_again(
-    health: HealthServer, states: States
-) -> None:
-    before = health.pid
-    assert before is not None
-    os.kill(before, signal.SIGKILL)
-    eventually(lambda: health.pid != before and is_serving(health.target)[0])
-    states.said = None
-    eventually(lambda: not is_serving(health.target)[0])
-    states.said = {"": True}
-    eventually(lambda: is_serving(health.target)[0])
-
-
-def test_a_port_that_is_taken_is_named(health: HealthServer) -> None:
-    with pytest.raises(InvalidInputError) as error:
-        HealthServer(health.target, dict).start()
-    assert health.target in error.value.subject
+def test_one_that_fails_to_say_does_not_serve_and_a_killed_process_is_started_again() -> None:
+    said: list[dict[str, bool]] = [{"": True, "other": False}]
+    with HealthServer("127.0.0.1:0", lambda: said[0]) as health:  # fails where nothing is said
+        eventually(lambda: is_serving(health.target)[0])
+        assert not is_serving(health.target, service="other")[0]
+        before = health.pid
+        assert before is not None
+        os.kill(before, signal.SIGKILL)
+        eventually(lambda: health.pid != before and is_serving(health.target)[0])
+        with pytest.raises(InvalidInputError) as error:
+            HealthServer(health.target, dict).start()
+        assert health.target in error.value.subject
+        said.clear()
+        eventually(lambda: not is_serving(health.target)[0])
     with pytest.raises(InvalidInputError):
         HealthServer("nonsense", dict)
 

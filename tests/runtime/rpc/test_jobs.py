@@ -36,7 +36,6 @@ from runtime.errors import (
     NoSuchJobError,
     OtherModelError,
     OverloadedError,
-    StalledError,
 )
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.known_pages import KnownPages, read_recorded
@@ -419,19 +418,10 @@ def test_what_comes_counts_against_the_memory_until_the_job_has_ended(start: Sta
     assert error.value.subject == "frames to recalibrate with"
 
 
-def test_a_caller_who_stalls_leaves_nothing(start: Start) -> None:
-    service, more = start(limits=Limits(stall_s=0.1)), threading.Event()
-    answer = refused(lambda: service.stub.RecalibrateFrames(until_told(ALL[:4], more), timeout=60))
-    more.set()
-    assert isinstance(answer.error, StalledError)
-    assert service.plane.received.used == 0
-    assert service.client.jobs() == []
-
-
 @pytest.mark.parametrize("way", ["leaves half way", "cancels", "hangs up", "runs out of time"])
 def test_a_caller_who_has_not_closed_its_stream_and_leaves_starts_nothing(way: str, start: Start) -> None:
     """Only a stream that its caller has closed counts: the library ends that of one who has gone too."""
-    service, more, channel = start(), threading.Event(), None
+    service, more = start(), threading.Event()
     messages, size = (ALL[:4], 2 * PAIR_BYTES + 16 * 24) if way == "leaves half way" else (ALL, ALL_BYTES)
     used = service.plane.received
     channel = service.channel()

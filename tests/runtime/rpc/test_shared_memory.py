@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,31 +104,6 @@ def test_unknown_foreign_and_dropped_regions_are_refused_alike(shared: Running) 
         answer = fails(shared, asked(region))
         told.add((answer.code, answer.text))
     assert [code for code, _ in told] == [grpc.StatusCode.INVALID_ARGUMENT]
-
-
-def test_contents_that_change_while_they_are_decoded_harm_nobody(shared: Running) -> None:
-    stop = threading.Event()
-    with shared.client.share_memory() as memory, ThreadPoolExecutor(1) as pool:
-        inside = memory.frames(toy.SHAPE, "uint8")
-        memory.write(FRAMES)
-
-        def scribble() -> None:
-            rng = np.random.default_rng(0)
-            while not stop.is_set():
-                inside.quadrature[...] = rng.integers(0, 256, toy.SHAPE, np.uint8)
-
-        scribbling = pool.submit(scribble)
-        try:
-            for _ in range(20):
-                try:
-                    shared.client.decode(inside, 16, memory=memory)
-                except LightpageError:
-                    continue  # what it saw was no page
-        finally:
-            stop.set()
-        scribbling.result(60)
-        memory.write(FRAMES)
-        assert (shared.client.decode(FRAMES, 16, memory=memory).symbols == SYMBOLS).all()
 
 
 def test_a_call_that_is_cancelled_while_it_is_copied_gives_its_memory_back(
