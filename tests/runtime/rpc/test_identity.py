@@ -96,6 +96,11 @@ def test_nobody_gets_in_without_a_certificate_of_the_authority(
     service = authority.service("another")
     for tls in (None, wrong, expired, service):
         assert ended(target, tls) is grpc.StatusCode.UNAVAILABLE
+    for tls, code in ((authority.caller("nobody"), None), (None, grpc.StatusCode.UNAVAILABLE)):  # health needs no role
+        with open_channel(target, tls) as channel:
+            call = health_pb2_grpc.HealthStub(channel).Check.future(health_pb2.HealthCheckRequest(), timeout=20)
+            error: Any = call.exception()
+            assert (error and error.code()) == code
     good = authority.caller("good", ["admin"])
     deceived = TlsFiles(tmp_path / "foreign" / "ca.pem", good.certificate, good.key)
     assert ended(target, deceived) is grpc.StatusCode.UNAVAILABLE, "the caller believes another authority"
@@ -119,14 +124,6 @@ def test_a_refusal_says_what_is_lacking_and_the_record_of_changes_who_asked(
         client.rollback()
     (line,) = (tmp_path / "audit.jsonl").read_text().splitlines()
     assert json.loads(line)["who"].startswith("operator 7 at ipv4:127.0.0.1:")
-
-
-def test_health_and_reflection_need_a_certificate_and_no_role(secured: Running, authority: Authority) -> None:
-    for tls, code in ((authority.caller("nobody"), None), (None, grpc.StatusCode.UNAVAILABLE)):
-        with open_channel(secured.server.target, tls) as channel:
-            call = health_pb2_grpc.HealthStub(channel).Check.future(health_pb2.HealthCheckRequest(), timeout=20)
-            error: Any = call.exception()
-            assert (error and error.code()) == code
 
 
 def test_callers_of_other_names_share_no_session_and_no_request_id(secured: Running, authority: Authority) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-from google.protobuf.descriptor import FieldDescriptor as FIELD
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoReflectionDescriptorDatabase
@@ -24,13 +22,13 @@ from runtime.errors import OtherModelError
 from runtime.pb.inference import open_inference_pb2 as oip
 from runtime.pb.inference import open_inference_pb2_grpc as oip_grpc
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
+from runtime.rpc.call import SERVICE
 from runtime.rpc.inference_calls import INFERENCE
 from runtime.rpc.tensors import Tensor, inputs_of
 from runtime.service.caller import Caller
 from runtime.service.limits import Limits
 from tests.runtime import coded, toy
 from tests.runtime.rpc.stage import Refused, Remembering, Running, Start, a_page, refused
-from tests.waiting import eventually
 
 ARRAYS = {"symbols": np.uint8, "confidence": np.float32, "phase": np.float32, "concentration": np.float32}
 MODEL_INFER = f"/{INFERENCE.full_name}/ModelInfer"
@@ -355,19 +353,6 @@ def test_a_whole_pair_passes_where_no_message_of_ones_own_may_be_so_large(start:
     assert refused(lambda: service.stub.DecodeFrames(iter([large]), timeout=20)).reason == "TOO_LARGE"
 
 
-def test_pairs_that_wait_count_against_the_budget(start: Start) -> None:
-    service = start(limits=Limits(receive_bytes=20_000, pair_bytes=20_000, concurrent_decodes=1))
-    request = request_of(levels=16)
-    with service.plane.decodes.held(Caller()):
-        first = stub_of(service).ModelInfer.future(request, timeout=60)
-        eventually(lambda: service.plane.received.used > 12_000)
-        answer = fails(service, request)
-        assert (answer.code, answer.reason) == (EXHAUSTED, "OVERLOADED")
-        assert answer.told["RetryInfo"].retry_delay.ToSeconds() == 1
-    assert first.result().outputs
-    assert service.plane.received.used == 0
-
-
 def test_typed_contents_count_against_the_budget_with_what_they_take_once_parsed(start: Start) -> None:
     typed = request_of(typed=True, levels=16)
     size = typed.ByteSize() + 2 * PAIR.in_phase.size * np.dtype(np.uint32).itemsize
@@ -376,6 +361,7 @@ def test_typed_contents_count_against_the_budget_with_what_they_take_once_parsed
     assert infer(short, request_of(levels=16)).outputs
     answer = fails(short, typed)
     assert (answer.code, answer.reason) == (EXHAUSTED, "OVERLOADED")
+    assert answer.told["RetryInfo"].retry_delay.ToSeconds() == 1
     assert short.plane.received.used == 0
 
 
@@ -396,19 +382,7 @@ def test_calls_beyond_the_protocol_are_told_so_and_counted_under_one_name(start:
         answer = refused(lambda call=call: call(b"", timeout=20))  # type: ignore[misc]
         assert (answer.code, method in answer.text) == (grpc.StatusCode.UNIMPLEMENTED, True)
     assert service.count("lightpage_calls_total", method="inference/other", code="UNIMPLEMENTED") == 3
-
-
-def test_calls_are_counted_and_logged_with_the_id_of_the_request(
-    start: Start, caplog: pytest.LogCaptureFixture
-) -> None:
-    service, request = start(), request_of(levels=999)
-    request.id = "order-9"
-    with caplog.at_level(logging.INFO):
-        fails(service, request)
-        stub_of(service).ServerLive(oip.ServerLiveRequest(), timeout=20)
-    (told,) = (record.told for record in caplog.records if hasattr(record, "told"))
-    assert (told["method"], told["correlation_id"]) == ("inference/ModelInfer", "order-9")
-    assert service.count("lightpage_calls_total", method="inference/ModelInfer", code="INVALID_ARGUMENT") == 1
+    stub_of(service).ServerLive(oip.ServerLiveRequest(), timeout=20)
     assert service.count("lightpage_calls_total", method="inference/ServerLive", code="OK") == 1
 
 
@@ -423,6 +397,7 @@ def test_a_service_without_the_protocol_does_not_know_it(start: Start) -> None:
 def test_a_stranger_finds_and_calls_the_protocol_by_reflection_alone(service: Running) -> None:
     channel = service.channel()
     database = ProtoReflectionDescriptorDatabase(channel)
+    assert {SERVICE.full_name, "grpc.health.v1.Health"} <= set(database.get_services())
     (name,) = (one for one in database.get_services() if one.startswith("inference."))
     method = DescriptorPool(database).FindServiceByName(name).methods_by_name["ModelInfer"]
     asked = GetMessageClass(method.input_type)
@@ -432,46 +407,3 @@ def test_a_stranger_finds_and_calls_the_protocol_by_reflection_alone(service: Ru
     response = channel.unary_unary(f"/{name}/ModelInfer", asked.SerializeToString, read)(request, timeout=20)
     assert response.outputs[0].name == "symbols"
     assert response.raw_output_contents[0] == a_page()[0].tobytes()
-
-
-SPECIFIED = """
-ServerLiveResponse live=1:bool
-ServerReadyResponse ready=1:bool
-ModelReadyRequest name=1:string version=2:string
-ModelReadyResponse ready=1:bool
-ServerMetadataResponse name=1:string version=2:string extensions=3:string*
-ModelMetadataRequest name=1:string version=2:string
-ModelMetadataResponse name=1:string versions=2:string* platform=3:string inputs=4:message* outputs=5:message* properties=6:message*
-ModelMetadataResponse.TensorMetadata name=1:string datatype=2:string shape=3:int64*
-ModelInferRequest model_name=1:string model_version=2:string id=3:string parameters=4:message* inputs=5:message* outputs=6:message* raw_input_contents=7:bytes*
-ModelInferRequest.InferInputTensor name=1:string datatype=2:string shape=3:int64* parameters=4:message* contents=5:message
-ModelInferRequest.InferRequestedOutputTensor name=1:string parameters=2:message*
-ModelInferResponse model_name=1:string model_version=2:string id=3:string parameters=4:message* outputs=5:message* raw_output_contents=6:bytes*
-ModelInferResponse.InferOutputTensor name=1:string datatype=2:string shape=3:int64* parameters=4:message* contents=5:message
-InferParameter bool_param=1:bool int64_param=2:int64 string_param=3:string double_param=4:double uint64_param=5:uint64
-InferTensorContents bool_contents=1:bool* int_contents=2:int32* int64_contents=3:int64* uint_contents=4:uint32* uint64_contents=5:uint64* fp32_contents=6:float* fp64_contents=7:double* bytes_contents=8:bytes*
-"""  # noqa: E501
-"""Fields of the public specification that have any: name=number:type, * where repeated."""
-
-
-def test_the_protocol_is_that_of_the_public_specification() -> None:
-    kinds = {
-        value: name.removeprefix("TYPE_").lower() for name, value in vars(FIELD).items() if name.startswith("TYPE_")
-    }
-    found = []
-
-    def describe(message: Any, prefix: str = "") -> None:
-        repeated = [(one, "*" * one.is_repeated) for one in message.fields]
-        told = " ".join(f"{one.name}={one.number}:{kinds[one.type]}{star}" for one, star in repeated)
-        if told and not message.GetOptions().map_entry:
-            found.append(f"{prefix}{message.name} {told}")
-        for inner in message.nested_types:
-            describe(inner, f"{prefix}{message.name}.")
-
-    for message in oip.DESCRIPTOR.message_types_by_name.values():
-        describe(message)
-    assert sorted(found) == sorted(SPECIFIED.split("\n")[1:-1])
-    assert INFERENCE.full_name == "inference.GRPCInferenceService"
-    ways = {(one.name, one.input_type.name, one.output_type.name) for one in INFERENCE.methods}
-    names = ("ServerLive", "ServerReady", "ModelReady", "ServerMetadata", "ModelMetadata", "ModelInfer")
-    assert ways == {(name, f"{name}Request", f"{name}Response") for name in names}

@@ -29,7 +29,6 @@ from lightpage.recording.reader import Recording
 from runtime.bundle.bundle import Bundle
 from runtime.client.answers import JobInfo, JobState
 from runtime.client.client import LightpageClient
-from runtime.decoding.decoder import Decoder
 from runtime.errors import (
     JobCancelledError,
     MalformedError,
@@ -43,7 +42,6 @@ from runtime.recalibration.outcome import RefitResult
 from runtime.rpc.job_calls import JobCalls
 from runtime.service.limits import Limits
 from tests.runtime import toy
-from tests.runtime.rpc.conftest import begun
 from tests.runtime.rpc.stage import Running, Start, raised, refused, slow_fit, until_told
 from tests.waiting import eventually
 
@@ -145,18 +143,6 @@ def test_a_watch_tells_each_change_and_holds_no_thread(start: Start) -> None:
     eventually(lambda: service.count("lightpage_calls_in_flight") == 0)
 
 
-def test_an_unknown_job_is_not_found(service: Running) -> None:
-    calls: list[Callable[[str], object]] = [
-        service.client.job,
-        service.client.cancel_job,
-        lambda name: list(service.client.watch_job(name, 20)),
-    ]
-    for call in calls:
-        with pytest.raises(NoSuchJobError):
-            call("no-such-job")
-    assert refused(lambda: service.stub.GetJob(pb.GetJobRequest(), timeout=20)).code is grpc.StatusCode.NOT_FOUND
-
-
 def test_a_cancelled_job_changes_nothing_and_makes_room(start: Start) -> None:
     fit = slow_fit()
     service = start(fit=fit)
@@ -172,6 +158,10 @@ def test_a_cancelled_job_changes_nothing_and_makes_room(start: Start) -> None:
     done = service.last(service.client.start_recalibration(count=2))
     assert done.state is JobState.DONE
     assert service.client.cancel_job(done.id) == done
+    for call in (service.client.job, service.client.cancel_job, lambda name: list(service.client.watch_job(name, 20))):
+        with pytest.raises(NoSuchJobError):
+            call("no-such-job")  # type: ignore[no-untyped-call]
+    assert refused(lambda: service.stub.GetJob(pb.GetJobRequest(), timeout=20)).code is grpc.StatusCode.NOT_FOUND
     assert service.version == "toy-1+r1"
     assert service.count("lightpage_recalibrations_total", result="dropped") == 1
 
@@ -372,28 +362,21 @@ WRONG: dict[str, tuple[Parts, type[LightpageError]]] = {
 }
 
 
-def test_bad_input_is_named_and_leaves_nothing(decoder: Decoder) -> None:
-    service = begun(decoder)
-    try:
-        for what, (messages, kind) in WRONG.items():
-            answer = refused(lambda parts=messages: service.stub.RecalibrateFrames(iter(parts), timeout=20))  # type: ignore[misc]
-            assert type(answer.error) is kind, what
-            assert service.client.jobs() == [], what
-            assert service.plane.received.used == 0, what
-    finally:
-        service.end()
+def halves(part: pb.RecalibrateFramesRequest) -> Parts:
+    kind = part.WhichOneof("part")
+    if kind not in ("reference", "chunk"):
+        return [part]
+    data = getattr(part, kind)
+    return [pb.RecalibrateFramesRequest(**{kind: piece}) for piece in (data[:1], b"", data[1:9000], data[9000:])]
 
 
-def test_the_right_order_is_taken_in_chunks_of_any_size(start: Start) -> None:
+def test_bad_input_is_named_and_leaves_nothing_and_good_input_comes_in_any_chunks(start: Start) -> None:
     service = start()
-
-    def halves(part: pb.RecalibrateFramesRequest) -> Parts:
-        kind = part.WhichOneof("part")
-        if kind not in ("reference", "chunk"):
-            return [part]
-        data = getattr(part, kind)
-        return [pb.RecalibrateFramesRequest(**{kind: piece}) for piece in (data[:1], b"", data[1:9000], data[9000:])]
-
+    for what, (messages, kind) in WRONG.items():
+        answer = refused(lambda parts=messages: service.stub.RecalibrateFrames(iter(parts), timeout=20))  # type: ignore[misc]
+        assert type(answer.error) is kind, what
+        assert service.client.jobs() == [], what
+        assert service.plane.received.used == 0, what
     job = service.stub.RecalibrateFrames(iter([piece for part in ALL for piece in halves(part)]), timeout=20)
     assert job.state == pb.JOB_STATE_RUNNING
     assert [one.state for one in service.client.watch_job(job.id, 20)][-1] is JobState.DONE

@@ -82,7 +82,7 @@ def test_a_sent_pair_comes_back_as_the_local_decoder_would_decode_it(service: Ru
     assert service.plane.received.used == 0
 
 
-def test_only_what_is_asked_for_is_sent_and_coarse_confidence_never_claims_more(service: Running) -> None:
+def test_what_is_asked_of_a_pair_is_done_and_no_more_is_sent(service: Running) -> None:
     pair = a_page(64)[1]
     exact, coarse = service.client.decode(pair, 64), service.client.decode(pair, 64, quantised=True)
     assert (coarse.concentration, coarse.phase) == (None, None)
@@ -90,8 +90,6 @@ def test_only_what_is_asked_for_is_sent_and_coarse_confidence_never_claims_more(
     assert (coarse.confidence <= exact.confidence).all()
     assert (exact.confidence - coarse.confidence).max() <= 1 / 255
 
-
-def test_any_level_count_can_be_asked_for_and_none_is_the_sources(service: Running) -> None:
     for levels in (2, 5, 256):
         page = service.client.decode(a_page(levels)[1], levels)
         assert page.levels == levels
@@ -99,16 +97,12 @@ def test_any_level_count_can_be_asked_for_and_none_is_the_sources(service: Runni
     assert service.stub.DecodeFrames(parts(a_page()[1], options=pb.DecodeOptions()), timeout=20).levels == 16
     assert service.client.read_page(3).levels == 16
 
-
-def test_pilots_of_ones_own_can_be_sent(service: Running) -> None:
     symbols = np.random.default_rng(5).integers(16, size=toy.PAGE).astype(np.uint8)
     mask = np.zeros(toy.PAGE, bool)
     mask[::4, ::6] = True
     pair = toy.ToyDevice().page(symbols, 16, 2.0)
     assert (service.client.decode(pair, 16, pilots=KnownPilots(mask, symbols, 16)).symbols == symbols).all()
 
-
-def test_the_black_level_is_taken_off(service: Running) -> None:
     symbols, pair = a_page()
     assert (service.client.decode(raised(pair, 6), 16, black_level=6).symbols == symbols).all()
     for level in (255, 256):
@@ -297,6 +291,9 @@ def test_a_page_whose_pilots_disagree_is_lost_and_not_answered(start: Start) -> 
     assert service.count("lightpage_pages_lost_total", reason="PILOTS_DISAGREE") == 1
     assert service.count("lightpage_recalibration_due") == 1
     assert service.count("lightpage_calls_total", method="DecodeFrames", code="DATA_LOSS") == 1
+    with pytest.raises(UnconfirmedPageError) as caught:  # a page of the source is named
+        service.reading(lambda shot: Shot(strange, shot.page_index)) or service.client.read_page(7)  # type: ignore[func-returns-value]
+    assert caught.value.subject == "page 7 of toy:device: pilots"
     # a caller's own pilots may be wrong, and say nothing of the device
     service.client.decode(PAIR, 16)
     wrong = np.random.default_rng(8).integers(16, size=toy.PAGE).astype(np.uint8)
@@ -309,17 +306,6 @@ def test_a_page_whose_pilots_disagree_is_lost_and_not_answered(start: Start) -> 
     assert not page.recalibration_due
     assert page.confirmed_bits == pytest.approx(page.claimed_bits, rel=0.15)
     assert page.image is None  # the toy knows no shift
-
-
-def test_a_lost_page_of_the_source_is_named_and_says_why_on_the_wire(start: Start) -> None:
-    service = start()
-    service.device.offsets = (230.0, 20.0)
-    with pytest.raises(grpc.RpcError) as caught:
-        service.stub.ReadPage(pb.ReadPageRequest(page=7), timeout=20)
-    assert caught.value.code() == grpc.StatusCode.DATA_LOSS
-    detail = pb.ErrorDetail.FromString(dict(caught.value.trailing_metadata())["lightpage-error-bin"])
-    assert (detail.kind, detail.thing) == ("UnconfirmedPageError", "page 7 of toy:device: pilots")
-    assert (detail.reason, detail.recalibration_due) == (pb.LOSS_REASON_PILOTS_DISAGREE, True)
 
 
 # ---- the server itself --------------------------------------------------------------------------------------------
@@ -337,20 +323,13 @@ def test_an_unforeseen_error_is_internal_and_tells_nothing_of_the_inside(
     assert "secret" not in answer.text
 
 
-def test_a_port_that_is_taken_is_named(service: Running) -> None:
+def test_a_server_is_found_where_it_is_and_says_what_it_lacks(service: Running, start: Start, tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError) as error:
         LightpageServer(service.plane, service.recalibrator, service.server.target).start()
     assert service.server.target in error.value.subject
 
-
-def test_a_service_on_a_unix_socket_is_found_there(start: Start, tmp_path: Path) -> None:
-    service = start(address=f"unix:{tmp_path}/s")
+    service = start(address=f"unix:{tmp_path}/s", source=None, recordings=None)
     assert service.server.target == f"unix:{tmp_path}/s"
-    assert service.client.describe().model.version == "toy-1"
-
-
-def test_a_service_without_a_source_says_so(start: Start) -> None:
-    service = start(source=None, recordings=None)
     assert service.client.describe().source == ""
     asked: list[Callable[[], object]] = [
         service.client.read_page,
@@ -362,8 +341,6 @@ def test_a_service_without_a_source_says_so(start: Start) -> None:
         with pytest.raises(NoSourceError):
             call()
 
-
-def test_nobody_at_the_address_is_said_plainly() -> None:
     with LightpageClient("127.0.0.1:9", timeout_s=3) as client, pytest.raises(LightpageError) as error:
         client.describe()
     assert error.value.subject == "service at 127.0.0.1:9"
@@ -416,19 +393,16 @@ def test_a_decode_for_which_memory_is_short_says_so(
     assert service.count("lightpage_rejects_total", reason="SURROUNDINGS") == 2
 
 
-@pytest.fixture
-def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No folder can be written, as on a read-only root without /tmp."""
+def test_a_recalibration_without_any_folder_is_refused_before_it_begins(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = start()
+    errors: list[OSError] = [FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']")]
 
     def none(*_: object, **__: object) -> str:
-        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp', '/var/tmp']")
+        raise errors[0]
 
     monkeypatch.setattr(tempfile, "mkdtemp", none)
-
-
-@pytest.mark.usefixtures("nowhere")
-def test_a_recalibration_without_any_folder_is_refused_before_it_begins(start: Start, tmp_path: Path) -> None:
-    service = start()
     trouble = service.recalibrator.no_room()
     assert isinstance(trouble, StoreError)
     assert "--store" in trouble.expected
@@ -437,14 +411,7 @@ def test_a_recalibration_without_any_folder_is_refused_before_it_begins(start: S
             call(count=2)  # type: ignore[operator]
     assert service.client.jobs() == []
     assert start(store=tmp_path / "store").recalibrator.no_room() is None
-
-
-def test_a_full_disk_is_no_missing_folder(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> str:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    service = start()
-    monkeypatch.setattr(tempfile, "mkdtemp", full)
+    errors[0] = OSError(errno.ENOSPC, "No space left on device")  # a full disk is no missing folder
     with pytest.raises(SurroundingsError):
         service.client.start_recalibration(count=2)
 

@@ -112,8 +112,8 @@ def test_a_slot_is_not_held_by_one_for_whom_it_comes_too_late() -> None:
     assert slots.busy == 0
 
 
-def test_slow_calls_are_forgotten() -> None:
-    """Where all are refused, nothing else would show that calls are fast again."""
+def test_slow_calls_are_forgotten_and_a_few_turn_nobody_away() -> None:
+    # Where all are refused, nothing else would show that calls are fast again.
     clock = HandClock()
     slots = Slots(1, "decodes", 60.0, clock)
     for _ in range(30):
@@ -129,9 +129,7 @@ def test_slow_calls_are_forgotten() -> None:
     with pytest.raises(OverloadedError):
         slots.check(waits(0.1))
 
-
-def test_a_few_slow_calls_turn_nobody_away() -> None:
-    """A page in twenty that is searched for, say, does not shut out callers whose pages are not."""
+    # A page in twenty that is searched for, say, does not shut out callers whose pages are not.
     slots = Slots(1, "decodes", 60.0)
     for _ in range(19):
         slots.took(0.1)
