@@ -79,17 +79,13 @@ def test_scripts_are_executable_and_parse() -> None:
 # ---- versions -----------------------------------------------------------------------------------------------------
 
 
-def test_constraints_are_plain_pins_that_resolve_anywhere() -> None:
+def test_requirements_are_pinned() -> None:
     for line in (ROOT / "constraints.txt").read_text().splitlines():
         assert line.startswith("#") or re.fullmatch(r"[\w.-]+==[\w.]+", line), line  # no URL, no path, no local tag
 
-
-def test_every_direct_requirement_is_pinned() -> None:
     expected = [*PROJECT["dependencies"], *EXTRAS["train"], *EXTRAS["dev"]]
     assert {normal(requirement) for requirement in expected} <= pins().keys()
 
-
-def test_torch_is_pinned_for_those_who_install_without_constraints_too() -> None:
     assert f"torch=={pins()['torch']}" in EXTRAS["train"]
     assert not any(normal(requirement) == "torch" for requirement in PROJECT["dependencies"])
 
@@ -184,12 +180,10 @@ def lend(listing: str, out: Path) -> tuple[str, list[str]]:
     return (out / "pip.conf").read_text(), told.getvalue().split()
 
 
-def test_a_machine_without_settings_lends_none(tmp_path: Path) -> None:
+def test_settings_of_pip_are_lent_to_the_build_of_an_image(tmp_path: Path) -> None:
     assert lend("", tmp_path) == ("[global]\n", [])
     assert not (tmp_path / "ca_bundle").exists()
 
-
-def test_local_folders_and_certificates_are_lent_under_neutral_names(tmp_path: Path) -> None:
     out, index, wheels, cert = (tmp_path / name for name in ("out", "index", "wheels", "my.pem"))
     for folder in (out, index / "simple", wheels):
         folder.mkdir(parents=True)
@@ -207,8 +201,6 @@ def test_local_folders_and_certificates_are_lent_under_neutral_names(tmp_path: P
     assert (out / "ca_bundle").read_text() == "certificates\n"
     assert str(tmp_path) not in settings
 
-
-def test_the_environment_beats_the_file_whatever_the_order(tmp_path: Path) -> None:
     listing = [
         ":env:.index-url='https://two.example/simple'",
         "WARNING: chatter",

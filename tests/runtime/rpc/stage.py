@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import grpc
@@ -36,11 +35,7 @@ OWN_CONNECTION = (("grpc.use_local_subchannel_pool", 1),)
 
 @dataclass
 class Running:
-    """A service with all its parts in reach.
-
-    Attributes:
-        stub: on a channel of its own.
-    """
+    """A service with all its parts in reach; its stub is on a channel of its own."""
 
     plane: DataPlane
     recalibrator: Recalibrator
@@ -216,8 +211,3 @@ class SlowFit:
 
 def slow_fit() -> SlowFit:
     return SlowFit(threading.Event(), threading.Event(), threading.Event())
-
-
-def new_bundle(folder: Path, version: str = "toy-2") -> Path:
-    """Another bundle for the same device."""
-    return toy.write_toy_bundle(folder / f"{version}.new.zip", version=version)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import grpc
 import numpy as np
@@ -44,33 +45,35 @@ def external(lab: Lab) -> tuple[CameraSource, LabModulator]:
     return source, stage
 
 
-def test_a_controller_shows_what_it_has_uploaded(start: Start) -> None:
-    lab = Lab()
-    source, stage = external(lab)
+def test_a_controller_shows_what_it_has_uploaded_and_moves_beams(start: Start) -> None:
+    source, stage = external(Lab())
     client = start(source=source).client
     assert client.upload_pages(PAGES[:1], 16) == 0
     assert client.upload_pages(PAGES[1], 16) == 1
-    seen: list[int] = []
 
-    def control() -> None:
+    def control() -> list[int]:
+        seen = []
         with LightpageClient(client.target, timeout_s=20) as mine:
-            for order in mine.display_orders(15.0):
+            for order in mine.display_orders(120.0):
+                if order.beams is not None:
+                    stage.let_through(signal=order.beams[0], reference=order.beams[1])
+                    mine.beams_set(signal=order.beams[0], reference=order.beams[1])
                 if order.page is not None:
                     seen.append(order.page)
                     stage.show(PAGES[order.page], 16, order.page, 1.0)
                     mine.page_shown(order.page)
                 if len(seen) == 2:
-                    return
+                    break
+        return seen
 
-    thread = threading.Thread(target=control)
-    thread.start()
-    for page in (1, 0):
-        reply = client.read_page(page, want_written=True)
-        assert (reply.symbols == PAGES[page]).all()
-        assert reply.written is not None
-        assert (reply.written == PAGES[page]).all()
-    thread.join(20)
-    assert seen == [1, 0]
+    with ThreadPoolExecutor(1) as pool:
+        controlling = pool.submit(control)
+        assert (source.references().in_phase == toy.ToyDevice().references().in_phase).all()
+        for page in (1, 0):
+            reply = client.read_page(page, want_written=True)
+            assert (reply.symbols == PAGES[page]).all()
+            assert (reply.written == PAGES[page]).all()  # type: ignore[union-attr]
+        assert controlling.result(60) == [1, 0]
     client.page_shown(None)
 
 
@@ -89,29 +92,6 @@ def test_an_upload_whose_caller_leaves_adds_no_page(start: Start) -> None:
 
     refused(lambda: service.stub.UploadPages(failing(), timeout=20))
     assert service.client.upload_pages(PAGES[:1], 16) == 0
-
-
-def test_beams_are_moved_by_the_controller_too(start: Start) -> None:
-    lab = Lab()
-    source, stage = external(lab)
-    client = start(source=source).client
-
-    def control() -> None:
-        with LightpageClient(client.target, timeout_s=20) as mine:
-            moved = 0
-            for order in mine.display_orders(15.0):
-                if order.beams is not None:
-                    stage.let_through(signal=order.beams[0], reference=order.beams[1])
-                    mine.beams_set(signal=order.beams[0], reference=order.beams[1])
-                    moved += 1
-                if moved == 2:
-                    return
-
-    thread = threading.Thread(target=control)
-    thread.start()
-    references = source.references()
-    thread.join(20)
-    assert (references.in_phase == toy.ToyDevice().references().in_phase).all()
 
 
 def test_what_cannot_be_uploaded_is_named(start: Start) -> None:

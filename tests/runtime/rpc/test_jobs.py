@@ -219,6 +219,8 @@ def test_a_job_that_ends_badly_says_why_as_a_call_would(start: Start, tmp_path: 
     message = service.stub.GetJob(pb.GetJobRequest(id=end.id), timeout=20)
     assert message.refusal.code == grpc.StatusCode.FAILED_PRECONDITION.value[0]
     assert message.refusal.reason == pb.ERROR_REASON_RECALIBRATION_REFUSED
+    for result, count in (("refused", 1), ("failed", 2)):
+        assert service.count("lightpage_recalibrations_total", result=result) == count
     assert service.version == "toy-1"
     # what is known at once fails the call
     for options, kind in (

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -98,20 +97,6 @@ def test_without_a_store_it_goes_on_after_a_rollback_and_keeps_only_the_models_h
 
 
 # ---- refused ------------------------------------------------------------------------------------------------------
-
-
-def test_wrong_symbols_are_refused_and_the_old_model_stays(start: Start) -> None:
-    service = start()
-
-    def lying(shot: Shot) -> Shot:
-        wrong = np.random.default_rng(shot.page_index).integers(16, size=toy.PAGE).astype(np.uint8)
-        return replace(shot, symbols=wrong)
-
-    service.reading(lying)
-    with pytest.raises(RecalibrationRefusedError):
-        service.client.recalibrate(count=3)
-    assert [m.version for m in service.client.models()] == ["toy-1"]
-    assert service.count("lightpage_recalibrations_total", result="refused") == 1
 
 
 class DriftTracker(NoTracker):
