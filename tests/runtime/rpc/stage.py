@@ -21,7 +21,6 @@ from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.recalibration.outcome import RefitResult
 from runtime.rpc.server import LightpageServer
 from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
@@ -187,27 +186,3 @@ class Remembering(NoTracker):
 
     def anew(self) -> Remembering:
         return Remembering(self._mine)
-
-
-@dataclass
-class SlowFit:
-    """A fit that waits for leave to go on."""
-
-    entered: threading.Event
-    go: threading.Event
-    ended: threading.Event
-
-    def __call__(
-        self, bundle: object, pages: object, progress: Callable[[str, float], None], decoder: object
-    ) -> RefitResult:
-        self.entered.set()
-        try:
-            while not self.go.wait(0.02):
-                progress("wait", 0.1)
-            return toy.fit_references(bundle, pages, progress, decoder)  # type: ignore[arg-type]
-        finally:
-            self.ended.set()
-
-
-def slow_fit() -> SlowFit:
-    return SlowFit(threading.Event(), threading.Event(), threading.Event())

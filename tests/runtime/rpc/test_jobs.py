@@ -42,7 +42,8 @@ from runtime.recalibration.outcome import RefitResult
 from runtime.rpc.job_calls import JobCalls
 from runtime.service.limits import Limits
 from tests.runtime import toy
-from tests.runtime.rpc.stage import Running, Start, raised, refused, slow_fit, until_told
+from tests.runtime.rpc.stage import Running, Start, raised, refused, until_told
+from tests.runtime.slow_fit import SlowFit
 from tests.waiting import eventually
 
 DRIFTED = (150.0, 62.0)
@@ -99,7 +100,7 @@ ALL_BYTES = 3 * PAIR_BYTES + 2 * 16 * 24
 
 
 def test_a_job_survives_its_caller_and_is_kept_over_a_restart(start: Start, tmp_path: Path) -> None:
-    fit = slow_fit()
+    fit = SlowFit()
     service = start(fit=fit, store=tmp_path / "store")
     with LightpageClient(service.server.target) as caller:
         job = caller.start_recalibration(count=2, correlation_id="night shift")
@@ -125,7 +126,7 @@ def test_a_job_survives_its_caller_and_is_kept_over_a_restart(start: Start, tmp_
 
 
 def test_a_watch_tells_each_change_and_holds_no_thread(start: Start) -> None:
-    fit = slow_fit()
+    fit = SlowFit()
     service = start(fit=fit, limits=Limits(concurrent_calls=2))
     job = service.client.start_recalibration(count=2)
     assert fit.entered.wait(60)
@@ -144,7 +145,7 @@ def test_a_watch_tells_each_change_and_holds_no_thread(start: Start) -> None:
 
 
 def test_a_cancelled_job_changes_nothing_and_makes_room(start: Start) -> None:
-    fit = slow_fit()
+    fit = SlowFit()
     service = start(fit=fit)
     job = service.client.start_recalibration(count=2)
     assert fit.entered.wait(60)
@@ -177,7 +178,7 @@ def test_a_job_that_does_not_hear_of_its_end_is_told_as_it_runs() -> None:
 
 
 def test_a_second_one_is_told_which_runs_whoever_began_it(start: Start) -> None:
-    fit = slow_fit()
+    fit = SlowFit()
     service = start(fit=fit)
     call = service.stub.Recalibrate(pb.RecalibrateRequest(source=pb.SourcePages(count=2)), timeout=60)
     assert next(call).progress.step
@@ -385,7 +386,7 @@ def test_bad_input_is_named_and_leaves_nothing_and_good_input_comes_in_any_chunk
 
 
 def test_what_comes_counts_against_the_memory_until_the_job_has_ended(start: Start) -> None:
-    fit = slow_fit()
+    fit = SlowFit()
     service = start(fit=fit, limits=Limits(receive_bytes=4 * PAIR_BYTES))
     job = send(service.client, PAGES)
     assert fit.entered.wait(60)

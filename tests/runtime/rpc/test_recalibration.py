@@ -33,7 +33,8 @@ from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.outcome import RefitResult
 from runtime.service.registry import KEPT_MODELS
 from tests.runtime import toy
-from tests.runtime.rpc.stage import Running, Start, a_page, refused, slow_fit
+from tests.runtime.rpc.stage import Running, Start, a_page, refused
+from tests.runtime.slow_fit import SlowFit
 from tests.waiting import eventually
 
 DRIFTED = (150.0, 62.0)
@@ -185,7 +186,7 @@ def test_recordings_on_the_server(start: Start, tmp_path: Path) -> None:
 
 
 def test_one_runs_at_a_time_beside_decoding_and_the_end_of_the_service_cuts_it_off(start: Start) -> None:
-    fit = slow_fit()
+    fit = SlowFit()
     service = start(fit=fit)
     with ThreadPoolExecutor(1) as pool:
         first = pool.submit(service.client.recalibrate, count=2)
@@ -235,7 +236,7 @@ def test_the_service_ends_beside_one_that_does_not_stop_and_it_changes_nothing_a
 
 
 def test_a_caller_who_leaves_ends_it(start: Start) -> None:
-    fit = slow_fit()
+    fit = SlowFit()
     service = start(fit=fit)
     call = service.stub.Recalibrate(pb.RecalibrateRequest(source=pb.SourcePages(count=2)), timeout=60)
     assert next(call).progress.step
@@ -249,7 +250,7 @@ def test_a_caller_who_leaves_ends_it(start: Start) -> None:
 
 
 def test_a_model_that_changes_meanwhile_makes_its_result_out_of_date(start: Start) -> None:
-    fit = slow_fit()
+    fit = SlowFit()
     service = start(fit=fit)
     fit.go.set()
     service.client.recalibrate(count=2)
