@@ -139,7 +139,7 @@ class Refused:
 
     @property
     def reason(self) -> str:
-        return self.told["ErrorInfo"].reason if self.told else ""  # type: ignore[no-any-return]
+        return self.told["ErrorInfo"].reason if self.told else ""
 
     @property
     def subject(self) -> str:

@@ -155,7 +155,7 @@ def test_a_model_without_a_code_says_so(serve: Serve) -> None:
     assert (client.describe().code_toml, client.describe().user_bytes_per_page) == ("", 0)
     for call in (lambda: client.read_page(0, user_data=True), lambda: list(client.read_data(0, 2))):
         with pytest.raises(BundleError) as error:
-            call()  # type: ignore[no-untyped-call]
+            call()
         assert error.value.subject == "bundle plain.zip: code"
 
 

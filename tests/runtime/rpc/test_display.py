@@ -72,7 +72,7 @@ def test_a_controller_shows_what_it_has_uploaded_and_moves_beams(start: Start) -
         for page in (1, 0):
             reply = client.read_page(page, want_written=True)
             assert (reply.symbols == PAGES[page]).all()
-            assert (reply.written == PAGES[page]).all()  # type: ignore[union-attr]
+            assert (reply.written == PAGES[page]).all()
         assert controlling.result(60) == [1, 0]
     client.page_shown(None)
 
@@ -107,10 +107,10 @@ def test_what_cannot_be_uploaded_is_named(start: Start) -> None:
     for pages, levels, kind in cases:
         with pytest.raises(kind):
             service.client.upload_pages(pages, levels)
-    source.pages.most_bytes = 2 * PAGES.nbytes - 1  # type: ignore[union-attr]
+    source.pages.most_bytes = 2 * PAGES.nbytes - 1
     with pytest.raises(LimitError):
         service.client.upload_pages(PAGES, 16)
-    assert len(source.pages) == 2  # type: ignore[arg-type]
+    assert len(source.pages) == 2
     levels = pb.UploadPagesRequest(levels=4)
     for messages in ([], [pb.UploadPagesRequest(symbols=b"a")], [levels] * 2, [levels, pb.UploadPagesRequest()]):
         answer = refused(lambda sent=messages: service.stub.UploadPages(iter(sent), timeout=20))  # type: ignore[misc]

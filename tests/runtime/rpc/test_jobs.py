@@ -161,7 +161,7 @@ def test_a_cancelled_job_changes_nothing_and_makes_room(start: Start) -> None:
     assert service.client.cancel_job(done.id) == done
     for call in (service.client.job, service.client.cancel_job, lambda name: list(service.client.watch_job(name, 20))):
         with pytest.raises(NoSuchJobError):
-            call("no-such-job")  # type: ignore[no-untyped-call]
+            call("no-such-job")
     assert refused(lambda: service.stub.GetJob(pb.GetJobRequest(), timeout=20)).code is grpc.StatusCode.NOT_FOUND
     assert service.version == "toy-1+r1"
     assert service.count("lightpage_recalibrations_total", result="dropped") == 1
@@ -230,7 +230,7 @@ def test_a_job_that_ends_badly_says_why_as_a_call_would(start: Start, tmp_path: 
         ({"recording": "../short.h5"}, InvalidInputError),
     ):
         with pytest.raises(kind):
-            service.client.start_recalibration(**options)  # type: ignore[arg-type]
+            service.client.start_recalibration(**options)
     answer = refused(lambda: service.stub.StartRecalibration(pb.StartRecalibrationRequest(), timeout=20))
     assert (answer.code, answer.subject) == (grpc.StatusCode.INVALID_ARGUMENT, "pages")
     assert len(service.client.jobs()) == 3

@@ -164,7 +164,7 @@ def test_a_service_of_the_library_gets_its_messages_parsed() -> None:
             yield request * 2
 
     async def all_of_it() -> None:
-        made = grpc.stream_stream_rpc_method_handler(both, parse)  # type: ignore[arg-type]
+        made = grpc.stream_stream_rpc_method_handler(both, parse)
         handler = await handler_of(gate, "/one.Service/Both", made)
         assert [reply async for reply in handler.stream_stream(messages(b"a", b"b"), Context())] == ["aa", "bb"]
         with pytest.raises(MalformedError) as error:

@@ -54,7 +54,7 @@ def recorded(path: Path, pages: int, **changes: Callable[[Any], Any]) -> np.ndar
 
 def air_of(service: Running, pages: int = 3) -> float:
     read = [service.client.read_page(want_phase=True, want_concentration=True, want_written=True) for _ in range(pages)]
-    data = ~np.stack([page.pilot_mask for page in read])  # type: ignore[arg-type,misc]
+    data = ~np.stack([page.pilot_mask for page in read])
     stacked = [np.stack([getattr(page, name) for page in read])[data] for name in ("phase", "concentration", "written")]
     return measure(*stacked, 16).air_bits_per_symbol
 
@@ -131,7 +131,7 @@ def test_a_re_fit_is_not_judged_by_the_page_that_it_was_fitted_on(start: Start, 
     # Of two pages the third one is the first.
     for twice, subject in (({"pages": [1, 1]}, "known page 1"), ({"count": 3}, "known page 2")):
         with pytest.raises(InvalidInputError) as error:
-            client.recalibrate(**twice)  # type: ignore[arg-type]
+            client.recalibrate(**twice)
         assert error.value.subject == subject
     assert client.recalibrate(pages=[1, 0]).pages_used == 2
 
@@ -144,7 +144,7 @@ def test_pages_without_symbols_are_the_fault_of_who_named_them(start: Start, tmp
         ({"source": pb.SourcePages(count=2)}, grpc.StatusCode.FAILED_PRECONDITION, "pages of toy:device"),
         ({"recording": "plain.h5"}, grpc.StatusCode.INVALID_ARGUMENT, "recording plain.h5"),
     ):
-        answer = refused(lambda asked=asked: service.stub.Recalibrate(pb.RecalibrateRequest(**asked), timeout=20))  # type: ignore[misc,arg-type]
+        answer = refused(lambda asked=asked: service.stub.Recalibrate(pb.RecalibrateRequest(**asked), timeout=20))
         assert (answer.code, answer.subject) == (code, subject)
 
 

@@ -408,7 +408,7 @@ def test_a_recalibration_without_any_folder_is_refused_before_it_begins(
     assert "--store" in trouble.expected
     for call in (service.client.recalibrate, service.client.start_recalibration):
         with pytest.raises(StoreError):
-            call(count=2)  # type: ignore[operator]
+            call(count=2)
     assert service.client.jobs() == []
     assert start(store=tmp_path / "store").recalibrator.no_room() is None
     errors[0] = OSError(errno.ENOSPC, "No space left on device")  # a full disk is no missing folder

@@ -71,7 +71,7 @@ def test_a_socket_path_longer_than_the_system_has_room_for_is_named(tmp_path: Pa
         lambda: SharedRegions(memory_path(target), 10, 1, 1.0).__enter__(),
         lambda: HealthServer(next_port(target), dict),
     ):
-        assert "112 bytes" in refused(make).got  # type: ignore[arg-type]
+        assert "112 bytes" in refused(make).got
 
 
 def test_names_that_a_stranger_can_choose_name_no_machine() -> None:
