@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import grpc
@@ -23,7 +24,7 @@ from runtime.pb.inference import open_inference_pb2 as oip
 from runtime.pb.inference import open_inference_pb2_grpc as oip_grpc
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.call import SERVICE
-from runtime.rpc.inference_calls import INFERENCE
+from runtime.rpc.inference_calls import INFERENCE, large_messages
 from runtime.rpc.tensors import Tensor, inputs_of
 from runtime.service.caller import Caller
 from runtime.service.limits import Limits
@@ -351,6 +352,24 @@ def test_a_whole_pair_passes_where_no_message_of_ones_own_may_be_so_large(start:
         assert ("4096" in answer.text) == (size == 5000)
     large = pb.DecodeFramesRequest(chunk=bytes(5000))
     assert refused(lambda: service.stub.DecodeFrames(iter([large]), timeout=20)).reason == "TOO_LARGE"
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "largest"),
+    [
+        ((3000, 4000), "uint16", 2 * 12_000_000 * 2 + 2 * 400_000 + 65_536),
+        ((1000, 1000), "uint8", 2 * 1_000_000 * 2 + 4 * 400_000 + 65_536),  # typed, as two bytes a pixel
+        ((2000, 1000), "uint8", 8 << 20),  # typed, at most so many of them
+        ((64, 96), "uint8", 4 << 20),  # as any other message
+        ((40_000, 40_000), "uint8", 2**31 - 1),
+    ],
+)
+def test_the_largest_message_is_a_pair_with_pilots(shape: tuple[int, int], dtype: str, largest: int) -> None:
+    profile = SimpleNamespace(frame_shape=shape, page_shape=(16, 24) if shape == (64, 96) else (500, 800))
+    bundle = SimpleNamespace(profile=profile, manifest=SimpleNamespace(frame_dtype=dtype))
+    registry = SimpleNamespace(current=SimpleNamespace(decoder=SimpleNamespace(bundle=bundle)))
+    plane: Any = SimpleNamespace(registry=registry, limits=Limits())
+    assert large_messages(plane) == {MODEL_INFER: largest}
 
 
 def test_typed_contents_count_against_the_budget_with_what_they_take_once_parsed(start: Start) -> None:
