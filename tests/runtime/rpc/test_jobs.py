@@ -224,6 +224,7 @@ def test_a_job_that_ends_badly_says_why_as_a_call_would(start: Start, tmp_path: 
         assert service.count("lightpage_recalibrations_total", result=result) == count
     assert service.version == "toy-1"
     # what is known at once fails the call
+    service.recalibrator.check_count(16)
     for options, kind in (
         ({"count": 17}, LimitError),
         ({"recording": "absent.h5"}, InvalidInputError),
@@ -353,6 +354,7 @@ WRONG: dict[str, tuple[Parts, type[LightpageError]]] = {
     "one page": ([header(pages=1)], InvalidInputError),
     "no pages": ([header(pages=0)], InvalidInputError),
     "too many pages": ([header(pages=17)], LimitError),
+    "as many as may be, but fewer come": ([header(pages=16), *ALL[1:]], MalformedError),
     "huge frames": ([header(rows_px=1 << 20, columns_px=1 << 20)], LimitError),
     "few flags": ([header(pilot_mask=flags()[:-1])], PageError),
     "a flag of 2": ([header(pilot_mask=flags(2))], PageError),
