@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import Profile, TomlTable
 from lightpage.errors import FrameError
 from lightpage.page.levels import MAX_LEVELS
@@ -100,6 +100,7 @@ class CameraSource(FrameSource):
         exposures: how they are taken.
         views: how each camera sees the image.
         name: for people.
+        clock: by which it waits; that of the trigger.
 
     Raises:
         SourceError: the cameras' bit depths differ.
@@ -117,6 +118,7 @@ class CameraSource(FrameSource):
         exposures: Exposures | None = None,
         views: tuple[View, View] = (View(), View()),
         name: str = "camera",
+        clock: Clock = SYSTEM,
     ) -> None:
         self.name, self.profile = name, profile
         self.frame_shape, self.page_shape = profile.frame_shape, profile.page_shape
@@ -130,10 +132,11 @@ class CameraSource(FrameSource):
         self.bit_depth = depths[0]
         self._exposures = exposures or Exposures()
         self.shot_s = self._exposures.shot_s
-        self._pairing = Pairing(cameras, trigger, pairing or PairingSettings())
+        self._pairing = Pairing(cameras, trigger, pairing or PairingSettings(), clock)
+        self._clock = clock
         self._lock = threading.RLock()
         """Held while the devices are used: one shot at a time."""
-        self._keeper = BeamKeeper(beams, self._lock, name)
+        self._keeper = BeamKeeper(beams, self._lock, name, clock)
         self._armed = self._was_armed = False
         self._next = 0
         self._dark: tuple[DarkFrame, DarkFrame] | None = None
@@ -221,7 +224,7 @@ class CameraSource(FrameSource):
 
     def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         """See `FrameSource.shot`."""
-        deadline = time.monotonic() + timeout_s
+        deadline = self._clock.now() + timeout_s
         with self._in_turn(timeout_s):
             index, symbols = self._page(page)
             take = self._attempt(index, symbols, deadline)
@@ -314,7 +317,7 @@ class CameraSource(FrameSource):
             nonlocal shown
             if not (shown and modulator.shows()):
                 shown = False
-                modulator.show(symbols, self.levels, index, max(0.0, deadline - time.monotonic()))
+                modulator.show(symbols, self.levels, index, max(0.0, deadline - self._clock.now()))
                 shown = True
 
         return lambda: self._pairing.shot(deadline, display, modulator.shows)
@@ -333,10 +336,10 @@ class CameraSource(FrameSource):
                 if error.reason in _DISARMING or self._pairing.distrusted:
                     self._armed = False
                 if error.reason in _AWAITED:
-                    if time.monotonic() + _AGAIN_S < deadline:
-                        time.sleep(_AGAIN_S)
+                    if self._clock.now() + _AGAIN_S < deadline:
+                        self._clock.sleep(_AGAIN_S)
                         continue
-                elif repeats > 0 and time.monotonic() < deadline and not self._never_came(error):
+                elif repeats > 0 and self._clock.now() < deadline and not self._never_came(error):
                     repeats -= 1
                     continue
                 raise error.about(f"{subject} of {self.name}") from None
@@ -382,7 +385,7 @@ class CameraSource(FrameSource):
         """Frames of both cameras [exposure, row, column], whatever is on display."""
         shots = []
         for _ in range(count):
-            deadline = time.monotonic() + self.shot_s
+            deadline = self._clock.now() + self.shot_s
             # nothing but the light has to stand still, so there is no reason to give up early
             attempt = partial(self._pairing.shot, deadline)
             taken = self._persistent("frames without a page", -1, deadline, attempt, _MOST_REPEATS)
