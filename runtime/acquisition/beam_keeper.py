@@ -114,10 +114,11 @@ class BeamKeeper:
             with self._lock:
                 if stop.is_set():
                     return
+                try:
+                    if self._trouble:
+                        self.open()
+                except Exception as error:
+                    _log.debug("%s: beams still not open: %s", self._name, error)
                 if not self._trouble:
                     self._thread = None
                     return
-                try:
-                    self.open()
-                except Exception as error:
-                    _log.debug("%s: beams still not open: %s", self._name, error)
