@@ -18,6 +18,7 @@ from runtime.modulator.lookup_table import LookupTable
 from runtime.modulator.screen import ScreenModulator
 from runtime.modulator.settings import ScreenSettings
 from tests.lightpage.small import small_profile
+from tests.processes import children, runs
 from tests.runtime.modulator.xvfb import COLUMNS, ROWS, XServer, x_server
 from tests.waiting import eventually
 
@@ -69,24 +70,7 @@ def shown(screen: ScreenModulator, seed: int = 1, offset_x_px: int = OFFSET_PX) 
 
 
 def windows_of(parent: int) -> list[int]:
-    """Processes of windows that a process has started and that run."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            state, above = (folder / "stat").read_text().rpartition(")")[2].split()[:2]
-            command = (folder / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if int(above) == parent and state != "Z" and b"runtime.modulator.screen_window" in command:
-            found.append(int(folder.name))
-    return found
-
-
-def runs(process: int) -> bool:
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    return children(parent, "runtime.modulator.screen_window")
 
 
 def test_each_pixel_of_the_screen_shows_the_grey_value_of_its_symbol(server: XServer, screen: ScreenModulator) -> None:
