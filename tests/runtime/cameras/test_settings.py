@@ -13,8 +13,8 @@ from runtime.cameras.settings import CameraSettings
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({}, "neither serial nor address, wanted one of them"),
-        ({"serial": "1", "address": "10.0.0.1"}, "serial and address, wanted one of them"),
+        ({}, "neither serial nor"),
+        ({"serial": "1", "address": "10.0.0.1"}, "serial and address"),
         ({"serial": "1", "exposure_us": "200"}, "exposure_us"),
         ({"serial": "1", "exposure_us": True}, "exposure_us"),
         ({"serial": 1}, "serial"),
@@ -24,8 +24,8 @@ from runtime.cameras.settings import CameraSettings
         ({"serial": "1", "buffers": 1}, "buffers"),
         ({"serial": "1", "packet_bytes": 70_000}, "packet_bytes"),
         ({"serial": "1", "driver": "vendor"}, "aravis"),
-        ({"serial": "1", "driver": "gentl"}, "no producer, wanted one"),
-        ({"serial": "1", "producer": "maker.cti"}, 'producer with .* wanted driver = "gentl"'),
+        ({"serial": "1", "driver": "gentl"}, "no producer"),
+        ({"serial": "1", "producer": "maker.cti"}, "producer with"),
         ({"address": "10.0.0.1", "driver": "gentl", "producer": "maker.cti"}, "address with"),
         ({"serial": "1", "packet_bytes": 1400, "driver": "gentl", "producer": "maker.cti"}, "packet_bytes with"),
         ({"serial": "1", "exposure_ms": 1}, "exposure_ms"),
