@@ -125,7 +125,7 @@ class CameraSource(FrameSource):
         self.modulator = modulator
         self.beams: Beams = beams
         self.pages: PageStore = pages if pages is not None else PageStore(profile)
-        self._cameras, self._trigger, self._views = cameras, trigger, views
+        self.cameras, self._trigger, self.views = cameras, trigger, views
         depths = [camera.bit_depth for camera in cameras]
         if depths[0] != depths[1]:
             raise SourceError(f"{self.name}: cameras", f"{depths[0]} and {depths[1]} bits", "the same for both")
@@ -177,7 +177,7 @@ class CameraSource(FrameSource):
                 return
             if not self._was_armed:
                 self._open_modulator()
-            for camera in self._cameras:
+            for camera in self.cameras:
                 self._arm(camera, Reason.CAMERA_GONE)
             self._arm(self._trigger, Reason.TRIGGER_GONE)
             self._pairing.forget()
@@ -205,7 +205,7 @@ class CameraSource(FrameSource):
         """See `FrameSource.disarm`."""
         with self._lock:
             self._armed = False
-            for device in (self._trigger, *self._cameras):
+            for device in (self._trigger, *self.cameras):
                 device.disarm()
 
     def close(self) -> None:
@@ -214,7 +214,7 @@ class CameraSource(FrameSource):
             self._armed = False
             self._keeper.close()
             stack.callback(self.pages.close)
-            for device in (self.modulator, *self._cameras, self._trigger, self.beams):
+            for device in (self.modulator, *self.cameras, self._trigger, self.beams):
                 if device is not None:
                     stack.callback(device.close)
 
@@ -282,7 +282,7 @@ class CameraSource(FrameSource):
                 stacks = self._stacks(self._exposures.dark_frames)
                 first, second = (
                     DarkFrame.of(stack, self.bit_depth, f"{camera.name}: dark frames")
-                    for stack, camera in zip(stacks, self._cameras, strict=True)
+                    for stack, camera in zip(stacks, self.cameras, strict=True)
                 )
             except BaseException as error:
                 self._dark = before
@@ -291,7 +291,7 @@ class CameraSource(FrameSource):
                 raise
             self._dark = (first, second)
             self._repairs = tuple(PixelRepair(self.frame_shape, dark.hot) for dark in self._dark)
-            for camera, dark in zip(self._cameras, self._dark, strict=True):
+            for camera, dark in zip(self.cameras, self._dark, strict=True):
                 _log.info("%s: black level %d, %d hot pixels", camera.name, dark.black_level, len(dark.hot))
             return self._dark
 
@@ -357,12 +357,12 @@ class CameraSource(FrameSource):
         """The counts of a frame, upright, hot pixels mended, the black level taken off."""
         pixels = frame.pixels
         assert pixels is not None  # of a complete frame
-        camera, full_scale = self._cameras[one], 2**self.bit_depth - 1
+        camera, full_scale = self.cameras[one], 2**self.bit_depth - 1
         if pixels.shape != self.frame_shape:
             raise SourceError(f"{camera.name}: frame", f"{pixels.shape}", f"{self.frame_shape}")
         pixels = self._to_full_scale(one, pixels.astype(frame_type(self.bit_depth), copy=False))
         self._saturated[camera.name] = float(np.count_nonzero(pixels >= full_scale) / pixels.size)
-        pixels = self._views[one].upright(pixels)
+        pixels = self.views[one].upright(pixels)
         if self._dark is None:
             return pixels
         return without_black(self._repairs[one](pixels), self._dark[one].black_level, self.bit_depth)
@@ -372,7 +372,7 @@ class CameraSource(FrameSource):
         found = unused_low_bits(pixels, self.bit_depth)
         if found and not self._unused[one]:
             warn(
-                f"{self._cameras[one].name}: {describe(self.bit_depth, found)}. The greatest of them is taken for full "
+                f"{self.cameras[one].name}: {describe(self.bit_depth, found)}. The greatest of them is taken for full "
                 f"scale; better a pixel_format of {self.bit_depth - found} bits, or less digital gain"
             )
         self._unused[one] = found or self._unused[one]
