@@ -16,7 +16,7 @@ from runtime.acquisition.camera_source import CameraSource, View
 from runtime.acquisition.page_store import PageStore
 from runtime.errors import LostShotError, Reason, SourceError
 from tests.runtime import toy
-from tests.runtime.acquisition.lab import Lab, LabModulator, pages_of, source_of
+from tests.runtime.acquisition.lab import PAIRING, Lab, LabModulator, pages_of, source_of
 from tests.told import Told
 
 
@@ -177,8 +177,8 @@ def test_a_frame_of_another_shape_and_cameras_of_different_depths_are_the_source
     with source, pytest.raises(SourceError, match="^Q: frame"):
         source.shot(page=0)
     lab.cameras[1].bit_depth = 12  # type: ignore[misc]
-    with pytest.raises(SourceError, match="^camera:lab: cameras"):
-        source_of(lab, pages)
+    with pytest.raises(SourceError, match="^camera: cameras"):
+        CameraSource(toy.PROFILE, (lab.cameras[0], lab.cameras[1]), lab, None, source.beams, pages, PAIRING)
 
 
 def test_a_trigger_that_never_arrives_is_told_soon(lab: Lab, pages: PageStore) -> None:

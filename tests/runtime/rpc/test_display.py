@@ -45,6 +45,7 @@ def external(lab: Lab) -> tuple[CameraSource, LabModulator]:
         PAIRING,
         Exposures(reference_frames=1),
         name="camera:lab",
+        clock=lab.clock,
     )
     source.arm()
     return source, stage
