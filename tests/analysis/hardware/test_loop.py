@@ -83,8 +83,9 @@ def test_a_week_begins_as_calibrated_and_is_knocked_in_its_middle() -> None:
     assert after.geometry.pipe_angle_deg - before.geometry.pipe_angle_deg == pytest.approx(KNOCK_DEG, abs=1e-4)
 
 
+# Simulates full pages of the bench device.
+@pytest.mark.long
 def test_with_the_true_table_a_drifted_device_is_read_as_well_as_before() -> None:
-    """Takes its seconds: three pages of the bench device."""
     decoder = Decoder.load(bundle_path(DEFAULT), threads=1)
     source = DriftingSource(decoder, lambda moment: moved(Device(), moment * direction(1)), seed=1)
     true_table, found = TrueTable(decoder), list[float]()

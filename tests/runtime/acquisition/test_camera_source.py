@@ -300,7 +300,7 @@ def test_nobody_waits_for_others_longer_than_it_wants(lab: Lab, pages: PageStore
         assert reason_of(lambda: source.shot(0.01, page=1)) is Reason.MISSING_FRAME
 
 
-class held:  # noqa: N801 — used as a context
+class held:
     """Another thread shows a page of the source, for as long as the `with` statement lasts."""
 
     def __init__(self, source: CameraSource, modulator: LabModulator) -> None:

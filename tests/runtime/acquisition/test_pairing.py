@@ -115,7 +115,10 @@ FAULTS: dict[str, tuple[Callable[[Bench], None], list[Reason | None]]] = {
     "both late": (lambda bench: both(bench, after_s=0.05), [Reason.OTHER_SHOT]),
     "doubled": (doubled, [None, Reason.STRAY_FRAME]),
     "packets lost": (incomplete, [Reason.INCOMPLETE_FRAME]),
-    "delivered too late": (lambda bench: both(bench, delivery_s=0.3), [Reason.MISSING_FRAME, *4 * [None], Reason.STRAY_FRAME]),
+    "delivered too late": (
+        lambda bench: both(bench, delivery_s=0.3),
+        [Reason.MISSING_FRAME, *4 * [None], Reason.STRAY_FRAME],
+    ),
 }
 """What becomes of an edge, and of the shots from then on until one is right again."""
 

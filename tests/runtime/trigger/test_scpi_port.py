@@ -300,7 +300,10 @@ def test_a_banner_is_no_answer(lab: Lab) -> None:
     lab.line.before_line = GREETING.encode() + b"\n"
     assert GREETING in lab.lost()
     first = [GREETING + "\n"]
-    lab.line.before_line, lab.line.answer = b"", lambda message: (first.pop() if first else "") + lab.device.answer(message)
+    lab.line.before_line, lab.line.answer = (
+        b"",
+        lambda message: (first.pop() if first else "") + lab.device.answer(message),
+    )
     assert lab.works()
     assert lab.port.identity == IDENTITY
 
