@@ -13,7 +13,6 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
@@ -26,16 +25,8 @@ MARKER = "own_network"
 _RESULTS = "LIGHTPAGE_TEST_OWN_NETWORK"
 """Environment variable in the network: the file that takes the results, a line of JSON for each."""
 _LONGEST_S = 540.0
-
-
-class Result(NamedTuple):
-    """What became of a test, or of its fixtures."""
-
-    outcome: str
-    told: str
-
-
-_found = pytest.StashKey[dict[str, Result]]()
+_found = pytest.StashKey[dict[str, tuple[str, str]]]()
+"""Outcome of each test in the network, and what is told of it."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -46,50 +37,24 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     found = pyfuncitem.session.stash.setdefault(_found, {})
     if pyfuncitem.nodeid not in found:
         found |= _run(pyfuncitem)
-    result = found[pyfuncitem.nodeid]
-    if result.outcome == "skipped":
-        pytest.skip(result.told)
-    if result.outcome != "passed":
-        pytest.fail(result.told, pytrace=False)
+    outcome, told = found[pyfuncitem.nodeid]
+    if outcome == "skipped":
+        pytest.skip(told)
+    if outcome != "passed":
+        pytest.fail(told, pytrace=False)
     return True
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     """Note what became of a test in the network."""
-    if (path := os.environ.get(_RESULTS)) is None or (report.when != "call" and report.passed):
-        return
-    told = report.longrepr[2].removeprefix("Skipped: ") if isinstance(report.longrepr, tuple) else report.longreprtext
-    with open(path, "a") as results:
-        results.write(json.dumps([report.nodeid, report.outcome, told]) + "\n")
+    if _RESULTS in os.environ and (report.when == "call" or not report.passed):
+        told = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longreprtext
+        with open(os.environ[_RESULTS], "a") as results:
+            results.write(json.dumps([report.nodeid, report.outcome, told.removeprefix("Skipped: ")]) + "\n")
 
 
-def _run(first: pytest.Function) -> dict[str, Result]:
+def _run(first: pytest.Function) -> dict[str, tuple[str, str]]:
     """Run the marked tests of a file."""
-    _skip_if_impossible()
-    items = [item for item in first.session.items if item.path == first.path and item.get_closest_marker(MARKER)]
-    names = [item.nodeid for item in items]
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *names]
-    with tempfile.TemporaryDirectory() as folder:
-        results = Path(folder) / "results"
-        results.touch()
-        run = subprocess.run(
-            namespace.enter(command),
-            cwd=first.config.rootpath,
-            env={**os.environ, _RESULTS: str(results), namespace.INSIDE: "1"},
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=_LONGEST_S,
-        )
-        found: dict[str, Result] = {}
-        for name, outcome, told in map(json.loads, results.read_text().splitlines()):
-            if name not in found or outcome == "failed":  # it may pass, and fail to clean up
-                found[name] = Result(outcome, told)
-    unended = Result("failed", run.stdout + run.stderr)
-    return {name: found.get(name, unended) for name in names}
-
-
-def _skip_if_impossible() -> None:
     if shutil.which("unshare") is None:
         pytest.skip("no unshare: util-linux is not installed")
     if namespace.available() is not None:
@@ -98,3 +63,24 @@ def _skip_if_impossible() -> None:
         aravis()
     except SourceError:
         pytest.skip(f"{PACKAGE} is not installed")
+    items = [item for item in first.session.items if item.path == first.path and item.get_closest_marker(MARKER)]
+    names = [item.nodeid for item in items]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *names]
+    with tempfile.TemporaryDirectory() as folder:
+        results = Path(folder, "results")
+        results.touch()
+        environment = {**os.environ, _RESULTS: str(results), namespace.INSIDE: "1"}
+        run = subprocess.run(
+            namespace.enter(command),
+            cwd=first.config.rootpath,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_LONGEST_S,
+        )
+        found: dict[str, tuple[str, str]] = {}
+        for name, outcome, told in map(json.loads, results.read_text().splitlines()):
+            if name not in found or outcome == "failed":  # it may pass, and fail to clean up
+                found[name] = outcome, told
+    return {name: found.get(name, ("failed", run.stdout + run.stderr)) for name in names}

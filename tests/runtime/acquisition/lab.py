@@ -1,4 +1,4 @@
-"""A device that exists in memory only, by a clock that tests move, with every fault that real ones were seen to have."""
+"""A device in memory, by a clock that tests move, with every fault that real ones were seen to have."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from lightpage.recording.layout import FrameInfo
 from lightpage.recording.pages import Pages, PagesWriter
@@ -80,11 +81,10 @@ class LabCamera:
             coming = [first[0][0] for first in (self.queue, self.exposures) if first]
             self.clock.advance(min([end, *coming]) - now)
 
-    def disarm(self) -> None:
-        pass
-
     def close(self) -> None:
         pass
+
+    disarm = close
 
     def _must_answer(self) -> None:
         if self.gone:
@@ -133,11 +133,10 @@ class Lab:
                 camera.edge()
         return self.fired[-1]
 
-    def disarm(self) -> None:
-        pass
-
     def close(self) -> None:
         pass
+
+    disarm = close
 
     def _must_answer(self) -> None:
         if self.gone:
@@ -201,3 +200,10 @@ def source_of(
     cameras = (lab.cameras[0], lab.cameras[1])
     given = (pages, PAIRING, Exposures(**exposures), views, "camera:lab", lab.clock)
     return CameraSource(toy.PROFILE, cameras, lab, modulator, modulator, *given), modulator
+
+
+def reason_of(take: Callable[[], object]) -> Reason:
+    """Why a shot is lost."""
+    with pytest.raises(LostShotError) as raised:
+        take()
+    return raised.value.reason

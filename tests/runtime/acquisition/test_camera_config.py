@@ -54,7 +54,7 @@ def test_what_is_left_out_is_done_by_hand(tmp_path: Path) -> None:
     assert (source.levels, source.bit_depth) == (16, 8)
     assert source.modulator is None
     assert isinstance(source.beams, OperatorBeams)
-    with pytest.raises(SourceError, match="^operator"):
+    with pytest.raises(SourceError, match=r"^operator"):
         source.references()
     asked: list[str] = []
     source.operator = asked.append
@@ -123,7 +123,7 @@ def test_a_file_that_makes_no_device_is_refused_by_the_name_of_the_key(
 
 
 def test_shutters_need_spare_channels_of_a_pulse_generator(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="^beams"):
+    with pytest.raises(InvalidInputError, match=r"^beams"):
         opened(tmp_path, PLAIN + SHUTTERS % 3)
     assert isinstance(opened(tmp_path, PULSES + SHUTTERS % 3).beams, ShutterBeams)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from runtime.acquisition.camera_source import CameraSource, View
 from runtime.acquisition.page_store import PageStore
 from runtime.errors import LostShotError, Reason, SourceError
 from tests.runtime import toy
-from tests.runtime.acquisition.lab import PAIRING, Lab, LabModulator, pages_of, source_of
+from tests.runtime.acquisition.lab import PAIRING, Lab, pages_of, reason_of, source_of
 from tests.told import Told
 
 
@@ -30,11 +31,10 @@ def pages(tmp_path: Path) -> PageStore:
     return pages_of(tmp_path)
 
 
-def reason_of(take: Callable[[], object]) -> Reason:
-    """Why a shot is lost."""
-    with pytest.raises(LostShotError) as raised:
-        take()
-    return raised.value.reason
+def on_arm(device: Any, act: Callable[[], object]) -> None:
+    """Do something whenever a device is set up."""
+    arm = device.arm
+    device.arm = lambda: (act(), arm())[1]
 
 
 def test_pages_are_shown_and_photographed_by_number_or_in_turn(lab: Lab, pages: PageStore) -> None:
@@ -112,7 +112,7 @@ def test_a_camera_that_was_never_there_is_the_sources_fault(lab: Lab, pages: Pag
         raise SourceError("in-phase camera", "no camera", "one with serial 1")
 
     camera.arm = absent  # type: ignore[method-assign]
-    with pytest.raises(SourceError, match="^in-phase camera"):
+    with pytest.raises(SourceError, match=r"^in-phase camera"):
         source.arm()
     del camera.arm
     source.arm()
@@ -174,10 +174,10 @@ def test_a_frame_of_another_shape_and_cameras_of_different_depths_are_the_source
 ) -> None:
     source, _ = source_of(lab, pages)
     lab.cameras[1].scene = lambda: np.full((4, 5), 9, np.uint8)
-    with source, pytest.raises(SourceError, match="^Q: frame"):
+    with source, pytest.raises(SourceError, match=r"^Q: frame"):
         source.shot(page=0)
     lab.cameras[1].bit_depth = 12  # type: ignore[misc]
-    with pytest.raises(SourceError, match="^camera: cameras"):
+    with pytest.raises(SourceError, match=r"^camera: cameras"):
         CameraSource(toy.PROFILE, (lab.cameras[0], lab.cameras[1]), lab, None, source.beams, pages, PAIRING)
 
 
@@ -214,7 +214,7 @@ def test_a_modulator_that_does_not_open_is_told_before_a_camera_is_looked_for(la
         raise LostShotError("screen", "no window", "one", Reason.NOT_ON_DISPLAY)
 
     modulator.open = absent  # type: ignore[method-assign]
-    with pytest.raises(SourceError, match="^screen"):
+    with pytest.raises(SourceError, match=r"^screen"):
         source.arm()
     assert not any(camera.opened for camera in lab.cameras)
 
@@ -222,19 +222,10 @@ def test_a_modulator_that_does_not_open_is_told_before_a_camera_is_looked_for(la
 def test_devices_are_set_up_again_after_three_contradictions_in_a_row(lab: Lab, pages: PageStore) -> None:
     """As a camera whose trigger somebody has switched off: it sends frames that nobody asked for."""
     source, _ = source_of(lab, pages, repeats=0)
-    camera = lab.cameras[0]
-    free: list[bool] = []
-    edge, arm = camera.edge, camera.arm
-
-    def sent(*how: float) -> None:
-        for _ in range(1 + len(free)):
-            edge(*how)  # type: ignore[arg-type]
-
-    def armed() -> None:
-        free.clear()
-        arm()
-
-    camera.edge, camera.arm = sent, armed  # type: ignore[method-assign,assignment]
+    camera, free = lab.cameras[0], list[bool]()
+    edge = camera.edge
+    camera.edge = lambda: [edge() for _ in range(1 + len(free))]  # type: ignore[assignment,method-assign]
+    on_arm(camera, free.clear)
     with source:
         source.shot(page=0)
         free.append(True)
@@ -245,21 +236,14 @@ def test_devices_are_set_up_again_after_three_contradictions_in_a_row(lab: Lab, 
 
 def test_a_trigger_that_refuses_is_set_up_again(lab: Lab, pages: PageStore) -> None:
     source, _ = source_of(lab, pages)
-    fire, arm, refuses = lab.fire, lab.arm, [False]
+    on_arm(lab, lambda: vars(lab).pop("fire", None))
 
-    def fired() -> float:
-        if refuses[0]:
-            raise LostShotError(lab.name, "?8", "no refusal", Reason.TRIGGER_REFUSED)
-        return fire()
+    def refuses() -> float:
+        raise LostShotError(lab.name, "?8", "no refusal", Reason.TRIGGER_REFUSED)
 
-    def armed() -> None:
-        refuses[0] = False
-        arm()
-
-    lab.fire, lab.arm = fired, armed  # type: ignore[method-assign]
     with source:
         source.shot(page=0)
-        refuses[0] = True
+        lab.fire = refuses  # type: ignore[method-assign]
         assert source.shot(page=1).page_index == 1
 
 
@@ -296,31 +280,21 @@ def test_left_aligned_counts_are_told_once_and_saturate(lab: Lab, pages: PageSto
 
 def test_nobody_waits_for_others_longer_than_it_wants(lab: Lab, pages: PageStore) -> None:
     source, modulator = source_of(lab, pages)
-    with source, held(source, modulator):
+    shows, leave, show = threading.Event(), threading.Event(), modulator.show
+
+    def slow(*given: Any) -> None:
+        shows.set()
+        leave.wait(60)
+        show(*given)
+
+    modulator.show = slow  # type: ignore[method-assign]
+    with source:
+        other = threading.Thread(target=source.shot)
+        other.start()
+        assert shows.wait(60)
         assert reason_of(lambda: source.shot(0.01, page=1)) is Reason.MISSING_FRAME
-
-
-class held:
-    """Another thread shows a page of the source, for as long as the `with` statement lasts."""
-
-    def __init__(self, source: CameraSource, modulator: LabModulator) -> None:
-        self._shows, self._leave, show = threading.Event(), threading.Event(), modulator.show
-
-        def slow(*given: Any) -> None:
-            self._shows.set()
-            assert self._leave.wait(60)
-            show(*given)
-
-        modulator.show = slow  # type: ignore[method-assign]
-        self._other = threading.Thread(target=source.shot)
-
-    def __enter__(self) -> None:
-        self._other.start()
-        assert self._shows.wait(60)
-
-    def __exit__(self, *_: object) -> None:
-        self._leave.set()
-        self._other.join(60)
+        leave.set()
+        other.join(60)
 
 
 @pytest.mark.parametrize("seconds", [-1.0, 0.0])
@@ -336,15 +310,12 @@ def test_everything_is_closed_whatever_becomes_of_the_others(lab: Lab, pages: Pa
     source, modulator = source_of(lab, pages)
     closed: list[str] = []
 
-    def failing(name: str) -> Callable[[], None]:
-        def close() -> None:
-            closed.append(name)
-            raise RuntimeError(name)
-
-        return close
+    def failing(name: str) -> None:
+        closed.append(name)
+        raise RuntimeError(name)
 
     for name, device in (("modulator", modulator), ("trigger", lab), *zip("IQ", lab.cameras, strict=True)):
-        device.close = failing(name)  # type: ignore[attr-defined]
+        device.close = partial(failing, name)  # type: ignore[attr-defined]
     with pytest.raises(RuntimeError):
         source.close()
     assert sorted(closed) == ["I", "Q", "modulator", "modulator", "trigger"]  # it moves the beams too

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from lightpage.recording.layout import FrameInfo
 from runtime.acquisition.pairing import Pairing, PairingSettings
 from runtime.cameras.camera import Frame, FrameStatus
 from runtime.errors import LostShotError, Reason
-from tests.runtime.acquisition.lab import Lab, LabCamera
+from tests.runtime.acquisition.lab import Lab
 
 SETTINGS = PairingSettings(tolerance_s=0.012, frame_s=0.15, quiet_s=0.05, spacing_s=0.032)
 SYNCHRONISING = 3
@@ -44,14 +45,13 @@ class Bench:
         self.lab.fired.clear()
         return count
 
-    def late(self, *after_s: float) -> None:
+    def plan(self, plan: Callable[[Bench], None]) -> None:
+        """What becomes of the next edge."""
+        self.lab.plan = lambda: plan(self)
+
+    def late(self, first_s: float, second_s: float) -> None:
         """The next edge exposes each camera so much later."""
-
-        def plan() -> None:
-            for camera, after in zip(self.cameras, after_s, strict=True):
-                camera.edge(after)
-
-        self.lab.plan = plan
+        self.plan(exposing({"after_s": first_s}, {"after_s": second_s}))
 
 
 @pytest.fixture
@@ -88,36 +88,29 @@ def test_a_page_stands_for_the_tolerance_before_its_trigger_and_triggers_keep_th
     assert last == pytest.approx([displayed + SETTINGS.tolerance_s, displayed + 0.012 + SETTINGS.spacing_s])
 
 
-def both(bench: Bench, **how: float) -> None:
-    for camera in bench.cameras:
-        camera.edge(**how)  # type: ignore[arg-type]
+def exposing(*edges: dict[str, Any] | None, twice_s: float | None = None) -> Callable[[Bench], None]:
+    """What becomes of an edge at each camera, and when the first camera has another one."""
 
+    def plan(bench: Bench) -> None:
+        for camera, edge in zip(bench.cameras, edges, strict=True):
+            if edge is not None:
+                camera.edge(**edge)
+        if twice_s is not None:
+            bench.cameras[0].edge(twice_s)
 
-def doubled(bench: Bench) -> None:
-    both(bench)
-    bench.cameras[0].edge(after_s=0.004)
-
-
-def late_by_one(bench: Bench) -> None:
-    bench.cameras[0].edge(after_s=0.04)
-    bench.cameras[1].edge()
-
-
-def incomplete(bench: Bench) -> None:
-    bench.cameras[0].edge()
-    bench.cameras[1].edge(status=FrameStatus.INCOMPLETE)
+    return plan
 
 
 FAULTS: dict[str, tuple[Callable[[Bench], None], list[Reason | None]]] = {
-    "missed by one": (lambda bench: bench.cameras[0].edge(), [Reason.MISSING_FRAME]),
-    "missed by both": (lambda bench: None, [Reason.MISSING_FRAME]),
-    "one late": (late_by_one, [Reason.OTHER_SHOT]),
-    "both late": (lambda bench: both(bench, after_s=0.05), [Reason.OTHER_SHOT]),
-    "doubled": (doubled, [None, Reason.STRAY_FRAME]),
-    "packets lost": (incomplete, [Reason.INCOMPLETE_FRAME]),
+    "missed by one": (exposing({}, None), [Reason.MISSING_FRAME]),
+    "missed by both": (exposing(None, None), [Reason.MISSING_FRAME]),
+    "one late": (exposing({"after_s": 0.04}, {}), [Reason.OTHER_SHOT]),
+    "both late": (exposing({"after_s": 0.05}, {"after_s": 0.05}), [Reason.OTHER_SHOT]),
+    "doubled": (exposing({}, {}, twice_s=0.004), [None, Reason.STRAY_FRAME]),
+    "packets lost": (exposing({}, {"status": FrameStatus.INCOMPLETE}), [Reason.INCOMPLETE_FRAME]),
     "delivered too late": (
-        lambda bench: both(bench, delivery_s=0.3),
-        [Reason.MISSING_FRAME, *4 * [None], Reason.STRAY_FRAME],
+        exposing({"delivery_s": 0.3}, {"delivery_s": 0.3}),
+        [Reason.MISSING_FRAME, None, None, None, None, Reason.STRAY_FRAME],
     ),
 }
 """What becomes of an edge, and of the shots from then on until one is right again."""
@@ -126,7 +119,7 @@ FAULTS: dict[str, tuple[Callable[[Bench], None], list[Reason | None]]] = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_each_fault_is_named_and_the_shots_after_it_are_right(bench: Bench, fault: str) -> None:
     plan, outcomes = FAULTS[fault]
-    bench.lab.plan = lambda: plan(bench)
+    bench.plan(plan)
     assert [bench.shot() for _ in range(9)] == outcomes + (9 - len(outcomes)) * [None]
 
 
@@ -134,8 +127,7 @@ def test_no_wrong_pair_among_shots_with_many_faults() -> None:
     bench, rng, outcomes = Bench(), np.random.default_rng(5), Counter[Reason | None]()
     for _ in range(400):
         if rng.random() < 0.4:
-            plan = FAULTS[str(rng.choice(list(FAULTS)))][0]
-            bench.lab.plan = lambda plan=plan: plan(bench)  # type: ignore[misc]
+            bench.plan(FAULTS[str(rng.choice(list(FAULTS)))][0])
         if rng.random() < 0.05:
             bench.cameras[int(rng.integers(2))].restart()
         outcomes[bench.shot()] += 1
@@ -234,25 +226,11 @@ def test_a_spacing_that_does_not_tell_shots_apart_is_refused() -> None:
         PairingSettings(tolerance_s=0.041, spacing_s=0.1)
 
 
-def clock_steps_back(camera: LabCamera) -> None:
-    camera.clock_s -= 3.0
-
-
-def clock_begins_anew(camera: LabCamera) -> None:
-    camera.id, camera.clock_s = 0, 5.0
-
-
-def clock_steps_by_a_little(camera: LabCamera) -> None:
-    camera.clock_s += 0.05
-
-
-@pytest.mark.parametrize("change", [clock_steps_back, clock_begins_anew, clock_steps_by_a_little])
+@pytest.mark.parametrize("change", [{"clock_s": 1e6 - 3.0}, {"id": 0, "clock_s": 5.0}, {"clock_s": 1e6 + 0.05}])
 @pytest.mark.parametrize("both", [False, True])
-def test_what_three_shots_contradict_is_learnt_anew(
-    bench: Bench, change: Callable[[LabCamera], None], both: bool
-) -> None:
+def test_what_three_shots_contradict_is_learnt_anew(bench: Bench, change: dict[str, float], both: bool) -> None:
     for camera in bench.cameras[: 1 + both]:
-        change(camera)
+        vars(camera).update(change)
     outcomes = [bench.shot() for _ in range(5)]
     assert set(outcomes[:3]) <= {Reason.OTHER_SHOT, Reason.SKIPPED_FRAME}
     assert outcomes[3:] == [None, None]

@@ -90,6 +90,6 @@ def test_the_greys_follow_the_levels_of_the_pages_that_are_shown(tmp_path: Path,
 
 def test_a_monitor_that_is_not_there_is_told_before_a_camera_is_looked_for(tmp_path: Path, server: XServer) -> None:
     source = opened(tmp_path, server.display, "monitor = 3")
-    with pytest.raises(SourceError, match="^screen.*monitor 3"):
+    with pytest.raises(SourceError, match=r"^screen.*monitor 3"):
         source.arm()
     source.close()

@@ -41,9 +41,9 @@ def test_storage_that_fails_is_no_fault_of_the_source_and_names_the_page(
 
     source = RecordingSource(recording[0])
     monkeypatch.setattr(Recording, "frames", fail)
-    with pytest.raises(StorageError, match="^page 1"):
+    with pytest.raises(StorageError, match=r"^page 1"):
         source.shot(page=1)
-    with pytest.raises(StorageError, match="^page 1"), own_fault():
+    with pytest.raises(StorageError, match=r"^page 1"), own_fault():
         source.shot(page=1)
 
 
@@ -103,7 +103,7 @@ def test_a_simulated_page_depends_on_seed_and_number_only(monkeypatch: pytest.Mo
     assert (again.pilot_mask == pilot_mask(toy.PROFILE)).all()
     with pytest.raises(PageError):
         one.shot(page=-1)
-    with pytest.raises(InvalidInputError, match="^source simulator"):
+    with pytest.raises(InvalidInputError, match=r"^source simulator"):
         one.check_against(load_profile("bench"))
 
 
@@ -211,7 +211,7 @@ def test_the_source_of_a_vendor_in_the_documents_works(vendor: EntryPoint, monke
         assert references is not None
         assert references.in_phase[0, 0] == 50
     monkeypatch.setattr(VendorSdk, "absent", True)
-    with pytest.raises(SourceError, match="^vendor"):
+    with pytest.raises(SourceError, match=r"^vendor"):
         open_source("vendor:7", [vendor]).arm()
 
 

@@ -79,7 +79,7 @@ def test_a_page_that_nobody_shows_in_time_is_lost_and_named(start: Start, said: 
     clock.advance(WAIT_S - 1)
     assert modulator.wanted() == 7
     clock.advance(1)
-    with pytest.raises(LostShotError, match="^page 7") as lost:
+    with pytest.raises(LostShotError, match=r"^page 7") as lost:
         shown.result(WAIT_S)
     assert lost.value.reason is Reason.NOT_ON_DISPLAY
     assert lost.value.got.startswith(got)
@@ -122,7 +122,7 @@ def test_beams_are_waited_for_in_the_same_way(start: Start) -> None:
 
 def test_beams_that_nobody_hears_of_are_named_and_open() -> None:
     beams = ExternalBeams(0.0)
-    with pytest.raises(LostShotError, match="^the controller's beams") as lost:
+    with pytest.raises(LostShotError, match=r"^the controller's beams") as lost:
         beams.let_through(signal=False, reference=True)
     assert lost.value.reason is Reason.BEAM_CONTROL_FAILED
     beams.close()

@@ -102,7 +102,7 @@ def test_beams_that_nobody_moved_are_not_said_to_be_blocked(lab: Lab, caplog: py
 
 
 def test_what_makes_no_sense(lab: Lab) -> None:
-    with pytest.raises(InvalidInputError, match="^shutters"):
+    with pytest.raises(InvalidInputError, match=r"^shutters"):
         ShutterBeams(lab.generator, SIGNAL, Shutter(channel=3))
     with pytest.raises(ValidationError, match="settle_s"):
         Shutter(channel=3, settle_s=float("nan"))

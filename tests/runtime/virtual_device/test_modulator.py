@@ -42,7 +42,7 @@ def test_pages_and_shutters_over_the_socket(tmp_path: Path) -> None:
         assert set(np.unique(light.pair().in_phase)) == {4, 255}
         driver.let_through(signal=True, reference=True)
         assert (light.pair().in_phase == seen.in_phase).all()
-        with pytest.raises(LostShotError, match="^simulated modulator") as raised:
+        with pytest.raises(LostShotError, match=r"^simulated modulator") as raised:
             driver.show(symbols[:-1], 16, 6, 30.0)
         assert raised.value.reason is Reason.NOT_ON_DISPLAY
         driver.show(symbols, 16, 7, 30.0)

@@ -56,9 +56,9 @@ def test_unplugged_it_is_gone_and_plugged_it_is_back(port: VirtualSerialPort) ->
 
 
 def test_an_address_that_cannot_be_had(tmp_path: Path) -> None:
-    with pytest.raises(LightpageError, match="^serial port"):
+    with pytest.raises(LightpageError, match=r"^serial port"):
         Pty(str.upper, tmp_path / "missing" / "tty").plug()
-    with TcpPort(str.upper) as port, pytest.raises(LightpageError, match="^serial port"):
+    with TcpPort(str.upper) as port, pytest.raises(LightpageError, match=r"^serial port"):
         TcpPort(str.upper, int(port.address.rpartition(":")[2])).plug()
     assert not os.listdir(tmp_path)
 
