@@ -82,16 +82,6 @@ def test_a_region_is_cut_out_where_it_was_asked_for() -> None:
         assert (pixels == stage.seen[0][7:31, 16:56]).all()
 
 
-def test_a_frame_is_a_copy() -> None:
-    with scene(buffers=2) as stage:
-        stage.camera.arm()
-        first = stage.take().pixels
-        assert first is not None
-        kept = first.copy()
-        assert all(equal(stage, seed) for seed in range(1, 5))
-        assert (first == kept).all()
-
-
 def test_numbers_follow_over_the_end_of_16_bits() -> None:
     with scene() as stage:
         stage.camera.arm()
@@ -173,13 +163,8 @@ def test_a_camera_that_goes_is_lost_and_found_again(found_by: str) -> None:
         assert stage.camera.opened == 2
         assert info_of(stage.take()).frame_id == 65401 == last
         assert stage.camera.statistics.completed == 2
-
-
-def test_a_camera_that_was_switched_off_and_on_is_lost_too() -> None:
-    with scene() as stage:
-        stage.camera.arm()
         stage.fake.close()
-        stage.fake.start()
+        stage.fake.start()  # it answers as if it had just been switched on
         gone(lambda: stage.camera.frame(0.1))
         stage.camera.arm()
         info_of(stage.take())

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from runtime.errors import LostShotError, SourceError
+from runtime.errors import SourceError
 from runtime.modulator.lookup_table import LookupTable
 from runtime.modulator.screen import ScreenModulator
 from runtime.modulator.settings import ScreenSettings
@@ -160,23 +160,6 @@ def test_a_server_that_is_not_as_it_must_be_is_refused(
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")
     refused(server.display, "screen extra")
     assert windows_of(os.getpid()) == []
-
-
-def test_a_killed_window_loses_one_page_and_is_opened_again(
-    server: XServer, screen: ScreenModulator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DISPLAY", server.display)
-    screen = screen_of(None, offset_x_px=OFFSET_PX)
-    shown(screen)
-    (first,) = eventually(lambda: windows_of(os.getpid()))  # it goes by its own name once it has begun
-    os.kill(first, signal.SIGKILL)
-    eventually(lambda: not runs(first))
-    assert not screen.shows()
-    with pytest.raises(LostShotError):
-        shown(screen)
-    np.testing.assert_array_equal(shown(screen), server.greys())
-    assert windows_of(os.getpid()) != [first]
-    screen.close()
 
 
 PARENT = """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -61,38 +62,24 @@ def test_unplugged_while_an_answer_is_waited_for_and_back(lab: Lab) -> None:
     assert lab.width(1) == 1e-5
     asked = threading.Event()
     lab.port.fault = lambda message: asked.set() or Fault.SILENCE  # type: ignore[func-returns-value]
-
-    def unplug() -> None:
-        asked.wait(60)
-        lab.port.unplug()
-
-    other = threading.Thread(target=unplug)
+    other = threading.Thread(target=lambda: asked.wait(60) and lab.port.unplug())  # type: ignore[func-returns-value]
     other.start()
-    with pytest.raises(LostShotError) as raised:
-        lab.width(1)
-    assert raised.value.reason is Reason.TRIGGER_GONE
-    other.join(60)
-    with pytest.raises(LostShotError):
-        lab.width(1)
+    for _ in range(2):
+        with pytest.raises(LostShotError) as raised:
+            lab.width(1)
+        assert raised.value.reason is Reason.TRIGGER_GONE
+        other.join(60)
     lab.port.fault = lambda message: None
     lab.port.plug()
-    assert eventually(lambda: answered(lab)) == 1e-5
 
-
-def answered(lab: Lab) -> float | None:
-    """A width, or None where a busy machine answered too late."""
-    try:
-        return lab.width(1)
-    except LostShotError:
+    def answered() -> float | None:
+        with suppress(LostShotError):  # a busy machine may answer too late
+            return lab.width(1)
         return None
 
-
-def test_a_line_that_was_closed_is_opened_by_the_next_message(lab: Lab) -> None:
+    assert eventually(answered) == 1e-5
     lab.line.close()
-    for session in (1, 2):
-        lab.line.send(":PULSE1:STATE ON")
-        assert lab.line.session == session
-        lab.line.close()
+    assert eventually(answered) == 1e-5
 
 
 def test_a_caller_waits_no_longer_than_it_wants(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,19 +98,20 @@ def test_a_caller_waits_no_longer_than_it_wants(monkeypatch: pytest.MonkeyPatch)
     other = threading.Thread(target=line.send, args=(":PULSE2:STATE ON",))
     other.start()
     assert hangs.wait(60)
-    refused: list[LostShotError] = []
+    refused: list[str] = []
 
     def impatient() -> None:
-        with pytest.raises(LostShotError) as raised:
+        try:
             line.send(":PULSE1:STATE ON", timeout_s=0.1)
-        refused.append(raised.value)
+        except LostShotError as error:
+            refused.append(error.reason)
 
     caller = threading.Thread(target=impatient)
     caller.start()
     port.clock.until_somebody_waits(2)
     port.clock.advance(0.7)
     caller.join(60)
-    assert [error.reason for error in refused] == [Reason.TRIGGER_GONE]
+    assert refused == [Reason.TRIGGER_GONE]
     leave.set()
     other.join(60)
     line.send(":PULSE3:STATE ON")
