@@ -18,8 +18,9 @@ CENTRE_PX = (3.0, -4.0)
 def test_the_middle_of_the_page_is_upright_and_in_phase_on_the_frames(tmp_path: Path) -> None:
     """There light meets no wall, and frames less references, averaged over pixels, are the symbols' phases."""
     device = ForeignDevice().with_parameters(pipe_angle_deg=-0.6, pipe_roll_deg=0.1, page_centre_px=CENTRE_PX)
-    symbols = device.write(tmp_path / "upright.h5", 1, 16, seed=4)
-    with h5py.File(tmp_path / "upright.h5") as file:
+    path = tmp_path / "upright.h5"
+    symbols = device.write(path, 1, 16, seed=4)
+    with h5py.File(str(path)) as file:
         assert (file.attrs["camera_bit_depth"], file.attrs["levels"]) == (8, 16)
         assert np.array_equal(file["symbols"], symbols)
         parts = []

@@ -11,7 +11,7 @@ import pytest
 from analysis.hardware.drifting import UNITS, DriftingSource, TrueTable, direction, moved
 from analysis.hardware.drifts import alarms, judged
 from analysis.hardware.rows import append_row, kept_rows
-from analysis.hardware.week import KNOCK_DEG, figures_of, state
+from analysis.hardware.week import figures_of
 from analysis.hardware.week_figure import draw
 from lightpage.device.state import Device
 from runtime.bundle.shipped import DEFAULT, bundle_path
@@ -75,12 +75,6 @@ def test_the_week_is_summed_up_and_drawn(tmp_path: Path) -> None:
     assert (told["failed_requests"], told["human_steps"], told["restarts"]) == (0, 0, 0)
     draw(rows, tmp_path / "week.png", 50, 300.0)
     assert (tmp_path / "week.png").stat().st_size > 10_000
-
-
-def test_a_week_begins_as_calibrated_and_is_knocked_in_its_middle() -> None:
-    assert state(0.0, 100) == Device()
-    before, after = state(49.999, 100), state(50.0, 100)
-    assert after.geometry.pipe_angle_deg - before.geometry.pipe_angle_deg == pytest.approx(KNOCK_DEG, abs=1e-4)
 
 
 # Simulates full pages of the bench device.

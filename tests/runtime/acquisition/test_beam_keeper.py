@@ -123,7 +123,7 @@ def test_no_page_is_taken_while_a_beam_may_be_blocked(tmp_path: Path) -> None:
     let_through, fails = modulator.let_through, [True]
     seen: list[str] = []
     scene = lab.cameras[0].scene
-    lab.cameras[0].scene = lambda: (seen.append(source.trouble()), scene())[1]
+    lab.cameras[0].scene = lambda: (seen.append(source.trouble()), scene())[1]  # type: ignore[func-returns-value]
 
     def failing(*, signal: bool, reference: bool) -> None:
         if signal and fails:
@@ -159,7 +159,9 @@ def test_shutters_open_when_their_generator_answers_again(tmp_path: Path, monkey
     port.fault = lambda message: None
     generator.arm()  # what failed is not done once more
     assert (level[3], level[4]) == (True, True)
-    eventually(lambda: lab.clock.advance(1.0) or not source.trouble())
+    lab.clock.until_somebody_waits()
+    lab.clock.advance(0.5)
+    eventually(lambda: not source.trouble())
     assert (level[3], level[4]) == (True, True)
     source.close()
 

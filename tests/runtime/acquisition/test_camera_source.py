@@ -176,7 +176,7 @@ def test_a_frame_of_another_shape_and_cameras_of_different_depths_are_the_source
     lab.cameras[1].scene = lambda: np.full((4, 5), 9, np.uint8)
     with source, pytest.raises(SourceError, match=r"^Q: frame"):
         source.shot(page=0)
-    lab.cameras[1].bit_depth = 12  # type: ignore[misc]
+    lab.cameras[1].bit_depth = 12
     with pytest.raises(SourceError, match=r"^camera: cameras"):
         CameraSource(toy.PROFILE, (lab.cameras[0], lab.cameras[1]), lab, None, source.beams, pages, PAIRING)
 
@@ -224,7 +224,7 @@ def test_devices_are_set_up_again_after_three_contradictions_in_a_row(lab: Lab, 
     source, _ = source_of(lab, pages, repeats=0)
     camera, free = lab.cameras[0], list[bool]()
     edge = camera.edge
-    camera.edge = lambda: [edge() for _ in range(1 + len(free))]  # type: ignore[assignment,method-assign]
+    camera.edge = lambda: [edge() for _ in range(1 + len(free))]  # type: ignore[assignment,method-assign,misc]
     on_arm(camera, free.clear)
     with source:
         source.shot(page=0)
@@ -256,13 +256,12 @@ def test_left_aligned_counts_are_told_once_and_saturate(lab: Lab, pages: PageSto
     few = np.full(toy.SHAPE, 2**bits - 1, np.uint16)  # too few counts to tell by
     seen = [plain]
     for camera in lab.cameras:
-        camera.bit_depth = 16  # type: ignore[misc]
+        camera.bit_depth = 16
     source, _ = source_of(lab, pages)
     for camera in lab.cameras:
         camera.scene = lambda: seen[0] << (16 - bits)
     with source, reporting(heard):
-        for _ in range(2):
-            shot = source.shot(page=0)
+        _, shot = source.shot(page=0), source.shot(page=0)
         assert (shot.pair.in_phase == plain << (16 - bits)).all()
         warned = [note for note in heard.notes if "left-aligned" in note]
         assert len(warned) == (2 if told else 0)  # of two cameras
@@ -287,7 +286,7 @@ def test_nobody_waits_for_others_longer_than_it_wants(lab: Lab, pages: PageStore
         leave.wait(60)
         show(*given)
 
-    modulator.show = slow  # type: ignore[method-assign]
+    modulator.show = slow  # type: ignore[assignment,method-assign]
     with source:
         other = threading.Thread(target=source.shot)
         other.start()

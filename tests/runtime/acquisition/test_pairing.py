@@ -209,9 +209,9 @@ def test_a_clock_whose_times_jump_is_not_synchronised() -> None:
     bench, rng = Bench(), np.random.default_rng(0)
     first, edge = bench.cameras[0], bench.cameras[0].edge
 
-    def jumping(*how: float) -> None:
+    def jumping() -> None:
         first.clock_s += float(rng.uniform(0.1, 1))
-        edge(*how)
+        edge()
 
     first.edge = jumping  # type: ignore[assignment,method-assign]
     assert bench.shot(60.0) is Reason.NOT_SYNCHRONISED
@@ -252,7 +252,7 @@ def test_single_contradictions_change_nothing(bench: Bench) -> None:
 def test_a_counter_may_wrap_sooner_than_its_driver_says(last: int, then: int) -> None:
     bench = Bench()
     for camera in bench.cameras:
-        camera.frame_numbers = 2**64 - 1  # type: ignore[misc]
+        camera.frame_numbers = 2**64 - 1
         camera.id = last - 4
         camera.follows = lambda number: then if number == last else number + 1
     assert bench.shot() is None

@@ -65,7 +65,7 @@ def test_pages_arrive_as_the_simulator_makes_them_with_the_black_level_and_hot_p
         assert (dark.black_level, len(dark.hot)) == (6, 20)
         free = np.ones(PROFILE.frame_shape, bool)
         free[tuple(dark.hot.T)] = False
-        for page in range(2):
+        for page in (0, 1):
             shot, pair = source.shot(WAIT_S), expected.page(symbols[page])
             assert shot.page_index == page
             assert shot.symbols is not None
@@ -73,8 +73,8 @@ def test_pages_arrive_as_the_simulator_makes_them_with_the_black_level_and_hot_p
             for seen, made in ((shot.pair.in_phase, pair.in_phase), (shot.pair.quadrature, pair.quadrature)):
                 below = free & (made <= 4095 - 6)  # full scale cuts off what is brighter
                 assert (seen[below] == made[below]).all()
-        away = np.abs(shot.pair.in_phase.astype(int) - pair.in_phase)
-        assert np.median(away[~free]) < 1000
+            away = np.abs(shot.pair.in_phase.astype(int) - pair.in_phase)
+            assert np.median(away[~free]) < 1000
         references = source.references()
         assert (references.in_phase[free] == expected.references().in_phase[free]).all()
 

@@ -10,8 +10,7 @@ import pytest
 import serial
 
 from lightpage.errors import LightpageError
-from runtime.virtual_device.serial_port import Fault, Pty, TcpPort, VirtualSerialPort
-from tests.runtime.trigger.memory_port import MemoryPort
+from runtime.virtual_device.serial_port import Pty, TcpPort, VirtualSerialPort
 
 WAIT_S = 60.0
 
@@ -61,31 +60,3 @@ def test_an_address_that_cannot_be_had(tmp_path: Path) -> None:
     with TcpPort(str.upper) as port, pytest.raises(LightpageError, match=r"^serial port"):
         TcpPort(str.upper, int(port.address.rpartition(":")[2])).plug()
     assert not os.listdir(tmp_path)
-
-
-@pytest.mark.parametrize("fault", Fault)
-def test_faults_come_as_they_are_chosen(fault: Fault, monkeypatch: pytest.MonkeyPatch) -> None:
-    port = MemoryPort(str.upper, monkeypatch)
-    port.fault = lambda message: fault if message == "four" else None
-    for _ in range(20):
-        port.take(b"four\r\nfive\r\n")
-        late = port.come()
-        port.clock.advance(1.0)
-        found = late + port.come()
-        if fault is Fault.SILENCE:
-            assert found == b"FIVE\r\n"
-        elif fault is Fault.LATE:
-            assert (late, found) == (b"", b"FOUR\r\nFIVE\r\n")
-        elif fault is Fault.MORE_LINES:
-            assert found == b"FOUR\r\nFOUR\r\nFIVE\r\n"
-        elif fault is Fault.CUT:
-            assert found.endswith(b"FIVE\r\n")
-            assert len(found) < 12
-        elif fault is Fault.GARBAGE:
-            assert found != b"FOUR\r\nFIVE\r\n"
-            assert found.endswith(b"FIVE\r\n")
-        else:
-            assert found != b"FOUR\r\nFIVE\r\n"
-            assert found.endswith(b"FIVE\r\n") or b"FOUR" not in found
-    assert port.faults[fault] == 20
-    assert sum(port.faults.values()) == 20
