@@ -21,7 +21,7 @@ def measured(command: click.Command, arguments: str, folder: Path) -> Any:
 
 @pytest.mark.own_network
 def test_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "_FULL", (128, 128))
+    monkeypatch.setattr(cameras, "FULL", (128, 128))
     monkeypatch.setattr(cameras, "PACKETS_BYTES", (1400,))
     monkeypatch.setattr(cameras, "TOLERANCES_S", (0.02,))
     monkeypatch.setattr(cameras, "idle_ticks", lambda seconds: {"p50_ms": 1.0, "p99_ms": 1.0, "max_ms": 1.0})
@@ -46,9 +46,9 @@ def test_pairs(tmp_path: Path) -> None:
 
 @pytest.mark.own_network
 def test_plugs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plugs, "_AWAY_S", 0.1)
+    monkeypatch.setattr(plugs, "AWAY_S", 0.1)
     monkeypatch.setattr(plugs, "TOLERANCE_S", 0.1)
-    monkeypatch.setattr(plugs, "_REPEATS", 20)
+    monkeypatch.setattr(plugs, "REPEATS", 20)
     found = measured(plugs.main, "--times 1", tmp_path)
     for what in ("camera", "serial line"):
         assert (found[what]["times"], found[what]["wrong_pairs"]) == (1, 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
 from collections.abc import Callable
 from typing import Any
@@ -267,11 +268,11 @@ def test_padding_behind_each_line_is_left_out(instead: Callable[..., None]) -> N
     rows, columns = SENSOR
 
     def padding(own: Callable[..., Any], buffer: int, x: Any, y: Any) -> None:
-        x._obj.value = 8
+        ctypes.cast(x, ctypes.POINTER(ctypes.c_int))[0] = 8
 
     def get_region(own: Callable[..., Any], camera: int, *corners: Any) -> None:
         own(camera, *corners)
-        corners[2]._obj.value -= 8
+        ctypes.cast(corners[2], ctypes.POINTER(ctypes.c_int))[0] -= 8
 
     instead(
         arv_camera_set_region=lambda own, camera, x, y, columns, rows: own(camera, x, y, columns + 8, rows),
@@ -290,7 +291,7 @@ def test_a_frame_that_ends_too_soon_is_incomplete(instead: Callable[..., None]) 
     def shorter(own: Callable[..., Any], buffer: int, size: Any) -> Any:
         place = own(buffer, size)
         if size is not None:  # as the fake camera calls it
-            size._obj.value -= 1
+            ctypes.cast(size, ctypes.POINTER(ctypes.c_size_t))[0] -= 1
         return place
 
     instead(arv_buffer_get_data=shorter)

@@ -115,7 +115,7 @@ def test_a_process_that_dies_is_a_camera_that_went_away_and_comes_back(camera: G
 
 def test_a_process_that_hangs_is_given_up(camera: GenTLCamera, monkeypatch: pytest.MonkeyPatch) -> None:
     camera.arm()
-    monkeypatch.setattr("runtime.cameras.gentl._COMMAND_S", 0.05)
+    monkeypatch.setattr("runtime.cameras.gentl.COMMAND_S", 0.05)
     hung = its_process()
     os.kill(hung, signal.SIGSTOP)
     assert "0.15 s" in lost(lambda: camera.frame(0.1)).got

@@ -72,8 +72,8 @@ def test_a_name_that_nobody_knows_is_an_error() -> None:
 
 
 def test_a_receive_buffer_that_is_too_small_names_the_setting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gige_network, "_may_read_packets", lambda: False)
+    monkeypatch.setattr(gige_network, "may_read_packets", lambda: False)
     assert receive_buffer_problem(2048) == ""
     assert "net.core.rmem_max=1000000000" in receive_buffer_problem(1_000_000_000)
-    monkeypatch.setattr(gige_network, "_may_read_packets", lambda: True)
+    monkeypatch.setattr(gige_network, "may_read_packets", lambda: True)
     assert receive_buffer_problem(1_000_000_000) == ""

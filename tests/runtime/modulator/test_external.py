@@ -135,7 +135,7 @@ def test_a_controller_that_may_have_blocked_a_beam_is_asked_to_open_it(start: St
     clock = HandClock()
     beams = ExternalBeams(10.0, clock)
     for order in (BeamState(signal=False, reference=True), BeamState(signal=True, reference=True)):
-        moved = start(beams.let_through, **order._asdict())
+        moved = start(beams.let_through, signal=order.signal, reference=order.reference)
         clock.until_somebody_waits()
         assert beams.wanted() == order
         clock.advance(10.0)

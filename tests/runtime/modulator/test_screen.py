@@ -77,7 +77,7 @@ class Lab:
         self.screen.show(SYMBOLS, LEVELS, 1, timeout_s)
 
     def lost(self, timeout_s: float = 10.0) -> None:
-        with pytest.raises(LostShotError, match=r"^page 1 on screen :5") as lost:
+        with pytest.raises(LostShotError, match=r"^page 1 ") as lost:
             self.show(timeout_s)
         assert lost.value.reason is Reason.NOT_ON_DISPLAY
         assert not self.screen.shows()
@@ -147,7 +147,7 @@ def test_a_window_that_is_slow_to_open_is_waited_for_by_the_next_page(lab: Lab) 
 
 def test_a_server_that_was_never_there_is_the_sources_fault_and_one_that_has_gone_loses_pages(lab: Lab) -> None:
     lab.next.refusal = "no server"
-    with pytest.raises(SourceError, match=r"^screen :5, monitor 0"):
+    with pytest.raises(SourceError, match=r"^screen :5,"):
         lab.show()
     lab.show()
     lab.windows[-1].dead = True
