@@ -9,18 +9,11 @@ from pathlib import Path
 import pytest
 
 from runtime.acquisition.beam_keeper import BeamKeeper
-from runtime.acquisition.camera_source import CameraSource
 from runtime.commands.serve import _take_dark_frames
 from runtime.errors import LostShotError, Reason, SourceError
 from runtime.modulator.operator import OperatorBeams
-from runtime.modulator.shutters import Shutter, ShutterBeams
-from runtime.trigger.pulse_generator import PulseGenerator, PulseGeneratorSettings
-from runtime.virtual_device.pulse_generator import PulseGeneratorEmulator
-from runtime.virtual_device.serial_port import Fault
 from tests.clock import HandClock
-from tests.runtime import toy
-from tests.runtime.acquisition.lab import Lab, LabModulator, pages_of, reason_of, source_of
-from tests.runtime.trigger.memory_port import MemoryPort
+from tests.runtime.acquisition.lab import Lab, pages_of, reason_of, source_of
 from tests.waiting import eventually
 
 
@@ -141,29 +134,6 @@ def test_no_page_is_taken_while_a_beam_may_be_blocked(tmp_path: Path) -> None:
         fails.clear()
         assert source.shot(5.0, page=0).page_index == 0
         assert (source.trouble(), modulator.beams[-1]) == ("", (True, True))
-
-
-def test_shutters_open_when_their_generator_answers_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    level = dict.fromkeys(range(1, 9), False)
-    port, lab = MemoryPort(PulseGeneratorEmulator(on_state=level.__setitem__).answer, monkeypatch), Lab()
-    generator = PulseGenerator(PulseGeneratorSettings(port=port.address), port.clock)
-    beams = ShutterBeams(generator, Shutter(channel=3), Shutter(channel=4), port.clock)
-    show = LabModulator(lab, toy.ToyDevice())
-    cameras = (lab.cameras[0], lab.cameras[1])
-    source = CameraSource(toy.PROFILE, cameras, lab, show, beams, pages_of(tmp_path), clock=lab.clock)
-    source.arm()
-    beams.let_through(signal=True, reference=True)
-    port.fault = lambda message: Fault.SILENCE if ":PULSE4" in message else None
-    assert reason_of(source.dark_frames) is Reason.BEAM_CONTROL_FAILED
-    assert source.trouble()
-    port.fault = lambda message: None
-    generator.arm()  # what failed is not done once more
-    assert (level[3], level[4]) == (True, True)
-    lab.clock.until_somebody_waits()
-    lab.clock.advance(0.5)
-    eventually(lambda: not source.trouble())
-    assert (level[3], level[4]) == (True, True)
-    source.close()
 
 
 def test_whoever_waits_while_the_beams_are_opened_hears_of_them(tmp_path: Path) -> None:

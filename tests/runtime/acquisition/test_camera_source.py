@@ -184,11 +184,14 @@ def test_a_frame_of_another_shape_and_cameras_of_different_depths_are_the_source
 def test_a_trigger_that_never_arrives_is_told_soon(lab: Lab, pages: PageStore) -> None:
     source, _ = source_of(lab, pages, repeats=50)
     lab.cameras[1].edge = lambda *_, **__: None  # type: ignore[method-assign]  # its trigger is on another line
+    lost: list[int] = []
     with source:
+        source.on_lost = lambda page, error: lost.append(page)
         for take in (source.dark_frames, source.references, source.shot):
             lab.fired.clear()
             assert reason_of(take) is Reason.MISSING_FRAME
             assert len(lab.fired) == 3
+        assert lost == [-1, -1, 0]
         del lab.cameras[1].edge
         assert source.shot(page=0).page_index == 0
 

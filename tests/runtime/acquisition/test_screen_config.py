@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,35 +19,24 @@ from tests.runtime.modulator.xvfb import COLUMNS, ROWS, XServer, x_server
 
 pytest.importorskip("xcffib")
 
-WAIT_S = 60.0
 PROFILE = small_profile()
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[XServer]:
-    with x_server(tmp_path_factory.mktemp("screen")) as running:
-        yield running
-
-
-def opened(tmp_path: Path, display: str, *lines: str) -> CameraSource:
-    (tmp_path / "profile.toml").write_text(PROFILE.to_toml())
-    text = f"""
+DEVICE = f"""
 profile = "profile.toml"
-[in_phase]
-serial = "1"
-[quadrature]
-serial = "2"
-[trigger]
-kind = "software"
+in_phase = {{serial = "1"}}
+quadrature = {{serial = "2"}}
+trigger = {{kind = "software"}}
 [modulator]
 kind = "screen"
-x_display = "{display}"
 rows_px = {ROWS}
 columns_px = {COLUMNS}
 settle_s = 0.0
-"""
-    (tmp_path / "device.toml").write_text("\n".join([text, *lines]))
-    return open_camera(str(tmp_path / "device.toml"))
+x_display = """
+
+
+def opened(folder: Path, display: str, more: str = "") -> CameraSource:
+    (folder / "profile.toml").write_text(PROFILE.to_toml())
+    (folder / "device.toml").write_text(f'{DEVICE}"{display}"\n{more}\n')
+    return open_camera(str(folder / "device.toml"))
 
 
 def pages(levels: int) -> np.ndarray:
@@ -58,38 +46,34 @@ def pages(levels: int) -> np.ndarray:
 def greys(source: CameraSource, server: XServer, symbols: np.ndarray, levels: int) -> set[int]:
     """Grey values on the screen once a page is."""
     assert source.modulator is not None
-    source.modulator.show(symbols, levels, 0, WAIT_S)
+    source.modulator.show(symbols, levels, 0, 60.0)
     return set(np.unique(server.greys()).tolist())
 
 
-def test_a_lookup_table_may_be_named(tmp_path: Path, server: XServer) -> None:
-    with pytest.raises(InvalidInputError, match=r"absent\.csv"):
-        opened(tmp_path, server.display, 'lookup_table = "absent.csv"')
+def test_the_greys_are_those_of_the_table_or_of_the_levels_that_are_shown(tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text("10 20 30 40")
-    source = opened(tmp_path, server.display, 'lookup_table = "table.csv"')
-    assert greys(source, server, pages(4)[0], 4) == {0, 10, 20, 30, 40}
-    assert source.modulator is not None
-    with pytest.raises(InvalidInputError, match="4 grey values"):
-        source.modulator.open(WAIT_S, 8)
-    source.close()
-
-
-def test_the_greys_follow_the_levels_of_the_pages_that_are_shown(tmp_path: Path, server: XServer) -> None:
-    source = opened(tmp_path, server.display)
     with PagesWriter(tmp_path / "pages.h5", PROFILE, 128, {}) as writer:
         writer.append(pages(128))
-    source.show_pages(PageStore(PROFILE, Pages.open(tmp_path / "pages.h5")))
-    assert greys(source, server, source.pages[0], source.levels) <= set(range(0, 256, 2))
-    source.show_pages(PageStore(PROFILE))
-    source.pages.append(pages(4), 4)  # as by an upload
-    assert greys(source, server, source.pages[0], source.levels) == {0, 64, 128, 192}
-    with pytest.raises(PageError):
-        greys(source, server, source.pages[0], 2)
-    source.close()
+    with x_server(tmp_path / "screen") as server:
+        source = opened(tmp_path, server.display, 'lookup_table = "table.csv"')
+        assert greys(source, server, pages(4)[0], 4) == {0, 10, 20, 30, 40}
+        with pytest.raises(InvalidInputError, match="4 grey values"):
+            greys(source, server, pages(8)[0], 8)
+        source.close()
+        source = opened(tmp_path, server.display)
+        source.show_pages(PageStore(PROFILE, Pages.open(tmp_path / "pages.h5")))
+        assert greys(source, server, source.pages[0], source.levels) <= set(range(0, 256, 2))
+        source.show_pages(PageStore(PROFILE))
+        source.pages.append(pages(4), 4)  # as by an upload
+        assert greys(source, server, source.pages[0], source.levels) == {0, 64, 128, 192}
+        with pytest.raises(PageError):
+            greys(source, server, source.pages[0], 2)
+        source.close()
+        source = opened(tmp_path, server.display, "monitor = 3")
+        with pytest.raises(SourceError, match=r"^screen.*monitor 3"):  # before a camera is looked for
+            source.arm()
 
 
-def test_a_monitor_that_is_not_there_is_told_before_a_camera_is_looked_for(tmp_path: Path, server: XServer) -> None:
-    source = opened(tmp_path, server.display, "monitor = 3")
-    with pytest.raises(SourceError, match=r"^screen.*monitor 3"):
-        source.arm()
-    source.close()
+def test_a_lookup_table_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"absent\.csv"):
+        opened(tmp_path, ":5", 'lookup_table = "absent.csv"')

@@ -11,19 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightpage.cli import main as cli_main
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError, LightpageError, PageError, RecordingError, StorageError
-from lightpage.page.symbols import pilot_mask, random_symbols
+from lightpage.page.symbols import pilot_mask
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.pages import PagesWriter
 from lightpage.recording.reader import Recording
 from runtime.acquisition.recording import RecordingSource
 from runtime.acquisition.simulator import SimulatorSource
 from runtime.acquisition.source import own_fault
 from runtime.acquisition.sources import open_source
-from runtime.commands import record
 from runtime.errors import LostShotError, Reason, SourceError
 from tests.runtime import toy
 
@@ -115,16 +112,15 @@ def test_a_simulator_is_opened_by_name_with_settings(monkeypatch: pytest.MonkeyP
     assert source.levels == 4
     page = source.shot(page=0)
     assert page.pair.in_phase.tolist() == [[0.25]]
+    source.set_device(Device())
+    assert source.shot(page=0).pair.in_phase.tolist() != [[0.25]]
 
 
 @pytest.mark.parametrize(
     ("spec", "named"),
     [
-        ("", "recording:FILE"),
         ("bench", "recording:FILE"),
-        ("recording:", "recording:FILE"),
         ("recording:/nonexistent.h5", "nonexistent"),
-        ("simulator:nonexistent", "nonexistent"),
         ("simulator:bench?levels=many", "whole numbers"),
         ("simulator:bench?colour=red", "colour"),
         ("simulator:bench?seed=-1", "at least 0"),
@@ -213,20 +209,3 @@ def test_the_source_of_a_vendor_in_the_documents_works(vendor: EntryPoint, monke
     monkeypatch.setattr(VendorSdk, "absent", True)
     with pytest.raises(SourceError, match=r"^vendor"):
         open_source("vendor:7", [vendor]).arm()
-
-
-def test_the_source_of_a_vendor_records(vendor: EntryPoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    profile = load_profile("bench")
-    symbols = random_symbols(profile, 8, 3, np.random.default_rng(1))
-    with PagesWriter(tmp_path / "pages.h5", profile, 8, {}) as writer:
-        writer.append(symbols)
-    monkeypatch.setattr(record, "open_source", lambda spec: open_source(spec, [vendor]))
-    out = tmp_path / "r.h5"
-    arguments = ["record", "--source", "vendor:7", "--symbols", str(tmp_path / "pages.h5"), "--out", str(out)]
-    assert cli_main.run(cli_main.lightpage, arguments) == 0
-    with Recording.open(out) as recording:
-        assert (recording.pages, recording.levels) == (3, 8)
-        for page in range(3):
-            assert (recording.symbols(page) == symbols[page]).all()
-            assert recording.frames(page).in_phase[0, 0] == 100 + symbols[page][0, 0]
-        assert [loss.page for loss in recording.losses()] == [0]

@@ -88,16 +88,16 @@ def test_a_page_that_nobody_shows_in_time_is_lost_and_named(start: Start, said: 
 
 
 def test_a_controller_that_follows_what_is_wanted_shows_every_page(start: Start) -> None:
-    modulator = ExternalModulator()
+    modulator, last = ExternalModulator(), 100
 
     def control() -> None:
-        while (page := modulator.wanted(WAIT_S)) != 200:
-            if page is not None:
-                modulator.shown(page)
-        modulator.shown(200)
+        shown = -1
+        while shown < last:
+            if (page := modulator.wanted(WAIT_S)) is not None:
+                modulator.shown(shown := page)
 
     control_ended = start(control)
-    for page in range(201):
+    for page in range(last + 1):
         show(modulator, page)
         assert modulator.shows()
     control_ended.result(WAIT_S)
