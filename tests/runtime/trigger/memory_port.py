@@ -121,4 +121,4 @@ class MemoryDriver:
         self._port.take(content)
 
     def close(self) -> None:
-        pass
+        self._port.driver = None

@@ -85,6 +85,7 @@ def test_a_message_was_sent_in_the_middle_of_its_sending_and_before_its_answer(l
 
 def test_a_connection_is_synchronised_by_two_identifications_after_silence(lab: Lab) -> None:
     lab.port.close()
+    assert lab.line.driver is None
     messages, begun = lab.device.messages, lab.clock.now()
     assert lab.width(1) == 1e-5
     assert lab.device.messages == messages + 2 + 2
