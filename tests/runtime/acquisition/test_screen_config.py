@@ -33,9 +33,9 @@ settle_s = 0.0
 x_display = """
 
 
-def opened(folder: Path, display: str, more: str = "") -> CameraSource:
+def opened(folder: Path, display: str, more: str = "", first: str = "") -> CameraSource:
     (folder / "profile.toml").write_text(PROFILE.to_toml())
-    (folder / "device.toml").write_text(f'{DEVICE}"{display}"\n{more}\n')
+    (folder / "device.toml").write_text(f'{first}{DEVICE}"{display}"\n{more}\n')
     return open_camera(str(folder / "device.toml"))
 
 
@@ -74,6 +74,9 @@ def test_the_greys_are_those_of_the_table_or_of_the_levels_that_are_shown(tmp_pa
             source.arm()
 
 
-def test_a_lookup_table_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match=r"absent\.csv"):
-        opened(tmp_path, ":5", 'lookup_table = "absent.csv"')
+def test_a_lookup_table_is_tried_where_that_can_be_done(tmp_path: Path) -> None:
+    (tmp_path / "table.csv").write_text("10 20 30 40")
+    for name, first in (("absent.csv", ""), ("absent.csv", "levels = 4"), ("table.csv", "levels = 8")):
+        with pytest.raises(InvalidInputError, match=name):
+            opened(tmp_path, ":5", f'lookup_table = "{name}"', first)
+    opened(tmp_path, ":5", 'lookup_table = "table.csv"', "levels = 4").close()
