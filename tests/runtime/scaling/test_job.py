@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from lightpage.errors import InvalidInputError
-from runtime.scaling.job import Choices, Job, found_recordings, of_fleet, of_recordings
+from runtime.scaling.job import Choices, found_recordings, of_fleet, of_recordings
 from runtime.scaling.task import FineTuning, NamedBundle, Operation
 from tests.runtime import toy
 from tests.runtime.scaling.jobs import BUNDLE, NEWER, PASSES, STAYS, job, source
