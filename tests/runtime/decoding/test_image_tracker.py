@@ -443,7 +443,7 @@ class NoiseTables(FakeTables):
         return NoiseDecoder(self._device, tilt_rad.copy())  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize("pilots", [1, 2, 3, 4, 6, 12, 54])
+@pytest.mark.parametrize("pilots", [1, 2, 4, 12])
 def test_noise_is_not_given_out_however_few_the_pilots_are(device: FakeDevice, pilots: int) -> None:
     """Piston and drift are fitted to the same pilots that then confirm the page: few would confirm anything."""
     tracker = ImageTracker(
@@ -456,7 +456,7 @@ def test_noise_is_not_given_out_however_few_the_pilots_are(device: FakeDevice, p
     mask.flat[np.linspace(0, mask.size - 1, pilots).astype(int)] = True
     known = Pilots.of_symbols(mask, toy.symbols_of(16, 1)[0], 16)
     pair, given_out = device.page(), 0
-    for _ in range(1000):
+    for _ in range(250):
         try:
             tracker.fork().decode(pair, 16, known)
         except UnconfirmedPageError:

@@ -22,7 +22,7 @@ from runtime.recalibration.known_pages import read_recorded
 from runtime.recalibration.recalibration import recalibrate
 from runtime.scaling.driver import AGAIN_S
 from runtime.scaling.ledger import Ledger
-from runtime.scaling.task import Problem, Task
+from runtime.scaling.task import Problem
 from tests.runtime import coded, toy
 from tests.runtime.scaling.archive import PAGES, RANGE, Archive, interrupt_after, spoil_page
 
@@ -112,25 +112,6 @@ def test_each_part_does_its_recordings_and_the_whole_is_added_up_without_parts(a
     status, figures = archive.run("evaluate", asked=False)
     assert (status, archive.tasks, figures["part"], figures["pages_read"]) == (0, [], None, 3 * PAGES)
     assert sorted(done) == [row["recording"] for row in figures["recordings"]]
-
-
-def test_recordings_that_vanish_or_change_are_named_and_the_others_go_on(
-    archive: Archive, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def spoil(task: Task) -> None:
-        if task.recording.name == "a.h5" and task.pages[0] == RANGE:
-            (archive.folder / "a.h5").rename(archive.folder / "a.gone")
-
-    archive.before_each = spoil
-    status, figures = archive.run("decode")
-    assert (status, figures["pages_read"], figures["pages_missing"]) == (75, RANGE + PAGES, PAGES - RANGE)
-    assert archive.firsts()[:3] == [("a", 0), ("a", RANGE), ("b", 0)]
-    archive.before_each = lambda task: None
-    (archive.folder / "a.gone").rename(archive.folder / "a.h5")
-    os.utime(archive.folder / "a.h5")
-    status, figures = archive.run("decode")
-    assert (status, figures["pages_missing"], archive.firsts()) == (75, PAGES - RANGE, [("a", RANGE)])
-    assert "changed since" in capsys.readouterr().err
 
 
 def test_a_recording_that_cannot_be_opened_is_missing_until_it_can(

@@ -13,9 +13,8 @@ import h5py
 import pytest
 
 from lightpage.cli.main import run as run_command
-from lightpage.errors import InvalidInputError, LightpageError, RecalibrationRefusedError, StorageError
+from lightpage.errors import InvalidInputError, LightpageError, RecalibrationRefusedError
 from lightpage.progress import Progress, note, track
-from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from runtime.bundle.bundle import Bundle
 from runtime.commands import bulk as command
@@ -139,53 +138,34 @@ def test_a_device_whose_pages_contradict_it_is_refused_by_name_and_the_rest_is_r
     assert re.search(r"^this run +nothing", capsys.readouterr().out, re.MULTILINE)
 
 
-def test_a_recording_that_is_lost_costs_its_device_alone(fleet: Fleet) -> None:
-    kept = {name: (fleet.folder / f"{name}.h5").read_bytes() for name in ("a-1", "a-2")}
-    for name in ("a-2", "a-1"):
-        (fleet.folder / f"{name}.h5").write_bytes(b"no recording")
-        status, rows = fleet.run()
-        assert (status, states(rows), name in rows["a"]["reason"]) == (75, A_FAILED, True)
-    for name, content in kept.items():
-        (fleet.folder / f"{name}.h5").write_bytes(content)
-    assert fleet.run()[0] == 0
-    for name in kept:  # of a finished device they may go
-        (fleet.folder / f"{name}.h5").unlink()
-    status, rows = fleet.run()
-    assert (status, states(rows)) == (0, DONE)
-
-
-@pytest.mark.parametrize("left", [None, b"no zip"])
-def test_a_bundle_that_is_lost_costs_its_device_alone(
-    left: bytes | None, fleet: Fleet, capsys: pytest.CaptureFixture[str]
+def test_what_a_device_lacks_costs_that_device_alone_until_it_is_there(
+    fleet: Fleet, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own = fleet.folder / "own.zip"
-    own.write_bytes(whole := fleet.bundle.read_bytes())
+    own, recording = fleet.folder / "own.zip", fleet.folder / "a-2.h5"
+    kept = {own: fleet.bundle.read_bytes(), recording: recording.read_bytes()}
     fleet.bundles["a"] = own
-    own.unlink() if left is None else own.write_bytes(left)
-    for _ in range(2):  # it is no other question
+    recording.write_bytes(b"no recording")
+    for content, lacking in ((None, own), (b"no zip", own), (kept[own], recording)):
+        own.unlink(missing_ok=True) if content is None else own.write_bytes(content)
         status, rows = fleet.run()
-        assert (status, states(rows), str(own) in rows["a"]["reason"]) == (75, A_FAILED, True)
-        assert f"device a: bundle {own}" in capsys.readouterr().err
-    own.write_bytes(whole)
-    assert fleet.run()[0] == 0
-    own.unlink()
+        assert (status, states(rows), str(lacking) in rows["a"]["reason"]) == (75, A_FAILED, True)
+    assert f"device a: bundle {own}" in capsys.readouterr().err
+    recording.write_bytes(kept[recording])
+    fleet.bundles["a"] = own.rename(fleet.folder / "moved.zip")
     status, rows = fleet.run()
     assert (status, states(rows)) == (0, DONE)
+    for path in (fleet.bundles["a"], recording):  # of a finished device they may go
+        path.unlink()
+    read, sha256 = list[Path](), job_module.bundle_sha256
 
+    def noted(path: Path) -> str:
+        read.append(path)
+        return sha256(path)
 
-def test_a_bundle_may_have_another_name_while_its_device_is_not_done(fleet: Fleet) -> None:
-    right = fleet.folder / "right.zip"
-    right.write_bytes(fleet.bundle.read_bytes())
-    fleet.bundles["a"] = fleet.folder / "mistyped.zip"
-    assert fleet.run()[0] == 75
-    fleet.bundles["a"] = right
-    whole = (fleet.folder / "a-1.h5").read_bytes()
-    (fleet.folder / "a-1.h5").write_bytes(b"no recording")
-    assert fleet.run()[0] == 75
-    (fleet.folder / "a-1.h5").write_bytes(whole)
-    fleet.bundles["a"] = right.rename(fleet.folder / "moved.zip")
+    monkeypatch.setattr(job_module, "bundle_sha256", noted)
     status, rows = fleet.run()
     assert (status, states(rows)) == (0, DONE)
+    assert fleet.bundle not in read  # it is as it was
 
 
 def test_a_pattern_that_names_no_file_costs_its_device_alone_in_every_run(
@@ -200,37 +180,23 @@ def test_a_pattern_that_names_no_file_costs_its_device_alone_in_every_run(
         shutil.copy(fleet.folder / "elsewhere.h5", fleet.folder / "b.h5")
 
 
-def test_bundles_that_are_as_they_were_are_not_read_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert fleet.run()[0] == 0
-    monkeypatch.setattr(job_module, "bundle_sha256", lambda path: pytest.fail(f"{path} is read"))
-    assert fleet.run()[0] == 0
-
-
-def test_frames_that_could_not_be_read_say_nothing_of_the_device(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(recording: Recording, page: int) -> FramePair:
-        raise StorageError(f"recording {recording.path}", "Input/output error", "data that can be read")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Recording, "frames", broken)
-        status, rows = fleet.run()
-        assert (status, states(rows)) == (75, dict.fromkeys("ab", "failed"))
-    status, rows = fleet.run()
-    assert (status, states(rows)) == (0, DONE)
-
-
-@pytest.mark.parametrize("form", [(), ("--deep",)])
-def test_a_part_has_whole_devices_and_tells_of_no_others(form: tuple[str, ...], fleet: Fleet) -> None:
+def test_a_part_has_whole_devices_and_tells_of_no_others(fleet: Fleet) -> None:
     for part, name, recordings in (("1/2", "b", 1), ("0/2", "a", 2)):
-        status, rows = fleet.run(*form, "--part", part, "--metrics-file", str(fleet.folder / "bulk.prom"))
+        status, rows = fleet.run("--part", part, "--metrics-file", str(fleet.folder / "bulk.prom"))
         assert (status, states(rows)) == (0, {name: "recalibrated"})
         assert len(rows[name]["recordings"]) == recordings
         assert f'lightpage_bulk_job_pages{{part="{part}",run="out"}} 1.0' in (fleet.folder / "bulk.prom").read_text()
-    status, rows = fleet.run(*form)
+    status, rows = fleet.run()
     assert (status, sorted(rows)) == (0, ["a", "b"])
     assert [path.parent.name for path in sorted(fleet.out.glob("shards/*/*.zip"))] == ["000000", "000002"]
 
 
 def test_the_deep_form_is_given_all_pages_and_the_run_of_each_device(fleet: Fleet) -> None:
+    status, rows = fleet.run("--deep", "--steps", "20", "--seed", "7", runs=("b",))
+    assert (status, states(rows), rows["a"]["reason"]) == (75, A_FAILED, "run: got none, wanted a run")
+    assert [asked[0] for asked in fleet.deep.asked] == ["run-b"]
+    shutil.rmtree(fleet.out)
+    fleet.deep.asked.clear()
     status, rows = fleet.run("--deep", "--steps", "20", "--seed", "7")
     tuning = FineTuning(steps=20, seed=7)
     assert fleet.deep.asked == [("run-a", 2 * PAGES, 2 * PAGES, tuning, []), ("run-b", PAGES, PAGES, tuning, [])]
@@ -244,16 +210,6 @@ def test_the_deep_form_is_given_all_pages_and_the_run_of_each_device(fleet: Flee
         with Recording.open(fleet.folder / f"{name}.h5") as recording:
             stored.append(recording.stored_page_bytes * PAGES)
     assert json.loads((fleet.out / "shards/000000/00000000.json").read_text())["read_bytes"] == sum(stored)
-
-
-def test_a_device_without_its_run_is_told_before_anything_is_done(
-    fleet: Fleet, capsys: pytest.CaptureFixture[str]
-) -> None:
-    status, rows = fleet.run("--deep", runs=("b",))
-    assert (status, states(rows)) == (75, A_FAILED)
-    assert rows["a"]["reason"] == "run: got none, wanted a run"
-    assert "device a: run:" in capsys.readouterr().err.partition("device b")[0]
-    assert [asked[0] for asked in fleet.deep.asked] == ["run-b"]
 
 
 def test_an_interrupted_fleet_goes_on_in_the_same_folder_and_what_is_done_needs_nothing_any_more(

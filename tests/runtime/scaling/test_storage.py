@@ -13,10 +13,8 @@ from lightpage.errors import StorageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from runtime.scaling.driver import AGAIN_S
-from runtime.scaling.shard import ShardRecord
 from runtime.scaling.task import Task
 from tests.runtime.scaling.archive import PAGES, RANGE, Archive
-from tests.runtime.scaling.jobs import lost
 from tests.storage_fault import StorageFault
 
 BAD_PAGE = 4
@@ -92,21 +90,6 @@ def test_recordings_that_vanished_or_never_opened_are_lost_on_request_and_opened
     (archive.folder / "b.h5").write_bytes(whole)
     assert archive.run("decode", asked=False)[1]["pages_read"] == 0
     assert archive.run("decode", "--retry-lost", asked=False)[1]["pages_read"] == PAGES
-
-
-def test_a_folder_of_version_0_1_0_is_healed_where_it_took_storage_for_a_finding(archive: Archive, disk: Disk) -> None:
-    archive.run("decode")
-    shard = archive.out / "shards" / "000000" / f"{RANGE:08d}"
-    record = ShardRecord.read(shard)
-    misfiled = lost(BAD_PAGE, "UnreadableError", "recording a.h5: got errno = 5, wanted data that can be read")
-    record.model_copy(update={"pages": (record.pages[0], misfiled, record.pages[2])}).write(shard)
-    disk.failures = 99
-    status, figures = archive.run("decode")
-    assert (status, figures["pages_lost"]) == (75, 0)
-    assert ShardRecord.read(shard).lost  # it stays until there is a better one
-    disk.failures = 0
-    status, figures = archive.run("decode")
-    assert (status, archive.firsts(), figures["pages_lost"]) == (0, [("a", RANGE)], 0)
 
 
 RUNS = """
