@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from onnx import TensorProto
 
 from lightpage.errors import BundleError, FrameError, InvalidInputError, PageError
 from lightpage.metrics.measures import measure
@@ -187,7 +186,7 @@ def test_a_bad_frame_is_named(frames: dict[str, np.ndarray], named: str, decoder
 
 
 def test_counts_beyond_the_bit_depth_are_refused(tmp_path: Path) -> None:
-    contents = toy.files() | {DECODER: toy.decoder_onnx(frame_type=TensorProto.UINT16)}
+    contents = toy.files() | {DECODER: toy.decoder_onnx(frame_type="uint16")}
     pair = pair_of()[1]
     wide = FramePair(pair.in_phase.astype(np.uint16), pair.quadrature.astype(np.uint16))
     contents[GOLDEN] = npz(in_phase=wide.in_phase, quadrature=wide.quadrature, p=toy.expected_p(pair))
@@ -224,7 +223,7 @@ def foreign_models() -> dict[str, tuple[dict[str, bytes], dict[str, object], str
         "empty": (good | {DECODER: b""}, {}, "ONNX"),
         "a twin": (good | {DECODER: toy.twin_onnx()}, {"table_inputs": ()}, r"decoder\.onnx: inputs"),
         "another camera": (good | {DECODER: toy.decoder_onnx(shape=(64, 128))}, {}, "input in_phase"),
-        "another type": (good | {DECODER: toy.decoder_onnx(frame_type=TensorProto.UINT16)}, {}, "input in_phase"),
+        "another type": (good | {DECODER: toy.decoder_onnx(frame_type="uint16")}, {}, "input in_phase"),
         "other tables": (good, {"table_inputs": ("homodyne",)}, "table inputs"),
         "no residual": (good, {"residual_output": "rest"}, "rest"),
         "other weights": (good | {DECODER: toy.decoder_onnx(kappa=401)}, {}, "golden"),

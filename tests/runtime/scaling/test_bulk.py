@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from lightpage.errors import InvalidInputError, LightpageError, StorageError
+from lightpage.errors import StorageError
 from lightpage.recording.reader import Recording
 from runtime.bulk.evaluation import evaluate
 from runtime.bundle.bundle import Bundle
@@ -22,7 +22,6 @@ from runtime.recalibration.known_pages import read_recorded
 from runtime.recalibration.recalibration import recalibrate
 from runtime.scaling.driver import AGAIN_S
 from runtime.scaling.ledger import Ledger
-from runtime.scaling.task import Problem
 from tests.runtime import coded, toy
 from tests.runtime.scaling.archive import PAGES, RANGE, Archive, interrupt_after, spoil_page
 
@@ -186,17 +185,25 @@ def test_files_come_back_from_pages_in_several_recordings(archive: Archive) -> N
     _, options = archive.shows_a_file({2: coded.dark})
     status, figures = archive.run("recover", *options)
     assert (status, figures["pages_lost"]) == (0, 1)
-    file = Path(figures["files"][0]["file"])
-    assert file.read_bytes() == coded.CONTENT
-    assert figures["files"][0]["restored"] == [2]
+    (told,) = figures["files"]
+    file = Path(told["file"])
+    assert (file.read_bytes(), told["restored"]) == (coded.CONTENT, [2])
     made = file.stat().st_mtime_ns
     left = file.with_name(f"{file.name}.0.partial")  # of a run that was killed
     left.touch()
     assert archive.run("recover", asked=False)[0] == 0
     assert (file.stat().st_mtime_ns, left.exists()) == (made, False)
+    (note := archive.out / "files.json").write_text(json.dumps([{**told, "volume": 3}, told]))
+    file.unlink()
+    (holes := file.with_name(f"{file.name}.holes")).write_bytes(b"from before the last page came")
+    assert archive.run("recover", "--volume", "9", asked=False)[0] == 0
+    assert [each["volume"] for each in json.loads(note.read_text())] == [3, 9]
+    assert (file.read_bytes(), holes.exists()) == (coded.CONTENT, False)
     shutil.rmtree(archive.out)
+    coded.CODE.save(archive.folder / "code.toml")
+    asked = ("--no-tracking", "--code", str(archive.folder / "code.toml"))  # a bundle without one
     for part, lost in (("0/2", 1), ("1/2", 0)):
-        status, figures = archive.run("recover", *options, "--part", part)
+        status, figures = archive.run("recover", *asked, "--part", part)
         assert (status, figures["pages_lost"], figures["files"]) == (0, lost, [])
     status, figures = archive.run("recover", asked=False)
     assert (status, archive.tasks, file.read_bytes()) == (0, [], coded.CONTENT)
@@ -224,33 +231,6 @@ def test_a_file_whose_pages_do_not_suffice_is_written_with_holes_on_request_unde
     assert archive.run("recover", *options, "--volume", "8:12")[0] == 2
 
 
-def test_one_volume_alone_leaves_what_is_known_of_the_others_and_a_whole_file_needs_no_holes(archive: Archive) -> None:
-    _, options = archive.shows_a_file()
-    (told,) = archive.run("recover", *options)[1]["files"]
-    note, file = archive.out / "files.json", Path(told["file"])
-    note.write_text(json.dumps([{**told, "volume": 3}, told]))
-    file.unlink()
-    holes = file.with_name(file.name + ".holes")
-    holes.write_bytes(b"from before the last page came")
-    assert archive.run("recover", *options, "--volume", "9")[0] == 0
-    assert [each["volume"] for each in json.loads(note.read_text())] == [3, 9]
-    assert file.read_bytes() == coded.CONTENT
-    assert not holes.exists()
-
-
-def test_a_code_of_its_own_reads_pages_whose_recording_and_bundle_have_none(archive: Archive) -> None:
-    archive.shows_a_file()
-    options = ("--no-tracking", "--bundle", str(archive.bundle))
-    assert archive.run("recover", *options)[0] == 75
-    shutil.rmtree(archive.out)
-    coded.CODE.save(archive.folder / "code.toml")
-    status, figures = archive.run("recover", *options, "--code", str(archive.folder / "code.toml"))
-    assert status == 0
-    assert Path(figures["files"][0]["file"]).read_bytes() == coded.CONTENT
-    assert archive.run("recover", asked=False)[0] == 0  # the code is part of what was asked
-    assert archive.tasks == []
-
-
 def test_pages_without_any_bytes_are_lost_data(archive: Archive) -> None:
     options = ("--no-tracking", "--bundle", str(coded.bundle(archive.folder / "coded.zip")))
     status, figures = archive.run("recover", *options)
@@ -275,11 +255,3 @@ def test_ctrl_c_keeps_what_is_done(archive: Archive) -> None:
     archive.before_each = lambda task: None
     status, figures = archive.run("decode")
     assert (status, len(archive.tasks), figures["pages_read"]) == (0, 4, 14)
-
-
-def test_errors_keep_their_parts() -> None:
-    error = InvalidInputError("a", "b", "c")
-    assert str(Problem.of(error)) == str(LightpageError("a", "b", "c"))
-    assert (Problem.of(error).passes, Problem.of(StorageError("a", "b", "c")).passes) == (False, True)
-    assert Problem.of(error).about("d").subject == "device d: a"
-    assert Problem.of(error).about("") == Problem.of(error)

@@ -12,7 +12,6 @@ from runtime.scaling.job import Job
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.part import Part
 from runtime.scaling.shard import PageRecord, ShardRecord
-from runtime.scaling.task import Operation
 from tests.clock import HandClock
 from tests.runtime.scaling.jobs import PAGES, RANGE, job, lost, page, source, write
 
@@ -144,21 +143,6 @@ def test_the_reading_counts_whose_pilots_confirm_most(
     assert counts.confirmed_bits == best
     (first,) = ledger.pages(0, 0, ledger.results(0), 1)
     assert first == readings[0][0]
-
-
-def test_a_device_has_a_result_by_its_first_recording_and_none_where_something_is_lacking(tmp_path: Path) -> None:
-    ledger = Ledger(tmp_path)
-    fleet = job(
-        source("a1", device="a"), source("a2", device="a"), source("b", device="b"), operation=Operation.RECALIBRATE
-    )
-    assert [(task.device, len(task.pages), len(task.more)) for task in ledger.missing(fleet)] == [
-        ("a", 2, 1),
-        ("b", 2, 0),
-    ]
-    assert not ledger.recalibrated(0)
-    write(ledger.shard(0, 0), page(0))
-    assert ledger.recalibrated(0)
-    assert [task.device for task in ledger.missing(fleet)] == ["b"]
 
 
 def test_a_record_that_is_damaged_is_named(tmp_path: Path) -> None:

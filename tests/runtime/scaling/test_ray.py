@@ -263,7 +263,6 @@ def test_a_cluster_of_this_machine_is_started_whatever_the_surroundings_say(
     ("error", "kind", "said"),
     [
         (FileNotFoundError(2, "No such file or directory", "/nowhere"), WorkerError, "HOME"),
-        (RuntimeError("Could not determine home directory."), WorkerError, "HOME"),
         (OSError(24, "Too many open files"), SurroundingsError, "ulimit -n"),
     ],
 )
