@@ -18,7 +18,7 @@ from lightpage.temporary import settle_matplotlib, short_folder, temporary_folde
 def test_no_folder_for_temporary_files_is_named_with_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/nowhere"])
-    with pytest.raises(SurroundingsError, match=r"scratch: got no folder for temporary files.*TMPDIR"):
+    with pytest.raises(SurroundingsError, match=r"^scratch: .*TMPDIR"):
         temporary_folder("scratch")
 
 
@@ -28,7 +28,7 @@ def test_a_long_tmpdir_is_not_taken_for_sockets(tmp_path: Path, monkeypatch: pyt
     with short_folder("sockets", "s-", 60) as folder:
         assert len(os.fsencode(folder)) <= 60
         assert os.path.isdir(folder)
-    with pytest.raises(SurroundingsError, match=r"sockets: got .*xxx.*at most .* bytes.*TMPDIR"):
+    with pytest.raises(SurroundingsError, match=r"^sockets: .*xxx.*TMPDIR"):
         short_folder("sockets", "s-", 10)
 
 

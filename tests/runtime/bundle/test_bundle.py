@@ -185,7 +185,7 @@ def test_links_and_folders_inside_are_refused(toy_zip: Path, toy_folder: Path, t
         entry = zipfile.ZipInfo("twin.onnx")
         entry.external_attr = (stat.S_IFLNK | 0o777) << 16
         archive.writestr(entry, "/etc/passwd")
-    with pytest.raises(BundleError, match="a link or special file"):
+    with pytest.raises(BundleError, match="special file"):
         Bundle.open(path)
 
 
@@ -217,7 +217,7 @@ def test_a_bomb_inside_a_file_is_stopped_before_it_unpacks(
     bundle = Bundle.open(write_bundle(tmp_path / "bomb.zip", toy.manifest(), toy.files() | {name: bomb}))
     monkeypatch.setattr("runtime.bundle.bundle.MAX_ARRAY_BYTES", 1_000_000)
     monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("unpacked"))
-    with pytest.raises(BundleError, match=rf"{name}: got 20000\d\d\d bytes unpacked, wanted at most 1000000"):
+    with pytest.raises(BundleError, match=rf"{name}: got 20000\d\d\d"):
         arrays_of(bundle, name)
 
 

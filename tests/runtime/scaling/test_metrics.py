@@ -85,6 +85,7 @@ def test_promtool_takes_the_file_and_every_metric_is_documented(archive: Archive
 def test_a_file_is_written_however_a_run_ends(archive: Archive, tmp_path: Path) -> None:
     interrupt_after(archive, 2)
     assert archive.run("decode", "--metrics-file", str(tmp_path / "bulk.prom"))[0] == 130
+    assert len(archive.records()) == 2
     assert values((tmp_path / "bulk.prom").read_text())["lightpage_bulk_job_pages_left{}"] == 2 * PAGES - 2 * RANGE
 
 
