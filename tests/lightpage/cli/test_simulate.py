@@ -167,15 +167,8 @@ def test_a_file_that_exists_is_kept_unless_forced(profile_file: Path, tmp_path: 
 
 def test_settings_and_a_device_file_make_the_device(profile_file: Path, tmp_path: Path) -> None:
     (tmp_path / "device.toml").write_text("[sensor]\nbit_depth = 12\n[drift]\npiston_rad = 0.4\n")
-    run(
-        profile_file,
-        tmp_path / "R.h5",
-        "--device",
-        str(tmp_path / "device.toml"),
-        "--set",
-        "drift.piston_rad=0.0",
-        pages=2,
-    )
+    device = ("--device", str(tmp_path / "device.toml"), "--set", "drift.piston_rad=0.0")
+    run(profile_file, tmp_path / "R.h5", *device, pages=2)
     with Recording.open(tmp_path / "R.h5") as recording:
         assert recording.bit_depth == 12
     assert np.ptp(contents(tmp_path / "R.h5")["truth/piston"]) == 0

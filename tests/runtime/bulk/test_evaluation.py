@@ -15,8 +15,8 @@ from runtime.decoding.decoder import Decoder
 from tests.runtime import toy
 
 
-@pytest.mark.parametrize("trained", [("u1", "u1"), ("u2", "u2"), ("u1", "u2")])
-@pytest.mark.parametrize("saved", [("u1", "u1"), ("u2", "u2"), (">u2", "u1")])
+@pytest.mark.parametrize("trained", [("u1", "u1"), ("u1", "u2")])
+@pytest.mark.parametrize("saved", [("u2", "u2"), (">u2", "u1")])
 def test_a_page_is_known_again_in_whichever_type_its_counts_are_stored(
     trained: tuple[str, str], saved: tuple[str, str], tmp_path: Path
 ) -> None:

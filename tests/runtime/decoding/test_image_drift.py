@@ -120,7 +120,7 @@ def test_slopes_are_measured_while_the_service_starts(monkeypatch: pytest.Monkey
     may_end = threading.Event()
 
     def slow(*_: object) -> np.ndarray:
-        assert may_end.wait(30)
+        assert may_end.wait(60)
         return SLOPES
 
     monkeypatch.setattr("runtime.decoding.image_drift.drift_slopes", slow)
