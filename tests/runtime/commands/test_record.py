@@ -182,7 +182,7 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_connected(
         (source, ("--pages", 2, "--profile", "bench"), "toy:bench"),
         (source, ("--symbols", pages, "--pages", 3), "--pages: got 3"),
         (empty, ("--pages", 3), "--symbols: got none"),
-        (source, ("--pages", 1), "2 pages already"),
+        (Bench(), ("--pages", 1), "2 pages already"),
     ):
         monkeypatch.setattr(shown, "arm", lambda: pytest.fail("armed"))
         assert record(shown, *options) == EXIT_ERROR

@@ -13,6 +13,7 @@ from lightpage.device.state import Device
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.simulator.simulator import Simulator
+from runtime.decoding.tracking import NoTracker
 from runtime.errors import UnconfirmedPageError
 from tests.runtime import toy
 
@@ -37,4 +38,4 @@ def test_an_image_that_has_moved_is_read_unless_it_is_not_followed() -> None:
     data = ~decoder.bundle.pilot_mask
     assert (decoder.decode(pair).symbols != symbols)[data].mean() < 0.55
     with pytest.raises(UnconfirmedPageError):
-        runtime.load("bench", threads=1, tracking=False).decode(pair)
+        NoTracker(decoder).decode(pair, 256)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import socket
 import subprocess
@@ -12,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from lightpage.cli.main import run as run_command
 from lightpage.progress import reporting
+from runtime.commands.bulk import bulk
 from runtime.scaling.driver import run
 from runtime.scaling.engine import ATTEMPTS, longest_s
 from runtime.scaling.inline import InlineEngine
@@ -22,7 +23,6 @@ from runtime.scaling.local import LocalEngine
 from runtime.scaling.metrics import BulkMetrics
 from runtime.scaling.shard import PageRecord, ShardRecord
 from runtime.scaling.task import Done, Failed, Operation, Outcome, Step, Task
-from runtime.scaling.totals import totals
 from runtime.scaling.work import Worker
 from tests.clock import HandClock
 from tests.runtime import toy
@@ -157,47 +157,25 @@ def pages(out: Path) -> dict[str, list[PageRecord]]:
     return {path.name: list(ShardRecord.read(path.with_suffix("")).pages) for path in found}
 
 
-def test_a_killed_worker_costs_its_range_only_and_nothing_comes_out_differently(job: Job, tmp_path: Path) -> None:
+def test_a_killed_worker_costs_a_restart_and_nothing_comes_out_differently(job: Job, tmp_path: Path) -> None:
     with Ledger(tmp_path / "single") as ledger:
         run(ledger, job, lambda: InlineEngine(Worker(1)))
-    for first, kills in ((0, 1), (6, ATTEMPTS)):
-        (tmp_path / f"a.{first}{KILLS}").write_text(str(kills))
+    (tmp_path / f"a.6{KILLS}").write_text("1")
     engine, metrics = LocalEngine(2, 1, WORKER), BulkMetrics("killed", Operation.DECODE)
     with Ledger(tmp_path / "killed") as ledger:
         made = run(ledger, job, lambda: engine, metrics)
-        found = totals(ledger, job)
     shown, labels = metrics.registry.get_sample_value, {"run": "killed", "part": "0/1"}
-    assert shown("lightpage_bulk_workers_died_total", labels) == 1 + ATTEMPTS
-    assert shown("lightpage_bulk_ranges_failed_total", labels) == 1
+    assert shown("lightpage_bulk_workers_died_total", labels) == made.restarts == 1
     assert shown("lightpage_bulk_workers", labels) == 0
-    assert (made.restarts, made.failed, made.ranges) == (1 + ATTEMPTS, 1, 3)
-    assert (found.tally.read, found.tally.missing) == (PAGES - RANGE, RANGE)
-    expected = {name: read for name, read in pages(tmp_path / "single").items() if name != "00000006.json"}
-    assert pages(tmp_path / "killed") == expected
+    assert (made.failed, made.pages) == (0, PAGES)
+    assert pages(tmp_path / "killed") == pages(tmp_path / "single")
 
 
-def test_two_parts_as_two_processes_do_every_page_once_by_the_usual_workers(toy_zip: Path, tmp_path: Path) -> None:
-    for number in range(3):
-        toy.write_toy_recording(tmp_path / f"{number}.h5", toy.ToyDevice(seed=number), 16, RANGE, number)
-    asked = ["--recordings", str(tmp_path / "?.h5"), "--bundle", str(toy_zip), "--workers", "1", "--threads", "1"]
-    words = [sys.executable, "-m", "lightpage.cli.main", "bulk", "decode", str(tmp_path / "out"), *asked]
-    parts = [
-        subprocess.Popen([*words, "--part", f"{index}/2", "--json", str(tmp_path / f"{index}.json")], cwd=ROOT)
-        for index in range(2)
-    ]
-    try:
-        assert [part.wait(LIMIT_S) for part in parts] == [0, 0]
-    finally:
-        for part in parts:
-            part.kill()
-            part.wait()
-    told = [json.loads((tmp_path / f"{index}.json").read_text()) for index in range(2)]
-    assert [each["this_run"]["pages"] for each in told] == [2 * RANGE, RANGE]
-    with Ledger(tmp_path / "out") as ledger:
-        asked_of_both = Job.read(ledger.folder)
-        assert asked_of_both is not None
-        assert list(ledger.missing(asked_of_both)) == []
-        assert totals(ledger, asked_of_both).tally.read == 3 * RANGE
+def test_the_command_works_with_the_usual_workers(job: Job, tmp_path: Path) -> None:
+    bundle, out = job.bundles[0].path, tmp_path / "out"
+    asked = f"decode {out} --recordings {tmp_path / 'a.h5'} --bundle {bundle} --workers 1 --threads 1"
+    assert run_command(bulk, asked.split()) == 0
+    assert sum(len(read) for read in pages(out).values()) == PAGES
 
 
 DRIVER = """

@@ -13,7 +13,6 @@ from lightpage.errors import StorageError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from runtime.scaling.driver import AGAIN_S
-from runtime.scaling.task import Task
 from tests.runtime.scaling.archive import PAGES, RANGE, Archive
 from tests.storage_fault import StorageFault
 
@@ -70,26 +69,6 @@ def test_pages_are_given_up_on_request_alone_and_read_again_on_another(
     assert archive.run(operation, *options)[1]["lost"] == {cause: 1}
     status, figures = archive.run(operation, *options, "--retry-lost")
     assert (status, figures["lost"], archive.firsts()) == (0, {}, [("a", RANGE)])
-
-
-def test_recordings_that_vanished_or_never_opened_are_lost_on_request_and_opened_on_another(archive: Archive) -> None:
-    whole = (archive.folder / "b.h5").read_bytes()
-    (archive.folder / "b.h5").write_bytes(b"")
-
-    def vanish(task: Task) -> None:
-        (archive.folder / "a.h5").unlink(missing_ok=True)
-
-    archive.before_each = vanish
-    status, figures = archive.run("decode")
-    assert (status, figures["pages_missing"], figures["this_run"]["failed"]) == (75, PAGES, 2)
-    for failed in (PAGES, 0):  # it stays given up
-        status, figures = archive.run("decode", "--give-up", asked=False)
-        assert (status, figures["pages_missing"], figures["lost"]) == (2, 0, {"RecordingError": PAGES})
-        assert (figures["this_run"]["given_up"], figures["this_run"]["failed"]) == (1, 0)
-        assert figures["this_run"]["pages"] == failed
-    (archive.folder / "b.h5").write_bytes(whole)
-    assert archive.run("decode", asked=False)[1]["pages_read"] == 0
-    assert archive.run("decode", "--retry-lost", asked=False)[1]["pages_read"] == PAGES
 
 
 RUNS = """

@@ -132,11 +132,15 @@ def test_another_recording_or_bundle_than_the_run_began_with_is_not_read(
     os.utime(tmp_path / "a.h5", (1, 1))
     changed = failure(task)
     assert (changed.problem.passes, changed.whole_recording) == (False, True)
-    gone = failure(task.model_copy(update={"recording": tmp_path / "gone.h5"}))
-    assert (gone.problem.subject, gone.whole_recording) == (f"recording {tmp_path / 'gone.h5'}", True)
+    gone = task.model_copy(update={"recording": tmp_path / "gone.h5"})
+    failed = failure(gone)
+    assert (failed.problem.subject, failed.whole_recording) == (f"recording {tmp_path / 'gone.h5'}", True)
+    given_up = Worker(1).work(gone.model_copy(update={"give_up": True}))
+    assert isinstance(given_up, Done)
+    assert given_up.lost == {"RecordingError": PAGES}
     toy.write_toy_bundle(tmp_path / "other.zip", version="toy-2")
     (tmp_path / "other.zip").replace(tmp_path / "coded.zip")
-    other = failure(task)
+    other = failure(task.model_copy(update={"shard": task.shard.with_name("other")}))
     assert (other.problem.subject, other.whole_recording) == (f"bundle {tmp_path / 'coded.zip'}", True)
 
 
