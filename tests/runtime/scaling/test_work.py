@@ -181,7 +181,7 @@ def test_steps_are_told_when_they_begin_and_then_now_and_then(tmp_path: Path) ->
     told, clock = list[str](), HandClock()
     log = StepLog(tmp_path / "log", told.append, clock.now)
     for number in log.track(range(4), "training", "step", 9, 5, lambda: "loss 2"):
-        clock.advance(EVERY_S if number == 2 else 1.0)
+        clock.advance(EVERY_S - 1.0 if number == 2 else 1.0)
     for share in (0.25, 0.5):
         log.progress("fit", share)
     assert told == [
