@@ -139,5 +139,5 @@ def test_a_golden_page_that_is_refused_off_its_place_is_the_bundles_fault() -> N
         bundle=SimpleNamespace(golden=SimpleNamespace(pair=None), profile=toy.PROFILE, subject="bundle toy"),
         infer=refuse,
     )
-    with pytest.raises(BundleError, match=r"golden page, .*0\.25 px"):
+    with pytest.raises(BundleError, match=r"golden page, .*0\.25"):
         drift_slopes(decoder, None, np.zeros(1))  # type: ignore[arg-type]

@@ -415,23 +415,30 @@ class NoiseDecoder(FakeDecoder):
         return sure.turned(self.rng.uniform(-np.pi, np.pi, toy.PAGE))
 
 
-class NoiseTables(FakeTables):
+class CurvedReference(FakeTables):
+    """Over which an image tilts as it shifts, if the reference stays."""
+
+    def __init__(self, device: FakeDevice, kind: type[FakeDecoder]) -> None:
+        super().__init__(device)
+        self._kind = kind
+
     def tilt_of(self, shift_px: Real) -> Real:
         return 0.2 * shift_px
 
     def traced(self, tilt_rad: Real) -> Decoder:
-        return NoiseDecoder(self._device, tilt_rad.copy())  # type: ignore[return-value]
+        return self._kind(self._device, tilt_rad.copy())  # type: ignore[return-value]
+
+
+def over_a_reference(device: FakeDevice, kind: type[FakeDecoder]) -> ImageTracker:
+    """A tracker with the slopes of `tests.runtime.decoding.test_image_drift`."""
+    decoder = kind(device, np.zeros(2))
+    return ImageTracker(decoder, DriftModel(SLOPES), CurvedReference(device, kind), None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("pilots", [1, 2, 4, 12])
 def test_noise_is_not_given_out_however_few_the_pilots_are(device: FakeDevice, pilots: int) -> None:
     """Piston and drift are fitted to the same pilots that then confirm the page: few would confirm anything."""
-    tracker = ImageTracker(
-        NoiseDecoder(device, np.zeros(2)),  # type: ignore[arg-type]
-        DriftModel(SLOPES),
-        NoiseTables(device),
-        None,
-    )
+    tracker = over_a_reference(device, NoiseDecoder)
     mask = np.zeros(toy.PAGE, bool)
     mask.flat[np.linspace(0, mask.size - 1, pilots).astype(int)] = True
     known = Pilots.of_symbols(mask, toy.symbols_of(16, 1)[0], 16)
@@ -456,24 +463,9 @@ class PhaseDecoder(FakeDecoder):
         return inference.turned(DriftModel(SLOPES).phase_change(device.drift - device.held))
 
 
-class CurvedReference(FakeTables):
-    """Over which an image tilts as it shifts, if the reference stays."""
-
-    def tilt_of(self, shift_px: Real) -> Real:
-        return 0.2 * shift_px
-
-    def traced(self, tilt_rad: Real) -> Decoder:
-        return PhaseDecoder(self._device, tilt_rad.copy())  # type: ignore[return-value]
-
-
 @pytest.mark.parametrize("stays", [False, True])
 def test_the_pilots_say_whether_the_reference_has_come_along(device: FakeDevice, stays: bool) -> None:
-    tracker = ImageTracker(
-        PhaseDecoder(device, np.zeros(2)),  # type: ignore[arg-type]
-        DriftModel(SLOPES),
-        CurvedReference(device),
-        None,
-    )
+    tracker = over_a_reference(device, PhaseDecoder)
     tracker.decode(device.page(), 16)
     device.drift = np.array([0.6, -0.3, 0.12 * stays, -0.06 * stays])
     page = tracker.decode(device.page(), 16)

