@@ -22,7 +22,7 @@ class StorageFault:
 
     @classmethod
     def compiled(cls, folder: Path, name: str, error: int, least_bytes: int) -> StorageFault:
-        """Compile the fault into `folder`; it hits files whose path holds `name`, and opens while `FAULT_OPEN` is set."""
+        """Compile it into `folder`; it hits files whose path holds `name`, their opening while `FAULT_OPEN` is set."""
         compiler = shutil.which("cc") or shutil.which("gcc")
         if compiler is None:
             pytest.skip("no C compiler")

@@ -13,6 +13,7 @@ from lightpage.device.state import Device
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.simulator.simulator import Simulator
+from runtime.decoding.decoder import Decoder
 from runtime.decoding.tracking import NoTracker
 from runtime.errors import UnconfirmedPageError
 from tests.runtime import toy
@@ -38,4 +39,4 @@ def test_an_image_that_has_moved_is_read_unless_it_is_not_followed() -> None:
     data = ~decoder.bundle.pilot_mask
     assert (decoder.decode(pair).symbols != symbols)[data].mean() < 0.55
     with pytest.raises(UnconfirmedPageError):
-        NoTracker(decoder).decode(pair, 256)
+        NoTracker(Decoder(decoder.bundle, 1, decoder.graph)).decode(pair, 256)
