@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lightpage.codec.page_bytes import Loss, PageBytes
-from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_position import ImagePosition
 from runtime.decoding.page import DecodedPage
@@ -18,18 +17,18 @@ from runtime.errors import Reason, UnconfirmedPageError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.metrics import ServiceMetrics
-from runtime.service.monitor import Monitor, MonitorSettings, PageFigures
+from runtime.service.monitor import Monitor, MonitorSettings, MonitorState, PageFigures
 from runtime.service.observation import Observation
 from runtime.service.registry import ModelRegistry
 from tests.runtime import toy
+from tests.waiting import eventually
 
 MARGIN, NOISE = 0.126, 0.019
 """Of a quiet bench device."""
 
 
 @pytest.fixture(scope="module")
-def page(toy_zip: Path) -> DecodedPage:
-    decoder = Decoder(Bundle.open(toy_zip), threads=1)
+def page(decoder: Decoder) -> DecodedPage:
     return decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
 
 
@@ -126,6 +125,24 @@ def test_a_restless_piston_is_shown_and_asks_for_no_recalibration() -> None:
     assert value("lightpage_monitor_due") == 0
 
 
+def test_the_state_that_is_shown_last_is_the_newest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that was held up before it showed what it saw."""
+    metrics, pages = ServiceMetrics(), iter([0.0])
+    monitor = Monitor(metrics=metrics)
+    state = monitor.state
+
+    def others_come_between() -> MonitorState:
+        found = state()
+        for _ in pages:
+            threading.Thread(target=followed, args=(monitor, [-1.0] * 8)).start()
+            threading.Event().wait(0.02)  # they would be shown by now, and then hidden by what was found before
+        return found
+
+    monkeypatch.setattr(monitor, "state", others_come_between)
+    followed(monitor, [0.1])
+    assert eventually(lambda: metrics.registry.get_sample_value("lightpage_monitor_due")) == 1
+
+
 def observation(page: DecodedPage | None, **changes: object) -> Observation:
     return Observation(
         **{
@@ -169,8 +186,7 @@ def test_what_a_page_says_of_the_device(page: DecodedPage) -> None:
     assert figures.of(observation(None, lost=Reason.MISSING_FRAME)) == {}
 
 
-def test_answers_and_lost_pages_carry_it(toy_zip: Path) -> None:
-    decoder = Decoder(Bundle.open(toy_zip), threads=1)
+def test_answers_and_lost_pages_carry_it(decoder: Decoder) -> None:
     settings = MonitorSettings(baseline_pages=3)
     source, monitor = toy.ToySource(toy.ToyDevice()), Monitor(settings)
     plane = DataPlane(ModelRegistry(decoder), source, monitor=monitor)

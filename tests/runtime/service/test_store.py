@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import logging
 import os
 import shutil
-import subprocess
-import sys
 import threading
-import time
 from collections import namedtuple
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -21,14 +20,12 @@ from lightpage.files import new_file
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.errors import StoreError
-from runtime.service import metrics as metrics_module
-from runtime.service import store as store_module
 from runtime.service.dataplane import DataPlane
 from runtime.service.registry import ModelRegistry
-from runtime.service.store import CURRENT, DAMAGED, KEPT_BUNDLES, LOCK, ModelStore, Note, Origin, Reason
+from runtime.service.store import CURRENT, DAMAGED, KEPT_BUNDLES, LOCK, PROBE_S, ModelStore, Note, Origin, Reason
+from tests.clock import HandClock
 from tests.runtime import toy
-
-ROOT = Path(__file__).resolve().parents[3]
+from tests.waiting import eventually
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -38,9 +35,15 @@ def store(decoder: Decoder, tmp_path: Path) -> ModelStore:
     return ModelStore(tmp_path / "store", decoder.bundle)
 
 
-def a_plane(decoder: Decoder, store: ModelStore) -> DataPlane:
+def at_every_look() -> Callable[[], float]:
+    """A clock by which the store is tried whenever somebody asks."""
+    return itertools.count(0.0, PROBE_S).__next__
+
+
+def a_plane(decoder: Decoder, store: ModelStore, clock: HandClock | None = None) -> DataPlane:
     """A service as it is after a restart."""
-    plane = DataPlane(ModelRegistry(decoder), store=ModelStore(store.folder, decoder.bundle))
+    now = at_every_look() if clock is None else clock.now
+    plane = DataPlane(ModelRegistry(decoder), store=ModelStore(store.folder, decoder.bundle, clock=now))
     plane.models.resume()
     return plane
 
@@ -98,7 +101,7 @@ def test_a_note_of_an_earlier_program_is_read_and_one_of_this_names_what_that_re
     decoder: Decoder, store: ModelStore
 ) -> None:
     put(store, "toy-1+r1")
-    base = store._base
+    base = base_of(store)
     (store.folder / CURRENT).write_text(json.dumps({"base": base, "bundle": "toy-1+r1.zip"}))
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1+r1"
@@ -115,17 +118,17 @@ def test_a_note_of_an_earlier_program_is_read_and_one_of_this_names_what_that_re
     assert store.read() == Note()
 
 
-def test_a_second_service_is_kept_out(toy_zip: Path, store: ModelStore, decoder: Decoder) -> None:
-    with store.locked():
-        with pytest.raises(StoreError, match="a store in use"), ModelStore(store.folder, decoder.bundle).locked():
-            pass
-        serve = [sys.executable, "-m", "lightpage.cli.main", "serve", "--address", "127.0.0.1:0"]
-        second = subprocess.run(
-            [*serve, "--bundle", toy_zip, "--store", store.folder], cwd=ROOT, capture_output=True, text=True, timeout=60
-        )
-        assert (second.returncode, second.stdout) == (2, "")
-        assert "a store in use, wanted one that no other service uses" in second.stderr
-    with ModelStore(store.folder, decoder.bundle).locked():
+def base_of(store: ModelStore) -> str:
+    """How its note names the base."""
+    store.change()
+    return str(json.loads((store.folder / CURRENT).read_text())["base"])
+
+
+def test_a_second_service_is_kept_out(store: ModelStore, decoder: Decoder) -> None:
+    again = ModelStore(store.folder, decoder.bundle)
+    with store.locked(), pytest.raises(StoreError, match="model store"), again.locked():
+        raise AssertionError("two at once")
+    with again.locked():
         pass
 
 
@@ -149,7 +152,7 @@ def test_a_damaged_bundle_is_said_and_the_newest_before_it_serves(
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1+r2"
     assert "toy-1+r3.zip" in plane.store_trouble()
-    assert "serving toy-1+r2: bundle" in caplog.text
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert figure(plane, "lightpage_store_ok") == 0
     assert figure(plane, "lightpage_store_trouble", reason="bundle") == 1
     assert figure(plane, "lightpage_model_info", version="toy-1+r2") == 1
@@ -177,7 +180,7 @@ def test_a_bundle_of_the_history_that_is_gone_is_said_and_stepped_over(
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1+r3"
     assert "toy-1+r2.zip" in plane.store_trouble()
-    assert "toy-1+r2.zip: got nothing" in caplog.text
+    assert "toy-1+r2.zip" in caplog.text
     assert plane.rollback()[0].version == "toy-1+r1"
 
 
@@ -202,18 +205,19 @@ def test_a_note_that_is_damaged_or_gone_is_said(
 ) -> None:
     a_worn_plane(decoder, store)
     note = store.folder / CURRENT
+    base = json.loads(note.read_text())["base"]
     note.unlink()
     if content is not None:
-        note.write_text(content.replace("BASE", store._base))
+        note.write_text(content.replace("BASE", base))
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1"
-    assert f"{CURRENT}: got" in plane.store_trouble()
-    assert "serving the base" in caplog.text
+    assert CURRENT in plane.store_trouble()
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert figure(plane, "lightpage_store_trouble", reason="note") == 1
     assert note.exists() == (content is not None)  # the next start says it again
     plane.models.activate("toy-1+r2")
     kept = store.folder / DAMAGED
-    assert (kept.read_text() if kept.exists() else None) == (content and content.replace("BASE", store._base))
+    assert (kept.read_text() if kept.exists() else None) == (content and content.replace("BASE", base))
     assert plane.store_trouble() == ""
     assert a_plane(decoder, store).registry.current.version == "toy-1+r2"
 
@@ -262,17 +266,33 @@ def test_pinned_loaded_and_foreign_bundles_are_never_pruned_and_pruned_ones_leav
     assert ModelStore(store.folder, decoder.bundle).read().history == (None, *(f"{name}.zip" for name in names[1:6]))
 
 
+def test_the_oldest_bundles_beyond_those_kept_are_deleted_but_none_that_is_held(store: ModelStore) -> None:
+    paths = [store.path_of(f"toy-1+r{number}") for number in range(1, KEPT_BUNDLES + 4)]
+    for age, path in enumerate([given := store.folder / "bench.zip", *paths]):  # the first put there by somebody else
+        path.write_bytes(b"")
+        os.utime(path, (age, age))
+    assert set(store.prune([paths[1]])) == {paths[0], paths[2]}
+    assert [path for path in paths if path.exists()] == [paths[1], *paths[3:]]
+    assert given.exists()
+    assert store.prune([paths[1]]) == []
+
+
+def test_what_was_in_service_last_is_told(store: ModelStore, caplog: pytest.LogCaptureFixture) -> None:
+    put(store, "toy-1+r1")
+    store.remember(store.path_of("toy-1+r1"))
+    assert store.last() == store.path_of("toy-1+r1")
+    store.remember(None)
+    assert store.last() is None
+    assert not caplog.records
+    store.remember(store.path_of("toy-1+r2"))
+    assert store.last() is None
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+
+
 def _read_only(*_: object, **__: object) -> None:
     raise OSError(errno.EROFS, "Read-only file system")
 
 
-@pytest.fixture
-def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The store is tried whenever somebody asks."""
-    monkeypatch.setattr(store_module, "PROBE_S", 0.0)
-
-
-@pytest.mark.usefixtures("hasty")
 def test_a_full_disk_is_noticed_and_said_until_there_is_room(
     decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -280,21 +300,20 @@ def test_a_full_disk_is_noticed_and_said_until_there_is_room(
     size = sum(map(len, decoder.bundle.files.values()))
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 2 * size - 1))
-        with pytest.raises(StoreError, match="bytes free"):
+        with pytest.raises(StoreError, match="model store"):
             plane.models.check_store()
         assert f"{2 * size} needed" in plane.store_trouble()
         assert figure(plane, "lightpage_store_ok") == 0
         assert figure(plane, "lightpage_store_trouble", reason="full") == 1
         patch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 2 * size))
         assert plane.store_trouble() == ""
-        with pytest.raises(StoreError, match="bytes free"):
+        with pytest.raises(StoreError, match="model store"):
             plane.models.check_store(2 * size + 1)
     assert figure(plane, "lightpage_store_ok") == 1
     assert [record.levelno for record in caplog.records] == [logging.WARNING] * 2
     assert sorted(path.name for path in store.folder.iterdir()) == [CURRENT]
 
 
-@pytest.mark.usefixtures("hasty")
 def test_a_store_that_cannot_be_written_is_noticed_and_nothing_changes(
     decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -303,7 +322,7 @@ def test_a_store_that_cannot_be_written_is_noticed_and_nothing_changes(
         for module in ("runtime.service.store", "lightpage.files"):
             patch.setattr(f"{module}.new_file", _read_only)
         for change in (plane.rollback, lambda: plane.models.pin("toy-1", True), lambda: plane.models.activate("toy-1")):
-            with pytest.raises(StoreError, match="Read-only"):
+            with pytest.raises(StoreError, match="model store"):
                 change()
         assert "Read-only" in plane.store_trouble()
         assert figure(plane, "lightpage_store_trouble", reason="read_only") == 1
@@ -313,9 +332,8 @@ def test_a_store_that_cannot_be_written_is_noticed_and_nothing_changes(
     assert plane.rollback()[0].version == "toy-1+r2"
 
 
-@pytest.mark.usefixtures("hasty")
 def test_a_folder_that_is_gone_or_another_is_noticed(decoder: Decoder, tmp_path: Path) -> None:
-    store = ModelStore(tmp_path / "store", decoder.bundle)
+    store = ModelStore(tmp_path / "store", decoder.bundle, clock=at_every_look())
     plane = DataPlane(ModelRegistry(decoder), store=store)
     with store.locked():
         plane.models.resume()
@@ -326,7 +344,7 @@ def test_a_folder_that_is_gone_or_another_is_noticed(decoder: Decoder, tmp_path:
         store.folder.mkdir()  # as under a disk that is not mounted
         (store.folder / LOCK).touch()
         assert "another folder" in plane.store_trouble()
-        with pytest.raises(StoreError, match="another folder"):
+        with pytest.raises(StoreError, match="model store"):
             store.change()
         shutil.rmtree(store.folder)
         away.rename(store.folder)
@@ -336,39 +354,42 @@ def test_a_folder_that_is_gone_or_another_is_noticed(decoder: Decoder, tmp_path:
 def test_the_store_is_tried_now_and_then_and_not_whenever_somebody_asks(
     decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plane = a_plane(decoder, store)
-    now = time.monotonic()
-    monkeypatch.setattr(time, "monotonic", lambda: now)
+    clock = HandClock()
+    plane = a_plane(decoder, store, clock)
     assert plane.store_trouble() == ""
     monkeypatch.setattr("runtime.service.store.new_file", _read_only)
+    clock.advance(PROBE_S - 0.1)
     assert plane.store_trouble() == ""
-    now += 29
-    assert plane.store_trouble() == ""
-    now += 2
+    clock.advance(0.1)
     assert "Read-only" in plane.store_trouble()
     assert plane.models.trouble().reason is Reason.READ_ONLY  # type: ignore[union-attr]
 
 
-@pytest.mark.usefixtures("hasty")
+class Passing(HandClock):
+    """Time passes by itself while somebody waits."""
+
+    def wait(self, event: threading.Event, seconds: float) -> bool:
+        self.advance(seconds)
+        return event.is_set()
+
+
 def test_a_disk_that_hangs_is_shown_and_holds_no_scrape_up(
     decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plane, answers, made = a_plane(decoder, store), threading.Event(), new_file
+    answers, clock = threading.Event(), Passing()
+    plane = DataPlane(ModelRegistry(decoder), store=store, clock=clock)
+    plane.models.resume()
 
     def hung(folder: Path, name: str) -> tuple[int, Path]:
-        answers.wait(10)
-        return made(folder, name)
+        answers.wait()
+        return new_file(folder, name)
 
-    with monkeypatch.context() as patch:
-        patch.setattr("runtime.service.store.new_file", hung)
-        patch.setattr(metrics_module, "_LOOK_S", 0.01)
-        patch.setattr(plane.store_health, "_longest_s", 0.0)
-        for _ in range(3):
-            assert figure(plane, "lightpage_store_ok") == 0
-            assert figure(plane, "lightpage_store_trouble", reason="hung") == 1
-        answers.set()
-    plane.store_health.is_well(10)  # the end of the look that hung
-    assert figure(plane, "lightpage_store_ok") == 1
+    monkeypatch.setattr("runtime.service.store.new_file", hung)
+    shown = [(figure(plane, "lightpage_store_ok"), clock.now() - 1000.0) for _ in range(4)]
+    assert shown == [(1, 2.0), (1, 4.0), (0, 6.0), (0, 6.0)]  # 2 s are waited for, not longer than 5 s in all
+    assert figure(plane, "lightpage_store_trouble", reason="hung") == 1
+    answers.set()
+    assert eventually(lambda: figure(plane, "lightpage_store_ok") == 1)
     assert figure(plane, "lightpage_store_trouble", reason="hung") == 0
 
 
