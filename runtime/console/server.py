@@ -48,6 +48,8 @@ MOST_CONNECTIONS = 64
 """Connections that are answered at once: browsers, Prometheus, and those who say nothing."""
 LONGEST_S = 60.0
 """For one connection: more than any answer takes, and too little to hold one for hours by a byte now and then."""
+SILENCE_S = 20.0
+"""A caller that says nothing for so long is hung up on."""
 _HANDSHAKE_S = 5.0
 POINTS = 600
 """Most points of a series."""
@@ -336,8 +338,10 @@ class _Server6(_Server):
 class _Handler(WSGIRequestHandler):
     """Says who calls. Logs no requests: there is one a second for each browser."""
 
-    timeout = 20
-    """A caller that says nothing is hung up on, seconds."""
+    def setup(self) -> None:
+        """See `socketserver.StreamRequestHandler`."""
+        self.timeout = SILENCE_S
+        super().setup()
 
     def get_stderr(self) -> Any:
         """Nowhere: a caller that hangs up is no fault, and what the console does not foresee it logs itself."""

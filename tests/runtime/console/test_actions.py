@@ -51,7 +51,7 @@ class Asked:
     def __init__(self, decoder: Decoder, folder: Path) -> None:
         self.source, self.clock = Numbered(), HandClock()
         self.plane = DataPlane(ModelRegistry(decoder), self.source)
-        self.plane.adopt(decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
+        self.plane.adopt(Decoder.load(toy.write_toy_bundle(folder / "c.zip", version="toy-2"), 1))
         self.recalibrator = Recalibrator(self.plane, toy.fit_references)
         actions = Actions(self.plane, self.recalibrator)
         registry, metrics = self.plane.registry, self.plane.metrics

@@ -46,7 +46,7 @@ def test_callers_that_say_nothing_or_hang_up_hold_up_nobody(
 def test_a_body_that_does_not_come_is_refused_and_nothing_else_is_said(
     decoder: Decoder, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("runtime.console.server._Handler.timeout", 0.1)
+    monkeypatch.setattr("runtime.console.server.SILENCE_S", 0.1)
     with stage(decoder) as running, connected(running) as connection:
         connection.sendall(b"POST /actions HTTP/1.1\r\nContent-Length: 100\r\n\r\nx")
         assert b" 408 " in connection.recv(1000)
