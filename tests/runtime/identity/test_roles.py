@@ -25,7 +25,7 @@ def test_a_certificate_says_who_and_what(tmp_path: Path) -> None:
 def test_a_certificate_without_roles_may_nothing(tmp_path: Path) -> None:
     identity = identity_of(Authority(tmp_path).caller("nobody").certificate.read_bytes())
     assert not any(identity.may(role) for role in Role)
-    with pytest.raises(NotAllowedError, match=r"call X: got nobody with no role, wanted .*urn:lightpage:role:read"):
+    with pytest.raises(NotAllowedError, match="call X: got nobody"):
         identity.check(Role.READ, "call X", 0.0)
 
 

@@ -13,7 +13,7 @@ import grpc
 import numpy as np
 import pytest
 
-from lightpage.errors import LightpageError, StorageError, SurroundingsError
+from lightpage.errors import LightpageError, StorageError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from runtime.acquisition.source import Shot
@@ -24,7 +24,6 @@ from runtime.errors import (
     CallerLeft,
     LostShotError,
     NoSourceError,
-    OtherModelError,
     Reason,
     RequestIdError,
     SlotsTakenError,
@@ -107,16 +106,15 @@ def test_nothing_holds_the_frames_of_a_lost_page(request_id: str, decoder: Decod
     assert not any(frame() is not None for frame in source.frames)
 
 
-FAILURES = [
-    LostShotError("page 1", "no frame", "one", Reason.MISSING_FRAME),
-    UnconfirmedPageError("pilots", "none", "some", Reason.PILOTS_DISAGREE, recalibration_due=True),
-    SourceError("source", "black", "light"),
-    OtherModelError("model in service", "bench-9", "bench-8"),
-    SurroundingsError("service", "too little memory", "more"),
-]
-
-
-@pytest.mark.parametrize("failure", FAILURES, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize(
+    "failure",
+    [
+        LostShotError("page 1", "no frame", "one", Reason.MISSING_FRAME),
+        UnconfirmedPageError("pilots", "none", "some", Reason.PILOTS_DISAGREE, recalibration_due=True),
+        SourceError("source", "black", "light"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
 def test_a_failure_that_is_kept_comes_again_as_it_was_and_is_counted(failure: LightpageError) -> None:
     replays, done = Replays(600, 1 << 20), list[bytes]()
 

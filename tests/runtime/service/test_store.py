@@ -10,7 +10,6 @@ import os
 import shutil
 import threading
 from collections import namedtuple
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,17 @@ from runtime.decoding.decoder import Decoder
 from runtime.errors import StoreError
 from runtime.service.dataplane import DataPlane
 from runtime.service.registry import ModelRegistry
-from runtime.service.store import CURRENT, DAMAGED, KEPT_BUNDLES, LOCK, PROBE_S, ModelStore, Note, Origin, Reason
+from runtime.service.store import (
+    CURRENT,
+    DAMAGED,
+    KEPT_BUNDLES,
+    LOCK,
+    PROBE_S,
+    ModelStore,
+    Note,
+    Origin,
+    Reason,
+)
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.waiting import eventually
@@ -32,18 +41,15 @@ Usage = namedtuple("Usage", "total used free")
 
 @pytest.fixture
 def store(decoder: Decoder, tmp_path: Path) -> ModelStore:
-    return ModelStore(tmp_path / "store", decoder.bundle)
+    """It is tried whenever somebody asks."""
+    return ModelStore(tmp_path / "store", decoder.bundle, clock=itertools.count(0.0, PROBE_S).__next__)
 
 
-def at_every_look() -> Callable[[], float]:
-    """A clock by which the store is tried whenever somebody asks."""
-    return itertools.count(0.0, PROBE_S).__next__
-
-
-def a_plane(decoder: Decoder, store: ModelStore, clock: HandClock | None = None) -> DataPlane:
+def a_plane(decoder: Decoder, store: ModelStore, **options: object) -> DataPlane:
     """A service as it is after a restart."""
-    now = at_every_look() if clock is None else clock.now
-    plane = DataPlane(ModelRegistry(decoder), store=ModelStore(store.folder, decoder.bundle, clock=now))
+    clock = itertools.count(0.0, PROBE_S).__next__
+    again = ModelStore(store.folder, decoder.bundle, **{"clock": clock, **options})  # type: ignore[arg-type]
+    plane = DataPlane(ModelRegistry(decoder), store=again)
     plane.models.resume()
     return plane
 
@@ -53,7 +59,8 @@ def put(store: ModelStore, *versions: str) -> None:
         toy.write_toy_bundle(store.path_of(version), version=version)
 
 
-def a_worn_plane(decoder: Decoder, store: ModelStore) -> DataPlane:
+@pytest.fixture
+def worn(decoder: Decoder, store: ModelStore) -> DataPlane:
     """A service with a history: base, r1, r2, r3."""
     put(store, "toy-1+r1", "toy-1+r2", "toy-1+r3")
     store.remember(store.path_of("toy-1+r1"))
@@ -67,46 +74,42 @@ def figure(plane: DataPlane, name: str, **labels: str) -> float | None:
     return plane.metrics.registry.get_sample_value(name, labels)
 
 
-def test_the_history_survives_a_restart(decoder: Decoder, store: ModelStore) -> None:
-    before = a_worn_plane(decoder, store)
-    before.rollback()
+def test_the_history_survives_a_restart(worn: DataPlane, decoder: Decoder, store: ModelStore) -> None:
+    worn.rollback()
     after = a_plane(decoder, store)
-    assert after.registry.history == before.registry.history
+    assert after.registry.history == worn.registry.history
     assert after.registry.current.version == "toy-1+r2"
     assert after.models.roll_forward()[0].version == "toy-1+r3"
     again = a_plane(decoder, store)
     assert [again.rollback()[0].version for _ in range(3)] == ["toy-1+r2", "toy-1+r1", "toy-1"]
-    assert a_plane(decoder, store).registry.current.version == "toy-1"
     assert a_plane(decoder, store).models.roll_forward()[0].version == "toy-1+r1"
     assert again.store_trouble() == ""
 
 
 def test_pins_and_origins_survive_a_restart_and_another_base(
-    decoder: Decoder, store: ModelStore, tmp_path: Path
+    worn: DataPlane, decoder: Decoder, store: ModelStore, tmp_path: Path
 ) -> None:
-    plane = a_worn_plane(decoder, store)
-    assert plane.models.pin("toy-1+r1", True).pinned
-    store.change(origins={"toy-1+r2": Origin.UPLOADED})
+    assert worn.models.pin("toy-1+r1", True).pinned
+    assert worn.store is not None
+    worn.store.change(origins={"toy-1+r2": Origin.UPLOADED})
     other = Bundle.open(toy.write_toy_bundle(tmp_path / "other.zip", version="other"))
-    for note in (ModelStore(store.folder, decoder.bundle).read(), ModelStore(store.folder, other).read()):
-        assert note.origins == {"toy-1+r2": Origin.UPLOADED}
-    plane = a_plane(decoder, store)
-    plane.models.pin("toy-1+r1", True)
-    assert a_plane(decoder, store).store.note.pinned == {"toy-1+r1"}  # type: ignore[union-attr]
-    assert ModelStore(store.folder, other).read().history == (None,)
-    assert ModelStore(store.folder, other).read().pinned == {"toy-1+r1"}
+    for base, places in ((decoder.bundle, 4), (other, 1)):
+        note = ModelStore(store.folder, base).read()
+        assert (note.origins, note.pinned) == ({"toy-1+r2": Origin.UPLOADED}, {"toy-1+r1"})
+        assert len(note.history) == places
 
 
 def test_a_note_of_an_earlier_program_is_read_and_one_of_this_names_what_that_reads(
     decoder: Decoder, store: ModelStore
 ) -> None:
     put(store, "toy-1+r1")
-    base = base_of(store)
+    store.change()
+    base = json.loads((store.folder / CURRENT).read_text())["base"]
     (store.folder / CURRENT).write_text(json.dumps({"base": base, "bundle": "toy-1+r1.zip"}))
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1+r1"
     assert plane.rollback()[0].version == "toy-1"
-    assert json.loads((store.folder / CURRENT).read_text()) == {
+    written = {
         "base": base,
         "bundle": None,
         "history": [None, "toy-1+r1.zip"],
@@ -114,40 +117,31 @@ def test_a_note_of_an_earlier_program_is_read_and_one_of_this_names_what_that_re
         "pinned": [],
         "origins": {},
     }
+    assert json.loads((store.folder / CURRENT).read_text()) == written
     (store.folder / CURRENT).write_text(json.dumps({"base": base, "bundle": None}))
     assert store.read() == Note()
 
 
-def base_of(store: ModelStore) -> str:
-    """How its note names the base."""
-    store.change()
-    return str(json.loads((store.folder / CURRENT).read_text())["base"])
-
-
-def test_a_second_service_is_kept_out(store: ModelStore, decoder: Decoder) -> None:
-    again = ModelStore(store.folder, decoder.bundle)
-    with store.locked(), pytest.raises(StoreError, match="model store"), again.locked():
-        raise AssertionError("two at once")
-    with again.locked():
-        pass
-
-
-def test_what_a_killed_program_left_is_swept_and_nothing_else(store: ModelStore) -> None:
+def test_a_second_service_is_kept_out_and_what_a_killed_one_left_is_swept(decoder: Decoder, store: ModelStore) -> None:
     put(store, "toy-1+r1")
     (store.folder / ".toy-1+r2.zip-abc").mkdir()
     (store.folder / ".toy-1+r2.zip-abc" / "bundle.zip").write_bytes(b"half")
     for name in (".upload-x", ".probe-x", f".{CURRENT}-x", ".nfs1", "notes.txt"):
         (store.folder / name).write_bytes(b"half")
     (store.folder / ".upload-link").symlink_to(store.path_of("toy-1+r1"))
+    again = ModelStore(store.folder, decoder.bundle)
     with store.locked():
         left = sorted(path.name for path in store.folder.iterdir())
+        with pytest.raises(StoreError, match="model store"), again.locked():
+            raise AssertionError("two at once")
     assert left == sorted([".nfs1", LOCK, "notes.txt", "toy-1+r1.zip"])
+    with again.locked():
+        pass
 
 
 def test_a_damaged_bundle_is_said_and_the_newest_before_it_serves(
-    decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
+    worn: DataPlane, decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
 ) -> None:
-    a_worn_plane(decoder, store)
     store.path_of("toy-1+r3").write_bytes(b"damaged")
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1+r2"
@@ -163,34 +157,24 @@ def test_a_damaged_bundle_is_said_and_the_newest_before_it_serves(
     assert figure(plane, "lightpage_store_ok") == 1
 
 
-def test_without_any_bundle_that_can_be_used_the_base_serves(decoder: Decoder, store: ModelStore) -> None:
-    a_worn_plane(decoder, store)
-    for number in (1, 2, 3):
+@pytest.mark.parametrize(("gone", "serves"), [((1, 2, 3), "toy-1"), ((2,), "toy-1+r3")])
+def test_bundles_of_the_history_that_are_gone_are_said_and_stepped_over(
+    gone: tuple[int, ...], serves: str, worn: DataPlane, decoder: Decoder, store: ModelStore
+) -> None:
+    for number in gone:
         store.path_of(f"toy-1+r{number}").unlink()
     plane = a_plane(decoder, store)
-    assert plane.registry.current.version == "toy-1"
-    assert "toy-1+r3.zip" in plane.store_trouble()
-
-
-def test_a_bundle_of_the_history_that_is_gone_is_said_and_stepped_over(
-    decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
-) -> None:
-    a_worn_plane(decoder, store)
-    store.path_of("toy-1+r2").unlink()
-    plane = a_plane(decoder, store)
-    assert plane.registry.current.version == "toy-1+r3"
-    assert "toy-1+r2.zip" in plane.store_trouble()
-    assert "toy-1+r2.zip" in caplog.text
-    assert plane.rollback()[0].version == "toy-1+r1"
+    assert plane.registry.current.version == serves
+    assert f"toy-1+r{gone[-1]}.zip" in plane.store_trouble()
+    if serves != "toy-1":
+        assert plane.rollback()[0].version == "toy-1+r1"
 
 
 def test_nothing_is_deleted_while_it_is_not_settled_what_is_to_be_in_service(
-    decoder: Decoder, store: ModelStore
+    worn: DataPlane, decoder: Decoder, store: ModelStore
 ) -> None:
-    a_worn_plane(decoder, store)
     (store.folder / CURRENT).unlink()
-    plane = DataPlane(ModelRegistry(decoder), store=ModelStore(store.folder, decoder.bundle, kept=0))
-    plane.models.resume()
+    plane = a_plane(decoder, store, kept=0)
     assert plane.store is not None
     plane.models.prune(plane.store)
     assert plane.store.versions() == ["toy-1+r1", "toy-1+r2", "toy-1+r3"]
@@ -201,14 +185,13 @@ def test_nothing_is_deleted_while_it_is_not_settled_what_is_to_be_in_service(
 
 @pytest.mark.parametrize("content", [None, "junk", "[]", '{"bundle": null}', '{"bundle": "../x", "base": "BASE"}'])
 def test_a_note_that_is_damaged_or_gone_is_said(
-    content: str | None, decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
+    content: str | None, worn: DataPlane, decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
 ) -> None:
-    a_worn_plane(decoder, store)
     note = store.folder / CURRENT
-    base = json.loads(note.read_text())["base"]
+    content = content and content.replace("BASE", json.loads(note.read_text())["base"])
     note.unlink()
     if content is not None:
-        note.write_text(content.replace("BASE", base))
+        note.write_text(content)
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1"
     assert CURRENT in plane.store_trouble()
@@ -217,18 +200,16 @@ def test_a_note_that_is_damaged_or_gone_is_said(
     assert note.exists() == (content is not None)  # the next start says it again
     plane.models.activate("toy-1+r2")
     kept = store.folder / DAMAGED
-    assert (kept.read_text() if kept.exists() else None) == (content and content.replace("BASE", base))
+    assert (kept.read_text() if kept.exists() else None) == content
     assert plane.store_trouble() == ""
     assert a_plane(decoder, store).registry.current.version == "toy-1+r2"
 
 
+@pytest.mark.usefixtures("worn")
 @pytest.mark.parametrize(
     "change", [{"cursor": 7}, {"cursor": -1}, {"cursor": 0}, {"history": [None, 3]}, {"history": 1}]
 )
-def test_a_note_that_contradicts_itself_is_damaged(
-    change: dict[str, object], decoder: Decoder, store: ModelStore
-) -> None:
-    a_worn_plane(decoder, store)
+def test_a_note_that_contradicts_itself_is_damaged(change: dict[str, object], store: ModelStore) -> None:
     note = store.folder / CURRENT
     note.write_text(json.dumps(json.loads(note.read_text()) | change))
     with pytest.raises(BundleError, match=CURRENT):
@@ -245,9 +226,8 @@ def test_pinned_loaded_and_foreign_bundles_are_never_pruned_and_pruned_ones_leav
 ) -> None:
     names = [f"toy-1+r{number}" for number in range(1, KEPT_BUNDLES + 8)]
     put(store, *names[:6])
-    for name in names[6:]:
+    for name in ("bench", *names[6:]):
         store.path_of(name).write_bytes(b"")
-    (store.folder / "bench.zip").write_bytes(b"")
     for age, name in enumerate(["bench", *names]):
         os.utime(store.path_of(name), (age, age))
     store.remember(store.path_of(names[0]))
@@ -257,32 +237,17 @@ def test_pinned_loaded_and_foreign_bundles_are_never_pruned_and_pruned_ones_leav
     plane.models.pin(names[1], True)
     assert plane.store is not None
     plane.models.prune(plane.store)
-    left = set(plane.store.versions())
-    loaded = [model.version for model in plane.registry.models]
-    assert loaded == names[2:6]
-    assert {"bench", names[1], *loaded} <= left
-    assert names[0] not in left
+    assert [model.version for model in plane.registry.models] == names[2:6]
+    assert set(plane.store.versions()) == {"bench", *names[1:6], *names[-KEPT_BUNDLES:]}
     assert [place.version for place in plane.registry.history.places] == ["toy-1", *names[1:6]]
     assert ModelStore(store.folder, decoder.bundle).read().history == (None, *(f"{name}.zip" for name in names[1:6]))
 
 
-def test_the_oldest_bundles_beyond_those_kept_are_deleted_but_none_that_is_held(store: ModelStore) -> None:
-    paths = [store.path_of(f"toy-1+r{number}") for number in range(1, KEPT_BUNDLES + 4)]
-    for age, path in enumerate([given := store.folder / "bench.zip", *paths]):  # the first put there by somebody else
-        path.write_bytes(b"")
-        os.utime(path, (age, age))
-    assert set(store.prune([paths[1]])) == {paths[0], paths[2]}
-    assert [path for path in paths if path.exists()] == [paths[1], *paths[3:]]
-    assert given.exists()
-    assert store.prune([paths[1]]) == []
-
-
 def test_what_was_in_service_last_is_told(store: ModelStore, caplog: pytest.LogCaptureFixture) -> None:
     put(store, "toy-1+r1")
-    store.remember(store.path_of("toy-1+r1"))
-    assert store.last() == store.path_of("toy-1+r1")
-    store.remember(None)
-    assert store.last() is None
+    for path in (store.path_of("toy-1+r1"), None):
+        store.remember(path)
+        assert store.last() == path
     assert not caplog.records
     store.remember(store.path_of("toy-1+r2"))
     assert store.last() is None
@@ -302,7 +267,7 @@ def test_a_full_disk_is_noticed_and_said_until_there_is_room(
         patch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 2 * size - 1))
         with pytest.raises(StoreError, match="model store"):
             plane.models.check_store()
-        assert f"{2 * size} needed" in plane.store_trouble()
+        assert str(2 * size) in plane.store_trouble()
         assert figure(plane, "lightpage_store_ok") == 0
         assert figure(plane, "lightpage_store_trouble", reason="full") == 1
         patch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 2 * size))
@@ -315,25 +280,24 @@ def test_a_full_disk_is_noticed_and_said_until_there_is_room(
 
 
 def test_a_store_that_cannot_be_written_is_noticed_and_nothing_changes(
-    decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch
+    worn: DataPlane, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plane = a_worn_plane(decoder, store)
+    models = worn.models
     with monkeypatch.context() as patch:
         for module in ("runtime.service.store", "lightpage.files"):
             patch.setattr(f"{module}.new_file", _read_only)
-        for change in (plane.rollback, lambda: plane.models.pin("toy-1", True), lambda: plane.models.activate("toy-1")):
+        for change in (worn.rollback, lambda: models.pin("toy-1", True), lambda: models.activate("toy-1")):
             with pytest.raises(StoreError, match="model store"):
                 change()
-        assert "Read-only" in plane.store_trouble()
-        assert figure(plane, "lightpage_store_trouble", reason="read_only") == 1
-    assert plane.registry.current.version == "toy-1+r3"
-    assert not plane.models.entry(plane.registry.models[0]).pinned
-    assert plane.store_trouble() == ""
-    assert plane.rollback()[0].version == "toy-1+r2"
+        assert "Read-only" in worn.store_trouble()
+        assert figure(worn, "lightpage_store_trouble", reason="read_only") == 1
+    assert worn.registry.current.version == "toy-1+r3"
+    assert not models.entry(worn.registry.models[0]).pinned
+    assert worn.store_trouble() == ""
+    assert worn.rollback()[0].version == "toy-1+r2"
 
 
-def test_a_folder_that_is_gone_or_another_is_noticed(decoder: Decoder, tmp_path: Path) -> None:
-    store = ModelStore(tmp_path / "store", decoder.bundle, clock=at_every_look())
+def test_a_folder_that_is_gone_or_another_is_noticed(decoder: Decoder, store: ModelStore, tmp_path: Path) -> None:
     plane = DataPlane(ModelRegistry(decoder), store=store)
     with store.locked():
         plane.models.resume()
@@ -344,7 +308,7 @@ def test_a_folder_that_is_gone_or_another_is_noticed(decoder: Decoder, tmp_path:
         store.folder.mkdir()  # as under a disk that is not mounted
         (store.folder / LOCK).touch()
         assert "another folder" in plane.store_trouble()
-        with pytest.raises(StoreError, match="model store"):
+        with pytest.raises(StoreError, match="another folder"):
             store.change()
         shutil.rmtree(store.folder)
         away.rename(store.folder)
@@ -355,7 +319,7 @@ def test_the_store_is_tried_now_and_then_and_not_whenever_somebody_asks(
     decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = HandClock()
-    plane = a_plane(decoder, store, clock)
+    plane = a_plane(decoder, store, clock=clock.now)
     assert plane.store_trouble() == ""
     monkeypatch.setattr("runtime.service.store.new_file", _read_only)
     clock.advance(PROBE_S - 0.1)
