@@ -29,11 +29,7 @@ from tests.runtime.commands.test_commands import Served
 
 def printed(*arguments: str | Path, **environment: str) -> Result:
     return CliRunner().invoke(
-        serve,
-        [*map(str, arguments), "--print-config"],
-        env=environment,
-        standalone_mode=False,
-        catch_exceptions=False,
+        serve, [*map(str, arguments), "--print-config"], env=environment, standalone_mode=False, catch_exceptions=False
     )
 
 

@@ -21,17 +21,7 @@ from runtime.decoding.decoder import Decoder
 from runtime.errors import StoreError
 from runtime.service.dataplane import DataPlane
 from runtime.service.registry import ModelRegistry
-from runtime.service.store import (
-    CURRENT,
-    DAMAGED,
-    KEPT_BUNDLES,
-    LOCK,
-    PROBE_S,
-    ModelStore,
-    Note,
-    Origin,
-    Reason,
-)
+from runtime.service.store import CURRENT, DAMAGED, KEPT_BUNDLES, LOCK, PROBE_S, ModelStore, Note, Origin, Reason
 from tests.clock import HandClock
 from tests.runtime import toy
 from tests.waiting import eventually
