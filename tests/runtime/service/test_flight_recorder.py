@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from contextlib import suppress
 from dataclasses import replace
@@ -18,7 +17,7 @@ from lightpage.errors import InvalidInputError, LimitError
 from lightpage.recording.reader import Recording
 from runtime.commands.evaluate import evaluate
 from runtime.decoding.decoder import Decoder
-from runtime.errors import LostShotError, Reason, UnconfirmedPageError
+from runtime.errors import Reason, UnconfirmedPageError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.file_ring import FileRing
@@ -180,15 +179,3 @@ def test_a_folder_that_cannot_be_made_is_refused(registry: ModelRegistry, tmp_pa
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidInputError, match="folder"):
         FlightRecorder(tmp_path / "file" / "folder", registry)
-
-
-def test_a_lost_shot_has_no_frames_to_keep(registry: ModelRegistry, tmp_path: Path) -> None:
-    class Losing(toy.ToySource):
-        def shot(self, timeout_s: float = 1.0, page: int | None = None) -> object:  # type: ignore[override]
-            raise LostShotError("page", "no frame", "two", Reason.MISSING_FRAME)
-
-    with FlightRecorder(tmp_path, registry) as recorder:
-        plane = DataPlane(registry, Losing(toy.ToyDevice()), observers=[recorder])
-        with pytest.raises(LostShotError):
-            plane.read_page(None, None, Caller())
-    assert os.listdir(tmp_path) == []

@@ -23,7 +23,6 @@ from runtime.decoding.tracking import NoTracker
 from runtime.errors import (
     CallerLeft,
     LostShotError,
-    NoSourceError,
     Reason,
     RequestIdError,
     SlotsTakenError,
@@ -41,24 +40,6 @@ from runtime.service.replays import Replays
 from runtime.wire.status import status_of
 from tests.clock import HandClock
 from tests.runtime import toy
-
-
-def test_requests_of_calls_that_failed_take_of_the_room_too() -> None:
-    replays, tried = Replays(600, 1 << 20), list[str]()
-
-    def ask(number: int) -> None:
-        def fail() -> bytes:
-            tried.append(str(number))
-            raise NoSourceError("source", "none", "one")
-
-        with pytest.raises(NoSourceError):
-            replays.once(f"{number}{'x' * (1 << 17)}", bytes(1 << 17), Caller(), fail)
-
-    for number in range(8):
-        ask(number)
-    ask(0)  # forgotten
-    ask(7)  # not yet
-    assert tried == [*"01234567", "0"]
 
 
 class Losing(NoTracker):
@@ -161,7 +142,7 @@ def test_what_failed_before_a_shot_is_tried_again(failure: LightpageError) -> No
     assert replays.once("a", b"", Caller(), work) == (b"page", False)
 
 
-def test_the_oldest_go_where_lost_pages_fill_the_budget() -> None:
+def test_the_oldest_go_where_the_budget_is_full() -> None:
     replays = Replays(600, 20_000)
 
     def lost() -> bytes:
@@ -169,8 +150,11 @@ def test_the_oldest_go_where_lost_pages_fill_the_budget() -> None:
 
     for number in range(200):
         with pytest.raises(LostShotError):
-            replays.once(str(number), b"", Caller(), lost)
+            replays.once(str(number), bytes(number), Caller(), lost)
     assert 10_000 < replays.held_bytes <= 22_000
+    assert replays.once("0", b"", Caller(), lambda: b"anew") == (b"anew", False)
+    with pytest.raises(LostShotError):
+        replays.once("199", bytes(199), Caller(), bytes)
 
 
 def test_answers_go_when_their_time_is_up() -> None:
