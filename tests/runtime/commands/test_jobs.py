@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
 from lightpage.cli import main as cli_main
-from lightpage.cli.main import LazyGroup
+from lightpage.cli.main import lightpage
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.recalibration.outcome import Refit
@@ -21,18 +20,11 @@ from runtime.service.registry import ModelRegistry
 from tests.runtime import toy
 from tests.runtime.slow_fit import SlowFit
 
-GROUP = LazyGroup(
-    [
-        EntryPoint("jobs", "runtime.commands.jobs:jobs", cli_main.GROUP),
-        EntryPoint("recalibrate", "runtime.commands.recalibrate:recalibrate", cli_main.GROUP),
-    ],
-    name="lightpage",
-)
 Start = Callable[..., LightpageServer]
 
 
 def run(*arguments: str | Path) -> int:
-    return cli_main.run(GROUP, [str(argument) for argument in arguments])
+    return cli_main.run(lightpage, [str(argument) for argument in arguments])
 
 
 @pytest.fixture

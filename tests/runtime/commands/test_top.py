@@ -41,10 +41,8 @@ def a_scrape(at: float, values: Mapping[str, float], started: float = 1.0) -> Sc
 def test_one_text_says_what_the_service_does(decoder: Decoder, capsys: pytest.CaptureFixture[str]) -> None:
     with stage(decoder) as running:
         running.plane.metrics.call_ended("ReadPage", "OK", "", 0.5)
-        thread = Thread(target=running.read, args=(10,))  # two of them are lost
         before = scrape(address(running))
-        thread.start()
-        thread.join()
+        running.read(10)  # two of them are lost
         assert cli_main.run(top, ["--address", address(running), "--interval", "0.1", "--once"]) == 0
         told = capsys.readouterr().out
         for text in ("model toy-1", "not due", "cores", "iB", "inference", "post processing", "0 of 2"):

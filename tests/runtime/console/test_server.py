@@ -161,33 +161,30 @@ def test_pictures_are_thinned_and_show_saturation() -> None:
     assert grid[-1, -1].sum() > grid[0, 0].sum()
 
 
-def test_the_command_finds_a_console_or_says_how_to_start_one(
-    decoder: Decoder, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with stage(decoder) as running:
-        address = running.url.removeprefix("http://")
-        assert cli_main.run(lightpage, ["console", "--address", address, "--no-browser"]) == 0
-        assert capsys.readouterr().out.strip() == f"{running.url}/"
-    assert cli_main.run(lightpage, ["console", "--address", address, "--no-browser"]) == EXIT_ERROR
-    assert address in capsys.readouterr().err
-
-
-def test_the_command_finds_a_console_with_tls(
+def test_the_command_finds_a_console_or_says_what_it_lacks(
     decoder: Decoder, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def found(url: str, *options: str) -> str:
+        """Where the command finds it; what it says where it does not."""
+        command = ["console", "--address", url.partition("://")[2], "--no-browser", *options]
+        status = cli_main.run(lightpage, command)
+        out, err = capsys.readouterr()
+        assert status == (0 if out else EXIT_ERROR)
+        return out.strip() or err
+
+    with stage(decoder) as running:
+        assert found(running.url) == f"{running.url}/"
+    assert running.url.removeprefix("http://") in found(running.url)
     authority = Authority(tmp_path)
     with stage(decoder, authority.service()) as running:
-        command = ["console", "--address", running.url.removeprefix("https://"), "--no-browser"]
         own = vars(authority.caller("watcher", ["read"]))
-        files = [word for name, path in own.items() for word in (f"--{name}", str(path))]
-        assert cli_main.run(lightpage, [*command, *files]) == 0
-        assert capsys.readouterr().out.strip() == f"{running.url}/"
-        assert cli_main.run(lightpage, command) == EXIT_ERROR
-        assert "--certificate" in capsys.readouterr().err
+        assert (
+            found(running.url, *(word for name in own for word in (f"--{name}", str(own[name])))) == f"{running.url}/"
+        )
+        assert "--certificate" in found(running.url)
         for name, path in own.items():
             monkeypatch.setenv(f"LIGHTPAGE_CLIENT_{name.upper()}", str(path))
-        assert cli_main.run(lightpage, command) == 0
-        assert capsys.readouterr().out.strip() == f"{running.url}/"
+        assert found(running.url) == f"{running.url}/"
 
 
 def status_of_host(running: Stage, host: str | None, path: str = "/state.json", method: str = "GET") -> int:
@@ -211,13 +208,11 @@ def test_a_name_that_a_stranger_made_resolve_to_this_machine_reads_nothing(decod
             assert status_of_host(running, f"rebound.example:{port}", path) == 421
         for method in ("HEAD", "POST"):
             assert status_of_host(running, "rebound.example", "/actions", method) == 421
-
-
-def test_names_that_are_configured_are_answered(decoder: Decoder) -> None:
-    with stage(decoder) as running, ConsoleServer(running.console, 0, names=("Device.example",)) as named:
-        running.server = named
-        assert status_of_host(running, "device.example") == 200
-        assert status_of_host(running, "other.example") == 421
+        with ConsoleServer(running.console, 0, names=("Device.example",)) as named:
+            running.server.close()
+            running.server = named
+            assert status_of_host(running, "device.example") == 200
+            assert status_of_host(running, "other.example") == 421
 
 
 def test_metrics_are_shown_on_ipv6(decoder: Decoder) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,12 +49,8 @@ def test_figures_count_data_symbols_alone() -> None:
     # a von Mises density of concentration 400 is a normal one of 0.05 rad, wider than a level of 256
     assert right.air_bits_per_symbol == pytest.approx(np.log2(2 * np.pi / (0.05 * np.sqrt(2 * np.pi))), abs=0.01)
     assert wrong.air_bits_per_symbol < right.air_bits_per_symbol - 1
-
-
-def test_a_page_without_what_was_written_is_no_evidence() -> None:
-    page = RemotePage(**{**remote().__dict__, "written": None})
-    with pytest.raises(InvalidInputError, match="page"):
-        summarise("x", [page])
+    with pytest.raises(InvalidInputError, match="page"):  # without what was written
+        summarise("x", [replace(remote(), written=None)])
 
 
 def test_drift_leaves_what_cannot_drift() -> None:
@@ -63,7 +60,9 @@ def test_drift_leaves_what_cannot_drift() -> None:
     assert (after.sensor, after.slm, after.reference) == (before.sensor, before.slm, before.reference)
 
 
-def test_a_bundle_without_field_or_calibration_cannot_be_refitted(decoder: Decoder) -> None:
+def test_a_bundle_without_code_field_or_calibration_is_no_demo(decoder: Decoder, tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="code: got none"):
+        run_demo(decoder.bundle.path, tmp_path, 0)
     device = toy.ToyDevice()
     symbols = toy.symbols_of(16, 1)[0]
     pair = device.page(symbols, 16)
@@ -71,11 +70,6 @@ def test_a_bundle_without_field_or_calibration_cannot_be_refitted(decoder: Decod
         refit(decoder.bundle, KnownPages((pair,), (symbols,), 16, device.references()), lambda *_: None, decoder)
     with pytest.raises(BundleError, match="bundle"):
         decoder.field_solver(pair, pair, np.zeros((2, 2, 10), np.float32), np.ones(2, np.float32))
-
-
-def test_a_bundle_without_a_code_is_no_demo(toy_zip: Path, tmp_path: Path) -> None:
-    with pytest.raises(BundleError, match="code: got none"):
-        run_demo(toy_zip, tmp_path, 0)
 
 
 def test_a_picture_is_lost_by_drift_and_won_back_with_the_shipped_bundle(

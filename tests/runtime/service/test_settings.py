@@ -143,14 +143,13 @@ def test_all_wrong_settings_are_named_at_once_with_where_they_come_from(tmp_path
 @pytest.mark.parametrize(
     ("variable", "value", "wanted"),
     [
-        (DECODES, "many", "whole"),
-        (DECODES, "0", "at least 1"),
-        ("LIGHTPAGE_LIMITS__CONCURENT_DECODES", "1", "limits.concurrent_decodes"),
-        ("LIGHTPAGE_LIMIT__STALL_S", "1", "[limits]"),
+        ("CONCURRENT_DECODES", "many", "whole"),
+        ("CONCURRENT_DECODES", "0", "at least 1"),
+        ("CONCURENT_DECODES", "1", "limits.concurrent_decodes"),
     ],
 )
 def test_a_wrong_variable_is_named(variable: str, value: str, wanted: str, tmp_path: Path) -> None:
-    error = refused(tmp_path, "", **{variable: value})
+    error = refused(tmp_path, "", **{f"LIGHTPAGE_LIMITS__{variable}": value})
     assert variable in str(error)
     assert wanted in str(error.expected)
 
@@ -235,6 +234,6 @@ def test_what_others_reach_needs_certificates(tmp_path: Path, key: str, table: s
     assert of_file(tmp_path, text, LIGHTPAGE_SERVICE__INSECURE="true").settings.service.insecure
 
 
-@pytest.mark.parametrize("address", ["127.0.0.1:0", "localhost:50051", "[::1]:50051", "127.3.2.1:50051", "unix:/run/a"])
-def test_this_machine_alone_needs_none(tmp_path: Path, address: str) -> None:
-    assert of_file(tmp_path, f"[service]\naddress = '{address}'\n").settings.service.address == address
+def test_this_machine_alone_needs_none(tmp_path: Path) -> None:
+    for address in ("127.0.0.1:0", "localhost:50051", "[::1]:50051", "127.3.2.1:50051", "unix:/run/a"):
+        assert of_file(tmp_path, f"[service]\naddress = '{address}'\n").settings.service.address == address
