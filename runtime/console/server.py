@@ -340,8 +340,8 @@ class _Handler(WSGIRequestHandler):
 
     def setup(self) -> None:
         """See `socketserver.StreamRequestHandler`."""
-        self.timeout = SILENCE_S
         super().setup()
+        self.connection.settimeout(SILENCE_S)
 
     def get_stderr(self) -> Any:
         """Nowhere: a caller that hangs up is no fault, and what the console does not foresee it logs itself."""
