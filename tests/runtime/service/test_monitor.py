@@ -148,17 +148,7 @@ def test_the_state_that_is_shown_last_is_the_newest(monkeypatch: pytest.MonkeyPa
 
 
 def observation(page: DecodedPage | None, **changes: object) -> Observation:
-    return Observation(
-        **{
-            "subject": "p",
-            "page_index": 1,
-            "model_version": "m",
-            "time_s": 0.0,
-            "seconds": 0.1,
-            "page": page,
-            **changes,
-        }
-    )  # type: ignore[arg-type]
+    return replace(Observation("p", 1, "m", 0.0, 0.1, page=page), **changes)  # type: ignore[arg-type]
 
 
 def found(loss: Loss | None, margin: float) -> PageBytes:
