@@ -44,9 +44,10 @@ def test_settings_come_from_the_file_the_environment_and_options(tmp_path: Path)
     assert (settings.service.threads, settings.service.tracking) == (2, False)
     assert (settings.metrics.port, settings.limits.stall_s) == (9100, 2.0)
     assert settings.self_calibration.pages == (3, 4)
-    assert "port = 9100  # option --metrics-port" in result.output
-    assert 'store = "models"  # environment LIGHTPAGE_STORE' in result.output
-    assert f"stall_s = 2.0  # file {file}" in result.output
+    lines = result.output.splitlines()
+    assert "port = 9100  # option --metrics-port" in lines
+    assert 'store = "models"  # environment LIGHTPAGE_STORE' in lines
+    assert f"stall_s = 2.0  # file {file}" in lines
 
 
 @pytest.mark.parametrize(

@@ -95,5 +95,5 @@ def test_the_folder_is_looked_at_while_the_service_runs(
     with Incoming(plane, folder, 5.0, clock):
         clock.until_somebody_waits()
         assert versions(plane) == ["toy-1"]
-        eventually(lambda: clock.advance(5.0) or "in the store as toy-2" in caplog.text)
+        eventually(lambda: clock.advance(5.0) or "as toy-2" in caplog.text)
     assert versions(plane) == ["toy-2", "toy-1"]
