@@ -104,6 +104,8 @@ def test_quantiles_are_those_of_what_came_between() -> None:
     assert change.quantile(0.5, "t") == pytest.approx(0.1 + 0.9 * 2 / 4)
     assert change.quantile(0.99, "t") == 1.0  # what lies beyond the last bound is not known
     assert math.isnan(Change(change.now, change.now).quantile(0.5, "t"))
+    new = Scrape(2.0, {("lost", frozenset({("reason", "dark")})): 3.0})
+    assert Change(Scrape(0.0, {}), new).rises("lost", "reason") == {"dark": 3.0}
 
 
 def test_a_restart_ends_what_was_counted_before() -> None:

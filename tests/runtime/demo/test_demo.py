@@ -72,6 +72,7 @@ def test_a_bundle_without_code_field_or_calibration_is_no_demo(decoder: Decoder,
         decoder.field_solver(pair, pair, np.zeros((2, 2, 10), np.float32), np.ones(2, np.float32))
 
 
+@pytest.mark.timeout(1800)  # its recalibration takes only what time others leave
 def test_a_picture_is_lost_by_drift_and_won_back_with_the_shipped_bundle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

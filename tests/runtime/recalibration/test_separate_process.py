@@ -203,6 +203,9 @@ def test_all_that_is_known_of_the_pages_comes_over(decoder: Decoder, tmp_path: P
         assert np.array_equal(one.quadrature, other.quadrature)
         assert one.quadrature.dtype == other.quadrature.dtype
     assert np.array_equal(found.symbols, pages.symbols)
+    (plain := WorkFolder(tmp_path / "plain")).path.mkdir()
+    plain.write_task(decoder.bundle, replace(known(), references=None), job)
+    assert (plain.read_task()[1].references, plain.read_task()[1].pilot_mask) == (None, None)
 
 
 def test_errors_keep_their_class_and_words(tmp_path: Path) -> None:
