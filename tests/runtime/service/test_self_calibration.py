@@ -115,9 +115,8 @@ def make(decoder: Decoder) -> Iterator[Make]:
         loop.recalibrator.close()
 
 
-def test_a_drifted_device_is_recalibrated_and_read_again(make: Make, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_drifted_device_is_recalibrated_and_read_again(loop: Loop, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    loop = make()
     assert loop.look() == "toy-1"
     with loop.running:
         loop.drift()  # wakes it
@@ -131,10 +130,9 @@ def test_a_drifted_device_is_recalibrated_and_read_again(make: Make, caplog: pyt
 
 
 def test_a_thread_looks_again_when_the_time_of_the_next_try_has_come(
-    make: Make, caplog: pytest.LogCaptureFixture
+    loop: Loop, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    loop = make()
     loop.plane.models.pin("toy-1", True)
     loop.complain()
     with loop.running:
@@ -148,6 +146,11 @@ def test_a_thread_looks_again_when_the_time_of_the_next_try_has_come(
         eventually(lambda: loop.version == "toy-1+r1")
 
 
+@pytest.fixture
+def loop(make: Make) -> Loop:
+    return make()
+
+
 def test_without_pages_of_its_own_the_next_two_serve(make: Make) -> None:
     loop = make(settings=SelfCalibrationSettings())
     loop.drift()
@@ -155,9 +158,8 @@ def test_without_pages_of_its_own_the_next_two_serve(make: Make) -> None:
     assert loop.source.shown == list(range(18))
 
 
-def test_a_pinned_model_stays_in_service_until_it_is_let_go_of(make: Make, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_pinned_model_stays_in_service_until_it_is_let_go_of(loop: Loop, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    loop = make()
     loop.plane.models.pin("toy-1", True)
     loop.drift()
     assert {loop.look(BUSY_S) for _ in range(3)} == {"toy-1"}
@@ -184,8 +186,7 @@ def test_after_a_refusal_it_waits_twice_as_long_each_time_and_nothing_changes(ma
     assert loop.plane.registry.models == (loop.plane.registry.current,)
 
 
-def test_a_success_is_followed_by_the_least_interval(make: Make) -> None:
-    loop = make()
+def test_a_success_is_followed_by_the_least_interval(loop: Loop) -> None:
     loop.drift()
     assert loop.look() == "toy-1+r1"
     loop.source.device.offsets = toy.OFFSETS
@@ -195,9 +196,8 @@ def test_a_success_is_followed_by_the_least_interval(make: Make) -> None:
     assert loop.look(0.1) == "toy-1+r2"
 
 
-def test_one_that_brings_nothing_doubles_the_interval(make: Make) -> None:
+def test_one_that_brings_nothing_doubles_the_interval(loop: Loop) -> None:
     """Else a device that stays as it is would be recalibrated each minute, for ever."""
-    loop = make()
     loop.complain()
     assert loop.look() == "toy-1+r1"
     loop.complain()
@@ -205,9 +205,8 @@ def test_one_that_brings_nothing_doubles_the_interval(make: Make) -> None:
     assert loop.look(0.1) == "toy-1+r2"
 
 
-def test_a_device_that_had_changed_before_the_start_is_recalibrated(make: Make) -> None:
+def test_a_device_that_had_changed_before_the_start_is_recalibrated(loop: Loop) -> None:
     """Its first pages are its baseline, so no sign that is measured from there can tell."""
-    loop = make()
     loop.monitor.begin(loop.version)
     for _ in range(7):
         loop.monitor.follow(loop.version, {"unread": 0.0, "share": 0.5, "page_due": 1.0})
@@ -217,9 +216,8 @@ def test_a_device_that_had_changed_before_the_start_is_recalibrated(make: Make) 
 
 
 def test_a_source_without_known_symbols_fails_quietly_and_reads_go_on(
-    make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    loop: Loop, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    loop = make()
     shot = loop.source.shot
 
     def unknown(timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
@@ -266,11 +264,10 @@ def test_reads_go_on_while_it_recalibrates_and_it_stops_in_the_middle(make: Make
     assert not [each for each in threading.enumerate() if each.name == "lightpage-self-calibration"]
 
 
-def test_pages_that_cannot_serve_are_refused_at_the_start(make: Make) -> None:
+def test_pages_that_cannot_serve_are_refused_at_the_start(loop: Loop) -> None:
     for pages in ((1,), (1, 1)):
         with pytest.raises(InvalidInputError, match="calibration pages"):
             SelfCalibrationSettings(pages)
-    loop = make()
     with pytest.raises(LimitError, match="calibration pages"):
         loop.another(SelfCalibrationSettings(tuple(range(17))))
     loop.source.page_count = lambda: 102  # type: ignore[method-assign]

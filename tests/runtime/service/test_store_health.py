@@ -62,25 +62,6 @@ def test_a_look_that_hangs_is_waited_for_by_nobody_and_shared_by_all(disk: Disk)
     assert disk.looks == 2
 
 
-def test_a_wait_ends_when_its_time_is_up(disk: Disk) -> None:
-    class Passing(HandClock):
-        """Time passes by itself while somebody waits."""
-
-        def wait(self, event: threading.Event, seconds: float) -> bool:
-            self.advance(seconds)
-            return event.is_set()
-
-    clock = Passing()
-    disk.answers.clear()
-    health = StoreHealth(disk, clock=clock)
-    start = clock.now()
-    assert health.is_well(WAIT_S)
-    assert clock.now() == start + WAIT_S
-    assert health.is_well(WAIT_S)
-    assert not health.is_well(WAIT_S)
-    disk.answers.set()
-
-
 def test_a_look_that_breaks_is_followed_by_another(disk: Disk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threading, "excepthook", lambda told: None)
     troubles = iter([1, 0, 1])
