@@ -96,6 +96,16 @@ def test_hysteresis_it_is_taken_back_only_well_within_the_threshold() -> None:
     assert monitor.state().reasons == ()
 
 
+def test_where_pages_differ_much_a_sign_is_raised_further_off() -> None:
+    monitor, (sign,) = Monitor(), [sign for sign in MonitorSettings().signs if sign.name == "margin_bits"]
+    followed(monitor, [0.1, 0.5] * 10)
+    (found,) = [found for found in monitor.state().signs if found.name == "margin_bits"]
+    noise = 1.25 * 1.4826 * 0.4 / math.sqrt(2 * sign.window)
+    assert found.baseline == 0.5
+    assert found.raise_at == pytest.approx(0.5 - sign.deviations * noise)
+    assert found.clear_at == pytest.approx(0.5 - sign.deviations * noise * sign.clear_by / sign.raise_by)
+
+
 def test_a_new_model_starts_anew_and_pages_of_the_old_one_say_nothing() -> None:
     monitor = Monitor()
     followed(monitor, [*quiet(25), *([-0.5] * 10)])
