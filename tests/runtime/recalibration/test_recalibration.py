@@ -28,7 +28,7 @@ from runtime.errors import UnconfirmedPageError
 from runtime.recalibration.judgement import JudgedPage, judge
 from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import Refit, RefitReport, RefitResult
-from runtime.recalibration.recalibration import next_version, recalibrate
+from runtime.recalibration.recalibration import next_version, reading_share, recalibrate
 from tests.runtime import toy
 from tests.runtime.recalibration.known import known, quiet, shuffled
 
@@ -168,6 +168,8 @@ def test_progress_is_in_proportion_to_the_work_however_many_pages_are_judged_by(
     assert shares("fit") == pytest.approx([judged, judged + 20])
     assert shares("judge by the held-back pages") == pytest.approx(range(judged + 20, 2 * judged + 20))
     assert shares("write the new bundle") == pytest.approx([2 * judged + 20])
+    assert reading_share(count) == count / (count + whole)
+    assert reading_share(0) == 0
 
 
 GOOD = known()

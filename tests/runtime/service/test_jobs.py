@@ -45,6 +45,8 @@ def test_one_runs_at_a_time_and_the_second_hears_which(folder: bool, tmp_path: P
     with pytest.raises(BusyError, match=running.id) as caught:
         jobs.begin("frames", Caller())
     assert caught.value.job == running.id
+    with pytest.raises(BusyError):
+        jobs.check_free()
     assert not jobs.wait_idle(0)
     jobs.tell("fit", 0.5)
     job = jobs.job(running.id)
@@ -54,6 +56,7 @@ def test_one_runs_at_a_time_and_the_second_hears_which(folder: bool, tmp_path: P
     ended = jobs.job(running.id)
     assert (job.created_s, job.ended_s, ended.created_s, ended.ended_s) == (1000.0, 0.0, 1000.0, 1005.0)
     assert jobs.wait_idle(0)
+    jobs.check_free()
     assert jobs.begin("frames", Caller()).id != running.id
 
 
@@ -179,8 +182,9 @@ def test_a_full_disk_costs_the_record_and_not_the_job(tmp_path: Path, caplog: py
 def test_what_nobody_foresaw_is_logged_with_its_traceback(caplog: pytest.LogCaptureFixture) -> None:
     jobs, caught = Jobs(), ZeroDivisionError("a bug")
     with caplog.at_level(logging.INFO):
+        ended(jobs, FrameError("frame", "black", "light"))
         ended(jobs, caught)
-    assert caplog.records[-1].exc_info
+    assert [(each.levelname, bool(each.exc_info)) for each in caplog.records] == [("INFO", False), ("ERROR", True)]
     assert "a bug" not in jobs.all()[0].refusal.detail.got  # its text may hold anything
 
 
