@@ -1,0 +1,23 @@
+"""What an error names, without the sentence that it makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+
+import pytest
+
+from lightpage.errors import InvalidInputError, LightpageError
+
+
+@contextmanager
+def refused(
+    subject: str = "",
+    got: object = "",
+    kind: type[LightpageError] | tuple[type[LightpageError], ...] = InvalidInputError,
+) -> Generator[None]:
+    """Inside, an error of a class is raised, with `subject` and `got` in what it says of either."""
+    with pytest.raises(kind) as caught:
+        yield
+    assert subject in caught.value.subject
+    assert str(got) in caught.value.got
