@@ -237,7 +237,9 @@ class ForeignDevice:
     @cached_property
     def facet_coordinates(self) -> tuple[FloatArray, FloatArray]:
         """(y', x) of the facet's samples, mm; the first sample of each lies on a wall."""
-        return tuple(np.arange(n) * d - self.pipe_width / 2 for n, d in zip(self.design.facet, self.pitches, strict=True))  # type: ignore[return-value]
+        return tuple(
+            np.arange(n) * d - self.pipe_width / 2 for n, d in zip(self.design.facet, self.pitches, strict=True)
+        )  # type: ignore[return-value]
 
     # --- light --------------------------------------------------------------------------------------------------------
 
@@ -262,14 +264,18 @@ class ForeignDevice:
         turned = rotated(padded, -roll)
         right, down = self.parameters.page_centre_px
         centre_x, centre_y = rotate(right * SLM_PITCH, down * SLM_PITCH, -roll)
-        y0, x0 = (float(c) - (n - 1) / 2 * SLM_PITCH for c, n in zip((centre_y, centre_x), self.design.padded_px, strict=True))
+        y0, x0 = (
+            float(c) - (n - 1) / 2 * SLM_PITCH for c, n in zip((centre_y, centre_x), self.design.padded_px, strict=True)
+        )
         facet_y, facet_x = self.facet_coordinates
         dy, dx = self.pitches
         tangent, cosine = np.tan(self.angle), np.cos(self.angle)
         field = fourier_sum(turned, (x0, SLM_PITCH), (facet_x[0], dx, self.design.facet[1]), -WAVENUMBER / f, axis=1)
         page_y = y0 + np.arange(self.design.padded_px[0]) * SLM_PITCH
         field *= np.exp(1j * WAVENUMBER / f * tangent * np.outer(page_y, facet_x))
-        field = fourier_sum(field, (y0, SLM_PITCH), (facet_y[0], dy, self.design.facet[0]), -WAVENUMBER / (f * cosine), axis=0)
+        field = fourier_sum(
+            field, (y0, SLM_PITCH), (facet_y[0], dy, self.design.facet[0]), -WAVENUMBER / (f * cosine), axis=0
+        )
         y = (facet_y[:, None] - facet_x[None, :] * np.sin(self.angle)) / cosine
         x = np.broadcast_to(facet_x, y.shape)
         # Cycles a pixel along the SLM's own axes: they set what a square pixel and the blur let through.
@@ -284,7 +290,9 @@ class ForeignDevice:
     def delaunch(self, facet: ComplexArray) -> Image:
         """From the exit facet to the camera plane, in the pipe's axes."""
         f, (facet_y, facet_x), (dy, dx) = self.focal_length, self.facet_coordinates, self.pitches
-        counts = [int(np.ceil((n * CAMERA_PITCH / 2 + IMAGE_MARGIN) / IMAGE_PITCH)) * 2 + 1 for n in self.design.frame_shape]
+        counts = [
+            int(np.ceil((n * CAMERA_PITCH / 2 + IMAGE_MARGIN) / IMAGE_PITCH)) * 2 + 1 for n in self.design.frame_shape
+        ]
         y0, x0 = (-(n - 1) / 2 * IMAGE_PITCH for n in counts)
         tangent, cosine = np.tan(self.angle), np.cos(self.angle)
         to_y = (y0, IMAGE_PITCH, counts[0])
@@ -437,7 +445,9 @@ class ForeignDevice:
             dtype = np.uint8 if self.parameters.bit_depth == 8 else np.uint16
             for name, intensity in zip(names, self.intensities(None), strict=True):
                 file[f"reference_{name}"] = self.expose(intensity, rng, REFERENCE_EXPOSURES)
-                file.create_dataset(name, (pages, *self.design.frame_shape), dtype, chunks=(1, *self.design.frame_shape))
+                file.create_dataset(
+                    name, (pages, *self.design.frame_shape), dtype, chunks=(1, *self.design.frame_shape)
+                )
             for page in range(pages):
                 image = self.image(symbols[page], levels, rng)
                 for name, intensity in zip(names, self.intensities(image, drifts[page]), strict=True):

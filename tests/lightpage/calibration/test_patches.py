@@ -148,27 +148,6 @@ class TestFinding:
         assert found.carrier == pytest.approx(per_px, abs=0.01)
         assert look(picture).carrier == pytest.approx([0, 0], abs=0.005)
 
-    def test_a_real_signal_is_enough_for_the_place(self) -> None:
-        picture = Picture(PROFILE, SYMBOLS, (6 * PIXEL, 3 * PIXEL))
-        found = look(lambda places: picture(places).real)
-        assert (found.pixels - found.read_at)[0] == pytest.approx([6, 3], abs=0.5)
-
-    def test_labels_are_handed_on(self) -> None:
-        window, twin = search_window(0, 1), FlatTwin(PROFILE)
-        found = measure(
-            Picture(PROFILE, SYMBOLS),
-            twin,
-            nominal(),
-            PROFILE,
-            MIDDLE,
-            SYMBOLS,
-            ("y", "direct"),
-            window,
-            samples=4,
-            cameras=(1,),
-        )
-        assert [(m.branch, m.cameras) for m in found] == [("y", (1,)), ("direct", (1,))]
-
 
 class TestSignificance:
     def test_right_symbols_reach_their_number(self) -> None:

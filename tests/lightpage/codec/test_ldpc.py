@@ -7,7 +7,7 @@ import pytest
 import torch
 from ldpc import BpDecoder
 from scipy.sparse import csr_matrix
-from sionna.phy.fec.ldpc import LDPC5GDecoder, LDPC5GEncoder
+from sionna.phy.fec.ldpc import LDPC5GEncoder
 
 from lightpage.codec.ldpc.code import LdpcCode
 from lightpage.codec.ldpc.decoder import MOST_ITERATIONS, MOST_LLR, decode
@@ -121,14 +121,6 @@ def by_ldpc_package(code: LdpcCode, llrs: np.ndarray) -> tuple[np.ndarray, np.nd
     return words, converged
 
 
-def by_sionna(code: LdpcCode, llrs: np.ndarray) -> np.ndarray:
-    """Information bits by Sionna's sum-product algorithm."""
-    encoder = LDPC5GEncoder(code.information_bits, code.sent_bits, bg="bg1")
-    decoder = LDPC5GDecoder(encoder, num_iter=50, hard_out=True)
-    # its ratios are ln P(1) / P(0)
-    return decoder(torch.tensor(-llrs, dtype=torch.float32)).numpy().astype(np.uint8)
-
-
 class TestNearTheLimit:
     """Light in which some of the blocks fail."""
 
@@ -153,19 +145,6 @@ class TestNearTheLimit:
         # the same noise in light that is weaker by what this algorithm may cost
         _, weaker = noisy(code, self.BLOCKS, decibel - self.LOSS_DB, 1)
         assert wrong <= failures(by_ldpc_package(code, weaker)[0][:, :information], bits)
-
-    def test_it_agrees_with_sionna(self) -> None:
-        information, sent, decibel = self.CASES[1]
-        code = LdpcCode(information, sent)
-        bits, llrs = noisy(code, self.BLOCKS, decibel, 2)
-        ours, theirs = decode(code, llrs, iterations=100), by_sionna(code, llrs)
-        right = (theirs == bits).all(axis=1)
-        assert np.count_nonzero(right & ours.converged) > 20
-        assert np.array_equal(ours.information[right & ours.converged], theirs[right & ours.converged])
-        wrong = failures(ours.information, bits)
-        assert wrong > 0
-        _, weaker = noisy(code, self.BLOCKS, decibel - self.LOSS_DB, 2)
-        assert wrong <= failures(by_sionna(code, weaker), bits)
 
     @pytest.mark.parametrize(("information", "sent", "decibel"), CASES[:2])
     def test_the_bound_on_iterations_costs_little(self, information: int, sent: int, decibel: float) -> None:
@@ -231,12 +210,7 @@ class TestDecoder:
         encoded = self.CODE.encode(found.information)
         assert np.array_equal((encoded == found.sent).all(axis=1), found.converged)
         assert 0 < np.count_nonzero(found.converged) < 60
-
-    def test_the_number_of_iterations_is_bounded(self) -> None:
-        _, llrs = noisy(self.CODE, 20, 0.6, 8)
-        found = decode(self.CODE, llrs, iterations=3)
-        assert found.iterations.max() == 3
-        assert not found.converged.all()
+        assert decode(self.CODE, llrs, iterations=3).iterations.max() == 3
 
     def test_no_blocks_give_none(self) -> None:
         found = decode(self.CODE, np.zeros((0, 204)))

@@ -160,11 +160,6 @@ class TestCorrections:
         found = codec.decode(phase, kappa)
         assert (found.data, found.loss, found.failed_blocks) == (None, Loss.CHECKSUM, 0)
 
-    def test_corrections_cost_their_parity(self) -> None:
-        sizes = [codec_of(64, 2, 700, corrections).user_bytes for corrections in (1, 2, 6)]
-        assert sizes[0] - sizes[1] == 3  # two symbols of 12 bits each
-        assert sizes[1] - sizes[2] == 12
-
 
 def any_light(codec: PageCodec, symbols: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Phases and concentrations of a page in light about the code's limit and below, claims right or wrong."""
@@ -283,12 +278,6 @@ class TestHeader:
         assert found.header is not None
         assert (found.header.code_id, found.data, found.loss) == (other, None, Loss.CODE)
         assert found.margin_bits < 0  # its bits are not made for this code, whose need is all of them
-
-    def test_a_page_of_another_rate_is_known_as_such(self) -> None:
-        other, rng = codec_of(64, 2, 705, 2), np.random.default_rng(1)
-        _, symbols = written(other, header_of(other), rng)
-        found = self.CODEC.decode(*noisy(symbols, 64, np.inf, rng), header_of(self.CODEC))
-        assert (found.data, found.loss) == (None, Loss.CODE)
 
     def test_the_body_is_lost_and_the_header_tells_which(self) -> None:
         _, phase, kappa = self.page(damaged=False)

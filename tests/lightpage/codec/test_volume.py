@@ -139,16 +139,6 @@ def collect(path: Path, pages: Iterator[PageBytes] | list[PageBytes]) -> tuple[b
 
 
 class TestEncoding:
-    def test_pages_hold_the_file_and_its_parity(self, written: Written) -> None:
-        for number, kind, place in listing(written.volume):
-            page = written.pages[number]
-            assert page.header is not None
-            assert (page.header.volume, page.header.volume_bytes) == (0xCAFE, len(written.file))
-            assert page.header.code_id == CODEC.code.id
-            assert page.file == written.volume.facts
-            if kind == "data":
-                assert page.data == written.file[place * SIZE :][:SIZE].ljust(SIZE, b"\0")
-
     def test_each_group_is_restored_from_any_of_its_pages(self, written: Written) -> None:
         volume, rng = written.volume, np.random.default_rng(2)
         for group in range(volume.groups):

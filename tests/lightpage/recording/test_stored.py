@@ -430,27 +430,15 @@ class TestChunksAndFilters:
 
 
 class TestChunkMemory:
-    def shared(self, path: Path, rows: int = 14) -> None:
+    def shared(self, path: Path) -> None:
         for name in ("in_phase", "quadrature", "symbols"):
             replace(
                 path,
                 name,
                 lambda file, data, name=name: file.create_dataset(
-                    name, data=data, chunks=(PAGES, min(rows, data.shape[1]), data.shape[2]), compression="gzip"
+                    name, data=data, chunks=(PAGES, data.shape[1], data.shape[2]), compression="gzip"
                 ),
             )
-
-    @pytest.mark.parametrize("rows", [14, 4])
-    def test_chunks_that_pages_share_are_kept(self, foreign: Path, rows: int) -> None:
-        self.shared(foreign, rows)
-        with Recording.open(foreign) as recording:
-            for name in ("in_phase", "quadrature", "symbols"):
-                dataset = recording._file.array(name).dataset
-                slots, size, _ = dataset.id.get_access_plist().get_chunk_cache()
-                across = -(-dataset.shape[1] // dataset.chunks[1])
-                assert size >= across * np.prod(dataset.chunks) * dataset.dtype.itemsize
-                assert slots > across
-            recording.frames(1)
 
     def test_chunks_beyond_the_memory_are_told_of(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.shared(foreign)

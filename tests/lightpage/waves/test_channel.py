@@ -10,7 +10,6 @@ import pytest
 from scipy import fft, integrate, linalg, ndimage
 
 from lightpage.device.lens_path import SeidelTerms
-from lightpage.waves import pipe
 from lightpage.waves.channel import WaveChannel
 from lightpage.waves.geometry import WaveGeometry, cells_for, modes_for, sine_matrix
 from lightpage.waves.lens import FourierLens
@@ -132,23 +131,6 @@ class TestPipe:
         expected = fft.dstn((half * (step @ (half * modes))).reshape(field.shape), type=1, norm="ortho")
         assert off(step, np.eye(len(step))) > 0.1
         assert off(PipePropagator(geometry, cells, 1).forward(field), expected) < 1e-5
-
-    @pytest.mark.parametrize("angle_deg", [-0.6, -3.0])
-    def test_without_kicks_between_modes_that_fall_apart_a_field_errs_several_times_less(
-        self, angle_deg: float, page_at_entrance: np.ndarray, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        geometry = device(angle_deg, length_m=8 * DEVICE.pipe_length_m)
-
-        def field(steps: int) -> np.ndarray:
-            return PipePropagator(geometry, CELLS, steps).forward(page_at_entrance)
-
-        exact, without = field(512), field(16)
-        pipe._parity_basis.cache_clear()
-        monkeypatch.setattr(pipe, "UNCOUPLED", (1e9, 1e8))
-        kicked = field(16)
-        pipe._parity_basis.cache_clear()
-        assert off(without, exact) < off(kicked, exact) / 7
-        assert off(kicked, exact) < 0.15
 
     def test_modes_that_the_glass_cannot_carry_are_refused(self) -> None:
         with pytest.raises(ValueError, match="wanted"):
