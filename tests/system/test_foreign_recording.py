@@ -20,8 +20,8 @@ from tests.lightpage.small import small_profile
 
 JUMPS = {0: (-6.0, 8.0), 2: (9.0, -5.0)}
 """Camera pixels: while nobody read, and between two pages."""
-KEPT_SHARE = 0.95
-"""Of the AIR of other pages, read in order: 98%, but for how pages differ and for what leaves the cameras."""
+KEPT_SHARE = 0.88
+"""Of the AIR of other pages, read in order: 98% at full size, 93% at half, but for what leaves the cameras."""
 SEED = "LIGHTPAGE_FOREIGN_SEED"
 """Environment variable with the seed of the device; without it, the long test draws another one each time."""
 
@@ -55,6 +55,7 @@ def half_profile() -> Profile:
             BENCH, load_profile("bench"), 16, "--preset accurate --steps 300", 48, 1500, marks=pytest.mark.long
         ),
     ],
+    ids=["half", "whole"],
 )
 def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decoded(
     tmp_path: Path, design: Design, profile: Profile, pages: int, choices: str, synthetic: int, file_bytes: int

@@ -330,17 +330,17 @@ class TestMargin:
             lost = np.mean([page.data is None for page in found])
             assert margin < before
             before = margin
-            if margin > 0.08:
+            if margin > 0.12:
                 assert lost == 0
-            elif margin < -0.08:
+            elif margin < -0.12:
                 assert lost == 1
             if 0 < lost < 1:
                 beginning.append(margin)
             for page in found:
                 # a page's information deviates by 0.01 of each of two bits from that of the mean
-                assert page.margin_bits > -0.08 if page.data is not None else page.margin_bits < 0.08
+                assert page.margin_bits > -0.12 if page.data is not None else page.margin_bits < 0.12
         assert beginning
-        assert np.abs(beginning).max() < 0.08
+        assert np.abs(beginning).max() < 0.12
 
     def test_it_is_all_that_the_code_does_not_need_on_a_perfect_page(self) -> None:
         codec, rng = codec_of(64, 2, 700, 2, needed=0.75), np.random.default_rng(4)
