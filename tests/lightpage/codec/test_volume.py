@@ -55,14 +55,8 @@ class TestNumbers:
         assert [volume.following(number) for number in numbers] == [*numbers[1:], None]
 
     def test_it_says_what_a_file_of_pages_keeps(self) -> None:
-        assert Volume(7, 99, 10, 5, 3).to_json() == {
-            "volume": 7,
-            "file_bytes": 99,
-            "page_bytes": 10,
-            "data_pages": 5,
-            "parity_pages": 3,
-            "checksum": 0,
-        }
+        names = "volume", "file_bytes", "page_bytes", "data_pages", "parity_pages", "checksum"
+        assert Volume(7, 99, 10, 5, 3).to_json() == dict(zip(names, (7, 99, 10, 5, 3, 0), strict=True))
 
     @pytest.mark.parametrize(
         ("change", "subject", "got"),

@@ -45,16 +45,6 @@ def test_bench_is_the_paper_device_at_a_quarter_of_its_size() -> None:
     assert (bench.page.rows, bench.page.columns, paper.page.rows, paper.page.columns) == (56, 87, 225, 350)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-def test_the_image_of_the_page_fits_on_the_camera(name: str) -> None:
-    profile = load_profile(name)
-    assert profile.page_width_m < profile.camera.columns_px * profile.camera.pitch_m
-    assert profile.page_height_m < profile.camera.rows_px * profile.camera.pitch_m
-    assert profile.page_width_m == pytest.approx(profile.page.columns * profile.symbol_pitch_m)
-    assert profile.page_shape == (profile.page.rows, profile.page.columns)
-    assert profile.frame_shape == (profile.camera.rows_px, profile.camera.columns_px)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "key"),
     [

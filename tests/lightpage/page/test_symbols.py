@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lightpage.device.profile import Profile, load_profile
+from lightpage.device.profile import load_profile
 from lightpage.errors import PageError
 from lightpage.page.symbols import (
     check_levels,
@@ -16,39 +16,6 @@ from lightpage.page.symbols import (
     symbol_phases,
 )
 from tests.lightpage.refused import refused
-
-
-def profile_with(**page: object) -> Profile:
-    bench = load_profile("bench")
-    return bench.model_copy(update={"page": bench.page.model_copy(update=page)})
-
-
-@pytest.mark.parametrize("name", ["bench", "paper"])
-def test_pilots_take_about_their_share_of_the_page(name: str) -> None:
-    profile = load_profile(name)
-    mask = pilot_mask(profile)
-    assert mask.shape == profile.page_shape
-    assert mask.dtype == np.bool_
-    assert mask.mean() == pytest.approx(profile.page.pilot_fraction, rel=0.15)
-
-
-def test_every_region_of_the_page_has_its_pilots() -> None:
-    mask = pilot_mask(load_profile("bench"))
-    blocks = mask.reshape(2, 28, 3, 29).sum(axis=(1, 3))
-    assert blocks.min() >= 0.6 * mask.sum() / blocks.size
-
-
-@pytest.mark.parametrize(("rows", "columns"), [(3, 3), (2, 2), (1, 40), (40, 1), (7, 5)])
-def test_a_small_page_still_has_four_pilots(rows: int, columns: int) -> None:
-    assert pilot_mask(profile_with(rows=rows, columns=columns)).sum() >= 4
-
-
-def test_pilots_repeat_with_the_seed_and_change_with_it() -> None:
-    first, again, other = profile_with(), profile_with(), profile_with(pilot_seed=1)
-    assert np.array_equal(pilot_mask(first), pilot_mask(again))
-    assert np.array_equal(pilot_symbols(first, 16), pilot_symbols(again, 16))
-    assert not np.array_equal(pilot_mask(first), pilot_mask(other))
-    assert not np.array_equal(pilot_symbols(first, 16), pilot_symbols(other, 16))
 
 
 def test_one_pilot_pattern_serves_every_level_count() -> None:

@@ -110,12 +110,6 @@ class TestWriting:
         with Pages.open(path) as pages:
             assert np.array_equal(list(pages), SYMBOLS)
 
-    def test_a_name_that_cannot_be_taken_is_refused(self, tmp_path: Path) -> None:
-        (tmp_path / "p.h5").mkdir()
-        with refused("p.h5", kind=RecordingError):
-            write(tmp_path / "p.h5")
-        assert [entry.name for entry in tmp_path.iterdir()] == ["p.h5"]
-
 
 class TestFullDisk:
     """Wherever the disk becomes full, and without leaving the HDF5 library unable to go on."""
@@ -135,12 +129,6 @@ class TestFullDisk:
             write(path, self.MANY)
         assert [entry.name for entry in tmp_path.iterdir()] == ["p.h5"]
         assert path.read_bytes() == before
-
-    def test_room_for_all_is_enough(self, tmp_path: Path) -> None:
-        with full_disk(1_000_000):
-            write(tmp_path / "p.h5", self.MANY)
-        with Pages.open(tmp_path / "p.h5") as pages:
-            assert len(pages) == 2000
 
 
 def set_attribute(name: str, value: object) -> Callable[[h5py.File], None]:
