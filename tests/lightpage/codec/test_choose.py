@@ -38,17 +38,17 @@ def choose_by(pages: int, kappa: float, lost_share: float, air_bits: float) -> t
 
 @pytest.mark.parametrize(("lost_share", "some_in_cosets"), [(0.0, True), (0.02, False)])
 def test_pages_are_read_with_the_code_that_was_chosen_by_their_like(lost_share: float, some_in_cosets: bool) -> None:
-    chosen, tried = choose_by(4, KAPPA, lost_share, 4.2)
+    chosen, tried = choose_by(3, KAPPA, lost_share, 4.2)
     assert (chosen.code.coded_bits < chosen.code.level_bits) == some_in_cosets
     assert chosen.user_bytes == max(each.user_bytes for each in tried)
     codec, rng = PageCodec(chosen.code, PILOTS), np.random.default_rng(8)
-    for page in range(5):
+    for page in range(3):
         data, symbols = written(codec, header_of(codec, page=page), rng)
         assert codec.decode(*light(symbols, chosen.code.levels, KAPPA, lost_share, rng)).data == data
 
 
 def test_fewer_levels_are_tried_where_none_near_the_rate_carries() -> None:
-    chosen, tried = choose_by(4, 50.0, 0.0, 7.5)  # a rate that no such page has
+    chosen, tried = choose_by(3, 50.0, 0.0, 7.5)  # a rate that no such page has
     assert chosen.code.levels < 64
     assert len(tried) == 1
 

@@ -428,6 +428,20 @@ class TestChunkMemory:
                 ),
             )
 
+    def test_chunks_that_pages_share_are_kept(self, foreign: Path) -> None:
+        self.shared(foreign)
+        with h5py.File(foreign, "r+") as file:
+            data = file["in_phase"][()]
+            del file["in_phase"]
+            file.create_dataset("in_phase", data=data, chunks=(PAGES, 4, 20), compression="gzip")
+            for name in ("in_phase", "quadrature", "symbols"):
+                array = stored.ArrayFile(file, "recording").array(name)
+                assert array is not None
+                chunks, across = array.dataset.chunks, -(-array.shape[1] // array.dataset.chunks[1])
+                slots, size, _ = array.dataset.id.get_access_plist().get_chunk_cache()
+                assert size >= across * np.prod(chunks) * array.dtype.itemsize
+                assert slots > across
+
     def test_chunks_beyond_the_memory_are_told_of(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.shared(foreign)
         monkeypatch.setattr(stored, "CACHE_BYTES", 1000)
