@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lightpage.calibration import patch_fit as module
 from lightpage.calibration.interfaces import BRANCHES
 from lightpage.calibration.parameters import NAMES, PRIORS, indices, nominal
-from lightpage.calibration.patch_fit import fit_parameters
+from lightpage.calibration.patch_fit import Design, fit_parameters
 from lightpage.calibration.patches import Measurement, patches
 from tests.lightpage.small import small_profile
 from train.models.twin import RayTwin, TorchTwin
@@ -85,7 +84,7 @@ class TestJacobian:
     @pytest.mark.parametrize("use_phase", [False, True])
     def test_it_equals_finite_differences_of_the_residuals(self, use_phase: bool) -> None:
         count, base = len(EVERY), some_device(1, 0.3)
-        design = module._Design(TWIN, PROFILE, scattered())
+        design = Design(TWIN, PROFILE, scattered())
 
         def residuals(vector: np.ndarray) -> np.ndarray:
             parameters = base + vector[:count] * PRIORS
@@ -103,7 +102,7 @@ class TestJacobian:
             assert np.abs(got[:, column] - by_hand[:, column]).max() < 2e-3 * scale, name
 
     def test_only_the_free_parameters_have_columns(self) -> None:
-        design, free = module._Design(TWIN, PROFILE, scattered()), indices("angle", "roll")
+        design, free = Design(TWIN, PROFILE, scattered()), indices("angle", "roll")
         every = design.jacobian(nominal(), EVERY, PRIORS, use_phase=True)
         some = design.jacobian(nominal(), free, PRIORS, use_phase=True)
         data = len(every) - len(EVERY)
@@ -148,7 +147,7 @@ class TestRecovery:
 
     def test_a_patch_on_one_camera_says_nothing_of_the_other_and_no_phase(self) -> None:
         one_camera = [replace(m, cameras=(0,)) for m in measured(some_device(8, 0.3), ("direct",))]
-        design = module._Design(TWIN, PROFILE, one_camera)
+        design = Design(TWIN, PROFILE, one_camera)
         jacobian = design.jacobian(nominal(), EVERY, PRIORS, use_phase=True)
         data = jacobian[: -len(EVERY)]
         assert np.abs(data[:, indices("quadrature")]).max() == 0

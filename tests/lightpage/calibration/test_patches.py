@@ -157,7 +157,7 @@ class TestSignificance:
             assert 0.9 * found.symbols < found.significance <= found.symbols * (1 + 1e-5)
 
     def test_unrelated_symbols_have_about_one_when_nothing_is_searched(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(module, "_SLOPES", np.array([-1e-9, 0, 1e-9]))
+        monkeypatch.setattr(module, "SLOPES", np.array([-1e-9, 0, 1e-9]))
         seen = self._unrelated(reach_px=0, pages=15)
         assert len(seen) == 180
         assert np.mean(seen) == pytest.approx(1, abs=5 / np.sqrt(len(seen)))

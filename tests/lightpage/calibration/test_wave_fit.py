@@ -99,12 +99,12 @@ def test_a_fit_tells_of_every_round_and_derivative_and_ends_where_it_is_stopped(
     fit, start = seen_by(device, 1), true_parameters(PROFILE, device)
     with pytest.raises(Stopped):
         fit.fit(start, device.homodyne.turn_rad, EVERY, progress=stop_in_the_derivative)
-    assert 0 < told[-1] < 1 / wave_fit._ROUNDS  # in the first round, a derivative of every parameter of the light
+    assert 0 < told[-1] < 1 / wave_fit.ROUNDS  # in the first round, a derivative of every parameter of the light
     shares = list[float]()
     fit.fit(start, device.homodyne.turn_rad, ("in_phase", "angle"), progress=shares.append)
     assert told == sorted(told)
     assert shares == sorted(shares)
-    assert {0, 1 / wave_fit._ROUNDS} <= set(shares) <= {n / wave_fit._ROUNDS for n in range(wave_fit._ROUNDS)}
+    assert {0, 1 / wave_fit.ROUNDS} <= set(shares) <= {n / wave_fit.ROUNDS for n in range(wave_fit.ROUNDS)}
 
 
 def test_how_much_path_real_lenses_add_comes_back() -> None:

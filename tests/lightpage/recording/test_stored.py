@@ -239,7 +239,7 @@ class TestVirtualDatasets:
                 np.testing.assert_array_equal(recording.frames(page).in_phase, data[page])
 
     def test_more_sources_than_may_be_open_are_read(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(stored, "_OPEN_SOURCES", 2)
+        monkeypatch.setattr(stored, "OPEN_SOURCES", 2)
         paths = [foreign.with_name(f"{number} 50%b 100%.h5") for number in range(4)]
         for path in paths:
             shutil.copy(foreign, path)
@@ -250,7 +250,7 @@ class TestVirtualDatasets:
             assert recording.stored_page_bytes == pytest.approx(one.stored_page_bytes)
 
     def test_a_source_that_goes_while_it_is_read_is_told(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(stored, "_OPEN_SOURCES", 1)
+        monkeypatch.setattr(stored, "OPEN_SOURCES", 1)
         paths = [foreign.with_name(f"{number}.h5") for number in range(2)]
         for path in paths:
             shutil.copy(foreign, path)
@@ -393,7 +393,7 @@ class TestChunksAndFilters:
         self.unknown_filter(foreign, "in_phase", 32001)
         loaded: list[str] = []
         monkeypatch.setattr(stored.importlib, "import_module", loaded.append)
-        monkeypatch.setattr(stored, "_decodes", lambda code: bool(loaded))
+        monkeypatch.setattr(stored, "decodes", lambda code: bool(loaded))
         Recording.open(foreign).close()
         assert loaded == ["hdf5plugin"]
 

@@ -35,8 +35,8 @@ def test_the_terms_are_the_leading_ones_however_many_they_are(
     # (measured) of few and many; what is dropped is below the tolerance each
     phase = phase_of(strength)
     errors = []
-    for looked_for_at_first in (expansion._SKETCH, 10**9):
-        monkeypatch.setattr(expansion, "_SKETCH", looked_for_at_first)
+    for looked_for_at_first in (expansion.SKETCH, 10**9):
+        monkeypatch.setattr(expansion, "SKETCH", looked_for_at_first)
         found = Expansion.of(phase, FIRST, SECOND, TOLERANCE)
         assert len(found.first) == rank
         total = sum(np.multiply.outer(first, second) for first, second in found.terms())
