@@ -60,20 +60,6 @@ class TestEncoder:
         expected = theirs(torch.tensor(bits, dtype=torch.float32)).numpy()
         assert np.array_equal(code.encode(bits), expected)
 
-    @pytest.mark.parametrize(("information", "sent", "lifting"), SIZES)
-    def test_every_check_holds_for_the_whole_word(self, information: int, sent: int, lifting: int) -> None:
-        shorter = LdpcCode(information, sent)
-        everything = shorter.word_bits - 2 * lifting - (22 * lifting - information)
-        code = LdpcCode(information, everything)  # sends all that is not punctured or filler: the whole word is known
-        assert code.word_bits == shorter.word_bits
-        bits = random_bits((2, information), 1)
-        word = np.zeros((2, code.word_bits), np.uint8)
-        word[:, :information] = bits
-        word[:, code.sent] = code.encode(bits)
-        assert np.array_equal(word[:, :information], bits)  # systematic
-        assert not (parity_checks(code) @ word.T % 2).any()
-        assert np.array_equal(shorter.encode(bits), code.encode(bits)[:, :sent])
-
     @pytest.mark.parametrize("information", [0, 8449, -1])
     def test_information_bits_out_of_range_are_refused(self, information: int) -> None:
         with refused("information bits", information):

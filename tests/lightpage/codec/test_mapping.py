@@ -114,17 +114,6 @@ class TestInformation:
         assert bit_information(ratios, bits) == pytest.approx(capacity, abs=1e-12)
         assert bit_information(-ratios, bits + 1) == pytest.approx(capacity, abs=1e-12)
 
-    def test_erased_bits_carry_nothing(self) -> None:
-        ratios = np.where(np.arange(100) < 30, 0, MOST_LLR)
-        assert bit_information(ratios) == pytest.approx(0.7, abs=1e-12)
-
-    def test_honest_ratios_claim_what_they_carry(self) -> None:
-        rng = np.random.default_rng(1)
-        bits, variance = rng.integers(0, 2, 200_000).astype(np.uint8), 1.3
-        ratios = 2 * (1 - 2.0 * bits + np.sqrt(variance) * rng.standard_normal(bits.size)) / variance
-        # each bit's own deviates by less than one bit: five deviations of the mean
-        assert bit_information(ratios) == pytest.approx(bit_information(ratios, bits), abs=5 / np.sqrt(bits.size))
-
 
 class TestRefusals:
     @pytest.mark.parametrize("levels", [0, 1, 3, 6, 255, 512])

@@ -147,10 +147,9 @@ class TestEncoding:
                     assert restore_group(volume, group, left) is None
 
     def test_a_file_is_read_from_where_it_stands(self, written: Written) -> None:
-        file = BytesIO(b"before" + written.file)
-        file.seek(6)
-        first = next(encode_volume(CODEC, written.volume, file, PILOTS))
-        again = next(encode_volume(CODEC, written.volume, BytesIO(written.file), PILOTS))
+        files = BytesIO(b"before" + written.file), BytesIO(written.file)
+        files[0].seek(6)
+        first, again = (next(encode_volume(CODEC, written.volume, file, PILOTS)) for file in files)
         assert np.array_equal(first, again)
 
     @pytest.mark.parametrize("missing", [1, 5, 6, SIZE + 5])

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from lightpage.device.profile import parse_profile
-from lightpage.errors import PageError, RecordingError, SurroundingsError
+from lightpage.errors import PageError, RecordingError
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.pages import Pages, PagesWriter
-from tests.lightpage.full_disk import full_disk
 from tests.lightpage.recording.test_recording import small_profile
 from tests.lightpage.refused import refused
 
@@ -109,26 +108,6 @@ class TestWriting:
         assert path.stat().st_size < 100_000
         with Pages.open(path) as pages:
             assert np.array_equal(list(pages), SYMBOLS)
-
-
-class TestFullDisk:
-    """Wherever the disk becomes full, and without leaving the HDF5 library unable to go on."""
-
-    MANY = np.zeros((2000, *PROFILE.page_shape), np.uint8)
-
-    @pytest.mark.parametrize("room", [0, 5_000, 60_000])
-    def test_it_leaves_nothing(self, tmp_path: Path, room: int) -> None:
-        with full_disk(room), refused("p.h5", kind=SurroundingsError):
-            write(tmp_path / "p.h5", self.MANY)
-        assert list(tmp_path.iterdir()) == []
-
-    def test_it_leaves_the_earlier_file(self, tmp_path: Path) -> None:
-        path = write(tmp_path / "p.h5")
-        before = path.read_bytes()
-        with full_disk(20_000), refused("p.h5", kind=SurroundingsError):
-            write(path, self.MANY)
-        assert [entry.name for entry in tmp_path.iterdir()] == ["p.h5"]
-        assert path.read_bytes() == before
 
 
 def set_attribute(name: str, value: object) -> Callable[[h5py.File], None]:

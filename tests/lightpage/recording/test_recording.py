@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from lightpage.device.profile import Profile, load_profile, parse_profile
-from lightpage.errors import PageError, RecordingError, SaturatedFrameError, SurroundingsError
+from lightpage.errors import PageError, RecordingError, SaturatedFrameError
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, RecordingWriter, hash_frames
-from tests.lightpage.full_disk import full_disk
 from tests.lightpage.refused import refused
 
 LEVELS = 16
@@ -572,38 +571,3 @@ class TestInterruption:
         with refused("own.h5.partial", kind=RecordingError):
             resumed(tmp_path / "own.h5")
         assert partial.exists()
-
-
-class TestFullDisk:
-    def big(self, path: Path, *, resume: bool = False) -> RecordingWriter:
-        profile = small_profile()
-        profile = profile.model_copy(
-            update={"camera": profile.camera.model_copy(update={"columns_px": 200, "rows_px": 140})}
-        )
-        frame = np.zeros((140, 200), np.uint16)
-        return RecordingWriter(path, profile, LEVELS, 12, FramePair(frame, frame), resume=resume)
-
-    def page(self) -> FramePair:
-        return FramePair(*np.random.default_rng(0).integers(0, 4096, (2, 140, 200), dtype=np.uint16))
-
-    def fill(self, path: Path, symbols: np.ndarray) -> None:
-        with full_disk(750_000), self.big(path) as writer:  # room for references and five pages
-            for _ in range(20):
-                writer.append(symbols, self.page())
-
-    def test_the_pages_before_stay_and_are_gone_on_with(self, tmp_path: Path) -> None:
-        symbols = random_symbols(small_profile(), LEVELS, 1, np.random.default_rng(1))[0]
-        path = tmp_path / "r.h5"
-        with refused("page 5", "File too large", SurroundingsError):
-            self.fill(path, symbols)
-        assert not path.exists()
-        with self.big(path, resume=True) as writer:
-            assert writer.pages == 5
-            writer.append(symbols, self.page())
-        with Recording.open(path) as recording:
-            assert recording.pages == 6
-            assert np.array_equal(recording.frames(5).quadrature, self.page().quadrature)
-
-    def test_a_disk_that_is_full_at_once_is_named(self, tmp_path: Path) -> None:
-        with full_disk(20_000), refused("r.h5.partial", "File too large", SurroundingsError):
-            self.big(tmp_path / "r.h5")

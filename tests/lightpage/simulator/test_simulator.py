@@ -240,13 +240,6 @@ class TestFrames:
             assert pair.in_phase.shape == TINY.frame_shape
             assert pair.in_phase.max() < 2**bits
 
-    def test_a_page_that_does_not_fit_is_refused(self) -> None:
-        simulator = Simulator(TINY, Device(), levels=16)
-        with refused(got=(3, 3), kind=PageError):
-            simulator.page(np.zeros((3, 3), np.uint8))
-        with refused(got=16, kind=PageError):
-            simulator.page(np.full(TINY.page_shape, 16, np.uint8))
-
 
 class TestLight:
     @pytest.mark.parametrize("device", [perfect_device(), Device()], ids=["perfect", "realistic"])
