@@ -37,7 +37,11 @@ class TestWriting:
             assert (len(pages), pages.levels, pages.page_shape, pages.path) == (7, LEVELS, PROFILE.page_shape, path)
             assert json.loads(pages.code or "") == CODE
             assert np.array_equal(list(pages), SYMBOLS)
-            assert np.array_equal(pages[5], SYMBOLS[5])
+            for page in (-7, 5, 6):
+                assert np.array_equal(pages[page], SYMBOLS[page])
+            for page in (-8, 7):
+                with pytest.raises(IndexError):
+                    pages[page]
             assert pages[5].dtype == np.uint8
 
     def test_the_layout_is_the_documented_one(self, tmp_path: Path) -> None:
