@@ -18,13 +18,6 @@ from lightpage.page.symbols import (
 from tests.lightpage.refused import refused
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(3, 3), (2, 2), (1, 40), (40, 1), (7, 5)])
-def test_a_small_page_still_has_four_pilots(rows: int, columns: int) -> None:
-    bench = load_profile("bench")
-    page = bench.page.model_copy(update={"rows": rows, "columns": columns})
-    assert pilot_mask(bench.model_copy(update={"page": page})).sum() >= 4
-
-
 def test_one_pilot_pattern_serves_every_level_count() -> None:
     """floor(u M) of the same u: the pattern of 4 levels is the coarse reading of that of 256."""
     profile = load_profile("bench")
