@@ -240,7 +240,7 @@ def test_the_ports_of_the_settings_are_those_of_the_pod() -> None:
 def test_kubelet_waits_until_calls_in_flight_have_ended() -> None:
     whole = manifests.manifest("StatefulSet", "lightpage")
     before = manifests.container(whole)["lifecycle"]["preStop"]["sleep"]["seconds"]
-    ending = pod_settings().limits.grace_s + rpc._LAST_WORD_S + rpc._END_S + serving._REST_S
+    ending = pod_settings().limits.grace_s + rpc._LAST_WORD_S + rpc._END_S + serving.REST_S
     given = whole["spec"]["template"]["spec"]["terminationGracePeriodSeconds"]
     assert given >= before + ending + 5  # what is left is for health checks and the store to end
 

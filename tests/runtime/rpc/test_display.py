@@ -20,8 +20,7 @@ from runtime.modulator.external import ExternalBeams, ExternalModulator
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.rpc.uploads import uploaded_pages
 from tests.runtime import toy
-from tests.runtime.acquisition.lab import Lab
-from tests.runtime.acquisition.test_camera_source import PAIRING, LabModulator
+from tests.runtime.acquisition.lab import PAIRING, Lab, LabModulator
 from tests.runtime.rpc.stage import Running, Start, refused, until_told
 from tests.waiting import eventually
 
@@ -40,6 +39,7 @@ def external(lab: Lab) -> tuple[CameraSource, LabModulator]:
         PAIRING,
         Exposures(reference_frames=1),
         name="camera:lab",
+        clock=lab.clock,
     )
     source.arm()
     return source, stage
