@@ -1,0 +1,150 @@
+"""Benchmarks of the service: their judges overlook nothing that they measure."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from analysis.service import changes, dashboard, identity, memory_attacks, outgoing
+from analysis.service.other_servers.calls import arrays_of, infer_request
+from analysis.service.other_servers.environments import NAMES, requirements
+from analysis.service.other_servers.figures import Comparison, Figure
+from analysis.service.other_servers.timing import WARM, in_turns
+from lightpage.errors import LightpageError
+from lightpage.recording.frame_pair import FramePair
+from runtime.pb.inference import open_inference_pb2 as oip
+
+ROOT = Path(__file__).resolve().parents[3]
+TRACE = """\
+71 1764100000.100000 connect(3, {sa_family=AF_UNIX, sun_path="/var/run/nscd/socket"}, 110) = -1 ENOENT (No such file)
+71 1764100000.200000 connect(3, {sa_family=AF_INET, sin_port=htons(50052), sin_addr=inet_addr("127.0.0.1")}, 16) = 0
+73 1764100001.100000 connect(5, {sa_family=AF_INET6, sin6_port=htons(443), sin6_flowinfo=htonl(0), \
+inet_pton(AF_INET6, "2001:db8::7", &sin6_addr), sin6_scope_id=0}, 28 <unfinished ...>
+74 1764100001.300000 sendmmsg(6, [{msg_hdr={msg_name={sa_family=AF_INET, sin_port=htons(9), \
+sin_addr=inet_addr("192.0.2.9")}, msg_namelen=16}, msg_len=3}], 1, 0) = 1
+74 1764100001.400000 connect(6, {sa_family=AF_INET, sin_port=htons(53), sin_addr=inet_addr("127.0.0.53")}, 16) = 0
+"""
+QUIET: dict[str, Any] = {
+    "crashes": 0,
+    "reads_outside": 0,
+    "tracebacks": 0,
+    "failed": [],
+    "good_at_the_end": True,
+    "regions_and_files_before": (1, 40),
+    "regions_and_files_after": (0, 38),
+    "receive_buffer_bytes_after": 0,
+}
+
+
+def test_answers_under_model_changes_are_judged() -> None:
+    changed = [changes._Changed(0.0, 0.0, "a"), changes._Changed(1.0, 2.0, "b"), changes._Changed(5.0, 6.0, "a")]
+    answers = [
+        changes._Answered(0.5, 1.5, "b", "B"),  # the change was under way
+        changes._Answered(1.5, 3.0, "a", "A"),
+        changes._Answered(3.0, 4.0, "UNAVAILABLE", ""),
+        changes._Answered(3.0, 4.0, "b", "A"),
+        changes._Answered(3.0, 4.0, "a", "A"),
+    ]
+    found = changes.judged(answers, changed, {"a": "A", "b": "B"})
+    assert found == {"answers": 5, "failed": 1, "wrong_or_mixed": 1, "stale": 1}
+
+
+def test_faults_of_shared_memory_are_told() -> None:
+    assert memory_attacks.faults(QUIET) == []
+    bad = {"crashes": 1, "reads_outside": 2, "tracebacks": 3, "failed": ["timed out"], "good_at_the_end": False}
+    bad |= {"regions_and_files_after": (2, 41), "receive_buffer_bytes_after": 4096}
+    for name, value in bad.items():
+        assert memory_attacks.faults(QUIET | {name: value}), name
+
+
+@pytest.mark.parametrize(
+    ("caller", "role", "right"),
+    [
+        ("none", "read", {"UNAVAILABLE"}),
+        ("nobody", "read", {"PERMISSION_DENIED"}),
+        ("watcher", "decode", {"PERMISSION_DENIED"}),
+        ("keeper", "recalibrate", {"OK", "INVALID_ARGUMENT"}),
+    ],
+)
+def test_each_caller_has_one_right_outcome(caller: str, role: str, right: set[str]) -> None:
+    codes = ("OK", "INVALID_ARGUMENT", "PERMISSION_DENIED", "UNAVAILABLE")
+    assert {code for code in codes if identity.outcome(code) == identity.expected(caller, role)} == right
+
+
+def test_addresses_of_other_machines_and_name_servers_are_outgoing(tmp_path: Path) -> None:
+    (trace := tmp_path / "trace.txt").write_text(TRACE)
+    found = [(call.call, call.address, call.port) for call in outgoing.calls(trace) if call.outgoing]
+    assert found == [("connect", "2001:db8::7", 443), ("sendmmsg", "192.0.2.9", 9), ("connect", "127.0.0.53", 53)]
+    trace.write_text("71 1764100000.100000 io_uring_setup(8, {flags=0}) = 4\n")
+    with pytest.raises(LightpageError):
+        list(outgoing.calls(trace))
+
+
+class Answers:
+    """Answers as Prometheus does, of the store's trouble with nothing."""
+
+    def over(self, expression: str, start: float, end: float, step_s: float) -> list[dict[str, Any]]:
+        if "store_trouble" in expression or "flight" in expression:
+            return []
+        named = {"stage": "queue", "code": "OK", "version": "bench-9"}
+        values = [(at, str(number % 7)) for number, at in enumerate(np.arange(start, end, step_s))]
+        return [{"metric": named, "values": values}]
+
+
+def test_every_panel_of_the_dashboard_is_drawn_and_empty_ones_are_named(tmp_path: Path) -> None:
+    out, drawing = tmp_path / "dashboard.png", dashboard.Drawing(Answers(), 1_000_000.0, 1_000_060.0)  # type: ignore[arg-type]
+    assert drawing.draw(json.loads(dashboard.DASHBOARD.read_text()), out) == ["Store and flight recorder"]
+    assert Image.open(out).width > 500
+    shown = [
+        dashboard.formatted(unit)(value, None) for unit, value in (("s", 0.0123), ("bytes", 3 << 20), ("ops", 1.5))
+    ]
+    assert shown == ["12.3 ms", "3 MiB", "1.5/s"]
+
+
+# ---- other servers --------------------------------------------------------------------------------------------------
+
+
+def test_a_server_is_better_only_by_more_than_the_larger_spread() -> None:
+    figure = Figure.of([float(value) for value in range(101)])
+    assert (figure.p10, figure.p50, figure.p90) == pytest.approx((10, 50, 90))
+    own = Figure(9, 10, 11)
+    assert Comparison.of(own, Figure(14, 15, 16)) == Comparison(difference=5, spread=2)
+    assert Comparison.of(own, Figure(10, 15, 20)).missed_by == 5
+    assert Comparison.of(own, Figure(4, 5, 6), more_is_better=True).missed_by == -3
+
+
+def test_calls_of_the_warm_up_do_not_count() -> None:
+    numbers = {"a": iter(range(100)), "b": iter(range(100, 200))}
+    told = in_turns({name: partial(next, each) for name, each in numbers.items()}, 2, "calls", np.random.default_rng(0))
+    assert told == {"a": [WARM, WARM + 1], "b": [100 + WARM, 101 + WARM]}
+
+
+def test_a_request_has_both_frames_and_an_answer_is_read_as_a_tensor() -> None:
+    pair = FramePair(*np.arange(12, dtype=np.uint8).reshape(2, 2, 3))
+    request = infer_request("decoder", pair, ("p",), False)
+    assert [(tensor.name, list(tensor.shape)) for tensor in request.inputs] == [
+        ("in_phase", [2, 3]),
+        ("quadrature", [2, 3]),
+    ]
+    assert list(request.raw_input_contents) == [pair.in_phase.tobytes(), pair.quadrature.tobytes()]
+    p, response = np.arange(12, dtype=np.float32).reshape(2, 2, 3), oip.ModelInferResponse()
+    response.outputs.add(name="p", datatype="FP32", shape=p.shape)
+    with pytest.raises(LightpageError):
+        arrays_of(response)
+    response.raw_output_contents.append(p.tobytes())
+    np.testing.assert_array_equal(arrays_of(response)["p"], p)
+
+
+def test_all_environments_are_pinned_and_have_the_onnx_runtime_of_the_service() -> None:
+    own = dict(re.findall(r"^([\w.-]+)==(\S+)$", (ROOT / "constraints.txt").read_text("utf-8"), re.M))
+    for name in NAMES:
+        pinned = dict(line.split("==") for line in requirements(name).split())
+        assert name in pinned
+        assert all(pinned[key] == own[key] for key in ("onnxruntime", "grpcio", "numpy"))
