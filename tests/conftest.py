@@ -47,12 +47,12 @@ def bench_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def bench_calibration(
     bench_recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Profile, Path, Calibration]:
-    """The bench profile, a recording of a realistic device, and that device's calibration, made by the command."""
+    """The bench profile, a recording of a realistic device, and what the command finds by its first page."""
 
     def make(out: Path) -> None:
         from train.commands.calibrate import calibrate
 
-        _command(calibrate, "--profile", "bench", "--recording", bench_recording, "--out", out)
+        _command(calibrate, "--profile", "bench", "--recording", bench_recording, "--pages", 1, "--out", out)
 
     calibration = load_calibration(_made_once(tmp_path_factory, "bench-calibration.toml", make))
     return load_profile("bench"), bench_recording, calibration

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from onnx import TensorProto, helper, parser
 
-from export.graph import DecoderGraph, table_tensors
+from export.graph import FRAME_INPUTS, DecoderGraph, table_tensors
 from export.onnx_files import OPSET, decoder_onnx
 from export.operators.check import fallbacks, page_part, repeated_products, shape_computations
 from export.operators.collect import collect
@@ -22,33 +22,27 @@ from lightpage.device.state import Device
 from lightpage.errors import InvalidInputError
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
+from runtime.bundle.bundle import Bundle
+from runtime.bundle.manifest import DECODER
 from tests.lightpage.small import small_profile
 from train.models.decoder import SymbolDecoder
-from train.models.presets import ACCURATE, FAST, PRESETS, STANDARD
+from train.models.presets import FAST, PRESETS
 from train.models.twin import RayTwin, TorchTwin
 
 ORIGIN = "someone/project docs/file.md at 0000000 (1.0)"
 SMALL = "agraph (float[1, 2, 6, 8] x, float[1, 4, 4, 2] grid) => (float[1, 2, 4, 4] y)"
 
 
-def exported(localizer: str, preset: str, frame_dtype: str = "uint8") -> bytes:
-    """A small device's decoder; what operators it has does not depend on the network's size."""
-    profile, device = small_profile(), Device()
-    parameters = true_parameters(profile, device)
-    choices = replace(PRESETS[preset].choices, channels=8, blocks=1)
-    graph = DecoderGraph(profile, SymbolDecoder(profile, parameters, localizer, choices), 1.0).eval()
-    table = sampling_table(TorchTwin(RayTwin(profile)), parameters, device.homodyne.turn_rad, profile)
-    tensors = table_tensors(graph, table, Simulator(profile, device, seed=1).references())
-    wide = {
-        name: value.astype(frame_dtype) if name.startswith("reference") else value for name, value in tensors.items()
-    }
-    return decoder_onnx(graph, frame_dtype, profile.frame_shape, wide)
-
-
 @pytest.fixture(scope="module")
 def fast() -> bytes:
-    """What runs for every page of a fast decoder."""
-    return page_part(exported("coherent", FAST))
+    """What runs for every page of a small device's fast decoder."""
+    profile, device = small_profile(), Device()
+    parameters = true_parameters(profile, device)
+    choices = replace(PRESETS[FAST].choices, channels=8, blocks=1)
+    graph = DecoderGraph(profile, SymbolDecoder(profile, parameters, "coherent", choices), 1.0).eval()
+    table = sampling_table(TorchTwin(RayTwin(profile)), parameters, device.homodyne.turn_rad, profile)
+    tensors = table_tensors(graph, table, Simulator(profile, device, seed=1).references())
+    return page_part(decoder_onnx(graph, "uint8", profile.frame_shape, tensors))
 
 
 def small(body: str, header: str = SMALL, opset: int = OPSET) -> bytes:
@@ -64,16 +58,9 @@ def test_no_node_of_a_fast_decoder_leaves_the_provider(fast: bytes) -> None:
     assert repeated_products(fast) == []
 
 
-@pytest.mark.parametrize(
-    ("localizer", "preset"),
-    [
-        ("coherent", ACCURATE),  # holds the operators of the two below
-        pytest.param("coherent", STANDARD, marks=pytest.mark.long),
-        pytest.param("wave", STANDARD, marks=pytest.mark.long),
-    ],
-)
-def test_nor_does_one_of_the_others(localizer: str, preset: str) -> None:
-    part = page_part(exported(localizer, preset))
+def test_nor_does_one_of_a_decoder_of_two_passes(small_bundle: Path) -> None:
+    """It holds the operators of one pass, by beams or by waves, too."""
+    part = page_part(Bundle.open(small_bundle).files[DECODER])
     for provider in PROVIDERS:
         assert fallbacks(part, provider) == [], provider
     assert shape_computations(part) == []
@@ -99,14 +86,17 @@ def test_a_product_that_repeats_both_of_its_factors_is_found(left: str, right: s
 
 def test_a_product_of_unknown_shapes_is_not_passed_over() -> None:
     model = small("y = MatMul (a, b)", "agraph (float[N, 4] a, float[4, 5] b) => (float[N, 5] y)")
-    with pytest.raises(InvalidInputError, match="node y: got no shape of a, wanted shapes of both factors"):
+    with pytest.raises(InvalidInputError, match="node y"):
         repeated_products(model)
 
 
-def test_frames_of_16_bits_are_converted_elsewhere_by_tensorrt_alone() -> None:
-    part = page_part(exported("coherent", FAST, "uint16"))
-    assert fallbacks(part, "cuda") == []
-    found = fallbacks(part, "tensorrt")
+def test_frames_of_16_bits_are_converted_elsewhere_by_tensorrt_alone(fast: bytes) -> None:
+    model = onnx.load_from_string(fast)
+    for value in model.graph.input:
+        if value.name in FRAME_INPUTS:
+            value.type.tensor_type.elem_type = TensorProto.UINT16
+    assert fallbacks(model.SerializeToString(), "cuda") == []
+    found = fallbacks(model.SerializeToString(), "tensorrt")
     assert [(one.operator, "uint16" in one.got) for one in found] == [("Cast", True), ("Cast", True)]
 
 
@@ -215,7 +205,7 @@ def test_a_graph_within_a_node_is_refused() -> None:
     inner = helper.make_graph([], "inner", [], [])
     node = helper.make_node("If", ["x"], ["y"], name="choice", then_branch=inner, else_branch=inner)
     model = helper.make_model(helper.make_graph([node], "outer", [], []))
-    with pytest.raises(InvalidInputError, match=r"node choice: got a graph within it, wanted .*without inner graphs"):
+    with pytest.raises(InvalidInputError, match="node choice"):
         fallbacks(model.SerializeToString(), "cuda")
 
 
@@ -225,7 +215,7 @@ def test_the_committed_lists_say_where_they_are_from() -> None:
         assert re.fullmatch(r"[\w-]+/[\w-]+ docs/\w+\.md at [0-9a-f]{40} \(.+\)", listed.origin)
         assert {domain for domain, _ in listed.operators} <= {"", "com.microsoft"}
         assert len(listed.operators) > 100
-    with pytest.raises(InvalidInputError, match=r"execution provider: got 'abacus', wanted one of cuda, tensorrt"):
+    with pytest.raises(InvalidInputError, match="'abacus'"):
         OperatorList.load("abacus")
 
 
@@ -294,13 +284,13 @@ TensorRT 10.0 supports operators in the inclusive range of opset 9 to opset 20.
     assert {name for _, name in listed.operators} == {"Acos", "GridSample", "Slice"}
     assert listed.operators["", "GridSample"].rank == 4
     assert listed.operators["", "Slice"].constant == ("axes",)
-    with pytest.raises(InvalidInputError, match=r"types of Acos: got FP33"):
+    with pytest.raises(InvalidInputError, match="FP33"):
         made(document.replace("FP32, FP16", "FP33"), "tensorrt", tmp_path)
 
 
 @pytest.mark.parametrize("provider", PROVIDERS)
 def test_another_document_is_refused(provider: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="operator document: got no "):
+    with pytest.raises(InvalidInputError, match="operator document"):
         made("# Something else", provider, tmp_path)
 
 
