@@ -125,7 +125,7 @@ def test_figures_are_collected_without_their_curves_and_what_lacks_is_left_out(t
     # a comparison that is not finished replaces nothing
     written(path, toy(outcome("ray", 3.0)))
     done = command(tmp_path, "--from", tmp_path / "runs", "--commit", "0123456")
-    assert any(line.endswith("lacks coherent at -0.6 degree") for line in done.output.splitlines())
+    assert "unfinished" in done.output
     assert kept_measurements(tmp_path / "kept")["sheared"].figures == figures
 
 

@@ -43,7 +43,7 @@ def figures_of(tmp_path: Path, *options: str) -> tuple[int, dict[str, Any]]:
 def test_it_says_how_far_a_cluster_goes_and_what_holds_it_up(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cost, "PAGES", 40_000)
+    monkeypatch.setattr(cost, "PAGES", 10_000)
     nodes = ("--nodes", "1", "--nodes", "4", "--nodes", "40")
     status, found = figures_of(tmp_path, *nodes, "--storage", "1e8", "--picture", str(tmp_path / "cost.png"))
     assert status == 0

@@ -45,12 +45,10 @@ def small(tmp_path: Path) -> Path:
     return tmp_path / "small.toml"
 
 
-def test_decoders_take_turns_and_are_compared_with_the_first(small: Path, tmp_path: Path) -> None:
-    chosen = ("--decoder", "ray 16/32", "--decoder", "coherent", "--repeats", 1, "--threads", 1)
-    found = figures(speed.main, tmp_path, "--profile", small, *chosen)
-    ray, coherent = found["decoders"]
-    assert (coherent["decoder"], ray["ratio"], ray["decoder"]) == ("coherent", 1.0, "ray 16/32")
-    assert coherent["ratio"] == pytest.approx(coherent["seconds"] / ray["seconds"])
+def test_a_decoder_is_timed_part_by_part(small: Path, tmp_path: Path) -> None:
+    found = figures(speed.main, tmp_path, "--profile", small, "--decoder", "coherent", "--repeats", 1, "--threads", 1)
+    (coherent,) = found["decoders"]
+    assert (coherent["decoder"], coherent["ratio"]) == ("coherent", 1.0)
     assert [part["name"] for part in found["parts"]["coherent"]] == ["field", "sampling", "network", "answers"]
     assert all(part["seconds"] > 0 and part["floor_s"] > 0 for part in found["parts"]["coherent"])
 

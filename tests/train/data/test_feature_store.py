@@ -78,7 +78,7 @@ def test_further_processes_wait_for_the_first(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(processes, "_PATIENCE_S", 0.5)
     monkeypatch.setenv("LOCAL_RANK", "1")
     other = Pages()
-    with pytest.raises(LightpageError, match="got 0 of 3, and no more"):
+    with pytest.raises(LightpageError, match="0 of 3"):
         fill(tmp_path, "device", 3, other, "pages")
     monkeypatch.delenv("LOCAL_RANK")
     fill(tmp_path, "device", 3, Pages(), "pages")
@@ -111,7 +111,7 @@ def test_room_is_taken_before_pages_are_made(
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "posix_fallocate", lacking)
-    with pytest.raises(kind, match=r"features in .*more room") if kind else nullcontext():
+    with pytest.raises(kind, match="room") if kind else nullcontext():
         fill(tmp_path, "device", 2, Pages(), "pages")
 
 
@@ -120,5 +120,5 @@ def test_a_file_system_that_maps_no_files_is_named(tmp_path: Path, monkeypatch: 
         raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
 
     monkeypatch.setattr("train.data.feature_store.open_memmap", lacking)
-    with pytest.raises(LightpageError, match="maps files into memory"):
+    with pytest.raises(LightpageError, match="features"):
         fill(tmp_path, "device", 2, Pages(), "pages")

@@ -35,14 +35,8 @@ def device(angle_rad: float, *, thick: bool = False, roll_rad: float | None = No
 
 @pytest.fixture(
     scope="module",
-    params=[
-        (0.0, True, False, 1),
-        (-0.01, True, False, 1),
-        (-0.01, False, False, 1),
-        (-0.01, True, True, 1),
-        (-0.01, True, True, 3),
-    ],
-    ids=["square", "sheared", "points", "real lenses", "tiles"],
+    params=[(0.0, True, False, 1), (-0.01, False, False, 1), (-0.01, True, True, 3)],
+    ids=["square", "points", "real lenses in tiles"],
 )
 def models(request: pytest.FixtureRequest) -> tuple[FittedWaves, Waves]:
     """The two models."""
@@ -87,8 +81,7 @@ def test_both_ways_are_adjoint(models: tuple[FittedWaves, Waves]) -> None:
     assert float((seen * field).sum()) == pytest.approx(float((page * back).sum()), rel=0.02)
 
 
-@pytest.mark.parametrize("roll_deg", [-0.4, 0.0, 0.4])
-@pytest.mark.parametrize(("fidelity", "at_most"), [(EXACT, 0.04), (ROUGH, 0.12)])
+@pytest.mark.parametrize(("fidelity", "at_most", "roll_deg"), [(EXACT, 0.04, 0.4), (ROUGH, 0.12, -0.4)])
 def test_light_is_followed_as_exactly_as_is_asked(fidelity: Fidelity, at_most: float, roll_deg: float) -> None:
     profile, parameters = device(-0.01, thick=True, roll_rad=float(np.deg2rad(roll_deg)))
     page = on_modulator(np.random.default_rng(2).uniform(0, 2 * np.pi, profile.page_shape), SAMPLES)

@@ -196,13 +196,12 @@ class TestLenses:
 
 
 class TestAgainstSingleRays:
-    @pytest.mark.parametrize("angle", [0.0, SLOPED, np.deg2rad(5)])
-    @pytest.mark.parametrize("lens", [None, ACHROMAT, ACHROMAT.reversed()], ids=["ideal", "thick", "reversed"])
+    @pytest.mark.parametrize(("lens", "angle"), [(None, np.deg2rad(5)), (ACHROMAT, 0.0), (ACHROMAT.reversed(), SLOPED)])
     def test_every_ray_goes_the_same_way(self, lens: LensPrescription | None, angle: float) -> None:
         # seven times as long: a dozen walls, by turns
         paper = load_profile("paper")
         profile = with_pipe(paper, length_m=7.3 * paper.pipe.length_m)
-        points = page_points(profile, 150, seed=1)
+        points = page_points(profile, 100, seed=1)
         tracer = RayTracer(profile, lens)
         traced, positions = trace(tracer, points, angle), path(tracer, points, angle)
         assert traced.valid.all()
@@ -385,22 +384,20 @@ class TestInput:
     @pytest.mark.parametrize(
         ("points", "angle", "got"),
         [
-            (torch.zeros(3, 3, dtype=torch.float64), scalar(0), r"shape \(3, 3\)"),
-            (torch.zeros(2, dtype=torch.float64), scalar(0), r"shape \(2,\)"),
+            (torch.zeros(3, 3, dtype=torch.float64), scalar(0), r"\(3, 3\)"),
             (torch.zeros(3, 2), scalar(0), "float32"),
             (torch.full((3, 2), torch.nan, dtype=torch.float64), scalar(0), "NaN"),
-            (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(1, dtype=torch.float64), r"shape \(1,\)"),
+            (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(1, dtype=torch.float64), r"\(1,\)"),
             (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(()), "float32"),
-            (torch.zeros(3, 2, dtype=torch.float64), scalar(-0.6), "-0.6 rad"),
+            (torch.zeros(3, 2, dtype=torch.float64), scalar(-0.6), r"-0\.6 rad"),
             (torch.zeros(3, 2, dtype=torch.float64), scalar(np.nan), "nan rad"),
         ],
     )
     def test_what_cannot_be_traced_is_refused(self, points: torch.Tensor, angle: torch.Tensor, got: str) -> None:
         tracer = RayTracer(small_profile())
-        with pytest.raises(InvalidInputError, match=got):
-            tracer(points, angle)
-        with pytest.raises(InvalidInputError, match=got):
-            tracer.path(points, angle)
+        for trace in (tracer, tracer.path):
+            with pytest.raises(InvalidInputError, match=got):
+                trace(points, angle)
 
     def test_no_points_are_no_rays(self) -> None:
         traced = trace(RayTracer(small_profile(), ACHROMAT), np.zeros((0, 2)))

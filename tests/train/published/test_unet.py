@@ -19,7 +19,7 @@ def test_each_symbol_gets_its_numbers_whatever_the_page(samples: int, page: tupl
 
 def test_table_1_of_samples_and_no_others() -> None:
     assert [samples_for(size) for size in (2, 4, 8, 16)] == [4, 4, 8, 16]
-    with pytest.raises(InvalidInputError, match=r"samples per symbol.*5.*4, 8, 16"):
+    with pytest.raises(InvalidInputError, match="4, 8, 16"):
         PublishedUNet(5)
 
 
