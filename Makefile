@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test test-long test-lowest bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test pytest test-long test-lowest messages bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -42,11 +42,17 @@ demo-hardware: $(STAMP)  ## the main job over fake cameras, real packets, a seri
 	    $(BIN)/lightpage demo --source camera:$(HARDWARE)/device/device.toml --out $(HARDWARE)
 
 PYTEST := $(ONE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
-test: lint  ## lint, then every test but the long ones; prints the slowest
+test: $(STAMP)  ## lint, then every test but the long ones; prints the slowest, and how far all stayed below the budget
+	@$(BIN)/python -m tests.budget "make test" $(MAKE) --no-print-directory lint pytest
+
+pytest: $(STAMP)
 	$(PYTEST) -m "not long" --durations 20 --durations-min 5 $(PYTEST_ARGS)
 
 test-long: $(STAMP)  ## tests that take minutes and prove little more
 	$(PYTEST) -m long $(PYTEST_ARGS)
+
+messages: $(STAMP)  ## write anew what the command line says in the failures that people meet most: tests/messages
+	$(PYTEST) tests/messages --snapshot-update
 
 LOWEST := build/lowest
 test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyproject.toml allows of what the runtime needs
