@@ -14,10 +14,10 @@ import pytest
 import torch
 
 from lightpage.errors import InvalidInputError, LightpageError
+from tests.clock import HandClock
 from tests.train.node import STEPS, train
-from train import processes
 from train.fitting.curves import curves_of
-from train.processes import Processes, is_first_process, process_number
+from train.processes import Processes, is_first_process, process_number, wait_for_first
 
 SECONDS = 240
 ROUNDING = 1e-5
@@ -120,11 +120,10 @@ def test_processes_that_cannot_be_are_told(
 
 
 def test_torchrun_says_how_many_there_are_and_which_one_this_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processes.Processes, "_check_devices", staticmethod(lambda devices: None))
-    started = {"RANK": "5", "LOCAL_RANK": "1", "WORLD_SIZE": "8", "LOCAL_WORLD_SIZE": "2"}
+    started = {"RANK": "5", "LOCAL_RANK": "0", "WORLD_SIZE": "8", "LOCAL_WORLD_SIZE": "1"}
     for name, value in {"TORCHELASTIC_RUN_ID": "r", **started}.items():
         monkeypatch.setenv(name, value)
-    assert Processes().checked() == Processes(2, 4)
+    assert Processes().checked() == Processes(1, 8)
     assert (process_number(), is_first_process()) == (5, False)
 
 
@@ -137,3 +136,12 @@ def test_every_process_of_every_node_has_a_number_of_its_own(monkeypatch: pytest
             numbers.append(process_number())
     assert len(set(numbers)) == len(numbers)
     assert numbers[0] == 0
+
+
+def test_a_process_waits_as_long_as_the_first_one_makes_progress() -> None:
+    clock, parts = HandClock(), iter([0, 1, 1, 2, 3])
+    wait_for_first(lambda: next(parts), 3, "parts", clock)
+    start = clock.now()
+    with pytest.raises(LightpageError, match=r"^parts: got 2"):
+        wait_for_first(lambda: min(2, int((clock.now() - start) / 1000)), 3, "parts", clock)
+    assert clock.now() - start == pytest.approx(2000 + 1800, abs=1)

@@ -44,13 +44,13 @@ QUIET: dict[str, Any] = {
 
 
 def test_answers_under_model_changes_are_judged() -> None:
-    changed = [changes._Changed(0.0, 0.0, "a"), changes._Changed(1.0, 2.0, "b"), changes._Changed(5.0, 6.0, "a")]
+    changed = [changes.Changed(0.0, 0.0, "a"), changes.Changed(1.0, 2.0, "b"), changes.Changed(5.0, 6.0, "a")]
     answers = [
-        changes._Answered(0.5, 1.5, "b", "B"),  # the change was under way
-        changes._Answered(1.5, 3.0, "a", "A"),
-        changes._Answered(3.0, 4.0, "UNAVAILABLE", ""),
-        changes._Answered(3.0, 4.0, "b", "A"),
-        changes._Answered(3.0, 4.0, "a", "A"),
+        changes.Answered(0.5, 1.5, "b", "B"),  # the change was under way
+        changes.Answered(1.5, 3.0, "a", "A"),
+        changes.Answered(3.0, 4.0, "UNAVAILABLE", ""),
+        changes.Answered(3.0, 4.0, "b", "A"),
+        changes.Answered(3.0, 4.0, "a", "A"),
     ]
     found = changes.judged(answers, changed, {"a": "A", "b": "B"})
     assert found == {"answers": 5, "failed": 1, "wrong_or_mixed": 1, "stale": 1}

@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from lightpage.errors import LightpageError, SurroundingsError
-from train import processes
 from train.data.feature_store import FeatureStore, fill
 from train.data.features import PageFeatures, PageState
 
@@ -74,15 +73,10 @@ def test_what_is_complete_is_not_made_again(tmp_path: Path) -> None:
     assert again.made == []
 
 
-def test_further_processes_wait_for_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processes, "_PATIENCE_S", 0.5)
-    monkeypatch.setenv("LOCAL_RANK", "1")
-    other = Pages()
-    with pytest.raises(LightpageError, match="0 of 3"):
-        fill(tmp_path, "device", 3, other, "pages")
-    monkeypatch.delenv("LOCAL_RANK")
+def test_further_processes_take_what_the_first_has_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fill(tmp_path, "device", 3, Pages(), "pages")
     monkeypatch.setenv("LOCAL_RANK", "1")
+    other = Pages()
     fill(tmp_path, "device", 3, other, "pages")
     assert other.made == []
 

@@ -43,10 +43,10 @@ def models(request: pytest.FixtureRequest) -> tuple[FittedWaves, Waves]:
     angle_rad, filled, thick, tiles = request.param
     profile, parameters = device(angle_rad, thick=thick)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wave_lens, "_WAVES", wave_lens._WAVES / tiles**2)
-        patch.setattr(wave_pipe, "_BLOCK", 20 if tiles > 1 else wave_pipe._BLOCK)
+        patch.setattr(wave_lens, "WAVES_A_TILE", wave_lens.WAVES_A_TILE / tiles**2)
+        patch.setattr(wave_pipe, "MODES_A_BLOCK", 20 if tiles > 1 else wave_pipe.MODES_A_BLOCK)
         waves = Waves(profile, parameters, SAMPLES, FINE, filled=filled)
-    assert (len(waves._pipe.blocks) > 1) == (tiles > 1)
+    assert any(name.endswith("blocks.1") for name, _ in waves.named_modules()) == (tiles > 1)
     return FittedWaves(profile, parameters, SAMPLES, filled=filled), waves
 
 
