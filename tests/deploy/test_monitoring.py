@@ -229,19 +229,6 @@ def test_the_composition_is_valid_and_nothing_of_it_can_be_reached_or_written_fr
             assert source in volumes or volume.endswith(":ro"), volume
 
 
-def test_images_of_others_can_be_named_by_digest() -> None:
-    text, digest = (promql.DEPLOY / "compose.yml").read_text(), f"sha256:{64 * 'a'}"
-    told = dict(re.findall(r"(\w+_IMAGE)=([\w/]+)@sha256:DIGEST", DOCUMENT.read_text()))
-    named = {variable: f"{image}@{digest}" for variable, image in told.items()}
-    plain, pinned = composed(text).services, composed(text, **named).services
-    assert plain is not None
-    assert pinned is not None
-    for name in plain.keys() - {"lightpage"}:
-        variable = f"{name.upper()}_IMAGE"
-        assert str(plain[name].image).startswith(f"{told[variable]}:")
-        assert str(pinned[name].image) == named[variable]
-
-
 def test_the_parts_of_the_composition_find_each_other() -> None:
     services = yaml.safe_load((promql.DEPLOY / "compose.yml").read_text())["services"]
     (scrape,) = yaml.safe_load((promql.DEPLOY / "prometheus" / "prometheus.yml").read_text())["scrape_configs"]

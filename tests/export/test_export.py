@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 
@@ -82,13 +81,6 @@ def test_eight_bit_counts_that_came_in_sixteen_bits_make_an_eight_bit_bundle(
     assert error <= 1e-3
 
 
-def test_the_bundle_does_not_tell_where_it_was_made(exported: Bundle) -> None:
-    root = str(Path(cli_export.__file__).parent.parent).encode()
-    for name, data in exported.files.items():
-        assert root not in data, name
-        assert b"site-packages" not in data, name
-
-
 def test_the_golden_page_is_the_runs_own_in_few_counts(exported: Bundle, decoder: Decoder, small_run: Path) -> None:
     bundle = exported
     with np.load(small_run / GOLDEN) as kept:
@@ -101,16 +93,6 @@ def test_the_golden_page_is_the_runs_own_in_few_counts(exported: Bundle, decoder
     assert 0 < own.residual < coarse.residual < limit
     together = np.vdot(own.p, coarse.p) / np.linalg.norm(own.p) / np.linalg.norm(coarse.p)
     assert together > 0.9
-
-
-def test_a_page_of_which_few_counts_are_too_few_is_kept_as_it_is(
-    small_run: Path, tmp_path: Path, frame_types: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cli_export, "shows_page", lambda *_: False)
-    bundle, error = export_run(small_run, tmp_path / "plain.zip")
-    with np.load(small_run / GOLDEN) as kept:
-        np.testing.assert_array_equal(bundle.golden.pair.quadrature, kept["quadrature"])
-    assert error <= 1e-3
 
 
 def test_the_fields_own_graph_shows_the_decoders_field(
@@ -202,12 +184,6 @@ def test_an_interrupted_export_leaves_nothing_and_works_again(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["F", "small.zip"]
 
 
-def test_without_one_a_bundle_gets_a_version_of_its_own(exported: Bundle) -> None:
-    manifest = exported.manifest
-    time = datetime.fromisoformat(manifest.created).strftime("%Y%m%dT%H%M%SZ")
-    assert manifest.version == f"{manifest.name}-{time}-{manifest.files[DECODER][:8]}"
-
-
 def test_a_version_that_is_none_is_refused_before_the_work(small_run: Path, tmp_path: Path) -> None:
     steps: list[str] = []
     with pytest.raises(BundleError, match="'v 2'"):
@@ -238,11 +214,6 @@ def test_a_run_of_earlier_names_is_read(small_run: Path, tmp_path: Path) -> None
     described["hyperparameters"]["levels"] = described["hyperparameters"].pop("depth")
     (tmp_path / "run.json").write_text(json.dumps(described))
     assert load_run(tmp_path) == load_run(small_run)
-
-
-def test_an_unfinished_run_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match=r"run\.json"):
-        load_run(tmp_path)
 
 
 def test_the_angle_is_the_arc_tangent_in_every_octant() -> None:

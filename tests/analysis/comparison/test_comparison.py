@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from click.testing import CliRunner
 
-from analysis.comparison import ablation, calibration, decoders
-from analysis.comparison.ablation import LOW_PASS, NOTHING, POSITIONS, REFLECTIONS, Unconditioned, features_without
-from analysis.comparison.bench import Bench
-from analysis.comparison.data_set import data_set_name, recorded
+from analysis.comparison import calibration, decoders
 from analysis.comparison.levels import level_figures
-from analysis.comparison.outcome import gained_at_the_end, symbols_by_walls
+from analysis.comparison.outcome import symbols_by_walls
 from analysis.comparison.weight_store import CALIBRATION, TRAINED, WeightStore
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES
-from lightpage.device.state import Device, Sensor, ideal_device
+from lightpage.device.state import Device, ideal_device
 from lightpage.errors import InvalidInputError
 from lightpage.page.symbols import pilot_mask, symbol_phases
 from lightpage.recording.reader import Recording
@@ -51,20 +46,6 @@ def prepared(out: Path, device: Device, name: str) -> list[str]:
     return ["--profile", str(out / "small.toml"), "--pages", "12", "--out", str(out)]
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    out = tmp_path_factory.mktemp("ablation")
-    prepared(out, DEVICE, name := data_set_name(DEVICE, PROFILE.page.symbol_size_px))
-    with recorded(PROFILE, DEVICE, 12, 5000, out / name) as recording:
-        yield Bench.of(recording, PROFILE, DEVICE, (), 5000, WeightStore(out / name, out / "kept"))
-
-
-def test_data_sets_are_told_apart_by_name() -> None:
-    assert data_set_name(DEVICE, 4) == "-0.6deg-32e-4px"
-    dim = DEVICE.model_copy(update={"sensor": Sensor(full_well_e=32, exposure_relative=0.13)})
-    assert data_set_name(dim, 2, "-ideal") == "-0.6deg-32e-2px-0.13x-ideal"
-
-
 def test_symbols_are_told_apart_by_the_walls_that_their_light_meets() -> None:
     zones = symbols_by_walls(PROFILE, calibration_of(ideal_device()))
     rows, columns = PROFILE.page_shape
@@ -75,19 +56,6 @@ def test_symbols_are_told_apart_by_the_walls_that_their_light_meets() -> None:
     assert (zones["no wall"] == ~across & ~down[:, None]).mean() > 0.98
     assert (zones["x"] == across & ~down[:, None]).mean() > 0.98
     assert sum(zone.astype(int) for zone in zones.values()).tolist() == np.ones((rows, columns)).tolist()
-
-
-def test_parts_of_the_light_are_left_out(bench: Bench) -> None:
-    parts = (NOTHING, REFLECTIONS, LOW_PASS)
-    whole, direct, unfiltered = (next(features_without(part, bench, 0, (0.0, 0.0))).light for part in parts)
-    assert np.all(direct[:, 1:] == 0)
-    np.testing.assert_array_equal(direct[:, 0], whole[:, 0])
-    assert np.abs(whole[:, 1:]).max() > 0
-    assert not np.array_equal(unfiltered, whole)
-    network, light = Unconditioned(8, channels=4, blocks=1), torch.randn(1, 8, 5, 6)
-    torch.nn.init.normal_(network.head.weight)
-    here, there = (network(light, torch.full((1, 2, 5, 6), place)) for place in (0.1, 1.7))
-    torch.testing.assert_close(here, there, rtol=0, atol=0)
 
 
 def test_confidences_among_few_levels_are_judged(small_device: list[str]) -> None:
@@ -102,11 +70,6 @@ def test_confidences_among_few_levels_are_judged(small_device: list[str]) -> Non
     assert 0.9 < calibrated.symbol_error_rate == bold.symbol_error_rate < 1
     assert calibrated.own_mi == pytest.approx(calibrated.air, abs=0.05)
     assert bold.own_mi > bold.air + 1
-
-
-def test_the_gain_at_the_end_is_read_from_a_curve() -> None:
-    curve = [(20, 1.0), (60, 2.5), (79, 2.4), (90, 2.6), (100, 2.55)]
-    assert gained_at_the_end(curve, 100) == pytest.approx(0.1)
 
 
 def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path) -> None:
@@ -156,15 +119,6 @@ def test_the_command_keeps_what_it_trained_and_takes_it_up(tmp_path: Path) -> No
     for one, other in zip(outcomes, figures["lights"][0]["outcomes"], strict=True):
         assert one["air"] == pytest.approx(other["air"], abs=0.01)  # large tensors are kept in half precision
         assert one["validation_curve"] == other["validation_curve"]
-
-
-@pytest.mark.long  # trains two networks of 10 steps, and simulates their pages
-def test_the_ablation_writes_its_parts(tmp_path: Path) -> None:
-    words = prepared(tmp_path, DEVICE, data_set_name(DEVICE, PROFILE.page.symbol_size_px))
-    done = CliRunner().invoke(ablation.main, [*words, "--steps", "10", "--part", NOTHING, "--part", POSITIONS])
-    assert done.exit_code == 0, done.output
-    outcomes = json.loads((tmp_path / "ablation.json").read_text())["outcomes"]
-    assert [outcome["arm"] for outcome in outcomes] == [NOTHING, POSITIONS]
 
 
 def test_weights_that_were_kept_are_taken_up_for_their_options_alone(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 import re
 import subprocess
 import sys
@@ -121,27 +120,6 @@ def test_a_fleet_that_was_recalibrated_tells_why_a_device_failed(archive: Archiv
     assert f"bad 1 refused {rows['bad'].reason}" in told(text)
     assert "lost 1 failed recording lost.h5" in told(text)
     assert str(archive.folder) not in text
-
-
-def test_devices_that_were_not_come_to_are_missing(archive: Archive, tmp_path: Path) -> None:
-    stopped_after(archive, 0)
-    archive.run("recalibrate")
-    text, seen = page_of(archive.out, tmp_path / "r.html")
-    check_whole(text, seen, SECTIONS)
-    assert "a.h5 1 missing" in told(text)
-
-
-def test_ranges_whose_time_was_not_noted_have_that_of_their_file(archive: Archive) -> None:
-    archive.run("decode")
-    for path in archive.out.glob("shards/*/*.json"):
-        record = json.loads(path.read_text())
-        path.write_text(
-            json.dumps({k: v for k, v in record.items() if k not in ("finished_s", "worker", "read_bytes")})
-        )
-    data = report_of_bulk(archive.out)
-    times = sorted(reading.finished_s for reading in data.found.readings)
-    assert times == sorted(path.stat().st_mtime for path in archive.out.glob("shards/*/*.json"))
-    assert [(worker.name, worker.pages) for worker in data.workers] == [("not noted", 2 * PAGES)]
 
 
 def test_the_pages_of_a_range_are_spread_over_its_time_and_none_is_lost() -> None:

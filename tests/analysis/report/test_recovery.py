@@ -128,12 +128,6 @@ def test_a_file_of_which_pages_or_all_are_lost(tmp_path: Path) -> None:
     assert not seen.pictures
 
 
-def test_frames_without_light_have_no_margin_to_draw(tmp_path: Path) -> None:
-    dark = replace(NOTHING, pages=tuple(replace(LOST[0], page=page) for page in range(3)))
-    _, seen = page_of(written(dark, tmp_path / "r.json"), tmp_path / "r.html")
-    assert {"read (0)", "optics (3)"} <= labels(seen.pictures["pages"][0])
-
-
 def test_long_lists_end_and_text_is_escaped(tmp_path: Path) -> None:
     evil = '<script>alert("1")</script>'
     lost = tuple(replace(LOST[1], page=page, number=page, reason=evil + 900 * "very long ") for page in range(2500))
@@ -194,8 +188,3 @@ def test_other_json_is_named(content: str, named: str, tmp_path: Path) -> None:
     (path := tmp_path / "j.json").write_text(content)
     with pytest.raises(InvalidInputError, match=named):
         run(report, path, "--out", tmp_path / "r.html")
-
-
-def test_a_recording_is_of_no_use_with_a_recovery(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="--recording"):
-        run(report, written(WHOLE, tmp_path / "r.json"), "--out", tmp_path / "r.html", "--recording", "r.h5")

@@ -3,8 +3,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from analysis.results.measurements import COMPARISONS, Measurement, collected, kept_measurements
-from analysis.results.page import PAGE, ROOT, Results, kilobytes, main, render
+from analysis.results.page import PAGE, ROOT, Results, main, render
 from lightpage.errors import InvalidInputError
 from runtime.bundle.bundle import Bundle
 from runtime.bundle.shipped import bundle_path
@@ -137,53 +135,7 @@ def test_a_page_of_nothing_has_no_figures(tmp_path: Path) -> None:
     assert not any(re.search(r"\d\.\d", row) for row in rows)
 
 
-def test_the_other_benchmarks_are_collected_as_numbers(tmp_path: Path) -> None:
-    evaluation = {"air_bits_per_symbol": 6.5, "page_kB": 3.914, "pages": 14, "maps": {"air": [[1.0]]}, "bundle": {}}
-    drift = {"seed": 0, "pages": 6, "levels": 16, "recalibration": {"pages_used": 2}, "seconds": 1.0}
-    drift["phases"] = [{"air_bits_per_symbol": air} for air in (6.0, 3.0, 5.7)]
-    timed = [{"decoder": "coherent", "seconds": 0.5}, {"decoder": "wave", "seconds": 1.0}]
-    times = {"profile": "bench", "threads": 2, "repeats": 3, "decoders": timed}
-    given = {"evaluation": evaluation, "demo": drift, "speed": times}
-    words = [f"--{name}={written(tmp_path / f'{name}.json', figures)}" for name, figures in given.items()]
-    assert command(tmp_path, *words, "--commit", "0123456").exit_code == 0
-    kept = kept_measurements(tmp_path / "kept")
-    assert kept["evaluation"].figures == {"air_bits_per_symbol": 6.5, "page_kB": 3.914, "pages": 14}
-    page = (tmp_path / "page.md").read_text()
-    assert "| 6.50 bits a symbol, 3.91 kB a page |" in page
-    assert "| 95.0% of the AIR before |" in page
-    assert Results(kept).times("bench", "wave", "coherent") == 2
-
-
-@pytest.mark.skipif(shutil.which("git") is None, reason="no git")
-def test_figures_of_an_unknown_commit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
-    path = written(tmp_path / "figures.json", toy())
-    with pytest.raises(InvalidInputError, match="checkout"):
-        collected("dim", path)
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
-    subprocess.run([*git, "init", "-q"], check=True)
-    subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "measured"], check=True)
-    commit = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout
-    path.write_text(path.read_text())
-    assert collected("dim", path).source.endswith(f" on commit {commit[:7]}")
-    os.utime(path, (1_700_000_000, 1_700_000_000))
-    with pytest.raises(InvalidInputError, match="younger"):
-        collected("dim", path)
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(InvalidInputError, match="checkout"):
-        collected("dim", path)
-
-
 @pytest.mark.parametrize(("name", "figures"), [("dim", {"pages": 3}), ("demo", {}), ("speed-bench", {}), ("dim", [])])
 def test_figures_of_another_benchmark_are_refused(name: str, figures: object, tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError):
         collected(name, written(tmp_path / "F.json", figures), "0123456")
-
-
-def test_a_file_without_a_source_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="source"):
-        Measurement.read(written(tmp_path / "F.json", {"figures": {}}))
-
-
-def test_large_pages_are_told_with_fewer_digits() -> None:
-    assert [kilobytes(size) for size in (8.966, 19.994, 43.56, 159.4)] == ["8.97", "19.99", "43.6", "159"]

@@ -25,12 +25,6 @@ def test_a_storage_that_is_slower_than_the_workers_sets_the_rate() -> None:
     assert rate.bound == "storage"
 
 
-def test_a_page_is_read_while_the_one_before_it_is_decoded() -> None:
-    one = replace(WIDE, nodes=1, workers=1, link_bytes_per_s=2.5e6)  # 0.4 s a page, of which the first is waited for
-    rate = simulated(one, WORK, IDLE)
-    assert rate.pages_per_s == pytest.approx(8 / (0.02 + 0.4 + 8 * 0.5 + 0.032), rel=1e-3)
-
-
 def test_a_driver_that_is_slower_than_the_workers_sets_the_rate() -> None:
     driver = Driver(base_s=0.5, in_flight_s=0.05, ahead=2)
     rate = simulated(WIDE, WORK, driver, ranges_per_worker=40)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,9 @@ import pytest
 from PIL import Image
 
 from analysis.service import changes, dashboard, identity, memory_attacks, outgoing
-from analysis.service.other_servers.calls import arrays_of, infer_request
 from analysis.service.other_servers.environments import NAMES, requirements
 from analysis.service.other_servers.figures import Comparison, Figure
-from analysis.service.other_servers.timing import WARM, in_turns
 from lightpage.errors import LightpageError
-from lightpage.recording.frame_pair import FramePair
-from runtime.pb.inference import open_inference_pb2 as oip
 
 ROOT = Path(__file__).resolve().parents[3]
 TRACE = """\
@@ -118,28 +113,6 @@ def test_a_server_is_better_only_by_more_than_the_larger_spread() -> None:
     assert Comparison.of(own, Figure(14, 15, 16)) == Comparison(difference=5, spread=2)
     assert Comparison.of(own, Figure(10, 15, 20)).missed_by == 5
     assert Comparison.of(own, Figure(4, 5, 6), more_is_better=True).missed_by == -3
-
-
-def test_calls_of_the_warm_up_do_not_count() -> None:
-    numbers = {"a": iter(range(100)), "b": iter(range(100, 200))}
-    told = in_turns({name: partial(next, each) for name, each in numbers.items()}, 2, "calls", np.random.default_rng(0))
-    assert told == {"a": [WARM, WARM + 1], "b": [100 + WARM, 101 + WARM]}
-
-
-def test_a_request_has_both_frames_and_an_answer_is_read_as_a_tensor() -> None:
-    pair = FramePair(*np.arange(12, dtype=np.uint8).reshape(2, 2, 3))
-    request = infer_request("decoder", pair, ("p",), False)
-    assert [(tensor.name, list(tensor.shape)) for tensor in request.inputs] == [
-        ("in_phase", [2, 3]),
-        ("quadrature", [2, 3]),
-    ]
-    assert list(request.raw_input_contents) == [pair.in_phase.tobytes(), pair.quadrature.tobytes()]
-    p, response = np.arange(12, dtype=np.float32).reshape(2, 2, 3), oip.ModelInferResponse()
-    response.outputs.add(name="p", datatype="FP32", shape=p.shape)
-    with pytest.raises(LightpageError):
-        arrays_of(response)
-    response.raw_output_contents.append(p.tobytes())
-    np.testing.assert_array_equal(arrays_of(response)["p"], p)
 
 
 def test_all_environments_are_pinned_and_have_the_onnx_runtime_of_the_service() -> None:

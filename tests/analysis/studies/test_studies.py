@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import click
@@ -17,18 +16,14 @@ from analysis.studies import (
     angle,
     cross_section,
     drift,
-    folding,
     imaging_condition,
-    lens_path,
     pipe_length,
     rays,
-    receptive_field,
     scaling,
 )
 from analysis.studies.command import study
-from analysis.studies.study import Settings, aligned, measured
+from analysis.studies.study import Settings, measured
 from analysis.studies.trained import chosen
-from lightpage.device.lenses import LENSES
 from lightpage.device.profile import load_profile
 from lightpage.errors import InvalidInputError, ProfileError
 from tests.lightpage.small import small_profile
@@ -107,49 +102,12 @@ def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) 
             measured(cross_section.STUDY, settings, case, tmp_path, lambda what, share: None)
 
 
-def test_results_of_unknown_origin_are_not_taken_for_these(small: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    arguments = ("imaging-condition", "--profile", small, "--out", out)
-    run(*arguments, "--quick")
-    begun = (out / "begun.json").read_text()
-    with pytest.raises(InvalidInputError, match="quick"):
-        run(*arguments)
-    (out / "begun.json").unlink()
-    with pytest.raises(InvalidInputError, match="unknown origin"):
-        run(*arguments, "--quick", "--seed", "9")
-    (out / "begun.json").write_text("[]")
-    with pytest.raises(InvalidInputError, match=r"begun\.json"):
-        run(*arguments, "--quick")
-    (out / "begun.json").write_text(begun)
-    shutil.rmtree(out / "results")
-    (out / "results").write_text("")
-    with pytest.raises(InvalidInputError, match="results"):
-        run(*arguments, "--quick")
-
-
-def test_a_table_lines_up() -> None:
-    assert aligned(("a", "long"), [("x", 1.23456), ("yy", float("nan"))]) == " a   long\n x  1.235\nyy      -"
-
-
 # ---- what they say --------------------------------------------------------------------------------------------------
-
-
-def test_layers_see_what_strides_of_two_let_them() -> None:
-    assert tuple(receptive_field.field_of_layers()) == receptive_field.EXPECTED
 
 
 def test_single_pixels_are_too_fine_for_the_full_size_pipe_and_pairs_are_not() -> None:
     assert imaging_condition.needed_width_m(PAPER, 1) * 1e3 == pytest.approx(4.63, abs=0.01)
     assert imaging_condition.needed_width_m(PAPER, 2) < PAPER.pipe.width_m < imaging_condition.needed_width_m(PAPER, 1)
-
-
-@pytest.mark.long  # fits a lens for seconds; the profile and the lens change seldom
-def test_the_full_size_profile_states_the_path_that_is_traced_through_its_lens() -> None:
-    found = lens_path.fitted_path(PAPER, LENSES["AC508-080-A"], seed=1)
-    assert found.spread_rad > 1.5
-    assert found.left_rad < 0.02
-    for name, value in found.path.model_dump().items():
-        assert getattr(PAPER.lens_path, name) == pytest.approx(value, abs=0.02), name
 
 
 def test_a_square_pipe_makes_one_two_or_four_spots_and_a_round_one_smears(tmp_path: Path) -> None:
@@ -173,16 +131,6 @@ def test_a_square_pipe_lays_no_zone_on_another_and_a_sheared_one_does() -> None:
     sheared = {(x, y): share for (angle, x, y), share in shared.items() if angle != 0}
     assert max(sheared, key=lambda zone: sheared[zone]) == (1, 1)  # the diagonal zones suffer most
     assert sheared[1, 1] > 0.03
-
-
-def test_the_middle_of_a_picture_stays_and_no_ray_is_added() -> None:
-    picture = folding.lettered_picture((112, 174))
-    folded = folding.folded_by_rays(BENCH, picture, 0.0)
-    assert folded.sum() == pytest.approx(picture.sum())
-    border = tuple((large - small) // 2 for large, small in zip(folded.shape, picture.shape, strict=True))
-    middle = (slice(40, 72), slice(60, 114))
-    inside = folded[border[0] : border[0] + 112, border[1] : border[1] + 174]
-    np.testing.assert_allclose(inside[middle], picture[middle])
 
 
 def test_what_a_drift_costs_is_counted_over_all_pages_and_bundles_are_not_mixed() -> None:
