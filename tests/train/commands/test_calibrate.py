@@ -101,7 +101,7 @@ def test_symbols_that_were_not_written_find_nothing(bench_recording: Path, tmp_p
 
 @pytest.mark.parametrize("level", [0, 255])
 def test_black_and_saturated_frames_are_refused(tmp_path: Path, level: int) -> None:
-    with pytest.raises(FrameError, match=r"^reference, in-phase"):
+    with pytest.raises(FrameError, match="reference, in-phase"):
         run(flat_recording(tmp_path / "R.h5", 100, reference=level), tmp_path / "calibration.toml")
     with pytest.raises(RecordingError, match="2 of them"):
         run(flat_recording(tmp_path / "R2.h5", level, reference=100), tmp_path / "calibration.toml")

@@ -300,8 +300,8 @@ def test_a_run_goes_on_with_its_own_options_alone(tmp_path: Path) -> None:
     for _ in range(2):
         begin(tmp_path, begun)
     for changed, named in (
-        ({"--channels": 16}, "^--channels: got 16, wanted 8"),
-        ({"calibration": "a = 1\nb = 3\n"}, "^calibration: got b = 3"),
+        ({"--channels": 16}, "--channels: got 16"),
+        ({"calibration": "a = 1\nb = 3\n"}, "calibration: got b"),
         ({"device": {"sensor": {"full_well_e": 64, "noise": 1}}}, "full_well_e: 64"),
         ({"--channels": [8, 16], "--rate": 0.1}, "--rate"),
     ):
