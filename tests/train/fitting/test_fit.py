@@ -106,7 +106,7 @@ def test_what_a_finished_training_kept_is_named_when_it_is_damaged(damaged: str,
 def test_few_steps_teach_large_confidences_and_small_ones(tmp_path: Path) -> None:
     noise = np.where(np.arange(PAGE[1]) < PAGE[1] // 2, 0.03, 0.6)
     training, validation = pages(12, 0, noise), pages(8, 1, noise)
-    module = fit_network(tmp_path, replace(CHOICES, steps=80), MASK, LEVELS, training, validation).module
+    module = fit_network(tmp_path, CHOICES, MASK, LEVELS, training, validation).module
     p, phases = decode_pages(module, validation)
     mu, kappa = np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])
     clear, noisy = np.split(kappa, 2, axis=2)
