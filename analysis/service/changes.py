@@ -41,7 +41,7 @@ _CALLERS = 2
 
 
 @dataclass(frozen=True)
-class Answered:
+class _Answered:
     """A call: when it began and ended, and what came; an error's status in place of a version."""
 
     begun: float
@@ -51,7 +51,7 @@ class Answered:
 
 
 @dataclass(frozen=True)
-class Changed:
+class _Changed:
     """A change: when it was asked for and answered, and the version in service from then on."""
 
     asked: float
@@ -59,7 +59,7 @@ class Changed:
     version: str
 
 
-def call(service: RunningService, requests: list[Any], stop: threading.Event, answered: list[Answered]) -> None:
+def call(service: RunningService, requests: list[Any], stop: threading.Event, answered: list[_Answered]) -> None:
     """Send the pair until told to stop."""
     with service.channel() as channel:
         while not stop.is_set():
@@ -69,7 +69,7 @@ def call(service: RunningService, requests: list[Any], stop: threading.Event, an
                 found = reply.model_version, hashlib.sha256(reply.symbols).hexdigest()
             except grpc.RpcError as error:
                 found = error.code().name, ""
-            answered.append(Answered(begun, time.monotonic(), *found))
+            answered.append(_Answered(begun, time.monotonic(), *found))
 
 
 def change(client: LightpageClient, versions: list[str], chance: random.Random) -> str | None:
@@ -85,7 +85,7 @@ def change(client: LightpageClient, versions: list[str], chance: random.Random) 
         return None
 
 
-def judged(answered: list[Answered], changed: list[Changed], expected: dict[str, str]) -> dict[str, int]:
+def judged(answered: list[_Answered], changed: list[_Changed], expected: dict[str, str]) -> dict[str, int]:
     """Answers that should not be."""
     failed = wrong = stale = 0
     for one in answered:
@@ -118,8 +118,8 @@ def main(changes: int, seed: int, json_path: Path | None) -> None:
         with RunningService(*own) as service, LightpageClient(service.target, 120) as client:
             for path in paths:
                 client.upload_model(path)
-            changed = [Changed(0.0, 0.0, base.version)]
-            answered: list[list[Answered]] = [[] for _ in range(_CALLERS)]
+            changed = [_Changed(0.0, 0.0, base.version)]
+            answered: list[list[_Answered]] = [[] for _ in range(_CALLERS)]
             stop = threading.Event()
             threads = [threading.Thread(target=call, args=(service, requests, stop, each)) for each in answered]
             for thread in threads:
@@ -132,7 +132,7 @@ def main(changes: int, seed: int, json_path: Path | None) -> None:
                         if (version := change(client, list(expected), chance)) is not None:
                             break
                     assert version is not None  # a model can always be activated
-                    changed.append(Changed(asked, time.monotonic(), version))
+                    changed.append(_Changed(asked, time.monotonic(), version))
                     time.sleep(chance.random() * 0.3)
             finally:
                 stop.set()

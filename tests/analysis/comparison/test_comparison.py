@@ -12,7 +12,6 @@ import pytest
 from click.testing import CliRunner
 
 from analysis.comparison import calibration, decoders
-from analysis.comparison.levels import level_figures
 from analysis.comparison.outcome import symbols_by_walls
 from analysis.comparison.weight_store import CALIBRATION, TRAINED, WeightStore
 from lightpage.calibration.calibrate import Registered
@@ -20,8 +19,7 @@ from lightpage.calibration.document import Calibration
 from lightpage.calibration.parameters import NAMES
 from lightpage.device.state import Device, ideal_device
 from lightpage.errors import InvalidInputError
-from lightpage.page.symbols import pilot_mask, symbol_phases
-from lightpage.recording.reader import Recording
+from lightpage.page.symbols import pilot_mask
 from lightpage.simulator.true_optics import true_parameters
 from tests.lightpage.small import small_profile
 from train.models.presets import FAST, PRESETS
@@ -56,20 +54,6 @@ def test_symbols_are_told_apart_by_the_walls_that_their_light_meets() -> None:
     assert (zones["no wall"] == ~across & ~down[:, None]).mean() > 0.98
     assert (zones["x"] == across & ~down[:, None]).mean() > 0.98
     assert sum(zone.astype(int) for zone in zones.values()).tolist() == np.ones((rows, columns)).tolist()
-
-
-def test_confidences_among_few_levels_are_judged(small_device: list[str]) -> None:
-    mask, pages, kappa, rng = pilot_mask(PROFILE), [0, 1], 3.0, np.random.default_rng(0)
-    with Recording.open(small_device[3]) as recording:
-        written = [recording.symbols(page) for page in pages]
-        phases = np.concatenate([symbol_phases(page, 256)[~mask] for page in written if page is not None])
-        # where estimates are drawn about the true phases, a symbol is as likely to be the true one as its estimate says
-        seen = phases + rng.vonmises(0, kappa, phases.shape)
-        p = kappa * np.stack([np.cos(seen), np.sin(seen)]).astype(np.float32)
-        calibrated, bold = (level_figures(scale * p, recording, pages, mask) for scale in (1, 3))
-    assert 0.9 < calibrated.symbol_error_rate == bold.symbol_error_rate < 1
-    assert calibrated.own_mi == pytest.approx(calibrated.air, abs=0.05)
-    assert bold.own_mi > bold.air + 1
 
 
 def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path) -> None:

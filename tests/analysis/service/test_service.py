@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from analysis.service import changes, dashboard, identity, memory_attacks, outgoing
+from analysis.service import dashboard, outgoing
 from analysis.service.other_servers.environments import NAMES, requirements
 from analysis.service.other_servers.figures import Comparison, Figure
 from lightpage.errors import LightpageError
@@ -26,51 +26,6 @@ inet_pton(AF_INET6, "2001:db8::7", &sin6_addr), sin6_scope_id=0}, 28 <unfinished
 sin_addr=inet_addr("192.0.2.9")}, msg_namelen=16}, msg_len=3}], 1, 0) = 1
 74 1764100001.400000 connect(6, {sa_family=AF_INET, sin_port=htons(53), sin_addr=inet_addr("127.0.0.53")}, 16) = 0
 """
-QUIET: dict[str, Any] = {
-    "crashes": 0,
-    "reads_outside": 0,
-    "tracebacks": 0,
-    "failed": [],
-    "good_at_the_end": True,
-    "regions_and_files_before": (1, 40),
-    "regions_and_files_after": (0, 38),
-    "receive_buffer_bytes_after": 0,
-}
-
-
-def test_answers_under_model_changes_are_judged() -> None:
-    changed = [changes.Changed(0.0, 0.0, "a"), changes.Changed(1.0, 2.0, "b"), changes.Changed(5.0, 6.0, "a")]
-    answers = [
-        changes.Answered(0.5, 1.5, "b", "B"),  # the change was under way
-        changes.Answered(1.5, 3.0, "a", "A"),
-        changes.Answered(3.0, 4.0, "UNAVAILABLE", ""),
-        changes.Answered(3.0, 4.0, "b", "A"),
-        changes.Answered(3.0, 4.0, "a", "A"),
-    ]
-    found = changes.judged(answers, changed, {"a": "A", "b": "B"})
-    assert found == {"answers": 5, "failed": 1, "wrong_or_mixed": 1, "stale": 1}
-
-
-def test_faults_of_shared_memory_are_told() -> None:
-    assert memory_attacks.faults(QUIET) == []
-    bad = {"crashes": 1, "reads_outside": 2, "tracebacks": 3, "failed": ["timed out"], "good_at_the_end": False}
-    bad |= {"regions_and_files_after": (2, 41), "receive_buffer_bytes_after": 4096}
-    for name, value in bad.items():
-        assert memory_attacks.faults(QUIET | {name: value}), name
-
-
-@pytest.mark.parametrize(
-    ("caller", "role", "right"),
-    [
-        ("none", "read", {"UNAVAILABLE"}),
-        ("nobody", "read", {"PERMISSION_DENIED"}),
-        ("watcher", "decode", {"PERMISSION_DENIED"}),
-        ("keeper", "recalibrate", {"OK", "INVALID_ARGUMENT"}),
-    ],
-)
-def test_each_caller_has_one_right_outcome(caller: str, role: str, right: set[str]) -> None:
-    codes = ("OK", "INVALID_ARGUMENT", "PERMISSION_DENIED", "UNAVAILABLE")
-    assert {code for code in codes if identity.outcome(code) == identity.expected(caller, role)} == right
 
 
 def test_addresses_of_other_machines_and_name_servers_are_outgoing(tmp_path: Path) -> None:
