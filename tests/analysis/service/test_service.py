@@ -1,4 +1,4 @@
-"""Benchmarks of the service: their judges overlook nothing that they measure."""
+"""Benchmarks of the service: what of them is cheap to check."""
 
 from __future__ import annotations
 
