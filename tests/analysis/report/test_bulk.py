@@ -19,7 +19,7 @@ from runtime.scaling.task import Task
 from runtime.scaling.totals import Reading
 from tests.analysis.report.pages import check_whole, page_of
 from tests.runtime import coded, toy
-from tests.runtime.scaling.test_bulk import PAGES, Archive, archive, spoil_page
+from tests.runtime.scaling.archive import PAGES, Archive, archive, spoil_page
 
 __all__ = ["archive"]
 

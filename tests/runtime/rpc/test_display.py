@@ -27,8 +27,7 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
 from tests.runtime import toy
-from tests.runtime.acquisition.lab import Lab
-from tests.runtime.acquisition.test_camera_source import PAIRING, LabModulator
+from tests.runtime.acquisition.lab import PAIRING, Lab, LabModulator
 
 PAGES = np.stack([toy.symbols_of(16, number)[0] for number in (4, 9)])
 
@@ -45,6 +44,7 @@ def external(lab: Lab) -> tuple[CameraSource, LabModulator]:
         PAIRING,
         Exposures(reference_frames=1),
         name="camera:lab",
+        clock=lab.clock,
     )
     source.arm()
     return source, stage
