@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test test-long test-lowest bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test test-long planted test-lowest bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -47,6 +47,10 @@ test: lint  ## lint, then every test but the long ones; prints the slowest
 
 test-long: $(STAMP)  ## tests that take minutes and prove little more
 	$(PYTEST) -m long $(PYTEST_ARGS)
+
+PLANTED_ARGS ?=
+planted: $(STAMP)  ## plant 60 faults, one at a time, and print which of them the tests find; PLANTED_ARGS="--out FOLDER" resumes
+	$(BIN)/python -m tests.planted.plant $(PLANTED_ARGS)
 
 LOWEST := build/lowest
 test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyproject.toml allows of what the runtime needs
