@@ -50,7 +50,7 @@ test-long: $(STAMP)  ## tests that take minutes and prove little more
 
 PLANTED_ARGS ?=
 planted: $(STAMP)  ## plant 60 faults, one at a time, and print which of them the tests find; PLANTED_ARGS="--out FOLDER" resumes
-	$(BIN)/python -m tests.planted.plant $(PLANTED_ARGS)
+	$(ONE_THREAD) $(BIN)/python -m tests.planted.plant $(PLANTED_ARGS)
 
 LOWEST := build/lowest
 test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyproject.toml allows of what the runtime needs

@@ -1,8 +1,7 @@
 """Draws faults of one line by a seed, spread over areas and kinds, and prints the list anew.
 
-python -m tests.planted.draw --seed 53 > list && mv list tests/planted/faults.toml
-
-What is struck out there is left out; a fault that was in the list keeps its tests.
+`python -m tests.planted.draw --seed 53 > list && mv list tests/planted/faults.toml`: what is struck out there is left
+out, and a fault that was there keeps its tests.
 """
 
 from __future__ import annotations
@@ -21,10 +20,7 @@ from tests.planted.faults import ROOT, Fault, blocks_of, load
 COUNT = 60
 AREAS = {
     "page-code": {"lightpage/codec": "* ldpc/*"},
-    "decoder": {
-        "lightpage": "page/* metrics/*",
-        "runtime/decoding": "decoder page frames phase_refit field_solver",
-    },
+    "decoder": {"lightpage": "page/* metrics/*", "runtime/decoding": "decoder page frames phase_refit field_solver"},
     "tracking": {"runtime/decoding": "image_tracker following tracking image_search image_drift"},
     "calibration": {"lightpage/calibration": "*", "train/fitting": "fit fitted"},
     "registry": {"runtime/service": "registry models replays"},
@@ -33,8 +29,8 @@ AREAS = {
     "ledger": {"runtime/scaling": "ledger totals shard task work job driver volumes"},
     "failures": {"lightpage": "failures errors", "runtime": "errors wire/status rpc/call"},
     "limits": {
+        "runtime": "rpc/message_gate rpc/uploads rpc/sent_pages rpc/frame_calls",
         "runtime/service": "slots limits settings sessions incoming receiver",
-        "runtime/rpc": "message_gate uploads sent_pages frame_calls",
     },
     "wire": {"runtime/wire": "[!s]* s[!t]*", "runtime/client": "[!c]*", "runtime/rpc": "tensors"},
 }
@@ -43,10 +39,9 @@ KINDS = ("comparison", "bound", "sign", "constant", "condition", "swallowed", "e
 TURNED = {"<": ">=", ">=": "<", ">": "<=", "<=": ">", "==": "!=", "!=": "=="}
 MOVED = {"<": "<=", "<=": "<", ">": ">=", ">=": ">"}
 SIGNS = {"+": "-", "-": "+", "+=": "-=", "-=": "+="}
+# Calls of which exchanged arguments fail at once, or change nothing.
 PLAIN = {"isinstance", "issubclass", "getattr", "hasattr", "setattr", "cast", "min", "max", "minimum", "maximum"}
-"""Calls of which exchanged arguments fail at once, or change nothing."""
-Edit = tuple[int, int, int, str]
-"""On a line, the bytes from one column to another become a text."""
+Edit = tuple[int, int, int, str]  # on a line, the bytes from one column to another become a text
 
 
 def _put(node: ast.expr | ast.stmt, text: str) -> Iterator[Edit]:
@@ -61,14 +56,6 @@ def _operator(left: ast.expr, right: ast.expr, names: dict[str, str], source: li
             yield right.lineno, left.end_col_offset or 0, right.col_offset, between.replace(sign, names[sign])
 
 
-def _exchanged(one: ast.expr, other: ast.expr, source: list[bytes]) -> Iterator[Edit]:
-    starred = isinstance(one, ast.Starred) or isinstance(other, ast.Starred)
-    if one.lineno == one.end_lineno == other.lineno == other.end_lineno and not starred:
-        a, b, c, d = one.col_offset, one.end_col_offset or 0, other.col_offset, other.end_col_offset or 0
-        line = source[one.lineno - 1]
-        yield one.lineno, a, d, (line[c:d] + line[b:c] + line[a:b]).decode()
-
-
 def edits(kind: str, node: ast.AST, source: list[bytes]) -> Iterator[Edit]:
     """What a kind of fault makes of a node."""
     match kind, node:
@@ -80,7 +67,7 @@ def edits(kind: str, node: ast.AST, source: list[bytes]) -> Iterator[Edit]:
         case "bound", ast.Slice(lower, upper):
             for end in filter(None, (lower, upper)):
                 yield from _put(end, f"{ast.unparse(end)} + 1")
-        case "bound", ast.Call(func=ast.Name(id="range"), args=[end] | [_, end, *_]):
+        case "bound", ast.Call(ast.Name("range"), [end] | [_, end, *_]):
             yield from _put(end, f"{ast.unparse(end)} + 1")
         case "sign", ast.BinOp(left, _, right) | ast.AugAssign(left, _, right):
             yield from _operator(left, right, SIGNS, source)
@@ -99,11 +86,13 @@ def edits(kind: str, node: ast.AST, source: list[bytes]) -> Iterator[Edit]:
         case "exchanged", ast.Call(ast.Name(called) | ast.Attribute(_, called), args, words) if called not in PLAIN:
             places = args[:2] if called.endswith("Error") else args  # behind an error's subject are but words
             for one, other in [*pairwise(places), *pairwise([word.value for word in words if word.arg])]:
-                yield from _exchanged(one, other, source)
-        case "unstored", ast.Assign([ast.Attribute() | ast.Subscript()], value) | ast.AugAssign(
-            ast.Attribute() | ast.Subscript(), _, value
-        ):
-            yield from _put(node, ast.unparse(value))
+                line, plain = source[one.lineno - 1], not {type(one), type(other)} & {ast.Starred}
+                if plain and one.lineno == one.end_lineno == other.lineno == other.end_lineno:
+                    a, b, c, d = one.col_offset, one.end_col_offset or 0, other.col_offset, other.end_col_offset or 0
+                    yield one.lineno, a, d, (line[c:d] + line[b:c] + line[a:b]).decode()
+        case "unstored", ast.Assign([target], value) | ast.AugAssign(target, _, value):
+            if isinstance(target, ast.Attribute | ast.Subscript):
+                yield from _put(node, ast.unparse(value))
 
 
 def reached(node: ast.AST) -> Iterator[ast.AST]:
@@ -123,33 +112,31 @@ def candidates(area: str, kind: str) -> Iterator[Fault]:
     """Every fault of one kind that an area has room for."""
     names = [f"{folder}/{name}.py" for folder, names in AREAS[area].items() for name in names.split()]
     for path in sorted({path for name in names for path in ROOT.glob(name)}):
-        text = path.read_text()
-        tree, source = ast.parse(text), text.encode().splitlines()
-        blocks = [("", 1, len(source)), *((name, b.lineno, b.end_lineno or 0) for name, b in blocks_of(tree))]
+        tree, source = ast.parse(path.read_text()), path.read_bytes().splitlines()
+        blocks = [("", (1, len(source))), *blocks_of(tree)]
         for number, start, end, put in (edit for node in reached(tree) for edit in edits(kind, node, source)):
-            within, first, last = [block for block in blocks if block[1] <= number <= block[2]][-1]
+            within, (first, last) = next(b for b in reversed(blocks) if b[1][0] <= number <= b[1][1])
             line = source[number - 1]
             same = [n for n in range(first, last + 1) if source[n - 1].strip() == line.strip()]
-            new = (line[:start] + put.encode() + line[end:]).decode().strip()
+            old, new = (text.decode().strip() for text in (line, line[:start] + put.encode() + line[end:]))
             nth = same.index(number) + 1 if len(same) > 1 else 0
-            yield Fault(area, kind, str(path.relative_to(ROOT)), within, line.decode().strip(), new, nth)
+            yield Fault(area, kind, str(path.relative_to(ROOT)), within, old, new, nth)
 
 
-def draw(seed: int, struck: set[tuple[str | int, ...]]) -> Iterator[Fault]:
+def draw(seed: int, struck: set[Fault]) -> Iterator[Fault]:
     """One fault for as many pairs of an area and a kind: the first one in an order that the seed makes."""
     areas, kinds = random.Random(seed).sample(list(AREAS), len(AREAS)), random.Random(seed).sample(KINDS, len(KINDS))
     taken = 0
     for turn in range(len(areas) * len(kinds)):  # numbers without a common divisor: every pair comes once
         found = candidates(areas[turn % len(areas)], kinds[turn % len(kinds)]) if taken < COUNT else ()
-        if left := [fault for fault in found if fault.key not in struck]:
-            yield min(left, key=lambda fault: hashlib.sha256(repr((seed, fault.key)).encode()).digest())
+        if left := {(one.file, one.within, one.line, one.nth, one.new): one for one in found if one not in struck}:
+            yield left[min(left, key=lambda parts: hashlib.sha256(repr((seed, parts)).encode()).digest())]
             taken += 1
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
-    listed, out = load()
-    tests = {fault.key: fault.tests for fault in listed}
-    drawn = draw(parser.parse_args().seed, {fault.key for fault in out})
-    print("".join(f.toml() for f in [*(replace(one, tests=tests.get(one.key, ())) for one in drawn), *out]), end="")
+    struck, tests = load("struck"), {fault: fault.tests for fault in load("fault")}
+    drawn = [replace(one, tests=tests.get(one, ())) for one in draw(parser.parse_args().seed, set(struck))]
+    print("".join(fault.toml() for fault in [*drawn, *struck]), end="")

@@ -6,7 +6,7 @@ import ast
 import json
 import subprocess
 import tomllib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -15,39 +15,29 @@ LIST = Path(__file__).with_name("faults.toml")
 
 @dataclass(frozen=True)
 class Fault:
-    """One line of a file, in a function or class (the whole file if that is ""), that another takes the place of.
+    """One line of a file, in a function or class (the whole file if that is ""), that another takes the place of."""
 
-    Attributes:
-        nth: which of several equal lines there, from 1; 0 where it is the only one.
-        tests: files that ought to see it.
-        reason: why it is struck out, where it is.
-    """
-
-    area: str
-    kind: str
+    area: str = field(compare=False)
+    kind: str = field(compare=False)
     file: str
     within: str = ""
     line: str = ""
     new: str = ""
-    nth: int = 0
-    tests: tuple[str, ...] = ()
-    reason: str = ""
+    nth: int = 0  # which of several equal lines there, from 1; 0 where it is the only one
+    tests: tuple[str, ...] = field(default=(), compare=False)  # files that ought to see it
+    reason: str = field(default="", compare=False)  # why it is struck out, where it is
 
     @property
     def id(self) -> str:
         return f"{self.area}-{self.kind}"
 
-    @property
-    def key(self) -> tuple[str | int, ...]:
-        return (self.file, self.within, self.line, self.nth, self.new)
-
-    def planted(self) -> str:
-        """Today's file with the fault in it; the program ends where its line is not found or is no Python."""
-        source = (ROOT / self.file).read_text() if (ROOT / self.file).is_file() else ""
+    def planted(self, root: Path = ROOT) -> str:
+        """The file with the fault in it; the program ends where its line is not found, and where it is no Python."""
+        source = (root / self.file).read_text() if (root / self.file).is_file() else ""
         lines = source.splitlines(keepends=True)
-        blocks = {name: range(node.lineno - 1, node.end_lineno or 0) for name, node in blocks_of(ast.parse(source))}
-        block = blocks.get(self.within, range(0)) if self.within else range(len(lines))
-        found = [number for number in block if lines[number].strip() == self.line]
+        blocks = dict([("", (1, len(lines))), *blocks_of(ast.parse(source))])
+        first, last = blocks.get(self.within, (1, 0))
+        found = [number for number in range(first - 1, last) if lines[number].strip() == self.line]
         if len(found) < max(self.nth, 1) or (not self.nth and len(found) > 1):
             grep = subprocess.run(["git", "grep", "-lF", self.line, "*.py"], cwd=ROOT, capture_output=True, text=True)
             raise SystemExit(
@@ -64,18 +54,18 @@ class Fault:
         return f"[[{'struck' if self.reason else 'fault'}]]\n{''.join(rows)}\n"
 
 
-def blocks_of(tree: ast.AST, outer: str = "") -> list[tuple[str, ast.FunctionDef | ast.ClassDef]]:
-    """Every function and class with its qualified name; the inner ones last."""
+def blocks_of(tree: ast.AST, outer: str = "") -> list[tuple[str, tuple[int, int]]]:
+    """First and last line of every function and class by its qualified name; the inner ones last."""
     found = []
     for node in ast.iter_child_nodes(tree):
-        named = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
-        name = f"{outer}.{node.name}".lstrip(".") if named else outer
-        found += [(name, node)] * named + blocks_of(node, name)
+        name = outer
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            found.append((name := f"{outer}.{node.name}".lstrip("."), (node.lineno, node.end_lineno or 0)))
+        found += blocks_of(node, name)
     return found
 
 
-def load() -> tuple[list[Fault], list[Fault]]:
-    """The faults of the list, and those that are struck out."""
-    read = tomllib.loads(LIST.read_text())
-    rows = [[{**row, "tests": tuple(row.get("tests", ()))} for row in read.get(of, ())] for of in ("fault", "struck")]
-    return [Fault(**row) for row in rows[0]], [Fault(**row) for row in rows[1]]
+def load(kind: str) -> list[Fault]:
+    """What the list has of one kind of entry: `fault`, or `struck`."""
+    rows = tomllib.loads(LIST.read_text()).get(kind, [])
+    return [Fault(**{**row, "tests": tuple(row.get("tests", ()))}) for row in rows]
