@@ -24,7 +24,7 @@ class Fault:
     line: str = ""
     new: str = ""
     nth: int = 0  # which of several equal lines there, from 1; 0 where it is the only one
-    tests: tuple[str, ...] = field(default=(), compare=False)  # files that ought to see it
+    tests: tuple[str, ...] = field(default=(), compare=False)  # files, or FILE::TEST, that ought to see it
     reason: str = field(default="", compare=False)  # why it is struck out, where it is
 
     @property

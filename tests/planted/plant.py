@@ -35,7 +35,7 @@ def digest(*what: object) -> str:
 
 def run(folder: Path, tests: list[str], limit_s: float, fault: Fault | None) -> dict[str, Any]:
     """Run test files in a copy, with a fault if there is one: whether they pass, what fails, seconds, last words."""
-    path = folder / (fault.file if fault else tests[0])
+    path = folder / (fault.file if fault else tests[0].partition("::")[0])
     whole, began = path.read_text(), time.monotonic()
     if fault:
         path.write_text(fault.planted(folder))
