@@ -65,7 +65,7 @@ def run(folder: Path, tests: list[str], limit_s: float, fault: Fault | None) -> 
 
 def measure(faults: list[Fault], given: argparse.Namespace, temporary: Path) -> list[dict[str, Any]]:
     """Run every named test file as it is, which must pass, and then each fault's."""
-    today = git("-c", "user.name=.", "-c", "user.email=.", "stash", "create").decode().strip() or "HEAD"
+    today = git("-c", "user.name=planted", "-c", "user.email=planted", "stash", "create").decode().strip() or "HEAD"
     parts = [(today, ".", ":!tests"), (given.tests, "tests"), (today, *KEPT)] if given.tests else [(today, ".")]
     copies, results = queue.SimpleQueue[Path](), given.out or temporary
     for folder in (temporary / str(number) / "copy" for number in range(WORKERS)):
