@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 export ORT_DISABLE_TELEMETRY = 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMEXPR_NUM_THREADS=1
 
-.PHONY: help setup demo demo-hardware test test-long planted test-lowest bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
+.PHONY: help setup demo demo-hardware test pytest test-long planted test-lowest messages bench bench-speed bench-service bench-other-servers bench-scaling dashboard soak bench-codec bench-hardware bench-image-search bench-decoders train-decoders results image sbom check-image check-camera-image lock licences audit proto lint format clean
 .DELETE_ON_ERROR:
 
 help:  ## list the targets
@@ -42,7 +42,10 @@ demo-hardware: $(STAMP)  ## the main job over fake cameras, real packets, a seri
 	    $(BIN)/lightpage demo --source camera:$(HARDWARE)/device/device.toml --out $(HARDWARE)
 
 PYTEST := $(ONE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
-test: lint  ## lint, then every test but the long ones; prints the slowest
+test: $(STAMP)  ## lint, then every test but the long ones; prints the slowest, and how far all stayed below the budget
+	@$(BIN)/python -m tests.budget "make test" $(MAKE) --no-print-directory lint pytest
+
+pytest: $(STAMP)
 	$(PYTEST) -m "not long" --durations 20 --durations-min 5 $(PYTEST_ARGS)
 
 test-long: $(STAMP)  ## tests that take minutes and prove little more
@@ -52,6 +55,9 @@ PLANTED_ARGS ?=
 planted: $(STAMP)  ## plant 60 faults, one at a time, and print which of them the tests find; PLANTED_ARGS="--out FOLDER" resumes
 	$(ONE_THREAD) $(BIN)/python -m tests.planted.plant $(PLANTED_ARGS)
 
+messages: $(STAMP)  ## write anew what the command line says in the failures that people meet most: tests/messages
+	$(PYTEST) tests/messages --snapshot-update
+
 LOWEST := build/lowest
 test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyproject.toml allows of what the runtime needs
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(LOWEST)
@@ -60,9 +66,10 @@ test-lowest: $(STAMP)  ## a share of the tests with the lowest versions that pyp
 	$(ONE_THREAD) $(LOWEST)/bin/python -m pytest -q -p no:cacheprovider tests/lightpage/recording tests/lightpage/test_files.py \
 	    tests/runtime/bundle tests/runtime/decoding/test_following.py tests/runtime/wire tests/runtime/scaling/test_storage.py
 
-lint: $(STAMP)  ## ruff, mypy --strict, hadolint
+lint: $(STAMP)  ## ruff, layers of imports, mypy --strict, hadolint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/mypy
 	$(BIN)/mypy packaging/*.py
 	$(BIN)/hadolint Dockerfile

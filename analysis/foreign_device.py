@@ -28,30 +28,63 @@ FloatArray = NDArray[np.floating]
 WAVELENGTH = 532e-6
 WAVENUMBER = 2 * np.pi / WAVELENGTH
 GLASS_INDEX = 1.461
-NOMINAL_FOCAL_LENGTH = 20.0
-NOMINAL_PIPE_LENGTH = 18.75
-NOMINAL_PIPE_WIDTH = 0.88963
 SLM_PITCH = 9.2e-3
 SYMBOL_PX = 4
-PAGE_SHAPE = (56, 87)
-FRAME_SHAPE = (912, 1368)
 CAMERA_PITCH = 2.4e-3
-
-PAGE_PX = (PAGE_SHAPE[0] * SYMBOL_PX, PAGE_SHAPE[1] * SYMBOL_PX)
-CORNER = float(np.hypot(*PAGE_PX)) * SLM_PITCH / 2
-"""Distance of the page's corner from its centre, mm."""
-
-PADDED_PX = (270, 400)
-"""SLM pixels with a dark border, in which the page is turned against the pipe."""
-FACET = (225, 320)
-"""Samples from wall to wall in (y', x): 292 x 416 SLM pixels' worth of angles, 25% more than the page fills."""
 IMAGE_PITCH = 3e-3
 """Pitch of the camera-plane field, a quarter of what its band asks for, so that cubic splines are good to -60 dB."""
 IMAGE_MARGIN = 0.09
 """How far beyond the nominal frame the camera-plane field is computed, mm: shift, scale, rotation and distortion."""
-STEPS = 64
 TAYLOR_TERMS = 4
 REFERENCE_EXPOSURES = 64
+
+
+@dataclass(frozen=True)
+class Design:
+    """What is nominal of a device, and how finely it is computed.
+
+    Attributes:
+        focal_length, pipe_length, pipe_width: mm.
+        page_shape: symbols (y, x).
+        frame_shape: camera pixels (y, x).
+        padded_px: SLM pixels with a dark border, in which the page is turned against the pipe.
+        facet: samples from wall to wall in (y', x), 25% more than the page's angles fill.
+        steps: through the pipe.
+    """
+
+    focal_length: float = 20.0
+    pipe_length: float = 18.75
+    pipe_width: float = 0.88963
+    page_shape: tuple[int, int] = (56, 87)
+    frame_shape: tuple[int, int] = (912, 1368)
+    padded_px: tuple[int, int] = (270, 400)
+    facet: tuple[int, int] = (225, 320)
+    steps: int = 64
+
+    @property
+    def page_px(self) -> tuple[int, int]:
+        """The page's SLM pixels (y, x)."""
+        return self.page_shape[0] * SYMBOL_PX, self.page_shape[1] * SYMBOL_PX
+
+    @property
+    def corner(self) -> float:
+        """Distance of the page's corner from its centre, mm."""
+        return float(np.hypot(*self.page_px)) * SLM_PITCH / 2
+
+
+BENCH = Design()
+PAGE_SHAPE, FRAME_SHAPE = BENCH.page_shape, BENCH.frame_shape
+HALF = Design(
+    focal_length=10.0,
+    pipe_length=9.375,
+    pipe_width=0.444815,
+    page_shape=(28, 44),
+    frame_shape=(456, 684),
+    padded_px=(136, 200),
+    facet=(112, 160),
+    steps=32,
+)
+"""The bench device with a page a quarter as large; light takes a tenth of the time."""
 
 
 @dataclass(frozen=True)
@@ -161,18 +194,19 @@ class PageDrift:
 
 @dataclass(frozen=True)
 class ForeignDevice:
-    """One device with its optics, cameras and noise; geometry and page of the bench device."""
+    """One device with its optics, cameras and noise."""
 
     parameters: Parameters = Parameters()
+    design: Design = BENCH
 
     @classmethod
-    def draw(cls, seed: int) -> ForeignDevice:
-        """A device anywhere within the capture range."""
-        return cls(draw_parameters(np.random.default_rng([seed, 1])))
+    def draw(cls, seed: int, design: Design = BENCH) -> ForeignDevice:
+        """Draw a device from anywhere within the capture range."""
+        return cls(draw_parameters(np.random.default_rng([seed, 1])), design)
 
     def with_parameters(self, **changes: object) -> ForeignDevice:
         """The same device with some parameters changed."""
-        return ForeignDevice(dataclasses.replace(self.parameters, **changes))  # type: ignore[arg-type]
+        return dataclasses.replace(self, parameters=dataclasses.replace(self.parameters, **changes))  # type: ignore[arg-type]
 
     # --- geometry -----------------------------------------------------------------------------------------------------
 
@@ -184,27 +218,29 @@ class ForeignDevice:
     @property
     def focal_length(self) -> float:
         """True focal length of both lenses, mm."""
-        return NOMINAL_FOCAL_LENGTH * (1 + self.parameters.focal_length_error)
+        return self.design.focal_length * (1 + self.parameters.focal_length_error)
 
     @property
     def pipe_length(self) -> float:
         """True length of the pipe, mm."""
-        return NOMINAL_PIPE_LENGTH * (1 + self.parameters.pipe_length_error)
+        return self.design.pipe_length * (1 + self.parameters.pipe_length_error)
 
     @property
     def pipe_width(self) -> float:
         """True distance of opposite walls, mm."""
-        return NOMINAL_PIPE_WIDTH * (1 + self.parameters.pipe_width_error)
+        return self.design.pipe_width * (1 + self.parameters.pipe_width_error)
 
     @property
     def pitches(self) -> tuple[float, float]:
         """Sample pitches (y', x) on the facet, mm."""
-        return self.pipe_width / FACET[0], self.pipe_width / FACET[1]
+        return self.pipe_width / self.design.facet[0], self.pipe_width / self.design.facet[1]
 
     @cached_property
     def facet_coordinates(self) -> tuple[FloatArray, FloatArray]:
         """(y', x) of the facet's samples, mm; the first sample of each lies on a wall."""
-        return tuple(np.arange(n) * d - self.pipe_width / 2 for n, d in zip(FACET, self.pitches, strict=True))  # type: ignore[return-value]
+        return tuple(
+            np.arange(n) * d - self.pipe_width / 2 for n, d in zip(self.design.facet, self.pitches, strict=True)
+        )  # type: ignore[return-value]
 
     # --- light --------------------------------------------------------------------------------------------------------
 
@@ -213,8 +249,8 @@ class ForeignDevice:
         p = self.parameters
         phase = np.kron(symbols * (2 * np.pi / levels), np.ones((SYMBOL_PX, SYMBOL_PX)))
         phase = phase + p.phase_noise_rad * rng.standard_normal(phase.shape)
-        y, x = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * SLM_PITCH for n in PAGE_PX), indexing="ij")
-        rho, phi = np.hypot(x, y) / CORNER, np.arctan2(y, x)
+        y, x = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * SLM_PITCH for n in self.design.page_px), indexing="ij")
+        rho, phi = np.hypot(x, y) / self.design.corner, np.arctan2(y, x)
         phase += p.defocus_rad * rho**2
         phase += p.astigmatism_rad * rho**2 * np.cos(2 * (phi - np.deg2rad(p.astigmatism_axis_deg)))
         phase += p.coma_rad * rho**3 * np.cos(phi - np.deg2rad(p.coma_axis_deg))
@@ -223,20 +259,24 @@ class ForeignDevice:
     def launch(self, page: ComplexArray) -> ComplexArray:
         """From SLM pixels to the entrance facet [y', x], as the pipe sees it."""
         roll, f = np.deg2rad(self.parameters.pipe_roll_deg), self.focal_length
-        padded = np.zeros(PADDED_PX, complex)
-        top, left = ((a - b) // 2 for a, b in zip(PADDED_PX, PAGE_PX, strict=True))
-        padded[top : top + PAGE_PX[0], left : left + PAGE_PX[1]] = page
+        padded = np.zeros(self.design.padded_px, complex)
+        top, left = ((a - b) // 2 for a, b in zip(self.design.padded_px, self.design.page_px, strict=True))
+        padded[top : top + self.design.page_px[0], left : left + self.design.page_px[1]] = page
         turned = rotated(padded, -roll)
         right, down = self.parameters.page_centre_px
         centre_x, centre_y = rotate(right * SLM_PITCH, down * SLM_PITCH, -roll)
-        y0, x0 = (float(c) - (n - 1) / 2 * SLM_PITCH for c, n in zip((centre_y, centre_x), PADDED_PX, strict=True))
+        y0, x0 = (
+            float(c) - (n - 1) / 2 * SLM_PITCH for c, n in zip((centre_y, centre_x), self.design.padded_px, strict=True)
+        )
         facet_y, facet_x = self.facet_coordinates
         dy, dx = self.pitches
         tangent, cosine = np.tan(self.angle), np.cos(self.angle)
-        field = fourier_sum(turned, (x0, SLM_PITCH), (facet_x[0], dx, FACET[1]), -WAVENUMBER / f, axis=1)
-        page_y = y0 + np.arange(PADDED_PX[0]) * SLM_PITCH
+        field = fourier_sum(turned, (x0, SLM_PITCH), (facet_x[0], dx, self.design.facet[1]), -WAVENUMBER / f, axis=1)
+        page_y = y0 + np.arange(self.design.padded_px[0]) * SLM_PITCH
         field *= np.exp(1j * WAVENUMBER / f * tangent * np.outer(page_y, facet_x))
-        field = fourier_sum(field, (y0, SLM_PITCH), (facet_y[0], dy, FACET[0]), -WAVENUMBER / (f * cosine), axis=0)
+        field = fourier_sum(
+            field, (y0, SLM_PITCH), (facet_y[0], dy, self.design.facet[0]), -WAVENUMBER / (f * cosine), axis=0
+        )
         y = (facet_y[:, None] - facet_x[None, :] * np.sin(self.angle)) / cosine
         x = np.broadcast_to(facet_x, y.shape)
         # Cycles a pixel along the SLM's own axes: they set what a square pixel and the blur let through.
@@ -244,14 +284,16 @@ class ForeignDevice:
         field *= np.sinc(u) * np.sinc(v) * np.exp(-2 * (np.pi * self.parameters.blur_px) ** 2 * (u**2 + v**2))
         return field * SLM_PITCH**2 / (WAVELENGTH * f)
 
-    def propagate(self, facet: ComplexArray, steps: int = STEPS) -> ComplexArray:
+    def propagate(self, facet: ComplexArray, steps: int | None = None) -> ComplexArray:
         """Through the pipe, from facet to facet [y', x]."""
-        return propagate_pipe(facet, self.pipe_width, self.pipe_length, self.angle, steps)
+        return propagate_pipe(facet, self.pipe_width, self.pipe_length, self.angle, steps or self.design.steps)
 
     def delaunch(self, facet: ComplexArray) -> Image:
         """From the exit facet to the camera plane, in the pipe's axes."""
         f, (facet_y, facet_x), (dy, dx) = self.focal_length, self.facet_coordinates, self.pitches
-        counts = [int(np.ceil((n * CAMERA_PITCH / 2 + IMAGE_MARGIN) / IMAGE_PITCH)) * 2 + 1 for n in FRAME_SHAPE]
+        counts = [
+            int(np.ceil((n * CAMERA_PITCH / 2 + IMAGE_MARGIN) / IMAGE_PITCH)) * 2 + 1 for n in self.design.frame_shape
+        ]
         y0, x0 = (-(n - 1) / 2 * IMAGE_PITCH for n in counts)
         tangent, cosine = np.tan(self.angle), np.cos(self.angle)
         to_y = (y0, IMAGE_PITCH, counts[0])
@@ -271,13 +313,13 @@ class ForeignDevice:
     def signal_rms(self) -> float:
         """Root mean square amplitude of the signal over the page's image: pipe and lenses keep the power."""
         rng = np.random.default_rng(0)
-        facet = self.launch(self.modulate(rng.integers(0, 256, PAGE_SHAPE), 256, rng))
+        facet = self.launch(self.modulate(rng.integers(0, 256, self.design.page_shape), 256, rng))
         power = np.sum(np.abs(facet) ** 2) * np.prod(self.pitches) / np.cos(self.angle)
-        return float(np.sqrt(power / (np.prod(PAGE_PX) * SLM_PITCH**2)))
+        return float(np.sqrt(power / (np.prod(self.design.page_px) * SLM_PITCH**2)))
 
     def plane_coordinates(self, camera: Camera, drift: PageDrift) -> tuple[FloatArray, FloatArray]:
         """(x, y) in the camera plane, mm, that each pixel of a frame looks at."""
-        rows, columns = (np.arange(n) - (n - 1) / 2 for n in FRAME_SHAPE)
+        rows, columns = (np.arange(n) - (n - 1) / 2 for n in self.design.frame_shape)
         x = columns[None, :] - camera.shift_px[0] - drift.shift_px[0]
         y = rows[:, None] - camera.shift_px[1] - drift.shift_px[1]
         scale = CAMERA_PITCH / (1 + camera.scale)
@@ -286,7 +328,7 @@ class ForeignDevice:
     def signal(self, image: Image, camera: Camera, drift: PageDrift) -> ComplexArray:
         """The signal on a camera's pixels."""
         x, y = self.plane_coordinates(camera, drift)
-        stretch = 1 + self.parameters.distortion * (x**2 + y**2) / CORNER**2
+        stretch = 1 + self.parameters.distortion * (x**2 + y**2) / self.design.corner**2
         x, y = rotate(x * stretch, y * stretch, -np.deg2rad(self.parameters.pipe_roll_deg))
         return np.asarray(image.at(x, y) * np.exp(1j * drift.piston_rad))
 
@@ -295,14 +337,14 @@ class ForeignDevice:
         p = self.parameters
         x, y = self.plane_coordinates(camera, PageDrift())
         rng = np.random.default_rng(p.ripple_seed)
-        fringes = np.zeros(FRAME_SHAPE)
+        fringes = np.zeros(self.design.frame_shape)
         for amplitude in (0.5, 0.3, 0.2):
             direction, period, phase = rng.uniform(0, np.pi), rng.uniform(0.4, 3.0), rng.uniform(0, 2 * np.pi)
             along = x * np.cos(direction) + y * np.sin(direction)
             fringes += amplitude * np.cos(2 * np.pi * along / period + phase)
-        half_height, half_width = (n * SLM_PITCH / 2 for n in PAGE_PX)
+        half_height, half_width = (n * SLM_PITCH / 2 for n in self.design.page_px)
         front = p.tilt_rad[0] * x / half_width + p.tilt_rad[1] * y / half_height
-        front = front + p.curvature_rad * (x**2 + y**2) / CORNER**2
+        front = front + p.curvature_rad * (x**2 + y**2) / self.design.corner**2
         return np.asarray(self.signal_rms * p.reference_ratio * (1 + p.ripple * fringes) * np.exp(1j * front))
 
     @property
@@ -388,7 +430,7 @@ class ForeignDevice:
             symbols: what the modulator shows, uint8 [pages, ny, nx]; drawn if left out.
         """
         rng = np.random.default_rng([seed, 2])
-        drawn = rng.integers(0, levels, size=(pages, *PAGE_SHAPE), dtype=np.uint8)
+        drawn = rng.integers(0, levels, size=(pages, *self.design.page_shape), dtype=np.uint8)
         symbols = drawn if symbols is None else symbols
         drifts = self.walk(pages, rng, jumps_px)
         with h5py.File(str(path), "w") as file:
@@ -404,7 +446,9 @@ class ForeignDevice:
             dtype = np.uint8 if self.parameters.bit_depth == 8 else np.uint16
             for name, intensity in zip(names, self.intensities(None), strict=True):
                 file[f"reference_{name}"] = self.expose(intensity, rng, REFERENCE_EXPOSURES)
-                file.create_dataset(name, (pages, *FRAME_SHAPE), dtype, chunks=(1, *FRAME_SHAPE))
+                file.create_dataset(
+                    name, (pages, *self.design.frame_shape), dtype, chunks=(1, *self.design.frame_shape)
+                )
             for page in range(pages):
                 image = self.image(symbols[page], levels, rng)
                 for name, intensity in zip(names, self.intensities(image, drifts[page]), strict=True):

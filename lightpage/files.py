@@ -33,7 +33,7 @@ _NAME_BYTES = 255
 _LACKING = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM})
 """Error numbers of a file system that lacks what was asked of it, e.g. locks or synchronisation."""
 
-_without_locks = set[int]()
+WITHOUT_LOCKS = set[int]()
 """Devices that have no locks, of which a warning was given."""
 
 _ENCODINGS = (
@@ -90,8 +90,8 @@ def lock(descriptor: int, subject: str, *, shared: bool = False) -> bool:
             raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from None
         if error.errno not in _LACKING:
             raise
-        if (device := os.fstat(descriptor).st_dev) not in _without_locks:
-            _without_locks.add(device)
+        if (device := os.fstat(descriptor).st_dev) not in WITHOUT_LOCKS:
+            WITHOUT_LOCKS.add(device)
             warn(f"{subject}: no lock ({error.strerror}); see to it that no other process writes on this file system")
         return False
     return True

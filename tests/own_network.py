@@ -1,50 +1,86 @@
-"""Tests with the marker `own_network` run in a private network each: fake cameras need two addresses, and one port.
+"""Tests with the marker `own_network` run in a private network: fake cameras need two addresses, and one port.
 
-Such a test is run by a second pytest inside that network. Its fixtures are set up in both, so they must not hold
-cameras.
+All such tests of a file are run at once, by a second pytest inside that network; each reports what became of it there.
+Their fixtures are set up in both, so they must not hold cameras.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import pytest
 
 from runtime.cameras.aravis_library import PACKAGE, aravis
 from runtime.errors import SourceError
-from runtime.virtual_device.namespace import available, enter
+from runtime.virtual_device import namespace
 from tests.skips import NO_NETWORKS
 
-_INSIDE = "LIGHTPAGE_TEST_OWN_NETWORK"
-_LONGEST_S = 120.0
+MARKER = "own_network"
+_RESULTS = "LIGHTPAGE_TEST_OWN_NETWORK"
+"""Environment variable in the network: the file that takes the results, a line of JSON for each."""
+_LONGEST_S = 540.0
+_found = pytest.StashKey[dict[str, tuple[str, str]]]()
+"""Outcome of each test in the network, and what is told of it."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Call the test here if this is its network, else there."""
-    if pyfuncitem.get_closest_marker("own_network") is None or os.environ.get(_INSIDE) == "1":
+    """Call the test here if this is its network, else see what became of it there."""
+    if pyfuncitem.get_closest_marker(MARKER) is None or _RESULTS in os.environ:
         return None
+    found = pyfuncitem.session.stash.setdefault(_found, {})
+    if pyfuncitem.nodeid not in found:
+        found |= _run(pyfuncitem)
+    outcome, told = found[pyfuncitem.nodeid]
+    if outcome == "skipped":
+        pytest.skip(told)
+    if outcome != "passed":
+        pytest.fail(told, pytrace=False)
+    return True
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Note what became of a test in the network."""
+    if _RESULTS in os.environ and (report.when == "call" or not report.passed):
+        told = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longreprtext
+        with open(os.environ[_RESULTS], "a") as results:
+            results.write(json.dumps([report.nodeid, report.outcome, told.removeprefix("Skipped: ")]) + "\n")
+
+
+def _run(first: pytest.Function) -> dict[str, tuple[str, str]]:
+    """Run the marked tests of a file."""
     if shutil.which("unshare") is None:
         pytest.skip("no unshare: util-linux is not installed")
-    if available() is not None:
+    if namespace.available() is not None:
         pytest.skip(NO_NETWORKS)
     try:
         aravis()
     except SourceError:
         pytest.skip(f"{PACKAGE} is not installed")
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", pyfuncitem.nodeid]
-    run = subprocess.run(
-        enter(command),
-        cwd=pyfuncitem.config.rootpath,
-        env={**os.environ, _INSIDE: "1"},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=_LONGEST_S,
-    )
-    if run.returncode != 0:
-        pytest.fail(run.stdout + run.stderr, pytrace=False)
-    return True
+    items = [item for item in first.session.items if item.path == first.path and item.get_closest_marker(MARKER)]
+    names = [item.nodeid for item in items]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *names]
+    with tempfile.TemporaryDirectory() as folder:
+        results = Path(folder, "results")
+        results.touch()
+        environment = {**os.environ, _RESULTS: str(results), namespace.INSIDE: "1"}
+        run = subprocess.run(
+            namespace.enter(command),
+            cwd=first.config.rootpath,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_LONGEST_S,
+        )
+        found: dict[str, tuple[str, str]] = {}
+        for name, outcome, told in map(json.loads, results.read_text().splitlines()):
+            if name not in found or outcome == "failed":  # it may pass, and fail to clean up
+                found[name] = outcome, told
+    return {name: found.get(name, ("failed", run.stdout + run.stderr)) for name in names}

@@ -21,13 +21,13 @@ class StorageFault:
     environment: dict[str, str]
 
     @classmethod
-    def compiled(cls, folder: Path, name: str, error: int, least_bytes: int, *, opening: bool = False) -> StorageFault:
-        """Compile the fault into `folder`; it hits files whose path holds `name`."""
+    def compiled(cls, folder: Path, name: str, error: int, least_bytes: int) -> StorageFault:
+        """Compile it into `folder`; it hits files whose path holds `name`, their opening while `FAULT_OPEN` is set."""
         compiler = shutil.which("cc") or shutil.which("gcc")
         if compiler is None:
             pytest.skip("no C compiler")
         library, flag = folder / "fault.so", folder / "fault"
         subprocess.run([compiler, "-shared", "-fPIC", "-o", library, SOURCE, "-ldl"], check=True, timeout=60)
         told = {"LD_PRELOAD": library, "FAULT_FLAG": flag, "FAULT_NAME": name, "FAULT_ERRNO": error}
-        told |= {"FAULT_LEAST": least_bytes} | ({"FAULT_OPEN": 1} if opening else {})
+        told |= {"FAULT_LEAST": least_bytes, "FAULT_OPEN": 1}
         return cls(flag, {**os.environ, **{key: str(value) for key, value in told.items()}})

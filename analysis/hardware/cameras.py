@@ -48,7 +48,7 @@ PACKETS_BYTES = (1400, 9000, 60_000)
 TOLERANCES_S = (0.02, 0.01)
 """Of the pairing; shots are 2.5 of them apart at least."""
 _SMALL = (256, 320)
-_FULL = (2048, 2048)
+FULL = (2048, 2048)
 _CHAIN = 4
 """Times as many shots of the whole chain: a lost one costs as much as ten others."""
 _TRIES = 10
@@ -184,8 +184,8 @@ def speed(shots: int, packet_bytes: int) -> dict[str, Any]:
     Every shot shows other pages than the last one, and is compared with them; that is not timed.
     """
     random = np.random.default_rng(0)
-    pages = [random.integers(0, 256, _FULL, dtype=np.uint8) for _ in range(_PAGES)]
-    with cameras(_FULL, "Mono8", packet_bytes) as stage:
+    pages = [random.integers(0, 256, FULL, dtype=np.uint8) for _ in range(_PAGES)]
+    with cameras(FULL, "Mono8", packet_bytes) as stage:
         take(stage)  # the first frame of a fake camera is late
         equal, seconds = 0, 0.0
         with Ticks() as ticks:
@@ -211,7 +211,7 @@ def speed(shots: int, packet_bytes: int) -> dict[str, Any]:
 class InstantCamera:
     """A camera that delivers a copy of its picture in no time: see `Camera`."""
 
-    name, frame_shape, bit_depth, frame_numbers, opened = "camera", _FULL, 8, 2**64 - 1, 1
+    name, frame_shape, bit_depth, frame_numbers, opened = "camera", FULL, 8, 2**64 - 1, 1
 
     def __init__(self, image: Counts) -> None:
         self._image, self._number, self._ready = image, 0, list[Frame]()
@@ -258,7 +258,7 @@ def pairs_per_s(
 ) -> tuple[float, int]:
     """Pairs a second from a source without a modulator, ready to be decoded, and lost shots, whose time counts too."""
     profile = load_profile("bench")
-    camera = profile.camera.model_copy(update={"rows_px": _FULL[0], "columns_px": _FULL[1]})
+    camera = profile.camera.model_copy(update={"rows_px": FULL[0], "columns_px": FULL[1]})
     profile = profile.model_copy(update={"camera": camera})
     exposures = Exposures(repeats=0)
     with CameraSource(
@@ -279,11 +279,11 @@ def pairs_per_s(
 def chain(shots: int, packet_bytes: int, tolerance_s: float) -> dict[str, float]:
     """Pairs a second over everything, over the slower of its two halves; one after the other, in one run."""
     random = np.random.default_rng(0)
-    first, second = (random.integers(0, 200, _FULL, dtype=np.uint8) for _ in range(2))
+    first, second = (random.integers(0, 200, FULL, dtype=np.uint8) for _ in range(2))
     settings = PairingSettings(tolerance_s=tolerance_s, spacing_s=2.5 * tolerance_s)
     instant = (InstantCamera(first), InstantCamera(second))
     pairing_alone, _ = pairs_per_s(instant, SoftwareTrigger(instant), settings, shots)
-    with cameras(_FULL, "Mono8", packet_bytes) as stage:
+    with cameras(FULL, "Mono8", packet_bytes) as stage:
         for (_, _, eye), image in zip(stage, (first, second), strict=True):
             eye.image = image
         take(stage)  # the first frame of a fake camera is late
@@ -317,18 +317,18 @@ def plain_unpack_12p(raw: NDArray[np.uint8]) -> Counts:
     counts = np.empty((first.size, 2), np.uint16)
     counts[:, 0] = first | (middle & 15) << 8
     counts[:, 1] = middle >> 4 | last << 4
-    return counts.reshape(_FULL)
+    return counts.reshape(FULL)
 
 
 def unpacking(pixel_format: str, work: Callable[[NDArray[np.uint8]], Counts] | None = None) -> float:
     """Milliseconds to unpack a frame at full size, median. The frames are kept, so each needs new memory."""
     depth = bit_depth(pixel_format)
-    image = np.random.default_rng(0).integers(0, 2**depth, _FULL, dtype=frame_type(depth))
+    image = np.random.default_rng(0).integers(0, 2**depth, FULL, dtype=frame_type(depth))
     raw = pack(image, pixel_format)
     taken, kept = [], []
     for _ in range(_UNPACKED):
         started = time.perf_counter()
-        kept.append(unpack(raw, _FULL, pixel_format) if work is None else work(raw))
+        kept.append(unpack(raw, FULL, pixel_format) if work is None else work(raw))
         taken.append(time.perf_counter() - started)
     assert all((counts == image).all() for counts in kept)
     return 1e3 * float(np.median(taken))

@@ -105,7 +105,7 @@ class Stage:
         self.port.plug()
         self.cameras = tuple(
             HeldCamera(
-                CameraSettings(serial=f"CAM-{one}", trigger_source="Line1", packet_bytes=1400, buffers=30),
+                CameraSettings(address=ADDRESSES[one], trigger_source="Line1", packet_bytes=1400, buffers=30),
                 (SIDE_PX, SIDE_PX),
                 f"camera {one}",
             )

@@ -28,11 +28,11 @@ from runtime.acquisition.camera_source import CameraSource
 from runtime.errors import LostShotError, SourceError
 from runtime.virtual_device.namespace import go_on_inside
 
-_AWAY_S = 1.0
+AWAY_S = 1.0
 _PATIENCE_S = 30.0
 _ATTEMPTS = 10
 TOLERANCE_S = 0.03
-_REPEATS = 3
+REPEATS = 3
 """Further shots of a page: a busy machine delays an edge now and then, which is not what is counted."""
 
 
@@ -62,7 +62,7 @@ def unplugged(
             at[0] = time.monotonic()
 
         unplug()
-        timer = threading.Timer(_AWAY_S, again)
+        timer = threading.Timer(AWAY_S, again)
         timer.start()
         page += 1
         try:
@@ -96,7 +96,7 @@ def main(times: int, json_path: Path | None) -> None:
     with tempfile.TemporaryDirectory(prefix="lightpage-") as folder:
         stage = Stage(small_cameras(), Path(folder))
         try:
-            with source_of(stage, TOLERANCE_S, _REPEATS) as source:
+            with source_of(stage, TOLERANCE_S, REPEATS) as source:
                 camera = stage.fakes[1]
                 for what, unplug, plug in (
                     ("camera", camera.close, camera.start),

@@ -33,6 +33,7 @@ from analysis.hardware.rows import Rows, append_row, kept_rows
 from analysis.hardware.week_figure import draw
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.clock import Clock
 from lightpage.device.state import Device
 from lightpage.errors import FramesDisagreeError, LightpageError
 from lightpage.files import write_json
@@ -89,6 +90,17 @@ def state(moment: float, pages: int) -> Device:
     return device.model_copy(update={"geometry": device.geometry.model_copy(update={"pipe_angle_deg": angle})})
 
 
+class SimulatedClock(Clock):
+    """The seconds of a week that is simulated; what waits by it waits real ones."""
+
+    def __init__(self, week: Week) -> None:
+        self._week = week
+
+    def now(self) -> float:
+        """Return the simulated seconds."""
+        return self._week.moment * PAGE_S
+
+
 @dataclass
 class Week:
     """A service and its device through a week.
@@ -106,10 +118,6 @@ class Week:
     threads: int | None
     rows: Rows = field(default_factory=list)
     moment: int = 0
-
-    def clock(self) -> float:
-        """Simulated seconds."""
-        return self.moment * PAGE_S
 
     def read_until(self, end: int) -> None:
         """Read the pages before number `end` that are not kept yet."""
@@ -133,7 +141,7 @@ class Week:
             watched = Watched(plane)
             stack.callback(watched.close)
             settings = SelfCalibrationSettings(CALIBRATION_PAGES, busy_s=0.05)
-            stack.enter_context(SelfCalibration(plane, monitor, watched, settings, self.clock))
+            stack.enter_context(SelfCalibration(plane, monitor, watched, settings, SimulatedClock(self)))
             begun = len(self.rows)
             numbers = track(range(begun, end), "week", total=end, done=begun)
             for number in numbers:

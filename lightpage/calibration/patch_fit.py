@@ -73,7 +73,7 @@ def fit_parameters(
         evaluations: bound on the solver's steps.
     """
     centre = np.zeros_like(start) if centre is None else centre
-    design = _Design(twin, profile, measurements)
+    design = Design(twin, profile, measurements)
     scale = PRIORS * prior_scale
 
     def unpack(vector: Real) -> tuple[Real, float]:
@@ -105,7 +105,7 @@ def fit_parameters(
     return PatchFit(parameters, deviations, piston, float(np.mean(np.minimum(data**2, 25.0))))
 
 
-class _Design:
+class Design:
     """The measurements as arrays, against what the twin predicts for them."""
 
     def __init__(self, twin: Twin, profile: Profile, measurements: list[Measurement]) -> None:

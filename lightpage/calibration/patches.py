@@ -18,7 +18,7 @@ Sampler = Callable[[Real], NDArray[np.inexact]]
 
 _EDGE_SYMBOLS, _EDGE_PX = 10, 40
 """Edge of a patch: symbols enough to know them from others, and modulator pixels enough to be seen in dim light."""
-_SLOPES = np.linspace(-24, 24, 17)
+SLOPES = np.linspace(-24, 24, 17)
 """Residual phase slopes tried, radians across a patch: page centre and lengths anywhere in the capture range."""
 _CARRIER_PROBE = 0.3
 """Reach of the finite difference that finds the carrier, samples."""
@@ -144,7 +144,7 @@ def measure(
     known = symbols[patch.rows, patch.columns]
     rows, columns = known.shape
     pitch = profile.symbol_pitch_m / samples
-    slopes = _SLOPES / (patch_edge(profile) * samples)
+    slopes = SLOPES / (patch_edge(profile) * samples)
     x = (np.arange(columns * samples) - (columns * samples - 1) / 2) * pitch + patch.centre_m[0]
     y = (np.arange(rows * samples) - (rows * samples - 1) / 2) * pitch + patch.centre_m[1]
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

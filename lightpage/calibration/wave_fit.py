@@ -29,7 +29,7 @@ Complex = NDArray[np.complexfloating]
 
 READ_NOISE = 0.3
 """Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
-_ROUNDS = 9
+ROUNDS = 9
 _CHORD = 4
 """Rounds that share one derivative of the light, which costs as much as several rounds."""
 _CHORD_ACCURACY = 3 / 8
@@ -162,8 +162,8 @@ class WaveFit:
         state = self._start(start, quadrature_phase)
         best = WaveFitted(start, np.zeros(len(PARAMETERS)), quadrature_phase, np.inf)
         fall, whole, slopes = 1.0, False, None
-        for number in range(_ROUNDS):
-            progress(number / _ROUNDS)
+        for number in range(ROUNDS):
+            progress(number / ROUNDS)
             if slopes is None or (number % _CHORD == 0 and not (whole and fall < _NEARLY)):
                 slopes = self._slopes(state, of_light, of_cameras, partial(_within_round, progress, number))
             directions = _directions(state.light, bends="launch" not in groups)
@@ -292,7 +292,7 @@ class WaveFit:
 
 def _within_round(progress: Callable[[float], None], number: int, share: float) -> None:
     """Tell of a share of round `number`."""
-    progress((number + share) / _ROUNDS)
+    progress((number + share) / ROUNDS)
 
 
 def _directions(light: Complex, *, bends: bool) -> Complex:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, TypeVar
 import h5py
 import numpy as np
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import Cause, LightpageError, RecordingError, StorageError
 from lightpage.failures import cause_of, error_number, hdf5_failure
 
@@ -24,7 +24,8 @@ hdf: Any = h5py
 PAUSES_S = (0.1, 0.5)
 """Before the second and the third try."""
 
-sleep = time.sleep
+clock: Clock = SYSTEM
+"""The clock that every try waits by."""
 
 DATA = "data that can be read"
 READABLE = "a readable, complete HDF5 file"
@@ -51,7 +52,7 @@ def retried(call: Callable[[], T], renew: Callable[[], object] = lambda: None) -
         except (OSError, KeyError, RuntimeError) as error:
             if pause is None or cause_of(error) is not Cause.STORAGE:
                 raise
-            sleep(pause)
+            clock.sleep(pause)
     raise AssertionError  # the last pause is None
 
 

@@ -35,7 +35,7 @@ from lightpage.words import counted
 CACHE_BYTES = 1 << 30
 """Most memory for the chunks of one array that hold a page; a chunk beyond it is decompressed anew for every page."""
 
-_OPEN_SOURCES = 16
+OPEN_SOURCES = 16
 """Files of virtual datasets that stay open; there may be more of them than the system lets a process open."""
 
 _UNLIMITED = hdf.h5s.UNLIMITED
@@ -89,7 +89,7 @@ class Sources:
             if not isinstance(found, h5py.Dataset):
                 raise RecordingError(subject, "none", "the array that the virtual dataset shows")
             arrays[name] = StoredArray(found, subject, self, (*chain, (path, name)))
-            while len(self._open) > 1 and (len(self._open) > _OPEN_SOURCES or self._kept_bytes() > CACHE_BYTES):
+            while len(self._open) > 1 and (len(self._open) > OPEN_SOURCES or self._kept_bytes() > CACHE_BYTES):
                 _, (file, _) = self._open.popitem(last=False)
                 file.close()
         return arrays[name]
@@ -357,13 +357,13 @@ class StoredArray:
     def _missing_filters(self, properties: Any) -> list[tuple[int, str]]:
         """Position and name of each filter that HDF5 cannot decode here."""
         filters = [properties.get_filter(index) for index in range(properties.get_nfilters())]
-        if not all(_decodes(code) for code, *_ in filters):
+        if not all(decodes(code) for code, *_ in filters):
             with suppress(ImportError):
                 importlib.import_module("hdf5plugin")  # tells HDF5 of its filters
         return [
             (index, f"{_FILTERS.get(code) or name.decode('utf-8', 'replace').strip() or 'unknown'} ({code})")
             for index, (code, _, _, name) in enumerate(filters)
-            if not _decodes(code)
+            if not decodes(code)
         ]
 
     def _check_external(self, properties: Any) -> None:
@@ -536,7 +536,8 @@ def _take_off(space: Any, axes: Sequence[Indices]) -> None:
         space.select_hyperslab(start, size, step, op=hdf.h5s.SELECT_NOTB)
 
 
-def _decodes(code: int) -> bool:
+def decodes(code: int) -> bool:
+    """Return whether HDF5 can decode a filter of this number here."""
     return hdf.h5z.filter_avail(code) and bool(hdf.h5z.get_filter_info(code) & hdf.h5z.FILTER_CONFIG_DECODE_ENABLED)
 
 

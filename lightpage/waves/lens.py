@@ -23,7 +23,7 @@ from lightpage.waves.low_rank import Expansion
 _TOLERANCE = 1e-7
 """Singular values of an ideal lens's expansion are dropped below this share of the largest: less than rounding."""
 
-_TOLERANCE_WITH_PATH = 1e-3
+TOLERANCE_WITH_PATH = 1e-3
 """The same for a real lens, a field error of about 0.002; 1e-5 would take twice the terms."""
 
 
@@ -128,7 +128,7 @@ class FourierLens:
         self.x_to_x = (unitary * kernel(factors.x_to_x, x_m, facet_x)).astype(np.complex64)
         self.y_and_x = kernel(factors.y_to_x, y_m, facet_x).astype(np.complex64)
         self.y_to_y = kernel(factors.y_to_y, facet_y, y_m).astype(np.complex64)
-        tolerance = _TOLERANCE if path is IDEAL else _TOLERANCE_WITH_PATH
+        tolerance = _TOLERANCE if path is IDEAL else TOLERANCE_WITH_PATH
         parts = LensPath(geometry, path, factors)
         beyond = parts.beyond
         self.terms = Expansion.of(parts.rest, (x_m, y_m), (facet_x, facet_y), tolerance)

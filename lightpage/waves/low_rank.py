@@ -25,7 +25,7 @@ _PROBES = 9
 """Places along an axis that are asked how steep the phase is."""
 _FLAT = 1e-9
 """Radians over half an axis below which a phase does not depend on it."""
-_SKETCH = 100
+SKETCH = 100
 """Random vectors with which the leading singular vectors of a large kernel are looked for at first."""
 _POINT = 1e-300
 """Half length of an axis with one sample, metres."""
@@ -193,7 +193,7 @@ def _leading_vectors(kernel: Complex, tolerance: float) -> Complex:
     Those of a large kernel are found among its products with random vectors (Halko, Martinsson and Tropp, SIAM Review
     53, 217, 2011), as many as it takes until the least of their values no longer counts.
     """
-    rng, columns = np.random.default_rng(0), _SKETCH
+    rng, columns = np.random.default_rng(0), SKETCH
     while columns < min(kernel.shape):
         probed = np.linalg.qr(kernel @ rng.standard_normal((kernel.shape[1], columns)))[0]
         probed = np.linalg.qr(kernel.conj().T @ probed)[0]

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import LightpageError
 from runtime.errors import LostShotError, Reason
 from runtime.modulator.modulator import Beams
@@ -27,10 +28,11 @@ class BeamKeeper:
         beams: of the source.
         lock: held while they are moved or in use; its owner may take it again.
         name: of the source, for the log.
+        clock: by which it waits between two attempts.
     """
 
-    def __init__(self, beams: Beams, lock: AbstractContextManager[object], name: str) -> None:
-        self._beams, self._lock, self._name = beams, lock, name
+    def __init__(self, beams: Beams, lock: AbstractContextManager[object], name: str, clock: Clock = SYSTEM) -> None:
+        self._beams, self._lock, self._name, self._clock = beams, lock, name, clock
         self._trouble = ""
         self._moved = False
         """Whether they were let through once: an earlier process may have ended while it blocked them."""
@@ -107,15 +109,16 @@ class BeamKeeper:
     def _run(self, stop: threading.Event) -> None:
         pause_s = _FIRST_PAUSE_S
         while True:
-            stop.wait(pause_s)
+            self._clock.wait(stop, pause_s)
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
             with self._lock:
                 if stop.is_set():
                     return
+                try:
+                    if self._trouble:
+                        self.open()
+                except Exception as error:
+                    _log.debug("%s: beams still not open: %s", self._name, error)
                 if not self._trouble:
                     self._thread = None
                     return
-                try:
-                    self.open()
-                except Exception as error:
-                    _log.debug("%s: beams still not open: %s", self._name, error)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import Profile, TomlTable
 from lightpage.errors import FrameError
 from lightpage.page.levels import MAX_LEVELS
@@ -100,6 +100,7 @@ class CameraSource(FrameSource):
         exposures: how they are taken.
         views: how each camera sees the image.
         name: for people.
+        clock: by which it waits; that of the trigger.
 
     Raises:
         SourceError: the cameras' bit depths differ.
@@ -117,23 +118,25 @@ class CameraSource(FrameSource):
         exposures: Exposures | None = None,
         views: tuple[View, View] = (View(), View()),
         name: str = "camera",
+        clock: Clock = SYSTEM,
     ) -> None:
         self.name, self.profile = name, profile
         self.frame_shape, self.page_shape = profile.frame_shape, profile.page_shape
         self.modulator = modulator
         self.beams: Beams = beams
         self.pages: PageStore = pages if pages is not None else PageStore(profile)
-        self._cameras, self._trigger, self._views = cameras, trigger, views
+        self.cameras, self._trigger, self.views = cameras, trigger, views
         depths = [camera.bit_depth for camera in cameras]
         if depths[0] != depths[1]:
             raise SourceError(f"{self.name}: cameras", f"{depths[0]} and {depths[1]} bits", "the same for both")
         self.bit_depth = depths[0]
         self._exposures = exposures or Exposures()
         self.shot_s = self._exposures.shot_s
-        self._pairing = Pairing(cameras, trigger, pairing or PairingSettings())
+        self._pairing = Pairing(cameras, trigger, pairing or PairingSettings(), clock)
+        self._clock = clock
         self._lock = threading.RLock()
         """Held while the devices are used: one shot at a time."""
-        self._keeper = BeamKeeper(beams, self._lock, name)
+        self._keeper = BeamKeeper(beams, self._lock, name, clock)
         self._armed = self._was_armed = False
         self._next = 0
         self._dark: tuple[DarkFrame, DarkFrame] | None = None
@@ -174,7 +177,7 @@ class CameraSource(FrameSource):
                 return
             if not self._was_armed:
                 self._open_modulator()
-            for camera in self._cameras:
+            for camera in self.cameras:
                 self._arm(camera, Reason.CAMERA_GONE)
             self._arm(self._trigger, Reason.TRIGGER_GONE)
             self._pairing.forget()
@@ -202,7 +205,7 @@ class CameraSource(FrameSource):
         """See `FrameSource.disarm`."""
         with self._lock:
             self._armed = False
-            for device in (self._trigger, *self._cameras):
+            for device in (self._trigger, *self.cameras):
                 device.disarm()
 
     def close(self) -> None:
@@ -211,7 +214,7 @@ class CameraSource(FrameSource):
             self._armed = False
             self._keeper.close()
             stack.callback(self.pages.close)
-            for device in (self.modulator, *self._cameras, self._trigger, self.beams):
+            for device in (self.modulator, *self.cameras, self._trigger, self.beams):
                 if device is not None:
                     stack.callback(device.close)
 
@@ -221,7 +224,7 @@ class CameraSource(FrameSource):
 
     def shot(self, timeout_s: float = SHOT_S, page: int | None = None) -> Shot:
         """See `FrameSource.shot`."""
-        deadline = time.monotonic() + timeout_s
+        deadline = self._clock.now() + timeout_s
         with self._in_turn(timeout_s):
             index, symbols = self._page(page)
             take = self._attempt(index, symbols, deadline)
@@ -279,7 +282,7 @@ class CameraSource(FrameSource):
                 stacks = self._stacks(self._exposures.dark_frames)
                 first, second = (
                     DarkFrame.of(stack, self.bit_depth, f"{camera.name}: dark frames")
-                    for stack, camera in zip(stacks, self._cameras, strict=True)
+                    for stack, camera in zip(stacks, self.cameras, strict=True)
                 )
             except BaseException as error:
                 self._dark = before
@@ -288,7 +291,7 @@ class CameraSource(FrameSource):
                 raise
             self._dark = (first, second)
             self._repairs = tuple(PixelRepair(self.frame_shape, dark.hot) for dark in self._dark)
-            for camera, dark in zip(self._cameras, self._dark, strict=True):
+            for camera, dark in zip(self.cameras, self._dark, strict=True):
                 _log.info("%s: black level %d, %d hot pixels", camera.name, dark.black_level, len(dark.hot))
             return self._dark
 
@@ -314,7 +317,7 @@ class CameraSource(FrameSource):
             nonlocal shown
             if not (shown and modulator.shows()):
                 shown = False
-                modulator.show(symbols, self.levels, index, max(0.0, deadline - time.monotonic()))
+                modulator.show(symbols, self.levels, index, max(0.0, deadline - self._clock.now()))
                 shown = True
 
         return lambda: self._pairing.shot(deadline, display, modulator.shows)
@@ -333,10 +336,10 @@ class CameraSource(FrameSource):
                 if error.reason in _DISARMING or self._pairing.distrusted:
                     self._armed = False
                 if error.reason in _AWAITED:
-                    if time.monotonic() + _AGAIN_S < deadline:
-                        time.sleep(_AGAIN_S)
+                    if self._clock.now() + _AGAIN_S < deadline:
+                        self._clock.sleep(_AGAIN_S)
                         continue
-                elif repeats > 0 and time.monotonic() < deadline and not self._never_came(error):
+                elif repeats > 0 and self._clock.now() < deadline and not self._never_came(error):
                     repeats -= 1
                     continue
                 raise error.about(f"{subject} of {self.name}") from None
@@ -354,12 +357,12 @@ class CameraSource(FrameSource):
         """The counts of a frame, upright, hot pixels mended, the black level taken off."""
         pixels = frame.pixels
         assert pixels is not None  # of a complete frame
-        camera, full_scale = self._cameras[one], 2**self.bit_depth - 1
+        camera, full_scale = self.cameras[one], 2**self.bit_depth - 1
         if pixels.shape != self.frame_shape:
             raise SourceError(f"{camera.name}: frame", f"{pixels.shape}", f"{self.frame_shape}")
         pixels = self._to_full_scale(one, pixels.astype(frame_type(self.bit_depth), copy=False))
         self._saturated[camera.name] = float(np.count_nonzero(pixels >= full_scale) / pixels.size)
-        pixels = self._views[one].upright(pixels)
+        pixels = self.views[one].upright(pixels)
         if self._dark is None:
             return pixels
         return without_black(self._repairs[one](pixels), self._dark[one].black_level, self.bit_depth)
@@ -369,7 +372,7 @@ class CameraSource(FrameSource):
         found = unused_low_bits(pixels, self.bit_depth)
         if found and not self._unused[one]:
             warn(
-                f"{self._cameras[one].name}: {describe(self.bit_depth, found)}. The greatest of them is taken for full "
+                f"{self.cameras[one].name}: {describe(self.bit_depth, found)}. The greatest of them is taken for full "
                 f"scale; better a pixel_format of {self.bit_depth - found} bits, or less digital gain"
             )
         self._unused[one] = found or self._unused[one]
@@ -382,7 +385,7 @@ class CameraSource(FrameSource):
         """Frames of both cameras [exposure, row, column], whatever is on display."""
         shots = []
         for _ in range(count):
-            deadline = time.monotonic() + self.shot_s
+            deadline = self._clock.now() + self.shot_s
             # nothing but the light has to stand still, so there is no reason to give up early
             attempt = partial(self._pairing.shot, deadline)
             taken = self._persistent("frames without a page", -1, deadline, attempt, _MOST_REPEATS)

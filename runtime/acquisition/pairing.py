@@ -23,13 +23,13 @@ stepped, or its trigger is off. What is remembered is dropped then, and learnt a
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import TomlTable
 from lightpage.progress import note
 from lightpage.recording.layout import FrameInfo
@@ -139,11 +139,13 @@ class Pairing:
         cameras: in-phase and quadrature, armed.
         trigger: armed.
         settings: how strict.
+        clock: by which it waits, and `trigger` tells the time of its shots.
     """
 
     cameras: Sequence[Camera]
     trigger: Trigger
     settings: PairingSettings = field(default_factory=PairingSettings)
+    clock: Clock = SYSTEM
 
     def __post_init__(self) -> None:
         self._channels = [_Channel(camera) for camera in self.cameras]
@@ -161,7 +163,7 @@ class Pairing:
     @property
     def synchronised(self) -> bool:
         """Whether frames can be told apart now, without a synchronisation before."""
-        fresh = time.monotonic() - self._referenced_at < self.settings.expires_s
+        fresh = self.clock.now() - self._referenced_at < self.settings.expires_s
         return fresh and all(
             channel.reference_s is not None and channel.opened == channel.camera.opened for channel in self._channels
         )
@@ -182,7 +184,7 @@ class Pairing:
         """Take one pair, synchronised before where that is needed.
 
         Args:
-            deadline: `time.monotonic` time after which no more trigger is fired.
+            deadline: time by the clock after which no more trigger is fired.
             display: puts the page on display and returns once it is; called once, before the first trigger.
             displayed: whether the page is still on display.
 
@@ -192,7 +194,7 @@ class Pairing:
         try:
             if display is not None:
                 display()
-            self._displayed_at = time.monotonic()
+            self._displayed_at = self.clock.now()
             if not self._settled:
                 self._settle(deadline)
             if self.distrusted:
@@ -234,7 +236,7 @@ class Pairing:
             raise LostShotError("frames", told, expected, Reason.OTHER_SHOT)
         for channel, deviation in zip(self._channels, deviations, strict=True):
             channel.reference_s = (channel.reference_s or 0.0) + _FOLLOWING * deviation
-        self._referenced_at = time.monotonic()
+        self._referenced_at = self.clock.now()
 
     def _synchronise(self, deadline: float) -> None:
         """Learn the references from three shots that agree.
@@ -258,7 +260,7 @@ class Pairing:
                 if spread <= tolerance:
                     for channel, ordered in zip(self._channels, each, strict=True):
                         channel.reference_s = ordered[len(ordered) // 2]
-                    self._referenced_at = time.monotonic()
+                    self._referenced_at = self.clock.now()
                     note("cameras and trigger are synchronised")
                     return
                 told = f"times that differ by {1e3 * spread:.1f} ms"
@@ -269,7 +271,7 @@ class Pairing:
                 if error.reason is Reason.MISSING_FRAME and tried >= _SILENT_TRIES and self.silent:
                     raise self._never(tried) from None
                 last = error
-            if time.monotonic() > deadline:
+            if self.clock.now() > deadline:
                 break
         told = f"{last.subject}: {last.got} ({last.reason.value})" if last is not None else "no time left"
         raise LostShotError("synchronisation", told, "three shots that agree", Reason.NOT_SYNCHRONISED)
@@ -288,17 +290,17 @@ class Pairing:
         """Fire once, and take both frames by rules 1 to 3, the page on display for long enough before."""
         settings = self.settings
         earliest = max(self._next_at, self._displayed_at + settings.tolerance_s)
-        if earliest > deadline or time.monotonic() > deadline:
+        if earliest > deadline or self.clock.now() > deadline:
             raise _no_time_left()
-        time.sleep(max(0.0, earliest - time.monotonic()))
+        self.clock.sleep(earliest - self.clock.now())
         if self._drain():
             raise LostShotError("frame", "one before the trigger", "none", Reason.STRAY_FRAME)
         fired = self.trigger.fire()
-        self._next_at = time.monotonic() + settings.spacing_s
-        end = time.monotonic() + settings.frame_s
+        self._next_at = self.clock.now() + settings.spacing_s
+        end = self.clock.now() + settings.frame_s
         frames, ids = list[Frame](), list[int]()
         for channel in self._channels:
-            frame = channel.frame(max(1e-3, end - time.monotonic()))
+            frame = channel.frame(max(1e-3, end - self.clock.now()))
             frames.append(frame := self._checked(channel, frame))
             ids.append(_info(frame).frame_id)
         if self._drain():
@@ -327,31 +329,31 @@ class Pairing:
 
     def _drain(self) -> int:
         """Drop the frames that wait, so many and for so long at most; returns how many there were."""
-        dropped, end = 0, time.monotonic() + self.settings.quiet_s
+        dropped, end = 0, self.clock.now() + self.settings.quiet_s
         for channel in self._channels:
             while dropped < _MOST_DRAINED and channel.frame(0.0) is not None:
                 dropped += 1
                 channel.last_id = None
-                if time.monotonic() > end:
+                if self.clock.now() > end:
                     return dropped
         return dropped
 
     def _settle(self, deadline: float) -> None:
         """Wait until no frame has come for a while; what came before is not known any more."""
         quiet = self.settings.quiet_s
-        end = time.monotonic() + quiet
+        end = self.clock.now() + quiet
         give_up, came = min(deadline, end + _MOST_QUIET * quiet), 0
-        while (now := time.monotonic()) < end:
+        while (now := self.clock.now()) < end:
             if now > give_up and came:
                 raise LostShotError("cameras", "frames without end", f"silence for {quiet:g} s", Reason.STRAY_FRAME)
             if now > give_up:
                 raise _no_time_left()
             if dropped := self._drain():
-                came, end = came + dropped, time.monotonic() + quiet
-            time.sleep(0.005)
+                came, end = came + dropped, self.clock.now() + quiet
+            self.clock.sleep(0.005)
         for channel in self._channels:
             channel.last_id = None
-        self._next_at = max(self._next_at, time.monotonic())
+        self._next_at = max(self._next_at, self.clock.now())
         self._settled = True
 
 

@@ -20,7 +20,7 @@ from runtime.helper_process import HelperProcess
 _PROCESS = "runtime.cameras.gentl_process"
 _OPEN_S = 30.0
 """Time to load the producer and to find and open the camera."""
-_COMMAND_S = 10.0
+COMMAND_S = 10.0
 """Time for an answer; producers wait for seconds for a camera that is gone."""
 _CLOSE_S = 3.0
 
@@ -151,12 +151,12 @@ class GenTLCamera:
         """
         assert self._process is not None  # of a camera that is open
         self._number += 1
-        deadline = time.monotonic() + timeout_s + _COMMAND_S
+        deadline = time.monotonic() + timeout_s + COMMAND_S
         try:
             self._process.send(Request(number=self._number, do=do, timeout_s=timeout_s).to_line(), deadline)
             answer = Answer.model_validate_json(self._process.line(deadline))
         except TimeoutError:
-            raise self._lose(f"no answer within {timeout_s + _COMMAND_S:g} s") from None
+            raise self._lose(f"no answer within {timeout_s + COMMAND_S:g} s") from None
         except (OSError, ValidationError) as error:
             raise self._lose(str(error)) from None
         if answer.number != self._number:

@@ -207,19 +207,11 @@ class GenTLDevice:
         if got != (columns, rows, known.code):
             told = f"{got[0]} x {got[1]} pixels in format {got[2]:#010x}"
             raise CameraGoneError(f"{told} in place of {columns} x {rows} in {known.code:#010x}")
-        size, offset, padding = known.nbytes(rows * columns), 0, 0
-        with suppress(*self._errors):
-            offset = buffer.image_offset
-        with suppress(*self._errors):
-            padding = buffer.padding_x
-        sent = np.frombuffer(buffer.raw_buffer, np.uint8)[offset:]
         try:
-            pixels = without_padding(sent, self._shape, known.name, padding)
+            sent = pixel_bytes(buffer, self._shape, known.name, self._errors)
         except FrameError as error:
             return Arrived(fault=f"{error.got} in place of {error.expected}")
-        if pixels.size < size:
-            return Arrived(fault=f"{pixels.size} bytes in place of {size}")
-        memory[:size] = pixels[:size].tobytes()
+        memory[: len(sent)] = sent
         return Arrived(frame_id=buffer.frame_id, device_time_s=self._device_time_s(buffer), host_time_s=arrived_s)
 
     def _device_time_s(self, buffer: Any) -> float:
@@ -335,6 +327,29 @@ class GenTLDevice:
             yield
         except self._errors as error:
             raise CameraGoneError(_plain(error)) from None
+
+
+def pixel_bytes(buffer: Any, shape: tuple[int, int], name: str, unknown: tuple[type[Exception], ...]) -> bytes:
+    """The bytes of a buffer's pixels, without what is before, between and behind them.
+
+    Args:
+        buffer: of harvesters.
+        shape: (rows, columns).
+        name: of the pixel format.
+        unknown: what a producer raises that does not tell an offset or a padding; then there is none.
+
+    Raises:
+        FrameError: too few bytes.
+    """
+    offset, padding, size = 0, 0, pixel_format(name).nbytes(shape[0] * shape[1])
+    with suppress(*unknown):
+        offset = buffer.image_offset
+    with suppress(*unknown):
+        padding = buffer.padding_x
+    pixels = without_padding(np.frombuffer(buffer.raw_buffer, np.uint8)[offset:], shape, name, padding)
+    if pixels.size < size:
+        raise FrameError(f"frame in {name}", f"{pixels.size} bytes", str(size))
+    return pixels[:size].tobytes()
 
 
 def _calling(called: Callable[[], None]) -> Any:

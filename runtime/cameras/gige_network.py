@@ -63,7 +63,7 @@ def receive_buffer_problem(frame_bytes: int) -> str:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
         line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, frame_bytes)
         granted = line.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2  # the kernel says twice as much
-    if granted >= frame_bytes or _may_read_packets():
+    if granted >= frame_bytes or may_read_packets():
         return ""
     return (
         f"the kernel grants a socket {granted} bytes, and a frame has {frame_bytes}: packets may be lost; "
@@ -71,7 +71,8 @@ def receive_buffer_problem(frame_bytes: int) -> str:
     )
 
 
-def _may_read_packets() -> bool:
+def may_read_packets() -> bool:
+    """Whether this program may read packets from the network card directly."""
     if not hasattr(socket, "AF_PACKET"):
         return False
     try:

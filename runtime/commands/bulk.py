@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -15,6 +14,7 @@ from lightpage.cli.groups import Group
 from lightpage.cli.main import RESUME_KEY
 from lightpage.cli.options import FiniteRange
 from lightpage.cli.paths import OutputFile, OutputFolder
+from lightpage.clock import SYSTEM
 from lightpage.codec.code import Code, load_code
 from lightpage.codec.volume_file import parse_volume, ranges
 from lightpage.errors import InvalidInputError, LightpageError, LostDataError, MissingResultsError
@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 
 LOCAL, RAY = "local", "ray"
 METRICS_SUFFIX = ".prom"
+
+CLOCK = SYSTEM
+"""Of the pauses before what may pass is tried again."""
 
 
 @click.group(cls=Group)
@@ -187,7 +190,7 @@ def _bulk(
         raise InvalidInputError("--address", f"with --engine {engine}", f"--engine {RAY}")
     _check_metrics(metrics_address, metrics_insecure, metrics_file)
     own = WHOLE if part is None else Part.parse(part)
-    with Ledger(out, own) as ledger:
+    with Ledger(out, own, CLOCK) as ledger:
         with ledger.question():
             before = Job.read(ledger.folder)
             given = {name: value for name, value in chosen.items() if value is not None}
@@ -207,9 +210,8 @@ def _bulk(
             job.write(ledger.folder)
         ledger.doubt(job, every_loss=retry_lost)
         with _watched(ledger, operation, metrics_address, metrics_file) as watch:
-            made = run(
-                ledger, job, partial(_engine, engine, address, workers, threads, provider), watch, give_up=give_up
-            )
+            works = partial(engine_of, engine, address, workers, threads, provider)
+            made = run(ledger, job, works, watch, give_up=give_up, clock=CLOCK)
         found = totals(ledger, job, made.failures)
         files = recovered_files(ledger, job, wanted) if operation is Operation.RECOVER and own == WHOLE else []
     if json_path is not None:
@@ -219,7 +221,8 @@ def _bulk(
         raise error
 
 
-def _engine(name: str, address: str | None, workers: int | None, threads: int | None, provider: Provider) -> Engine:
+def engine_of(name: str, address: str | None, workers: int | None, threads: int | None, provider: Provider) -> Engine:
+    """What has the work done; see the options."""
     on_gpu = provider.name != CPU
     if name == RAY:
         from runtime.scaling.ray_engine import RayEngine
@@ -334,7 +337,7 @@ def _job(
         if not asked.passing():
             break
         note(f"recordings or bundles could not be opened; they are tried again in {pause_s:g} s")
-        time.sleep(pause_s)
+        CLOCK.sleep(pause_s)
         asked = asked.looked_at_again()
     return asked
 

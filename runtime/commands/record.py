@@ -66,7 +66,7 @@ def record(
     if out.exists() and not force:
         raise InvalidInputError(f"--out {out}", "a file that exists", "a new name, or --force")
     source = open_source(spec)
-    source.operator = _ask
+    source.operator = ask_operator
     try:
         profile = load_profile(profile_name) if profile_name is not None else source.profile
         if profile is None:
@@ -247,7 +247,7 @@ def _darkness(dark: tuple[DarkFrame, DarkFrame]) -> tuple[FramePair, tuple[NDArr
     return FramePair(first.mean, second.mean), (first.hot, second.hot)
 
 
-def _ask(text: str) -> None:
+def ask_operator(text: str) -> None:
     """Ask whoever sits at the terminal, and wait for Enter."""
     if not sys.stdin.isatty():
         raise SourceError("operator", "no terminal to ask at", f"somebody who does this: {text}")

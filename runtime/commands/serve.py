@@ -71,7 +71,7 @@ from runtime.wire.shared_memory import memory_path
 
 _log = logging.getLogger(__name__)
 
-_REST_S = 3.0
+REST_S = 3.0
 """For what still computes once all calls have ended."""
 
 _HANGUP = getattr(signal, "SIGHUP", None)
@@ -190,7 +190,7 @@ def serve(context: click.Context, /, config: Path | None, print_config: bool, **
     written = logging_to_stderr(logs.format, logs.level, logs.lines_per_second)
     with stop_signals() as wait_for_stop, written, reporting(None):  # what work tells of itself is logged too
         _serve(effective, wait_for_stop)
-        _leave_the_rest()
+        leave_the_rest()
 
 
 def _given(context: click.Context) -> list[Option]:
@@ -216,8 +216,9 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
         if service.store is not None:
             models = ModelStore(service.store, base.bundle)
             stack.enter_context(models.locked())
-        pages = None if service.source is None else stack.enter_context(_source(service.source, service.pages, base))
-        if pages is not None:
+        pages = None
+        if service.source is not None:
+            pages = stack.enter_context(checked_source(service.source, service.pages, base))
             _take_dark_frames(pages)
         history = History()
         observers: list[Observer] = [history, PageLog()]
@@ -278,9 +279,14 @@ def _serve(effective: Effective[ServiceSettings], wait_for_stop: Callable[[], No
     _log.info("stopped")
 
 
-def _leave_the_rest() -> None:
-    """End the process if its threads do not: a decode that has hung would keep it for ever."""
-    until = time.monotonic() + _REST_S
+def leave_the_rest(rest_s: float = REST_S, leave: Callable[[int], object] = os._exit) -> None:
+    """End the process if its threads do not: a decode that has hung would keep it for ever.
+
+    Args:
+        rest_s: time that they have.
+        leave: ends the process with a status.
+    """
+    until = time.monotonic() + rest_s
     for thread in threading.enumerate():
         if thread is not threading.current_thread() and not thread.daemon:
             thread.join(max(0.0, until - time.monotonic()))
@@ -288,7 +294,7 @@ def _leave_the_rest() -> None:
                 _log.warning("ended while %s was still at work", thread.name)
                 for stream in (sys.stdout, sys.stderr):
                     stream.flush()
-                os._exit(0)
+                leave(0)
 
 
 def _log_start(model: str, source: str, address: str, provider: Provider, given: int) -> None:
@@ -299,8 +305,8 @@ def _log_start(model: str, source: str, address: str, provider: Provider, given:
     _log.info(text, model, source, address, provider, given, extra={"told": versions})
 
 
-def _source(name: str, pages_file: Path | None, base: Decoder) -> FrameSource:
-    """The source, checked, with its pages to show.
+def checked_source(name: str, pages_file: Path | None, base: Decoder) -> FrameSource:
+    """Open a source, check it, and give it its pages to show.
 
     Raises:
         InvalidInputError: it is not there, or not for this device.

@@ -59,7 +59,7 @@ def virtual_device(
     device = (load_device(device_file) if device_file else Device()).of_profile(profile).with_settings(list(settings))
     with VirtualDevice(profile, device, out, seed, pixel_format, black_level, hot_pixels) as running:
         click.echo(f"simulated device at camera:{running.config}", err=True)
-        status = _run(command or (os.environ.get("SHELL", "/bin/sh"),))
+        status = run_to_its_end(command or (os.environ.get("SHELL", "/bin/sh"),))
         running.check()
     context.exit(status)
 
@@ -77,22 +77,32 @@ def _make(folder: Path) -> None:
         raise InvalidInputError(f"--out {folder}", error, "a folder that can be made and written") from None
 
 
-def _run(command: Sequence[str]) -> int:
-    """Run a command to its end, and return its exit status as shells have it; SIGTERM ends it too.
+def run_to_its_end(command: Sequence[str]) -> int:
+    """Run a command, and return its exit status as shells have it; SIGTERM and SIGHUP end it too.
 
     Raises:
         InvalidInputError: there is no such command.
     """
+    came: list[int] = []  # signals that come before the command is known, which would go on alone
+    caught = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) != signal.SIG_IGN]
+    usual = {number: signal.signal(number, lambda got, _: came.append(got)) for number in caught}
+    process: subprocess.Popen[bytes] | None = None
+    before = signal.getsignal(signal.SIGINT)
     try:
-        process = subprocess.Popen(command)
-    except OSError as error:
-        raise InvalidInputError(f"command {command[0]}", error, "a command that can be started") from None
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the command by itself
-    try:
+        try:
+            process = subprocess.Popen(command)
+        except OSError as error:
+            raise InvalidInputError(f"command {command[0]}", error, "a command that can be started") from None
+        finally:
+            for number, handler in usual.items():
+                signal.signal(number, handler)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the command by itself
+        if came:
+            signal.raise_signal(came[0])
         status = process.wait()
     finally:
         signal.signal(signal.SIGINT, before)
-        if process.poll() is None:
+        if process is not None and process.poll() is None:
             process.terminate()
             with suppress(subprocess.TimeoutExpired):
                 process.wait(_END_S)

@@ -48,6 +48,8 @@ MOST_CONNECTIONS = 64
 """Connections that are answered at once: browsers, Prometheus, and those who say nothing."""
 LONGEST_S = 60.0
 """For one connection: more than any answer takes, and too little to hold one for hours by a byte now and then."""
+SILENCE_S = 20.0
+"""A caller that says nothing for so long is hung up on."""
 _HANDSHAKE_S = 5.0
 POINTS = 600
 """Most points of a series."""
@@ -89,6 +91,7 @@ class Console:
         monitor: says whether a recalibration is due.
         source: of the pages, for people.
         actions: what callers may do who prove that they may; None for nothing.
+        clock: seconds since 1970.
     """
 
     def __init__(
@@ -99,11 +102,12 @@ class Console:
         monitor: Monitor,
         source: str,
         actions: Actions | None = None,
+        clock: Callable[[], float] = time.time,
     ) -> None:
-        self._actions = actions
+        self._actions, self._clock = actions, clock
         self._metrics = make_wsgi_app(metrics.registry)
         self._history, self._registry, self._monitor, self._source = history, registry, monitor, source
-        self._begun = time.time()
+        self._begun = clock()
 
     def __call__(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         """Answer a request; see PEP 3333."""
@@ -113,7 +117,7 @@ class Console:
             return self._act(environ, start_response, identity)
         try:
             if identity is not None:  # whose certificate was checked when its TLS session began, and not since
-                identity.check(Role.READ, "a page of the console", time.time())
+                identity.check(Role.READ, "a page of the console", self._clock())
         except NotAllowedError as error:
             return _refused(start_response, "403 Forbidden", str(error))
         if method != "GET":
@@ -150,7 +154,7 @@ class Console:
             return _refused(start_response, "413 Content Too Large", f"1 to {_ACTION_BYTES} bytes only")
         name = f"{identity.name} at {environ.get('REMOTE_ADDR', '')}"
         try:
-            identity.check(ROLE, "an action of the console", time.time())
+            identity.check(ROLE, "an action of the console", self._clock())
             outcome = self._actions.do(content, Actor(name, "console"))
         except NotAllowedError as error:
             _log.warning("console: an action of %s is refused: %s", name, error)
@@ -183,7 +187,7 @@ class Console:
     def state(self, identity: Identity | None = None) -> dict[str, Any]:
         """All that the page shows to a caller, as JSON has it."""
         acts = self._actions if identity is not None and identity.may(ROLE) else None
-        rows, now = self._history.rows(), time.time()
+        rows, now = self._history.rows(), self._clock()
         thinned = rows[:: max(1, -(-len(rows) // POINTS))]
         if rows and thinned[-1] is not rows[-1]:
             thinned.append(rows[-1])
@@ -334,8 +338,10 @@ class _Server6(_Server):
 class _Handler(WSGIRequestHandler):
     """Says who calls. Logs no requests: there is one a second for each browser."""
 
-    timeout = 20
-    """A caller that says nothing is hung up on, seconds."""
+    def setup(self) -> None:
+        """See `socketserver.StreamRequestHandler`."""
+        super().setup()
+        self.connection.settimeout(SILENCE_S)
 
     def get_stderr(self) -> Any:
         """Nowhere: a caller that hangs up is no fault, and what the console does not foresee it logs itself."""

@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.clock import SYSTEM, Clock
 from runtime.errors import LostShotError, Reason
 from runtime.modulator.beam_state import BOTH, BeamState
 
@@ -15,9 +16,14 @@ T = TypeVar("T")
 
 
 class Announcement(Generic[T]):
-    """What is wanted of somebody else, and what they say that there is. Its methods may be called from many threads."""
+    """What is wanted of somebody else, and what they say that there is. Its methods may be called from many threads.
 
-    def __init__(self) -> None:
+    Args:
+        clock: by which it is waited.
+    """
+
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        self._clock = clock
         self._changed = Condition()
         self._wanted: T | None = None
         self._announced: T | None = None
@@ -27,7 +33,7 @@ class Announcement(Generic[T]):
     def wanted(self, timeout_s: float = 0.0) -> T | None:
         """What is being waited for, or None where nothing is, nor comes to be within `timeout_s`."""
         with self._changed:
-            self._changed.wait_for(lambda: self._wanted is not None, timeout_s)
+            self._clock.wait_for(self._changed, lambda: self._wanted is not None, timeout_s)
             self._asked = self._asked or self._wanted is not None
             return self._wanted
 
@@ -67,7 +73,7 @@ class Announcement(Generic[T]):
         with self._changed:
             self.want(what)
             try:
-                self._changed.wait_for(lambda: self._announced == what, timeout_s)
+                self._clock.wait_for(self._changed, lambda: self._announced == what, timeout_s)
                 return self._announced, self._changes
             finally:
                 self._wanted = None
@@ -83,12 +89,15 @@ class ExternalModulator:
 
     One thread uses `show`, `shows` and `close`; others say what the controller does, by `shown` and `withdrawn`, and
     look at `wanted`. A page may be announced before it is asked for.
+
+    Args:
+        clock: by which it waits.
     """
 
     name = "the controller's modulator"
 
-    def __init__(self) -> None:
-        self._pages = Announcement[int]()
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        self._pages = Announcement[int](clock)
         self._at_last_show = -1
 
     def wanted(self, timeout_s: float = 0.0) -> int | None:
@@ -134,13 +143,14 @@ class ExternalBeams:
 
     Args:
         timeout_s: longest wait for it.
+        clock: by which it waits.
     """
 
     name = "the controller's beams"
 
-    def __init__(self, timeout_s: float = 10.0) -> None:
+    def __init__(self, timeout_s: float = 10.0, clock: Clock = SYSTEM) -> None:
         self._timeout_s = timeout_s
-        self._states = Announcement[BeamState]()
+        self._states = Announcement[BeamState](clock)
 
     def wanted(self, timeout_s: float = 0.0) -> BeamState | None:
         """What is being waited for, or None where nothing is, nor comes to be within `timeout_s`."""

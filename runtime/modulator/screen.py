@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import Profile
 from runtime.errors import LostShotError, Reason, SourceError
 from runtime.modulator.lookup_table import LookupTable
@@ -33,15 +33,22 @@ class ScreenModulator:
         settings: which monitor, its resolution, and where the page lies.
         profile: how large page and symbols are.
         lookup_table: grey value of each level, or what makes a table for a number of levels.
+        window: opens a window, in a process of its own.
+        clock: by which it waits; that of the window.
 
     Raises:
         InvalidInputError: the page does not lie on the modulator.
     """
 
     def __init__(
-        self, settings: ScreenSettings, profile: Profile, lookup_table: LookupTable | Callable[[int], LookupTable]
+        self,
+        settings: ScreenSettings,
+        profile: Profile,
+        lookup_table: LookupTable | Callable[[int], LookupTable],
+        window: Callable[[ScreenSettings], WindowProcess] = WindowProcess,
+        clock: Clock = SYSTEM,
     ) -> None:
-        self._settings = settings
+        self._settings, self._make_window, self._clock = settings, window, clock
         self._raster = Raster(profile, settings)
         self._table_of: Callable[[int], LookupTable]
         if isinstance(lookup_table, LookupTable):
@@ -68,7 +75,7 @@ class ScreenModulator:
         """
         if levels is not None:
             self._table_of(levels)
-        self._opened(self.name, time.monotonic() + timeout_s)
+        self._opened(self.name, self._clock.now() + timeout_s)
 
     def show(self, symbols: NDArray[np.uint8], levels: int, page: int, timeout_s: float) -> None:
         """Show a page and return once it is on display; see `Modulator`.
@@ -80,7 +87,7 @@ class ScreenModulator:
             LostShotError: `Reason.NOT_ON_DISPLAY`: not by then, or the window, or the X server, has gone away, or
                 something covers the window. It is opened again at the next call.
         """
-        deadline = time.monotonic() + timeout_s
+        deadline = self._clock.now() + timeout_s
         subject = f"page {page} on {self.name}"
         image = self._raster.image(self._table_of(levels).greys_of(symbols, levels))
         self._has_page = False
@@ -96,9 +103,9 @@ class ScreenModulator:
         if not answer.shows:
             self.close()
             raise _lost(subject, "a window that something covers, or whose monitor has changed")
-        if (settle_s := self._settings.settle_s) > deadline - time.monotonic():
+        if (settle_s := self._settings.settle_s) > deadline - self._clock.now():
             raise _lost(subject, f"a page that has not settled for {settle_s:g} s after {timeout_s:g} s")
-        time.sleep(settle_s)
+        self._clock.sleep(settle_s)
         self._has_page = True
 
     def shows(self) -> bool:
@@ -106,7 +113,7 @@ class ScreenModulator:
         if not self._has_page or self._window is None:
             return False
         try:
-            return self._window.ask(time.monotonic() + ANSWER_S).shows
+            return self._window.ask(self._clock.now() + ANSWER_S).shows
         except (TimeoutError, ConnectionError):
             self._has_page = False
             self._window.end()  # and the next `show` finds it so
@@ -126,7 +133,7 @@ class ScreenModulator:
             raise _lost(subject, "the process of its window, or the X server, has ended")
         try:
             if self._window is None:
-                self._window = WindowProcess(self._settings)
+                self._window = self._make_window(self._settings)
             opening = self._window.opening(deadline)
         except TimeoutError:
             raise _lost(subject, "a window that is not open yet") from None

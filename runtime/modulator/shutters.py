@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.device.profile import TomlTable
 from lightpage.errors import InvalidInputError, LightpageError
 from runtime.errors import LostShotError, Reason, SourceError
@@ -43,15 +43,16 @@ class ShutterBeams:
     Args:
         generator: whose channels move the shutters; it may be the cameras' trigger as well.
         signal, reference: the shutters.
+        clock: by which they settle.
 
     Raises:
         InvalidInputError: both are on one channel.
     """
 
-    def __init__(self, generator: PulseGenerator, signal: Shutter, reference: Shutter) -> None:
+    def __init__(self, generator: PulseGenerator, signal: Shutter, reference: Shutter, clock: Clock = SYSTEM) -> None:
         if signal.channel == reference.channel:
             raise InvalidInputError("shutters of signal and reference", f"channel {signal.channel} for both", "two")
-        self._generator, self._signal, self._reference = generator, signal, reference
+        self._generator, self._signal, self._reference, self._clock = generator, signal, reference, clock
         self._moved = False
         self.name = f"shutters on channels {signal.channel} and {reference.channel} of {generator.name}"
 
@@ -74,7 +75,7 @@ class ShutterBeams:
                     f"{self.name}: {error.subject}", error.got, error.expected, Reason.BEAM_CONTROL_FAILED
                 ) from None
             raise
-        time.sleep(max(self._signal.settle_s, self._reference.settle_s))
+        self._clock.sleep(max(self._signal.settle_s, self._reference.settle_s))
 
     def _move(self, wanted: Sequence[tuple[Shutter, bool]]) -> None:
         """Move the shutters, one after another. One that cannot be opened does not keep the other one closed."""

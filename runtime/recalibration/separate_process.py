@@ -61,6 +61,7 @@ def recalibrate_apart(
     limit_s: float,
     scratch: Path | None = None,
     worker: Sequence[str] = WORKER,
+    clock: Callable[[], float] = time.monotonic,
 ) -> RecalibrationOutcome:
     """Recalibrate in a process of its own; see `runtime.recalibration.recalibration.recalibrate`.
 
@@ -78,6 +79,7 @@ def recalibrate_apart(
         scratch: folder for the work's own files, in a hidden folder of it whose name begins with `SCRATCH`; the
             machine's temporary folder if None.
         worker: arguments of the interpreter that start the worker, before its folder.
+        clock: seconds that never go back, by which `limit_s` is taken.
 
     Raises:
         WorkerError: the process was killed, broke, or took longer than `limit_s`.
@@ -96,7 +98,7 @@ def recalibrate_apart(
         done = False
         try:
             with (path / "log").open("w+b") as log:
-                status = _run([sys.executable, *worker, str(path)], log, progress, check, limit_s)
+                status = _run([sys.executable, *worker, str(path)], log, progress, check, limit_s, clock)
                 outcome = folder.read_result()
                 if outcome is None:
                     _show(log)
@@ -118,9 +120,16 @@ def _private_folder(scratch: Path | None) -> Iterator[Path]:
         yield Path(name)
 
 
-def _run(command: Sequence[str], log: IO[bytes], progress: Progress, check: Callable[[], None], limit_s: float) -> int:
+def _run(
+    command: Sequence[str],
+    log: IO[bytes],
+    progress: Progress,
+    check: Callable[[], None],
+    limit_s: float,
+    clock: Callable[[], float],
+) -> int:
     """Run the worker to its end, hand its steps on, and return its exit status; on an error it is ended."""
-    until = time.monotonic() + limit_s
+    until = clock() + limit_s
     lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     try:
         # Its input is a pipe that nobody writes to: once it is closed, the worker ends.
@@ -135,7 +144,7 @@ def _run(command: Sequence[str], log: IO[bytes], progress: Progress, check: Call
         threading.Thread(target=_listen, args=(process.stdout, lines), name="lightpage-worker", daemon=True).start()
         while True:
             check()
-            if (left := until - time.monotonic()) <= 0:
+            if (left := until - clock()) <= 0:
                 raise WorkerError(_SUBJECT, f"no end within {limit_s:g} s", "one; nothing was changed")
             try:
                 line = lines.get(timeout=min(_POLL_S, left))

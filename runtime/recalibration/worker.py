@@ -6,9 +6,11 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import LightpageError
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_tracker import tracker_for
@@ -60,7 +62,9 @@ def yield_to_reads() -> None:
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def yield_more(room: float = ROOM, look_s: float = _LOOK_S) -> threading.Thread:
+def yield_more(
+    room: float = ROOM, clock: Clock = SYSTEM, worked: Callable[[], float] = time.process_time
+) -> threading.Thread:
     """Yield all to reads, from a thread, as soon as they leave room.
 
     There is no way back: who has not the right to it cannot raise a priority. Where reads leave no pause later on, the
@@ -68,15 +72,16 @@ def yield_more(room: float = ROOM, look_s: float = _LOOK_S) -> threading.Thread:
 
     Args:
         room: share of a core.
-        look_s: time over which it is taken.
+        clock: by which the time passes over which it is taken.
+        worked: processor time that this process has had, seconds.
     """
 
     def watch() -> None:
         share = -1.0
         while share < room:
-            begun, worked = time.monotonic(), time.process_time()
-            time.sleep(look_s)
-            share = (time.process_time() - worked) / (time.monotonic() - begun)
+            begun, before = clock.now(), worked()
+            clock.sleep(_LOOK_S)
+            share = (worked() - before) / (clock.now() - begun)
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, os.getpid(), LOWEST)  # of the thread that works, which is the first one
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.progress import note, track, warn
 from runtime.scaling.engine import Engine
 from runtime.scaling.job import Job
@@ -49,8 +49,8 @@ class Progressed:
 
     @property
     def pages_per_s(self) -> float | None:
-        """Of all workers together; None where nothing was to do."""
-        return self.pages / self.seconds if self.pages else None
+        """Of all workers together; None where nothing was to do, or it took no time."""
+        return self.pages / self.seconds if self.pages and self.seconds else None
 
     def count(self, outcome: Outcome) -> int:
         """Count an outcome and return how much of the work it was worth."""
@@ -106,7 +106,7 @@ def run(
     watch: Watch = _NOBODY,
     *,
     give_up: bool = False,
-    sleep: Callable[[float], None] = time.sleep,
+    clock: Clock = SYSTEM,
 ) -> Progressed:
     """Do all that is missing of a job: its first reading, then its rounds one after the other.
 
@@ -119,13 +119,13 @@ def run(
         engine: makes the engine; not called where nothing is missing.
         watch: is told how it fares.
         give_up: whether pages of recordings that cannot be read in the end are lost.
-        sleep: waits so many seconds.
+        clock: of the pauses.
 
     Raises:
         WorkerError: there are no workers.
         InvalidInputError: a shard cannot be read.
     """
-    start = time.perf_counter()
+    start = clock.now()
     made = Progressed()
     ledger.sweep(job)
     for problem, is_given_up in dict.fromkeys(  # a bundle is lacking to all recordings of its device
@@ -163,7 +163,7 @@ def run(
                     tasks = list(_of_failures(tasks, again, [*failed, *counted], turn.give_up))
                     todo = sum(task.weight for task in tasks)
                     note(f"{again[0].problem}; {todo} {unit}s are tried again in {turn.pause_s:g} s")
-                    sleep(turn.pause_s)
+                    clock.sleep(turn.pause_s)
                 works = engine()
                 watch.begin(works)
                 steps = _steps(works, tasks, ledger, made, watch, turn.later, failed, counted)
@@ -172,7 +172,7 @@ def run(
                         pass
     finally:
         ledger.sweep(job)
-    made.seconds = time.perf_counter() - start
+    made.seconds = clock.now() - start
     return made
 
 

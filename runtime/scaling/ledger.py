@@ -5,13 +5,13 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import LightpageError, SurroundingsError, TakenError
 from lightpage.failures import os_failure
 from lightpage.files import check_utf8, lock
@@ -38,6 +38,7 @@ class Ledger:
     Args:
         folder: of the run, there or yet to be made.
         part: what this process does of it.
+        clock: by which another part is waited for.
 
     Attributes:
         doubted: paths of shards whose ranges are read again; until then they count as having no result.
@@ -47,8 +48,8 @@ class Ledger:
         InvalidInputError: the folder cannot be written, or its name is not UTF-8.
     """
 
-    def __init__(self, folder: Path, part: Part = WHOLE) -> None:
-        self.folder, self.part = folder.absolute(), part
+    def __init__(self, folder: Path, part: Part = WHOLE, clock: Clock = SYSTEM) -> None:
+        self.folder, self.part, self._clock = folder.absolute(), part, clock
         self.doubted: set[Path] = set()
         check_utf8(self.folder, "bulk run")
         self._subject = f"bulk run {self.folder}"
@@ -79,7 +80,7 @@ class Ledger:
         Raises:
             TakenError: another one has not ended with it in time.
         """
-        asking = self._question_lock(time.monotonic() + _QUESTION_S)
+        asking = self._question_lock(self._clock.now() + _QUESTION_S)
         try:
             yield
         finally:
@@ -90,9 +91,9 @@ class Ledger:
             try:
                 return self._locked(_QUESTION)
             except TakenError:
-                if time.monotonic() > until:
+                if self._clock.now() > until:
                     raise
-                time.sleep(_AGAIN_S)
+                self._clock.sleep(_AGAIN_S)
 
     def _locked(self, name: str, *, shared: bool = False) -> int:
         """A descriptor that holds a lock until it is closed.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import select
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Sized
+from collections.abc import Callable, Generator, Iterable, Sized
+from typing import Protocol
 
 from pydantic import TypeAdapter
 
@@ -30,6 +31,42 @@ def default_workers() -> int:
     return max(1, available_cpus() // THREADS_OF_WORKER)
 
 
+class WorkerLink(Protocol):
+    """A worker as the engine needs it; see `runtime.helper_process.HelperProcess`."""
+
+    @property
+    def status(self) -> int | None:
+        """Its exit status; None while it runs."""
+
+    def send(self, data: bytes, deadline: float) -> None:
+        """Send it a task."""
+
+    def line(self, deadline: float) -> bytes:
+        """The next line of its answer."""
+
+    def has_line(self) -> bool:
+        """Whether a line has come already."""
+
+    def fileno(self) -> int:
+        """Of its socket."""
+
+    def end(self, grace_s: float = 0.0) -> None:
+        """End it."""
+
+
+def started(module: str, threads: int) -> WorkerLink:
+    """A process that runs a module with so many threads.
+
+    Raises:
+        SurroundingsError, WorkerError: it cannot be started.
+    """
+    try:
+        return HelperProcess(module, str(threads), subject="a worker", environment=same_packages(threads))
+    except OSError as error:
+        short = short_resource("a worker", error)
+        raise short or WorkerError("a worker", error, "a process that can be started") from error
+
+
 class LocalEngine:
     """Has processes of this machine do tasks; see `runtime.scaling.engine.Engine`.
 
@@ -39,31 +76,40 @@ class LocalEngine:
         workers: how many.
         threads: of each one's inferences; by default its share of the cores.
         module: what a worker runs.
+        start: starts one, given module and threads.
+        clock: by which one is too late.
     """
 
-    def __init__(self, workers: int, threads: int | None = None, module: str = WORKER) -> None:
-        self.workers, self._module = workers, module
+    def __init__(
+        self,
+        workers: int,
+        threads: int | None = None,
+        module: str = WORKER,
+        start: Callable[[str, int], WorkerLink] = started,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.workers, self._module, self._start, self._clock = workers, module, start, clock
         self.threads = threads or max(1, available_cpus() // workers)
         self.restarts, self.in_flight, self.workers_alive = 0, 0, 0
 
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
         """See `Engine`."""
         following, again = iter(tasks), deque[Attempt]()
-        busy: dict[HelperProcess, Attempt] = {}
-        free: list[HelperProcess] = []
+        busy: dict[WorkerLink, Attempt] = {}
+        free: list[WorkerLink] = []
         try:
             while True:
                 while len(busy) < self.workers:
                     attempt = again.popleft() if again else next_attempt(following)
                     if attempt is None:
                         break
-                    worker = free.pop() if free else self._start()
+                    worker = free.pop() if free else self._start(self._module, self.threads)
                     busy[worker] = attempt
                     self._hand_over(worker, attempt)
                 self._count(busy, free)
                 if not busy:
                     return
-                for worker in _heard(busy):
+                for worker in self._heard(busy):
                     attempt = busy.pop(worker)
                     try:
                         line = worker.line(attempt.deadline)
@@ -93,37 +139,26 @@ class LocalEngine:
     def _count(self, busy: Sized, free: Sized) -> None:
         self.in_flight, self.workers_alive = len(busy), len(busy) + len(free)
 
-    def _start(self) -> HelperProcess:
-        try:
-            return HelperProcess(
-                self._module, str(self.threads), subject="a worker", environment=same_packages(self.threads)
-            )
-        except OSError as error:
-            short = short_resource("a worker", error)
-            raise short or WorkerError("a worker", error, "a process that can be started") from error
-
-    @staticmethod
-    def _hand_over(worker: HelperProcess, attempt: Attempt) -> None:
+    def _hand_over(self, worker: WorkerLink, attempt: Attempt) -> None:
         """Send a task; a worker that cannot take it has died, which its socket tells."""
-        attempt.deadline = time.monotonic() + longest_s(attempt.task)
+        attempt.deadline = self._clock() + longest_s(attempt.task)
         try:
-            worker.send(attempt.task.model_dump_json().encode() + b"\n", time.monotonic() + _SEND_S)
+            worker.send(attempt.task.model_dump_json().encode() + b"\n", self._clock() + _SEND_S)
         except OSError:
             worker.end()
 
+    def _heard(self, busy: dict[WorkerLink, Attempt]) -> list[WorkerLink]:
+        """Workers that have answered or ended, at least one; those whose time is up among them."""
+        heard = [worker for worker in busy if worker.fileno() < 0 or worker.has_line()]
+        if heard:
+            return heard
+        left = min(attempt.deadline for attempt in busy.values()) - self._clock()
+        ready, _, _ = select.select(list(busy), [], [], max(0.0, left))
+        now = self._clock()
+        return ready or [worker for worker, attempt in busy.items() if attempt.deadline <= now]
 
-def _heard(busy: dict[HelperProcess, Attempt]) -> list[HelperProcess]:
-    """Workers that have answered or ended, at least one; those whose time is up among them."""
-    heard = [worker for worker in busy if worker.fileno() < 0 or worker.has_line()]
-    if heard:
-        return heard
-    left = min(attempt.deadline for attempt in busy.values()) - time.monotonic()
-    ready, _, _ = select.select(list(busy), [], [], max(0.0, left))
-    now = time.monotonic()
-    return ready or [worker for worker, attempt in busy.items() if attempt.deadline <= now]
 
-
-def _told(worker: HelperProcess, error: Exception) -> str:
+def _told(worker: WorkerLink, error: Exception) -> str:
     """How a worker has ended, for people."""
     if isinstance(error, TimeoutError):
         return "no answer in time"

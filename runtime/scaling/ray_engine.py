@@ -50,6 +50,7 @@ class RayEngine:
         threads: CPUs of a worker, and threads of its inferences; by default `THREADS_OF_WORKER`, or what a node has.
         work: what a worker does with a task and so many threads.
         gpus: of a worker, 0 or 1: Ray shows it that one alone.
+        clock: by which a worker is too late.
     """
 
     def __init__(
@@ -59,9 +60,10 @@ class RayEngine:
         threads: int | None = None,
         work: Callable[[Task, int], Outcome] | None = None,
         gpus: int = 0,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._address, self._workers, self._work = address, workers, work or _work
-        self._threads, self._gpus = threads, gpus
+        self._threads, self._gpus, self._clock = threads, gpus, clock
         self.restarts, self.in_flight, self.workers_alive = 0, 0, 0
 
     def run(self, tasks: Iterable[Task]) -> Generator[Outcome, None, None]:
@@ -90,8 +92,8 @@ class RayEngine:
                 if not busy:
                     return
                 for attempt in islice(busy.values(), max(1, self.workers_alive)):  # Ray begins them in this order
-                    attempt.deadline = min(attempt.deadline, time.monotonic() + longest_s(attempt.task))
-                left_s = min(attempt.deadline for attempt in busy.values()) - time.monotonic()
+                    attempt.deadline = min(attempt.deadline, self._clock() + longest_s(attempt.task))
+                left_s = min(attempt.deadline for attempt in busy.values()) - self._clock()
                 ready, _ = ray.wait(list(busy), num_returns=1, timeout=max(0.0, left_s))
                 for ref in ready or self._overdue(ray, threads, busy):
                     attempt = busy.pop(ref)
@@ -137,7 +139,7 @@ class RayEngine:
         self._count(ray, threads)
         if not self.workers_alive:
             raise WorkerError("the Ray cluster", "no workers any more", "nodes that have what a worker takes")
-        now = time.monotonic()
+        now = self._clock()
         return [ref for ref, attempt in busy.items() if attempt.deadline <= now]
 
     def _count(self, ray: Any, threads: int) -> None:

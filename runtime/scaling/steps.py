@@ -22,10 +22,11 @@ class StepLog:
     Args:
         path: of the log, which is gone on with.
         tell: called with each line.
+        clock: by which lines are told now and then.
     """
 
-    def __init__(self, path: Path, tell: Callable[[str], None]) -> None:
-        self._path, self._tell = path, tell
+    def __init__(self, path: Path, tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self._path, self._tell, self._clock = path, tell, clock
         self._step, self._next = "", 0.0
 
     def track(
@@ -50,7 +51,7 @@ class StepLog:
 
     def _now(self, step: str, where: str, state: State) -> None:
         """A line when a step begins, and then one every so often."""
-        if step == self._step and time.monotonic() < self._next:
+        if step == self._step and self._clock() < self._next:
             return
-        self._step, self._next = step, time.monotonic() + EVERY_S
+        self._step, self._next = step, self._clock() + EVERY_S
         self.note(f"{step}: {where}" + (f", {state()}" if state() else ""))

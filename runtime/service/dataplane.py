@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.codec.page_bytes import Header, Loss, PageBytes
 from lightpage.errors import FrameError, InvalidInputError
 from lightpage.page.levels import MAX_LEVELS
@@ -83,6 +84,7 @@ class DataPlane:
             those of `device_sessions`. Other sessions of callers get monitors of their own with the same settings.
         audit: where changes of models are written down, None for the log alone.
         device_sessions: sessions of callers whose frames are of the device, by their names in `Caller.session`.
+        clock: by which callers wait for slots and answers, and what hangs is known.
 
     Raises:
         InvalidInputError: the source is not for this device.
@@ -99,6 +101,7 @@ class DataPlane:
         monitor: Monitor | None = None,
         audit: AuditLog | None = None,
         device_sessions: Collection[str] = (),
+        clock: Clock = SYSTEM,
     ) -> None:
         self.registry, self.store = registry, store
         self.limits = limits or Limits()
@@ -116,14 +119,14 @@ class DataPlane:
         self.received = ReceiveBudget(self.limits.receive_bytes)
         self.shared: SharedMemory | None = None
         """Memory that clients share with the service."""
-        self.heart = Heart(self.limits.decode_s)
-        self.replays = Replays(self.limits.replay_s, self.limits.replay_bytes)
-        self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s)
-        self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s)
-        self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s)
-        self.uploads = Slots(1, "uploads of models", self.limits.deadline_s)
+        self.heart = Heart(self.limits.decode_s, clock.now)
+        self.replays = Replays(self.limits.replay_s, self.limits.replay_bytes, clock)
+        self.decodes = Slots(self.limits.concurrent_decodes, "decodes", self.limits.deadline_s, clock)
+        self.ranges = Slots(self.limits.concurrent_ranges, "ranges of pages", self.limits.deadline_s, clock)
+        self.watches = Slots(self.limits.concurrent_watches, "watches of the display", self.limits.deadline_s, clock)
+        self.uploads = Slots(1, "uploads of models", self.limits.deadline_s, clock)
         self.models = Models(registry, store, self.limits.model_bytes, self._in_service, self.audit)
-        self.store_health = StoreHealth(self.models.trouble)
+        self.store_health = StoreHealth(self.models.trouble, clock=clock)
         """Tells of the store without waiting for its disk."""
         self._in_service(registry.current)
         self.metrics.watch_load(self.decodes, self.received)

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import BusyError, LightpageError
 from runtime.bundle.signature_file import read_signature, signature_path
 from runtime.errors import CallerLeft, StoreError
@@ -36,10 +37,11 @@ class Incoming:
         plane: of the service, which has a store.
         folder: is looked at for files that end in .zip.
         look_s: how often.
+        clock: by which it waits between two looks.
     """
 
-    def __init__(self, plane: DataPlane, folder: Path, look_s: float = LOOK_S) -> None:
-        self._plane, self._folder, self._look_s = plane, folder, look_s
+    def __init__(self, plane: DataPlane, folder: Path, look_s: float = LOOK_S, clock: Clock = SYSTEM) -> None:
+        self._plane, self._folder, self._look_s, self._clock = plane, folder, look_s, clock
         self._seen: dict[Path, _Stamp] = {}
         self._refused: dict[Path, _Stamp] = {}
         self._put_off: dict[Path, _Stamp] = {}
@@ -69,7 +71,7 @@ class Incoming:
                 del told[path]
 
     def _run(self) -> None:
-        while not self._stopping.wait(self._look_s):
+        while not self._clock.wait(self._stopping, self._look_s):
             try:
                 self.look()
             except CallerLeft:

@@ -8,6 +8,7 @@ import os
 import secrets
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,10 +69,17 @@ class Jobs:
         folder: where `jobs.json` is kept, or None: then a restart forgets all jobs.
         kept: ended jobs that are kept.
         version: of the model in service: by it a job is known whose service ended while it put its model in service.
+        clock: seconds since 1970.
     """
 
-    def __init__(self, folder: Path | None = None, kept: int = JOBS_KEPT, version: str = "") -> None:
-        self._path, self._kept = None if folder is None else folder / FILE, kept
+    def __init__(
+        self,
+        folder: Path | None = None,
+        kept: int = JOBS_KEPT,
+        version: str = "",
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._path, self._kept, self._clock = None if folder is None else folder / FILE, kept, clock
         self._lock = threading.Lock()
         """Guards the list and the running job; never held while the file is written."""
         self._running: RunningJob | None = None
@@ -80,7 +88,7 @@ class Jobs:
         self._jobs: list[pb.Job] = []
         """The oldest first. Only `begin` and `end` change it, and they follow each other: no two write the file."""
         if self._path is not None:
-            self._jobs = _ended_by_restart(_read(self._path), version)[-kept:]
+            self._jobs = _ended_by_restart(_read(self._path), version, clock())[-kept:]
             if self._jobs:
                 self._write(self._jobs)
 
@@ -103,7 +111,7 @@ class Jobs:
                 id=running.id,
                 state=pb.JOB_STATE_RUNNING,
                 progress=pb.Progress(step="begin"),
-                created_s=time.time(),
+                created_s=self._clock(),
                 correlation_id=correlation_id,
                 pages_of=pages_of,
             )
@@ -151,7 +159,7 @@ class Jobs:
             *earlier, job = self._jobs
             ended = _copy(job)
         try:
-            ended.ended_s, ended.state = time.time(), _state(end)
+            ended.ended_s, ended.state = self._clock(), _state(end)
             if isinstance(end, RecalibrationOutcome):
                 ended.result.CopyFrom(result_message(end))
             else:
@@ -258,12 +266,12 @@ def _read(path: Path) -> list[pb.Job]:
     return jobs
 
 
-def _ended_by_restart(jobs: list[pb.Job], version: str) -> list[pb.Job]:
+def _ended_by_restart(jobs: list[pb.Job], version: str, now_s: float) -> list[pb.Job]:
     """The jobs, those that ran when the service ended now as they are: cut off, or done but for their note."""
     for job in jobs:
         if job.state != pb.JOB_STATE_RUNNING:
             continue
-        job.ended_s = time.time()
+        job.ended_s = now_s
         if job.HasField("result") and job.result.model_version == version:
             job.state = pb.JOB_STATE_DONE
             continue

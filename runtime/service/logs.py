@@ -6,13 +6,13 @@ import json
 import logging
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal, TextIO
 
+from lightpage.clock import SYSTEM, Clock
 from runtime.service.observation import Observation
 
 FIELDS = ("method", "peer", "correlation_id", "code", "reason", "seconds")
@@ -112,20 +112,20 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
     Args:
         stream: where they go.
         lines_per_second: of one kind.
-        clock: seconds that never go back.
+        clock: by which seconds pass.
     """
 
-    def __init__(
-        self, stream: TextIO | None, lines_per_second: int, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, stream: TextIO | None, lines_per_second: int, clock: Clock = SYSTEM) -> None:
         super().__init__(stream)
         self._most, self._clock = lines_per_second, clock
         self._seconds: dict[tuple[str, ...], _Second] = {}
-        self._timer: threading.Timer | None = None
+        self._ending = threading.Event()
+        self._waker: threading.Thread | None = None
+        """Tells of what was left out if nothing else is logged."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record, or count it; called with the handler's lock held."""
-        kind, now = _kind(record), self._clock()
+        kind, now = _kind(record), self._clock.now()
         second = self._seconds.get(kind)
         if second is None or now - second.begun >= _WINDOW_S:
             self._tell(kind, now)
@@ -143,7 +143,7 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         """Say what was left out in seconds that are over; `at_once`, in those that are not over too."""
         self.acquire()
         try:
-            now, self._timer = self._clock(), None
+            now, self._waker = self._clock.now(), None
             over = [kind for kind, each in self._seconds.items() if at_once or now - each.begun >= _WINDOW_S]
             for kind in over:
                 self._tell(kind, now)
@@ -155,15 +155,17 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
 
     def _wake_later(self) -> None:
         """See to it that what was left out is told of, even if nothing else is logged."""
-        if self._timer is None:
-            self._timer = threading.Timer(_WINDOW_S, self.tell_left_out)
-            self._timer.daemon = True
-            self._timer.start()
+        if self._waker is None:
+            self._waker = threading.Thread(target=self._wait, name="lightpage-left-out", daemon=True)
+            self._waker.start()
+
+    def _wait(self) -> None:
+        if not self._clock.wait(self._ending, _WINDOW_S):
+            self.tell_left_out()
 
     def close(self) -> None:
         """Say what was left out, and end."""
-        if self._timer is not None:
-            self._timer.cancel()
+        self._ending.set()
         self.tell_left_out(at_once=True)
         super().close()
 
@@ -205,7 +207,11 @@ def _thread_broke(found: threading.ExceptHookArgs) -> None:
 
 @contextmanager
 def logging_to_stderr(
-    form: Literal["text", "json"], level: str, lines_per_second: int, stream: TextIO | None = None
+    form: Literal["text", "json"],
+    level: str,
+    lines_per_second: int,
+    stream: TextIO | None = None,
+    clock: Clock = SYSTEM,
 ) -> Iterator[LimitedHandler]:
     """Have everything that is logged in the `with` statement written, and what ends threads that nobody waits for.
 
@@ -214,9 +220,10 @@ def logging_to_stderr(
         level: `debug`, `info`, `warning` or `error`; lesser lines are left out.
         lines_per_second: of one kind.
         stream: where to, stderr by default.
+        clock: by which lines are counted.
     """
     root = logging.getLogger()
-    handler = LimitedHandler(sys.stderr if stream is None else stream, lines_per_second)
+    handler = LimitedHandler(sys.stderr if stream is None else stream, lines_per_second, clock)
     handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
     before, hook = root.level, threading.excepthook
     root.addHandler(handler)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -110,11 +110,21 @@ class Seen:
 
     Args:
         subject, page_index, model_version: see `Observation`.
+        clock: seconds since 1970.
+        lap: seconds that never go back, by which the page is timed.
     """
 
-    def __init__(self, subject: str, page_index: int | None, model_version: str) -> None:
-        self.observation = Observation(subject, page_index, model_version, time.time(), 0.0)
-        self._begun = time.perf_counter()
+    def __init__(
+        self,
+        subject: str,
+        page_index: int | None,
+        model_version: str,
+        clock: Callable[[], float] = time.time,
+        lap: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self._clock, self._lap = clock, lap
+        self.observation = Observation(subject, page_index, model_version, clock(), 0.0)
+        self._begun = lap()
 
     def note(self, **known: Any) -> None:
         """Take in fields of `Observation`."""
@@ -122,8 +132,8 @@ class Seen:
 
     def ended(self, lost: Reason | None, detail: str) -> Observation:
         """The observation of the page, which was given out or lost now."""
-        seconds = time.perf_counter() - self._begun
-        return replace(self.observation, time_s=time.time(), seconds=seconds, lost=lost, detail=detail)
+        seconds = self._lap() - self._begun
+        return replace(self.observation, time_s=self._clock(), seconds=seconds, lost=lost, detail=detail)
 
 
 @contextmanager

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import InvalidInputError, StorageError
 from runtime.errors import RequestIdError, SlotsTakenError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -49,10 +49,10 @@ class Replays:
     Args:
         keep_s: how long, seconds.
         keep_bytes: how much of all answers, with their requests; the oldest go first.
-        clock: seconds that never go back.
+        clock: by which answers age and callers wait.
     """
 
-    def __init__(self, keep_s: float, keep_bytes: int, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, keep_s: float, keep_bytes: int, clock: Clock = SYSTEM) -> None:
         self._keep_s, self._keep_bytes, self._clock = keep_s, keep_bytes, clock
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
@@ -95,11 +95,9 @@ class Replays:
             self._work(request_id, entry, work)
         else:
             with caller.telling(self._tell):
-                until = time.monotonic() + caller.seconds_left()
+                left_s = min(caller.seconds_left(), threading.TIMEOUT_MAX)
                 with self._changed:
-                    self._changed.wait_for(
-                        lambda: entry.done or not caller.is_here, min(until - time.monotonic(), threading.TIMEOUT_MAX)
-                    )
+                    self._clock.wait_for(self._changed, lambda: entry.done or not caller.is_here, left_s)
             caller.check()
             if not entry.done:
                 expected = "its answer; ask again with the same id"
@@ -119,7 +117,7 @@ class Replays:
             raise
         finally:
             with self._changed:
-                entry.done, entry.ended_at = True, self._clock()
+                entry.done, entry.ended_at = True, self._clock.now()
                 if kept:
                     parts = (request_id, entry.request, entry.answer, entry.failure or b"")
                     entry.size = _OWN_BYTES + sum(map(sys.getsizeof, parts))
@@ -134,7 +132,7 @@ class Replays:
 
     def _forget(self) -> None:
         """Drop answers that are too old, then the oldest where there are too many bytes of them."""
-        now, gone = self._clock(), list[str]()
+        now, gone = self._clock.now(), list[str]()
         for request_id, entry in self._entries.items():
             if not entry.done:
                 continue

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import BusyError, InvalidInputError, LightpageError, LimitError, RecalibrationRefusedError
 from runtime.errors import CallerLeft, StoppingError
 from runtime.recalibration.known_pages import MIN_PAGES
@@ -66,7 +66,7 @@ class SelfCalibration:
         monitor: says when it is due.
         recalibrator: of the service.
         settings: when and with what.
-        clock: seconds that never go back.
+        clock: by which it waits.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class SelfCalibration:
         monitor: Monitor,
         recalibrator: Recalibrator,
         settings: SelfCalibrationSettings | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Clock = SYSTEM,
     ) -> None:
         self._plane, self._monitor, self._recalibrator = plane, monitor, recalibrator
         self._settings, self._clock = settings or SelfCalibrationSettings(), clock
@@ -115,17 +115,21 @@ class SelfCalibration:
 
     def _run(self) -> None:
         while True:
-            self._wake.wait(self._pause_s())
+            self._clock.wait(self._wake, self._pause_s())
             self._wake.clear()
             if self._stopping.is_set():
                 return
-            if self._monitor.due and self._clock() >= self._not_before:
-                self._try_once()
+            self.look()
 
-    def _pause_s(self) -> float | None:
+    def look(self) -> None:
+        """Recalibrate if the monitor says that it is due, and the last time was long enough ago."""
+        if self._monitor.due and self._clock.now() >= self._not_before:
+            self._try_once()
+
+    def _pause_s(self) -> float:
         """How long to sleep where nobody wakes: until it is looked again where a try is due, else for ever."""
-        left = max(0.0, self._not_before - self._clock())
-        return min(left, self._settings.busy_s) if self._monitor.due else None
+        left = max(0.0, self._not_before - self._clock.now())
+        return min(left, self._settings.busy_s) if self._monitor.due else threading.TIMEOUT_MAX
 
     def _try_once(self) -> None:
         """Recalibrate, and decide when the next time may be; not while the model in service is pinned."""
@@ -175,7 +179,7 @@ class SelfCalibration:
         _log.warning("self-calibration: %s, next in %.0f s: %s", end, self._interval_s, error, exc_info=unforeseen)
 
     def _wait(self, seconds: float) -> None:
-        self._not_before = self._clock() + seconds
+        self._not_before = self._clock.now() + seconds
 
 
 def _check_pages(plane: DataPlane, pages: Sequence[int]) -> None:

@@ -11,7 +11,7 @@ import selectors
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -104,9 +104,9 @@ def unknown_region() -> InvalidInputError:
 class _Client:
     """A connection: what has come of a size, its region once it has one, and when it began."""
 
+    begun: float
     received: bytearray = field(default_factory=bytearray)
     region: Region | None = None
-    begun: float = field(default_factory=time.monotonic)
 
 
 class SharedMemory:
@@ -117,11 +117,19 @@ class SharedMemory:
         most_bytes: of all regions together.
         most_regions: at once.
         silence_s: a client that does not say how much it wants is hung up on after so long.
+        clock: seconds that never go back.
     """
 
-    def __init__(self, path: str, most_bytes: int, most_regions: int, silence_s: float) -> None:
+    def __init__(
+        self,
+        path: str,
+        most_bytes: int,
+        most_regions: int,
+        silence_s: float,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._path, self._most_bytes, self._most_regions = Path(path), most_bytes, most_regions
-        self.most_bytes, self._silence_s = most_bytes, silence_s
+        self.most_bytes, self._silence_s, self._clock = most_bytes, silence_s, clock
         self._regions: dict[bytes, Region] = {}
         self._lock = threading.Lock()
         self._stopping = threading.Event()
@@ -189,7 +197,7 @@ class SharedMemory:
                     except Exception:  # one client's trouble is nobody else's
                         _log.exception("shared memory: a client could not be served")
                         self._stopping.wait(_PAUSE_S)
-                late = time.monotonic() - self._silence_s
+                late = self._clock() - self._silence_s
                 for connection in [one for one, client in clients.items() if not client.region and client.begun < late]:
                     self._hang_up(selector, connection, clients)
             for connection in list(clients):
@@ -212,7 +220,7 @@ class SharedMemory:
         if len(clients) >= 2 * self._most_regions:
             connection.close()
             return
-        clients[connection] = _Client()
+        clients[connection] = _Client(self._clock())
         selector.register(connection, selectors.EVENT_READ)
 
     def _hang_up(

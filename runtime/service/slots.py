@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import ceil
 from statistics import median
 
+from lightpage.clock import SYSTEM, Clock
 from runtime.errors import OverloadedError, SlotsTakenError
 from runtime.service.caller import Caller
 
@@ -45,10 +45,10 @@ class Slots:
         count: slots.
         what: they are for, for the error, e.g. ``"decodes"``.
         deadline_s: longest wait, seconds.
-        clock: seconds that never go back.
+        clock: by which callers wait.
     """
 
-    def __init__(self, count: int, what: str, deadline_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, count: int, what: str, deadline_s: float, clock: Clock = SYSTEM) -> None:
         self._count, self._what, self._deadline_s, self._clock = count, what, deadline_s, clock
         self._lock = threading.Lock()
         self._free = count
@@ -156,7 +156,7 @@ class Slots:
     def took(self, seconds: float) -> None:
         """Learn from work that was done how long it usually takes."""
         with self._lock:
-            self._lately.append((self._clock(), seconds))
+            self._lately.append((self._clock.now(), seconds))
 
     @property
     def _needed_s(self) -> float:
@@ -166,14 +166,13 @@ class Slots:
 
     def _taken(self) -> list[float]:
         """What was lately taken, the shortest first."""
-        since = self._clock() - FORGET_S
+        since = self._clock.now() - FORGET_S
         with self._lock:
             return sorted(seconds for ended, seconds in self._lately if ended >= since)
 
     def _wait(self, ticket: _Ticket, caller: Caller) -> None:
-        until = time.monotonic() + min(caller.seconds_left(), self._deadline_s)
         with caller.telling(ticket.told.set):
-            ticket.told.wait(max(0.0, until - time.monotonic()))
+            self._clock.wait(ticket.told, min(caller.seconds_left(), self._deadline_s))
         with self._lock:
             if not ticket.has_slot:
                 self._queue.remove(ticket)

@@ -10,7 +10,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -107,6 +107,7 @@ class ModelStore:
         folder: made if absent.
         base: the bundle that the operator gave; another base has its own history.
         kept: how many of the newest bundles `prune` leaves.
+        clock: by which it is tried again now and then.
 
     Attributes:
         note: as it was read or written last.
@@ -115,8 +116,10 @@ class ModelStore:
         StoreError: the folder cannot be made.
     """
 
-    def __init__(self, folder: Path, base: Bundle, kept: int = KEPT_BUNDLES) -> None:
-        self.folder, self._kept = folder, kept
+    def __init__(
+        self, folder: Path, base: Bundle, kept: int = KEPT_BUNDLES, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.folder, self._kept, self._clock = folder, kept, clock
         self._base = sha256(base.manifest.to_json())
         self._lock_file: int | None = None
         self._writing = threading.Lock()
@@ -324,7 +327,7 @@ class ModelStore:
             StoreError: it cannot, or has not.
         """
         with self._guard:
-            self._probed = time.monotonic()
+            self._probed = self._clock()
         try:
             self._probe(needed_bytes)
         except OSError as error:
@@ -345,7 +348,7 @@ class ModelStore:
 
     def trouble(self, needed_bytes: int) -> Trouble | None:
         """What is wrong with the store, None where nothing is; it is tried again where that was long ago."""
-        if time.monotonic() - self._probed >= PROBE_S:
+        if self._clock() - self._probed >= PROBE_S:
             with suppress(StoreError):
                 self.check(needed_bytes)
         return self.known_trouble()

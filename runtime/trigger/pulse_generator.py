@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import InvalidInputError
 from runtime.errors import LostShotError, Reason, SourceError
 from runtime.trigger.scpi_line import ScpiLine
@@ -88,11 +89,12 @@ class PulseGenerator:
 
     Args:
         settings: see there.
+        clock: by which it waits, and tells the time of a shot.
     """
 
-    def __init__(self, settings: PulseGeneratorSettings) -> None:
+    def __init__(self, settings: PulseGeneratorSettings, clock: Clock = SYSTEM) -> None:
         self.settings = settings
-        self._line = ScpiLine(settings.port, settings.baud, settings.times)
+        self._line = ScpiLine(settings.port, settings.baud, settings.times, clock)
         self.name = self._line.name
         self._lock = threading.RLock()
         """Held during each of the methods: a shot does not come between the steps of a set-up."""

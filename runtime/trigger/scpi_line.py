@@ -8,10 +8,10 @@ from __future__ import annotations
 import queue
 import re
 import threading
-import time
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
+from lightpage.clock import SYSTEM, Clock
 from lightpage.errors import InvalidInputError
 from runtime.errors import LostShotError, Reason
 from runtime.trigger.scpi_port import LineTimes, ScpiPort
@@ -45,11 +45,13 @@ class ScpiLine:
         port: device path, e.g. ``/dev/ttyUSB0``, or pyserial URL, e.g. ``socket://127.0.0.1:2101``.
         baud: bits per second of a serial port.
         times: how long is waited.
+        clock: by which it is waited.
     """
 
-    def __init__(self, port: str, baud: int = 115200, times: LineTimes | None = None) -> None:
+    def __init__(self, port: str, baud: int = 115200, times: LineTimes | None = None, clock: Clock = SYSTEM) -> None:
         self._times = times or LineTimes()
-        self._port = ScpiPort(port, baud, self._times)
+        self._clock = clock
+        self._port = ScpiPort(port, baud, self._times, clock)
         self.name = self._port.name
         self._requests: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
@@ -67,7 +69,7 @@ class ScpiLine:
         return self._port.identity
 
     def send(self, command: str, session: int | None = None, timeout_s: float | None = None) -> float:
-        """Send a command, wait for its ``ok``, return the middle of its sending in `time.monotonic` seconds.
+        """Send a command, wait for its ``ok``, return the middle of its sending by the clock.
 
         Args:
             command: without line end.
@@ -114,19 +116,20 @@ class ScpiLine:
         if not (message.isascii() and message.isprintable() and message):
             raise InvalidInputError(f"{self.name}: message", repr(message), "one line of printable ASCII")
         timeout_s = self._times.longest_s if timeout_s is None else timeout_s
-        request = _Request(message, answer, twice, session, time.monotonic() + timeout_s)
+        request = _Request(message, answer, twice, session, self._clock.now() + timeout_s)
         with self._lock:
             if self._thread is None or not self._thread.is_alive():
                 self._thread = threading.Thread(target=self._own, name=self.name, daemon=True)
                 self._thread.start()
             self._requests.put(request)
-        try:
-            return request.result.result(timeout_s + _GRACE_S)
-        except TimeoutError:
+        answered = threading.Event()
+        request.result.add_done_callback(lambda _: answered.set())
+        if not self._clock.wait(answered, timeout_s + _GRACE_S):
             request.result.cancel()
             raise LostShotError(
                 self.name, f"{message} not answered within {timeout_s:g} s", "an answer", Reason.TRIGGER_GONE
-            ) from None
+            )
+        return request.result.result()
 
     def _own(self) -> None:
         """Serve callers until told to stop; only this thread touches the port."""

@@ -13,11 +13,11 @@ from __future__ import annotations
 import os
 import re
 import termios
-import time
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from lightpage.clock import SYSTEM, Clock
 from runtime.errors import LostShotError, Reason, SourceError
 
 if TYPE_CHECKING:
@@ -83,17 +83,19 @@ class ScpiPort:
         port: device path or pyserial URL.
         baud: of a tty.
         times: how long is waited.
+        clock: by which it is waited.
 
     Attributes:
         session: grows whenever the port is synchronised. As long as it stays, every message was answered.
         identity: what the device says of itself, once that is known.
     """
 
-    def __init__(self, port: str, baud: int, times: LineTimes) -> None:
+    def __init__(self, port: str, baud: int, times: LineTimes, clock: Clock = SYSTEM) -> None:
         self.name = f"pulse generator {port}"
         self.session = 0
         self.identity: str | None = None
         self._path, self._baud, self._times = port, baud, times
+        self._now = clock.now
         self._port: Serial | None = None
         self._adapter: tuple[object, ...] | None = None
         """The USB adapter behind the port, where it is one: plugged in again, it may have another path."""
@@ -113,25 +115,25 @@ class ScpiPort:
         """Those of them that are taken as lost."""
 
     def ask(self, message: str, answer: re.Pattern[str], session: int | None, deadline: float) -> tuple[str, float]:
-        """Send a message and return its answer, and the middle of its sending in `time.monotonic` seconds.
+        """Send a message and return its answer, and the middle of its sending by the clock.
 
         Args:
             message: without line end.
             answer: what an answer looks like, all of it.
             session: send it in this session only; None connects and synchronises first where that is needed.
-            deadline: it is not sent after this, `time.monotonic` seconds.
+            deadline: it is not sent after this time by the clock.
 
         Raises:
             LostShotError: `Reason.TRIGGER_GONE`: no such answer, or no port; `Reason.TRIGGER_REFUSED`: answered `?n`.
             SourceError: the port's name or the baud rate makes no sense.
         """
         port = self._ready(session)
-        if time.monotonic() > deadline:
+        if self._now() > deadline:
             raise self._gone(f"no time left to send {message}", "an answer in time")
         try:
             begin, end = self._send(port, message)
             found = self._answer(port, message, answer)
-            return found, (begin + min(end, time.monotonic())) / 2  # it was sent when the answer came
+            return found, (begin + min(end, self._now())) / 2  # it was sent when the answer came
         except GONE as error:
             self.close()
             raise self._gone(f"{_words(error)} at {message}", "a device that is plugged in") from None
@@ -215,15 +217,15 @@ class ScpiPort:
     def _send(self, port: Serial, message: str) -> tuple[float, float]:
         """Send a line; returns begin and end of its sending, as far as that can be known."""
         line = message.encode("ascii") + b"\r\n"
-        begin = time.monotonic()
+        begin = self._now()
         port.write(line)
-        end = time.monotonic()
+        end = self._now()
         if "://" not in self._path:
             end = max(end, begin + 10 * len(line) / self._baud)  # write() only fills the driver's buffer
         return begin, end
 
     def _answer(self, port: Serial, message: str, answer: re.Pattern[str]) -> str:
-        until = time.monotonic() + self._times.answer_s
+        until = self._now() + self._times.answer_s
         line = self._line(port, until)
         if line == message:  # the port echoes
             self._echo = True
@@ -254,10 +256,10 @@ class ScpiPort:
         """
         self._synchronised = False
         self._heard, self._slowest_s, self._asked = "", 0.0, []
-        end = time.monotonic() + self._times.synchronise_s
+        end = self._now() + self._times.synchronise_s
         rounds = 0
         while rounds < _ROUNDS:
-            if time.monotonic() > end:
+            if self._now() > end:
                 self.close()
                 raise self._unclear()
             if not self._quiet(port, end):
@@ -270,7 +272,7 @@ class ScpiPort:
 
     def _one_round(self, port: Serial, end: float) -> bool:
         """Whether every identification that was due has come and nothing after it."""
-        until = min(end, time.monotonic() + self._times.answer_s)
+        until = min(end, self._now() + self._times.answer_s)
         known, came, echo = self.identity, False, False
         while self._due:
             line = self._line(port, until)
@@ -282,7 +284,7 @@ class ScpiPort:
             if line == _IDENTIFY:
                 echo = True
             elif self._identified(line):
-                came, until = True, min(end, time.monotonic() + self._times.late_s)
+                came, until = True, min(end, self._now() + self._times.late_s)
             else:
                 self._heard = _quoted(line)
         self._echo = echo
@@ -307,7 +309,7 @@ class ScpiPort:
             return False
         self.identity = line
         if 0 < self._due <= len(self._asked):
-            self._slowest_s = max(self._slowest_s, time.monotonic() - self._asked[-self._due])
+            self._slowest_s = max(self._slowest_s, self._now() - self._asked[-self._due])
         if not self._due:
             self._due, self._given_up = self._given_up, 0  # none is lost, they are late
         self._due = max(0, self._due - 1)
@@ -315,10 +317,10 @@ class ScpiPort:
 
     def _quiet(self, port: Serial, end: float) -> bool:
         """Read until nothing has come for a while; whether nothing came at all."""
-        nothing, since = True, time.monotonic()
-        while (now := time.monotonic()) - since < self._times.quiet_s and now < end:
+        nothing, since = True, self._now()
+        while (now := self._now()) - since < self._times.quiet_s and now < end:
             if self._read(port):
-                nothing, since = False, time.monotonic()
+                nothing, since = False, self._now()
             while (line := self._next_line()) is not None:
                 if not self._identified(line) and line != _IDENTIFY:
                     self._heard = _quoted(line)
@@ -328,7 +330,7 @@ class ScpiPort:
 
     def _line(self, port: Serial, until: float) -> str | None:
         """The next line without its end, or None where it does not end in time."""
-        while (line := self._next_line()) is None and time.monotonic() < until:
+        while (line := self._next_line()) is None and self._now() < until:
             self._read(port)
         return line
 

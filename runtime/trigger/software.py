@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from runtime.cameras.camera import Camera
 
@@ -16,26 +16,27 @@ class SoftwareTrigger:
 
     Args:
         cameras: that are set up to be triggered by a command, first to last.
+        clock: tells the time of a shot.
     """
 
     name = "software trigger"
 
-    def __init__(self, cameras: Sequence[Camera]) -> None:
-        self._cameras = tuple(cameras)
+    def __init__(self, cameras: Sequence[Camera], clock: Callable[[], float] = time.monotonic) -> None:
+        self._cameras, self._clock = tuple(cameras), clock
 
     def arm(self) -> None:
         """See `Trigger`; the cameras are armed by those who use them."""
 
     def fire(self) -> float:
-        """Fire all; returns the middle between the first command and the last answer, `time.monotonic` seconds.
+        """Fire all; returns the middle between the first command and the last answer.
 
         Raises:
             LostShotError: `Reason.CAMERA_GONE`: a camera has gone; those before it have been fired.
         """
-        before = time.monotonic()
+        before = self._clock()
         for camera in self._cameras:
             camera.fire()
-        return (before + time.monotonic()) / 2
+        return (before + self._clock()) / 2
 
     def disarm(self) -> None:
         """See `Trigger`."""

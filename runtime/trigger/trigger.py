@@ -21,7 +21,7 @@ class Trigger(Protocol):
         """
 
     def fire(self) -> float:
-        """Fire once; returns when that was, `time.monotonic` seconds.
+        """Fire once; returns when that was, by the clock of who pairs its frames.
 
         Raises:
             LostShotError: `Reason.TRIGGER_GONE`: it has gone away or does not answer, and may or may not have fired;

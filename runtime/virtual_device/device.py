@@ -121,14 +121,14 @@ def _configuration(pixel_format: str, packet_bytes: int) -> str:
         f"""
 [{role}]
 driver = "aravis"
-serial = "{serial}"
+address = "{address}"
 pixel_format = "{pixel_format}"
 exposure_us = 200
 trigger_source = "Line1"
 packet_bytes = {packet_bytes}
 buffers = 16
 """
-        for role, serial in zip(("in_phase", "quadrature"), SERIALS, strict=True)
+        for role, address in zip(("in_phase", "quadrature"), ADDRESSES, strict=True)
     )
     return f"""# A simulated device: cameras on loopback, pulse generator on a serial port of its own.
 profile = "{_PROFILE}"

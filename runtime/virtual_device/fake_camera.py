@@ -28,7 +28,7 @@ _ADDED_FORMATS = ("Mono10", "Mono10p", "Mono10Packed", "Mono12", "Mono12p", "Mon
 """Beside Mono8 and Mono16, which the library's fake knows by itself."""
 _ROWS, _COLUMNS, _X, _Y = 0x104, 0x100, 0x130, 0x134
 _SENSOR_ROWS, _SENSOR_COLUMNS = 0x118, 0x11C
-_PERIOD_US = 0x138
+_PIXEL_FORMAT, _PERIOD_US = 0x128, 0x138
 _TRIGGER_MODE, _LIBRARY_TRIGGER_SOURCE, _SHOOT = 0x300, 0x304, 0x30C
 _TRIGGER_SOURCE = 0x3F4
 """Where the edited description keeps the trigger's source. The library shoots on a command only while its own register
@@ -141,6 +141,11 @@ class FakeCamera:
         if self._camera is not None:
             self._write(_PERIOD_US, round(1e6 * period_s))
             self._write(_TRIGGER_MODE, 0)
+
+    def change_format(self, name: str) -> None:
+        """Change its pixel format behind its user's back."""
+        if self._camera is not None:
+            self._write(_PIXEL_FORMAT, pixel_format(name).code)
 
     def lose(self, share: float) -> None:
         """Lose this share of the packets on the way from now on; lost ones are never sent again."""

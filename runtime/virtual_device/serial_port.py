@@ -126,17 +126,24 @@ class VirtualSerialPort(ABC):
         received = bytearray()
         while not self._stop.is_set():
             try:
-                new = self._read()
-                if self.echo and new:
-                    self._write(new)
-                received += new
-                while b"\r\n" in received:
-                    line, _, rest = bytes(received).partition(b"\r\n")
-                    received[:] = rest
-                    self._respond(line, received)
+                self._take(self._read(), received)
             except OSError:
                 received.clear()
                 self._stop.wait(_POLL_S)
+
+    def _take(self, new: bytes, received: bytearray) -> None:
+        """Answer the lines that are whole with what is new; the rest of `received` waits for more."""
+        if self.echo and new:
+            self._write(new)
+        received += new
+        while b"\r\n" in received:
+            line, _, rest = bytes(received).partition(b"\r\n")
+            received[:] = rest
+            self._respond(line, received)
+
+    def _delay(self, seconds: float) -> None:
+        """Let what is written next come so much later."""
+        self._stop.wait(seconds)
 
     def _respond(self, line: bytes, received: bytearray) -> None:
         message = line.decode("latin-1")
@@ -153,7 +160,7 @@ class VirtualSerialPort(ABC):
         if fault is Fault.SILENCE:
             return
         if fault is Fault.LATE:
-            self._stop.wait(self._random.uniform(*self.late_s))
+            self._delay(self._random.uniform(*self.late_s))
         elif fault is Fault.CUT:
             content = self._without_some(content)
         elif fault is Fault.GARBAGE:

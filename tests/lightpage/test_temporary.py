@@ -10,15 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from lightpage import temporary
 from lightpage.errors import SurroundingsError
 from lightpage.temporary import settle_matplotlib, short_folder, temporary_folder
 
 
 def test_no_folder_for_temporary_files_is_named_with_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/nowhere"])
-    with pytest.raises(SurroundingsError, match=r"scratch: got no folder for temporary files.*TMPDIR"):
+    def nowhere(**_: object) -> None:
+        raise FileNotFoundError(2, "No usable temporary directory found in ['/nowhere']")
+
+    monkeypatch.setattr(tempfile, "mkdtemp", lambda *_: nowhere())
+    with pytest.raises(SurroundingsError, match=r"^scratch: .*TMPDIR"):
         temporary_folder("scratch")
 
 
@@ -28,7 +29,7 @@ def test_a_long_tmpdir_is_not_taken_for_sockets(tmp_path: Path, monkeypatch: pyt
     with short_folder("sockets", "s-", 60) as folder:
         assert len(os.fsencode(folder)) <= 60
         assert os.path.isdir(folder)
-    with pytest.raises(SurroundingsError, match=r"sockets: got .*xxx.*at most .* bytes.*TMPDIR"):
+    with pytest.raises(SurroundingsError, match=r"^sockets: .*xxx.*TMPDIR"):
         short_folder("sockets", "s-", 10)
 
 
@@ -40,7 +41,6 @@ def test_matplotlib_gets_a_folder_where_it_has_none(tmp_path: Path, monkeypatch:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(home))
     monkeypatch.delitem(sys.modules, "matplotlib", raising=False)
-    monkeypatch.setattr(temporary, "_kept", [])
     settle_matplotlib()
     assert (os.environ.get("MPLCONFIGDIR") is None) == own
     if not own:

@@ -8,10 +8,12 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from string import Template
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+import onnx.parser
+from onnx import numpy_helper
 
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import CalibrationError
@@ -85,100 +87,77 @@ def symbols_of(levels: int, seed: int, pages: int = 1) -> np.ndarray:
     return random_symbols(PROFILE, levels, pages, np.random.default_rng(seed))
 
 
-def decoder_onnx(kappa: float = 400.0, shape: tuple[int, int] = SHAPE, frame_type: int = TensorProto.UINT8) -> bytes:
+_DECODER = Template("""
+<ir_version: 10, opset_import: ["" : 18]>
+toy ($frame[$h, $w] in_phase, $frame[$h, $w] quadrature, float[$h, $w] reference_in_phase,
+     float[$h, $w] reference_quadrature, float[2] homodyne)
+  => (float[2, $ny, $nx] p, float[$ny, $nx] phase, float[$ny, $nx] concentration, float residual)
+<int64[2] both_axes = {0, 1}, int64[1] axis = {0}, int64 first = {0}, int64 second = {1}, float small = {1e-3},
+ float tiny = {1e-9}>
+{
+  i = Cast<to = 1>(in_phase)
+  i_seen = Sub(i, reference_in_phase)
+  i_deep = Unsqueeze(i_seen, both_axes)
+  i_mean = AveragePool<kernel_shape = [4, 4], strides = [4, 4]>(i_deep)
+  x = Squeeze(i_mean, axis)
+  q = Cast<to = 1>(quadrature)
+  q_seen = Sub(q, reference_quadrature)
+  q_deep = Unsqueeze(q_seen, both_axes)
+  q_mean = AveragePool<kernel_shape = [4, 4], strides = [4, 4]>(q_deep)
+  y = Squeeze(q_mean, axis)
+  gain = Gather(homodyne, first)
+  q_gain = Gather(homodyne, second)
+  y_scaled = Mul(y, q_gain)
+  both = Concat<axis = 0>(x, y_scaled)
+  p = Mul(both, gain)
+  px_deep, py_deep = Split<axis = 0, num_outputs = 2>(p)
+  px = Squeeze(px_deep, axis)
+  py = Squeeze(py_deep, axis)
+  px2 = Mul(px, px)
+  py2 = Mul(py, py)
+  sum2 = Add(px2, py2)
+  concentration = Sqrt(sum2)
+  size = Abs(py)
+  vanishes = Less(size, small)
+  rise = Where(vanishes, small, py)
+  along = Add(concentration, px)
+  safe = Max(along, tiny)
+  half_tangent = Div(rise, safe)
+  half_angle = Atan(half_tangent)
+  phase = Add(half_angle, half_angle)
+  mean = ReduceMean<keepdims = 0>(concentration)
+  deviation = Sub(concentration, mean)
+  deviation2 = Mul(deviation, deviation)
+  variance = ReduceMean<keepdims = 0>(deviation2)
+  spread = Sqrt(variance)
+  residual = Div(spread, mean)
+}""")
+"""atan2(y, x) = 2 atan(y / (|p| + x)), with y kept off zero, where x < 0 would give 0 / 0."""
+
+
+def decoder_onnx(kappa: float = 400.0, shape: tuple[int, int] = SHAPE, frame_type: str = "uint8") -> bytes:
     """The toy decoder; `kappa` is the concentration it claims at full amplitude."""
     h, w = shape
-    f = TensorProto.FLOAT
     tables = {
         "reference_in_phase": np.full(shape, OFFSETS[0], np.float32),
         "reference_quadrature": np.full(shape, OFFSETS[1], np.float32),
         "homodyne": np.array([kappa / AMPLITUDE, 1.0], np.float32),
     }
-    nodes, parts = [], []
-    for index, name in enumerate(("in_phase", "quadrature")):
-        nodes += [
-            helper.make_node("Cast", [name], [f"{name}_f"], to=f),
-            helper.make_node("Sub", [f"{name}_f", f"reference_{name}"], [f"{name}_s"]),
-            helper.make_node("Unsqueeze", [f"{name}_s", "axes01"], [f"{name}_4"]),
-            helper.make_node("AveragePool", [f"{name}_4"], [f"{name}_a"], kernel_shape=[4, 4], strides=[4, 4]),
-            helper.make_node("Squeeze", [f"{name}_a", "axis0"], [f"{name}_m"]),
-            helper.make_node("Gather", ["homodyne", f"gain_index{index}"], [f"{name}_gain"]),
-        ]
-        parts.append(f"{name}_m")
-    nodes += [
-        helper.make_node("Mul", ["quadrature_m", "quadrature_gain"], ["q_scaled"]),
-        helper.make_node("Concat", ["in_phase_m", "q_scaled"], ["both"], axis=0),
-        helper.make_node("Mul", ["both", "in_phase_gain"], ["p"]),
-        helper.make_node("Split", ["p"], ["px1", "py1"], axis=0, num_outputs=2),
-        helper.make_node("Squeeze", ["px1", "axis0"], ["px"]),
-        helper.make_node("Squeeze", ["py1", "axis0"], ["py"]),
-        helper.make_node("Mul", ["px", "px"], ["px2"]),
-        helper.make_node("Mul", ["py", "py"], ["py2"]),
-        helper.make_node("Add", ["px2", "py2"], ["sum2"]),
-        helper.make_node("Sqrt", ["sum2"], ["concentration"]),
-        # atan2(y, x) = 2 atan(y / (|p| + x)), with y kept off zero, where x < 0 would give 0 / 0.
-        helper.make_node("Abs", ["py"], ["size"]),
-        helper.make_node("Less", ["size", "small"], ["vanishes"]),
-        helper.make_node("Where", ["vanishes", "small", "py"], ["rise"]),
-        helper.make_node("Add", ["concentration", "px"], ["along"]),
-        helper.make_node("Max", ["along", "tiny"], ["safe"]),
-        helper.make_node("Div", ["rise", "safe"], ["half_tangent"]),
-        helper.make_node("Atan", ["half_tangent"], ["half_angle"]),
-        helper.make_node("Add", ["half_angle", "half_angle"], ["phase"]),
-        helper.make_node("ReduceMean", ["concentration"], ["mean"], keepdims=0),
-        helper.make_node("Sub", ["concentration", "mean"], ["deviation"]),
-        helper.make_node("Mul", ["deviation", "deviation"], ["deviation2"]),
-        helper.make_node("ReduceMean", ["deviation2"], ["variance"], keepdims=0),
-        helper.make_node("Sqrt", ["variance"], ["spread"]),
-        helper.make_node("Div", ["spread", "mean"], ["residual"]),
-    ]
-    constants = {
-        "axes01": np.array([0, 1], np.int64),
-        "axis0": np.array([0], np.int64),
-        "gain_index0": np.array(0, np.int64),
-        "gain_index1": np.array(1, np.int64),
-        "tiny": np.array(1e-9, np.float32),
-        "small": np.array(1e-3, np.float32),
-    }
-    ny, nx = h // 4, w // 4
-    graph = helper.make_graph(
-        nodes,
-        "toy",
-        [
-            helper.make_tensor_value_info("in_phase", frame_type, [h, w]),
-            helper.make_tensor_value_info("quadrature", frame_type, [h, w]),
-            *(helper.make_tensor_value_info(name, f, value.shape) for name, value in tables.items()),
-        ],
-        [
-            helper.make_tensor_value_info("p", f, [2, ny, nx]),
-            helper.make_tensor_value_info("phase", f, [ny, nx]),
-            helper.make_tensor_value_info("concentration", f, [ny, nx]),
-            helper.make_tensor_value_info("residual", f, []),
-        ],
-        [numpy_helper.from_array(value, name) for name, value in {**tables, **constants}.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    model = onnx.parser.parse_model(_DECODER.substitute(frame=frame_type, h=h, w=w, ny=h // 4, nx=w // 4))
+    model.graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in tables.items())
     onnx.checker.check_model(model, full_check=True)
-    return model.SerializeToString()
+    return bytes(model.SerializeToString())
+
+
+_TWIN = """
+<ir_version: 10, opset_import: ["" : 18]>
+twin (double[3] parameters, double[n, 2] points) => (double[n, 2] places) <int64[2] indices = {0, 1}>
+{ shift = Gather(parameters, indices) places = Add(points, shift) }"""
 
 
 def twin_onnx() -> bytes:
     """places = points + the first two parameters."""
-    double = TensorProto.DOUBLE
-    graph = helper.make_graph(
-        [
-            helper.make_node("Gather", ["parameters", "indices"], ["shift"]),
-            helper.make_node("Add", ["points", "shift"], ["places"]),
-        ],
-        "twin",
-        [
-            helper.make_tensor_value_info("parameters", double, [3]),
-            helper.make_tensor_value_info("points", double, ["n", 2]),
-        ],
-        [helper.make_tensor_value_info("places", double, ["n", 2])],
-        [numpy_helper.from_array(np.array([0, 1], np.int64), "indices")],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9).SerializeToString()
+    return bytes(onnx.parser.parse_model(_TWIN).SerializeToString())
 
 
 def expected_p(pair: FramePair, kappa: float = 400.0, offsets: tuple[float, float] = OFFSETS) -> np.ndarray:

@@ -1,116 +1,119 @@
-"""The strictest test: recordings made by a simulator that shares nothing with ours, through the command line."""
+"""The strictest test: recordings made by a simulator that shares nothing with ours, through the commands."""
 
 from __future__ import annotations
 
+import io
 import json
 import os
-import subprocess
-import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
-from analysis.foreign_device import ForeignDevice
+from analysis.foreign_device import BENCH, HALF, Design, ForeignDevice
+from lightpage.cli import main
+from lightpage.device.profile import Profile, load_profile
+from tests.lightpage.small import small_profile
 
-MINUTES = 20
-"""Machines differ by a factor of three, and other tests run beside these."""
-TRAININGS = {
-    "short": (9, ["--preset", "standard", "--channels", "32", "--blocks", "1", "--steps", "200"], 0),
-    "long": (16, ["--preset", "accurate", "--steps", "300"], 48),
-}
-"""Pages, choices and synthetic pages: enough to read a page, and all that a decoder is made of."""
 JUMPS = {0: (-6.0, 8.0), 2: (9.0, -5.0)}
 """Camera pixels: while nobody read, and between two pages."""
-KEPT_SHARE = 0.95
-"""Of the AIR of other pages, read in order: 98%, but for how pages differ and for what leaves the cameras."""
+KEPT_SHARE = 0.88
+"""Of the AIR of other pages, read in order: 98% at full size, 93% at half, but for what leaves the cameras."""
 SEED = "LIGHTPAGE_FOREIGN_SEED"
-"""Environment variable that repeats the device of an earlier test; another is drawn each time without it."""
+"""Environment variable with the seed of the device; without it, the long test draws another one each time."""
 
 
-def lightpage(*arguments: str, status: int = 0) -> str:
-    """Run the command as a user would, in a process of its own; returns what it writes to standard error."""
-    command = [sys.executable, "-m", "lightpage.cli.main", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60 * MINUTES, check=False)
-    assert done.returncode == status, f"{' '.join(arguments)}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
-    return done.stderr
+def lightpage(*arguments: object, status: int = 0) -> str:
+    """Run a command line, and return what it writes to standard error."""
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as told:
+        assert main.run(main.lightpage, [str(argument) for argument in arguments]) == status, told.getvalue()[-4000:]
+    return told.getvalue()
 
 
-def read_after_jumps(device: ForeignDevice, bundle: Path, still: float, seed: int, folder: Path) -> None:
-    """Pages of a device that walks and jumps, read by a decoder that was just started; `still` is the AIR without."""
-    path, figures = folder / "jumped.h5", folder / "jumped.json"
-    device.write(path, pages=3, levels=256, seed=seed + 1, jumps_px=JUMPS)
-    lightpage("evaluate", "--bundle", str(bundle), "--recording", str(path), "--json", str(figures))
-    rates = json.loads(figures.read_text())["air_per_page"]
-    print(f"AIR of pages whose image has jumped {np.round(rates, 2)}, without {still:.2f}")
-    assert len(rates) == 3
-    assert min(rates) > KEPT_SHARE * still, f"seed {seed}"
+def figures_of(folder: Path, *arguments: object) -> dict[str, Any]:
+    """Run a command that writes figures, and return them."""
+    lightpage(*arguments, "--json", folder / "figures.json")
+    return dict(json.loads((folder / "figures.json").read_text()))
 
 
-def refuse_another_device(bundle: Path, seed: int, folder: Path) -> None:
-    """No page of another device is given out, whatever its cameras show."""
-    path = folder / "other.h5"
-    depth = ForeignDevice.draw(seed).parameters.bit_depth
-    ForeignDevice.draw(seed + 1).with_parameters(bit_depth=depth).write(path, pages=1, levels=256, seed=seed)
-    told = lightpage("evaluate", "--bundle", str(bundle), "--recording", str(path), status=2)
-    assert "1 of 1 pages that were refused" in told, told
+def half_profile() -> Profile:
+    """The small profile with as many pilots as a page of the bench device has."""
+    small = small_profile()
+    return small.model_copy(update={"page": small.page.model_copy(update={"pilot_fraction": 0.05})})
 
 
-def carry_a_file(device: ForeignDevice, bundle: Path, seed: int, folder: Path) -> None:
-    """A file goes through the device and comes back bit by bit, read from frames and pilots alone."""
-    known, code, written = folder / "known.h5", folder / "code.toml", folder / "pages.h5"
-    sent, read, figures = folder / "sent.bin", folder / "read.bin", folder / "recovered.json"
-    device.write(known, pages=4, levels=256, seed=seed + 2)
-    lightpage("code", "--bundle", str(bundle), "--recording", str(known), "--out", str(code))
-    sent.write_bytes(np.random.default_rng(seed).bytes(1500))
-    lightpage("encode", str(sent), "--bundle", str(bundle), "--code", str(code), "--data-pages", "2",
-              "--parity-pages", "1", "--out", str(written))  # fmt: skip
-    with h5py.File(written) as file:
-        symbols, levels = file["symbols"][()], int(file.attrs["levels"])
-    shown = folder / "shown.h5"
-    device.write(shown, len(symbols), levels, seed + 3, with_symbols=False, symbols=symbols)
-    lightpage("recover", "--bundle", str(bundle), "--code", str(code), "--recording", str(shown), "--out", str(read),
-              "--json", str(figures))  # fmt: skip
-    told = json.loads(figures.read_text())
-    print(f"{told['user_bytes_per_page']} user bytes a page, margin at least {told['margin_bits_least']:.2f} bits")
-    assert read.read_bytes() == sent.read_bytes(), f"seed {seed}"
-
-
-@pytest.mark.timeout(60 * MINUTES)
-@pytest.mark.parametrize("training", ["short", pytest.param("long", marks=pytest.mark.long)])
+@pytest.mark.timeout(20 * 60)
+@pytest.mark.parametrize(
+    ("design", "profile", "pages", "choices", "synthetic", "file_bytes"),
+    [
+        (HALF, half_profile(), 6, "--preset standard --channels 16 --blocks 1 --steps 100", 0, 600),
+        # minutes: the whole bench device, another one each time
+        pytest.param(
+            BENCH, load_profile("bench"), 16, "--preset accurate --steps 300", 48, 1500, marks=pytest.mark.long
+        ),
+    ],
+    ids=["half", "whole"],
+)
 def test_a_device_that_nobody_here_made_is_calibrated_trained_exported_and_decoded(
-    tmp_path: Path, training: str
+    tmp_path: Path, design: Design, profile: Profile, pages: int, choices: str, synthetic: int, file_bytes: int
 ) -> None:
-    pages, choices, synthetic = TRAININGS[training]
-    seed = int(os.environ.get(SEED) or np.random.SeedSequence().generate_state(1)[0])
+    drawn = 1 if design is HALF else np.random.SeedSequence().generate_state(1)[0]
+    seed = int(os.environ.get(SEED) or drawn)
     print(f"foreign device, seed {seed}")
-    recording = tmp_path / "foreign.h5"
-    device = ForeignDevice.draw(seed)
+    device, recording, toml = ForeignDevice.draw(seed, design), tmp_path / "R.h5", tmp_path / "profile.toml"
+    toml.write_text(profile.to_toml())
     device.write(recording, pages=pages, levels=256, seed=seed)
     with h5py.File(recording) as file:
         assert "profile" not in file.attrs
 
     calibration, run, bundle = tmp_path / "calibration.toml", tmp_path / "run", tmp_path / "bundle.zip"
-    found, figures = tmp_path / "calibration.json", tmp_path / "evaluation.json"
-    lightpage("calibrate", "--profile", "bench", "--recording", str(recording), "--out", str(calibration),
-              "--pages", "2", "--json", str(found))  # fmt: skip
-    angle = json.loads(found.read_text())["angle_deg"]
-    assert abs(angle - device.parameters.pipe_angle_deg) <= 0.03, f"seed {seed}"
-
-    lightpage("train", "--profile", "bench", "--recording", str(recording), "--calibration", str(calibration),
-              *choices, "--synthetic-pages", str(synthetic),
-              "--out", str(run))  # fmt: skip
-    lightpage("export", str(run), "--out", str(bundle))
-    lightpage("evaluate", "--bundle", str(bundle), "--recording", str(recording), "--json", str(figures))
-    evaluation = json.loads(figures.read_text())
-    print(
-        f"angle {angle:.4f}, true {device.parameters.pipe_angle_deg:.4f}; AIR {evaluation['air_bits_per_symbol']:.2f}"
-    )
-    assert evaluation["pages"] >= 1
-    # so few steps on eight pages are a start, not a decoder; unrelated light gives none
-    assert evaluation["air_bits_per_symbol"] > 2.5, f"seed {seed}: {evaluation}"
+    known = ["--profile", toml, "--recording", recording]
+    found = figures_of(tmp_path, "calibrate", *known, "--out", calibration, "--pages", 1)
+    assert abs(found["angle_deg"] - device.parameters.pipe_angle_deg) <= 0.03
+    trained = ["--calibration", calibration, *choices.split(), "--synthetic-pages", synthetic]
+    lightpage("train", *known, *trained, "--out", run)
+    lightpage("export", run, "--out", bundle)
+    evaluation = figures_of(tmp_path, "evaluate", "--bundle", bundle, "--recording", recording)
+    print(f"AIR {evaluation['air_bits_per_symbol']:.2f}")
+    # so few steps on few pages are a start, not a decoder; unrelated light gives none
+    assert evaluation["air_bits_per_symbol"] > 2.5
 
     read_after_jumps(device, bundle, evaluation["air_bits_per_symbol"], seed, tmp_path)
-    refuse_another_device(bundle, seed, tmp_path)
-    carry_a_file(device, bundle, seed, tmp_path)
+    refuse_another_device(device, bundle, seed, tmp_path)
+    carry_a_file(device, bundle, seed, np.random.default_rng(seed).bytes(file_bytes), tmp_path)
+
+
+def read_after_jumps(device: ForeignDevice, bundle: Path, still: float, seed: int, folder: Path) -> None:
+    """Read pages of a device that walks and jumps, just started; `still` is the AIR without."""
+    device.write(folder / "jumped.h5", pages=3, levels=256, seed=seed + 1, jumps_px=JUMPS)
+    figures = figures_of(folder, "evaluate", "--bundle", bundle, "--recording", folder / "jumped.h5")
+    print(f"AIR of pages whose image has jumped {np.round(figures['air_per_page'], 2)}, without {still:.2f}")
+    assert len(figures["air_per_page"]) == 3
+    assert min(figures["air_per_page"]) > KEPT_SHARE * still
+
+
+def refuse_another_device(device: ForeignDevice, bundle: Path, seed: int, folder: Path) -> None:
+    """Read no page of another device, whatever its cameras show."""
+    other = ForeignDevice.draw(seed + 1, device.design).with_parameters(bit_depth=device.parameters.bit_depth)
+    other.write(folder / "other.h5", pages=1, levels=256, seed=seed)
+    told = lightpage("evaluate", "--bundle", bundle, "--recording", folder / "other.h5", status=2)
+    assert "1 of 1" in told
+
+
+def carry_a_file(device: ForeignDevice, bundle: Path, seed: int, sent: bytes, folder: Path) -> None:
+    """Send a file through the device and read it bit by bit, from frames and pilots alone."""
+    known, code, written, shown = (folder / name for name in ("known.h5", "code.toml", "pages.h5", "shown.h5"))
+    device.write(known, pages=4, levels=256, seed=seed + 2)
+    lightpage("code", "--bundle", bundle, "--recording", known, "--out", code)
+    (folder / "sent").write_bytes(sent)
+    coded = ["--bundle", bundle, "--code", code]
+    lightpage("encode", folder / "sent", *coded, "--data-pages", 2, "--parity-pages", 1, "--out", written)
+    with h5py.File(written) as file:
+        symbols, levels = file["symbols"][()], int(file.attrs["levels"])
+    device.write(shown, len(symbols), levels, seed + 3, with_symbols=False, symbols=symbols)
+    told = figures_of(folder, "recover", *coded, "--recording", shown, "--out", folder / "read")
+    print(f"{told['user_bytes_per_page']} user bytes a page, margin at least {told['margin_bits_least']:.2f} bits")
+    assert (folder / "read").read_bytes() == sent

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from analysis.hardware.drifting import UNITS, DriftingSource, TrueTable, direction, moved
+from analysis.hardware.drifting import DriftingSource, TrueTable, direction, moved
 from analysis.hardware.drifts import alarms, judged
 from analysis.hardware.rows import append_row, kept_rows
-from analysis.hardware.week import KNOCK_DEG, figures_of, state
+from analysis.hardware.week import figures_of
 from analysis.hardware.week_figure import draw
 from lightpage.device.state import Device
 from runtime.bundle.shipped import DEFAULT, bundle_path
@@ -27,16 +26,6 @@ def test_a_row_that_was_cut_off_is_measured_again(tmp_path: Path) -> None:
     assert [row["page"] for row in kept_rows(path)] == [0, 1, 2]
     append_row(path, {"page": 3})
     assert [json.loads(line)["page"] for line in path.read_text().splitlines()] == [0, 1, 2, 3]
-
-
-def test_every_part_of_the_geometry_drifts() -> None:
-    before, after = Device().model_dump(), moved(Device(), np.ones(len(UNITS))).model_dump()
-    changed = {f"{t}.{key}" for t in before for key in before[t] if before[t][key] != after[t][key]}
-    assert changed == set(UNITS)
-    geometry = {"geometry", "in_phase_camera", "quadrature_camera"}
-    assert {f"{t}.{key}" for t in geometry for key in before[t]} <= set(UNITS)
-    assert np.linalg.norm(direction(3)) == pytest.approx(1)
-    assert not np.allclose(direction(3), direction(4))
 
 
 def drift(page: int) -> dict[str, object]:
@@ -77,14 +66,9 @@ def test_the_week_is_summed_up_and_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "week.png").stat().st_size > 10_000
 
 
-def test_a_week_begins_as_calibrated_and_is_knocked_in_its_middle() -> None:
-    assert state(0.0, 100) == Device()
-    before, after = state(49.999, 100), state(50.0, 100)
-    assert after.geometry.pipe_angle_deg - before.geometry.pipe_angle_deg == pytest.approx(KNOCK_DEG, abs=1e-4)
-
-
+# Simulates full pages of the bench device.
+@pytest.mark.long
 def test_with_the_true_table_a_drifted_device_is_read_as_well_as_before() -> None:
-    """Takes its seconds: three pages of the bench device."""
     decoder = Decoder.load(bundle_path(DEFAULT), threads=1)
     source = DriftingSource(decoder, lambda moment: moved(Device(), moment * direction(1)), seed=1)
     true_table, found = TrueTable(decoder), list[float]()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lightpage.calibration.coherence import COHERENT_BRANCHES, branch_shares, page_coherence, seen_share
+from lightpage.calibration.coherence import branch_shares, page_coherence, seen_share
 from lightpage.calibration.interfaces import BRANCHES
 from lightpage.calibration.parameters import NAMES, nominal
 from lightpage.calibration.samplers import FieldSampler
@@ -70,10 +70,6 @@ def test_a_turn_of_all_symbols_and_the_strength_of_the_light_do_not_matter(light
     assert page_coherence(light, TWIN, TRUTH, PROFILE, SYMBOLS * np.exp(2j)) == pytest.approx(plain, rel=1e-6)
     brighter = page_coherence(lambda places: 7 * light(places), TWIN, TRUTH, PROFILE, SYMBOLS)
     assert brighter == pytest.approx(plain, rel=1e-5)
-
-
-def test_mixed_branches_are_left_out() -> None:
-    assert COHERENT_BRANCHES == ("direct", "x", "y")
 
 
 def test_no_light_has_no_coherence() -> None:

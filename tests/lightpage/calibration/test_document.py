@@ -12,10 +12,11 @@ from lightpage.calibration.document import Calibration, load_calibration, parse_
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.device.profile import load_profile
-from lightpage.errors import CalibrationError, InvalidInputError, ProfileError, RecordingError
+from lightpage.errors import CalibrationError, ProfileError, RecordingError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, RecordingWriter
 from tests.lightpage.calibration.flat_twin import FlatTwin
+from tests.lightpage.refused import refused
 
 PROFILE = load_profile("bench")
 HASHES = ("0123456789abcdef" * 4, "f" * 64)
@@ -57,44 +58,45 @@ def test_the_angle_is_the_profiles_and_the_fitted_one(calibration: Calibration) 
 
 def test_a_calibration_of_another_profile_is_refused(calibration: Calibration) -> None:
     calibration.check_profile(PROFILE)
-    with pytest.raises(ProfileError, match="'bench', wanted 'paper'"):
+    with refused(got="bench", kind=ProfileError):
         calibration.check_profile(load_profile("paper"))
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "complaint"),
+    ("old", "new", "named"),
     [
-        ("pipe_roll_rad", "pipe_rool_rad", r"\[parameters\]: got no pipe_roll_rad; unknown pipe_rool_rad"),
-        ("turn_rad = -1.55", "turn_rad = nan", r"turn_rad = nan"),
-        ("coherence_after = 0.8", "coherence_after = 1.8", r"coherence_after = 1.8"),
-        ("schema_version = 1", "schema_version = 2", r"schema_version = 2"),
-        ("cost = ", "costs = ", "got no cost; unknown costs, wanted"),
-        (HASHES[1], "../../etc/passwd", r"calibrated_pages.1 = '../../etc/passwd'"),
-        ("schema_version = 1", "schema_version = ", "not TOML"),
-        ("[deviations]", "[variances]", "no deviations; unknown variances"),
+        ("pipe_roll_rad", "pipe_rool_rad", "pipe_rool_rad"),
+        ("turn_rad = -1.55", "turn_rad = nan", "turn_rad = nan"),
+        ("coherence_after = 0.8", "coherence_after = 1.8", "coherence_after = 1.8"),
+        ("schema_version = 1", "schema_version = 2", "schema_version = 2"),
+        ("cost = ", "costs = ", "costs"),
+        (HASHES[1], "../../etc/passwd", "calibrated_pages.1 = "),
+        ("schema_version = 1", "schema_version = ", "TOML"),
+        ("[deviations]", "[variances]", "variances"),
     ],
 )
 def test_a_wrong_document_is_refused_by_the_name_of_its_key(
-    calibration: Calibration, old: str, new: str, complaint: str
+    calibration: Calibration, old: str, new: str, named: str
 ) -> None:
     text = calibration.to_toml()
     assert old in text
-    with pytest.raises(ProfileError, match=complaint):
+    with pytest.raises(ProfileError) as caught:
         parse_calibration(text.replace(old, new, 1))
+    assert named in str(caught.value)
 
 
 def test_a_parameter_that_is_no_number_is_refused(calibration: Calibration) -> None:
     value = repr(calibration.parameters["pipe_roll_rad"])
-    with pytest.raises(ProfileError, match=r"parameters\.pipe_roll_rad = inf"):
+    with refused(got="pipe_roll_rad = inf", kind=ProfileError):
         parse_calibration(calibration.to_toml().replace(value, "inf", 1))
 
 
 def test_a_file_that_is_not_there_and_a_folder_that_is_not_there_are_named(
     calibration: Calibration, tmp_path: Path
 ) -> None:
-    with pytest.raises(ProfileError, match=r"absent\.toml"):
+    with refused("absent.toml", kind=ProfileError):
         load_calibration(tmp_path / "absent.toml")
-    with pytest.raises(InvalidInputError, match="nowhere"):
+    with refused("nowhere"):
         calibration.save(tmp_path / "nowhere" / "calibration.toml")
 
 
@@ -116,7 +118,7 @@ def test_known_pages_hold_the_phasors_at_the_recordings_level_count(tmp_path: Pa
 
 def test_pages_without_symbols_are_not_known(tmp_path: Path) -> None:
     _record(tmp_path / "r.h5", 256, None)
-    with Recording.open(tmp_path / "r.h5") as recording, pytest.raises(RecordingError, match="'symbols': got none"):
+    with Recording.open(tmp_path / "r.h5") as recording, refused("'symbols'", "none", RecordingError):
         known_pages(recording, PROFILE, [0])
 
 
@@ -129,19 +131,17 @@ def test_a_device_that_was_found_is_accepted(coherence: float, significant: floa
 
 
 @pytest.mark.parametrize(
-    ("coherence", "significant"),
-    [(0.0165, 0.5), (0.033, 0.5), (0.49, 0.03), (float("nan"), 0.5)],
-    ids=["unrelated symbols", "nominal geometry", "a few patches by chance", "nothing at all"],
+    ("coherence", "significant"), [(0.0165, 0.5), (0.1, 0.5), (0.49, 0.03), (0.49, 0.099), (float("nan"), 0.5)]
 )
 def test_an_outcome_near_chance_is_no_calibration(coherence: float, significant: float) -> None:
-    with pytest.raises(CalibrationError, match="calibration, outcome"):
+    with refused("calibration, outcome", kind=CalibrationError):
         check_found(coherence, significant, BENCH_SYMBOLS, {"x": 0.6, "y": 0.3})
 
 
 @pytest.mark.parametrize("branch", ["x", "y"])
 def test_a_reflection_that_is_not_found_leaves_the_device_unknown(branch: str) -> None:
     reflected = {"x": 0.6, "y": 0.3} | {branch: 0.02}
-    with pytest.raises(CalibrationError, match=f"light that the pipe reflects along {branch}: got 2%"):
+    with refused(f"along {branch}", "2%", CalibrationError):
         check_found(0.43, 0.37, BENCH_SYMBOLS, reflected)
 
 
@@ -153,10 +153,7 @@ def test_a_page_too_small_to_be_found_is_refused_before_anything_is_searched() -
     def solve(*_: object) -> tuple[np.ndarray, np.ndarray]:
         raise AssertionError("nothing may be computed")
 
-    with pytest.raises(
-        CalibrationError,
-        match=r"profile bench: got a page of 20 x 24 symbols, which makes 4 patches to look for, wanted at least 5",
-    ):
+    with refused("profile bench", "20 x 24", CalibrationError):
         calibrate(FlatTwin(profile), solve, profile, page.pair, [page])
 
 

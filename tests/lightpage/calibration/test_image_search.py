@@ -39,7 +39,7 @@ def known(symbols: NDArray[np.uint8] = SYMBOLS, count: int = 54) -> Pilots:
 def fields() -> dict[tuple[float, float, bool], NDArray[np.complexfloating]]:
     """Fields of one page whose image lies (x, y) off, moving over a reference that stays or with it."""
     found = {}
-    for x, y, stays in [(0.0, 0.0, False), (-2.6, 1.6, False), (8.0, -3.3, True), (-12.0, 12.0, False)]:
+    for x, y, stays in [(-2.6, 1.6, False), (8.0, -3.3, True), (-12.0, 12.0, False)]:
         simulator = Simulator(PROFILE, DEVICE, seed=4, reference_stays=stays)
         simulator.knock((x, y))
         found[x, y, stays] = field_of(simulator.page(SYMBOLS), simulator.references())
@@ -83,9 +83,9 @@ def test_beyond_reach_it_is_not_found_unless_it_is_looked_for_there(
 def test_other_pages_and_noise_are_not_found(
     fields: dict[tuple[float, float, bool], NDArray[np.complexfloating]],
 ) -> None:
-    field = fields[0.0, 0.0, False]
+    field = fields[-2.6, 1.6, False]
     rng = np.random.default_rng(3)
-    for seed in range(10):
+    for seed in range(4):
         others = random_symbols(PROFILE, 256, 1, np.random.default_rng(100 + seed))[0]
         mask = known().mask & ~Pilots.of_profile(PROFILE, 256).mask
         assert not SEARCH.find(field, Pilots.of_symbols(mask, others, 256)).found
@@ -93,17 +93,17 @@ def test_other_pages_and_noise_are_not_found(
         assert not SEARCH.find(noise, known()).found
 
 
-@pytest.mark.parametrize("pilots", [4, 12, 54, 787])
+@pytest.mark.parametrize("pilots", [4, 54, 200])
 def test_what_is_needed_is_what_unrelated_light_reaches_as_seldom_as_stated(
     pilots: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At a rate that can be seen: once in a thousand searches of an area that is one independent trial."""
+    """At a rate that can be seen: once in a hundred searches of an area that is one independent trial."""
     rng = np.random.default_rng(pilots)
-    light = rng.standard_normal((20_000, pilots)) + 1j * rng.standard_normal((20_000, pilots))
+    light = rng.standard_normal((5000, pilots)) + 1j * rng.standard_normal((5000, pilots))
     seen = np.abs(light.sum(axis=1)) ** 2 / np.sum(np.abs(light) ** 2, axis=1)
     stated = needed_significance(pilots)
-    monkeypatch.setattr("lightpage.calibration.image_search.FALSE_ALARMS", 1e-3)
-    assert np.mean(seen >= needed_significance(pilots, 2.0)) == pytest.approx(1e-3, rel=0.5)
+    monkeypatch.setattr("lightpage.calibration.image_search.FALSE_ALARMS", 1e-2)
+    assert np.mean(seen >= needed_significance(pilots, 2.0)) == pytest.approx(1e-2, rel=0.4)
     assert needed_significance(pilots, 2.0) < needed_significance(pilots, 200.0) < stated < pilots
 
 

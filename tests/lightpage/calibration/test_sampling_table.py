@@ -100,12 +100,6 @@ def test_a_cubic_holds_the_pixels_of_the_whole_grid() -> None:
     assert np.abs(rebuilt - twin.pixels(parameters, places)).max() < 1e-3
 
 
-def test_a_cubic_has_ten_terms_each_once() -> None:
-    powers = monomial_powers()
-    assert len(set(powers)) == len(powers) == 10
-    assert max(i + j for i, j in powers) == 3
-
-
 def test_what_it_holds_of_symbols_has_no_digits_that_nobody_needs() -> None:
     profile = small_profile()
     table = sampling_table(TorchTwin(RayTwin(profile)), some_device(), TURN, profile)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -34,15 +32,14 @@ def seen_by(device: Device, seed: int, profile: Profile = PROFILE) -> WaveFit:
     return WaveFit(twin, profile, pair, references, np.exp(1j * symbol_phases(symbols, 256)))
 
 
-@pytest.mark.parametrize(("ratio", "full_well_e"), [(1.3, 15_000.0), (3.0, 15_000.0), (1.6, 100.0)])
-def test_both_cameras_and_the_angle_between_the_arms_come_back(ratio: float, full_well_e: float) -> None:
+def test_both_cameras_and_the_angle_between_the_arms_come_back_in_dim_light() -> None:
     device = Device(
         in_phase_camera=CameraPose(scale_relative_error=2e-3, rotation_deg=0.1, shift_x_px=1.0),
         quadrature_camera=CameraPose(scale_relative_error=-1e-3, rotation_deg=-0.1, shift_y_px=-2.0),
         aberration=Aberration(distortion_relative=0),
-        reference=Reference(amplitude_ratio=ratio),
+        reference=Reference(amplitude_ratio=1.6),
         homodyne=Homodyne(quadrature_error_deg=3, quadrature_sign=-1, quadrature_gain=0.9),
-        sensor=Sensor(full_well_e=full_well_e),
+        sensor=Sensor(full_well_e=100.0),
         drift=Drift(shift_px=0),
     )
     truth = true_parameters(PROFILE, device)
@@ -70,8 +67,8 @@ def test_both_cameras_and_the_angle_between_the_arms_come_back(ratio: float, ful
     assert np.array_equal(np.flatnonzero(result.deviations), np.sort(poses))
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations(seed: int) -> None:
+def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations() -> None:
+    seed = 1
     device = draw_device(np.random.default_rng(seed))
     truth = true_parameters(PROFILE, device)
     rng, angle = np.random.default_rng([seed, 1]), NAMES.index("pipe_angle_rad")
@@ -88,30 +85,6 @@ def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations(seed
     assert np.sqrt(np.mean(off**2)) < 2
 
 
-def test_a_derivative_that_has_all_but_converged_serves_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    looked, taken = list[float](), list[int]()
-
-    def counted(fit: WaveFit, *arguments: Any, slopes: Any = WaveFit._slopes) -> Any:
-        taken.append(len(looked))
-        return slopes(fit, *arguments)
-
-    def noted(fit: WaveFit, *arguments: Any, equations: Any = WaveFit._equations) -> Any:
-        columns, left = equations(fit, *arguments)
-        looked.append(float(np.sqrt(np.mean(left**2))))
-        return columns, left
-
-    monkeypatch.setattr(WaveFit, "_slopes", counted)
-    monkeypatch.setattr(WaveFit, "_equations", noted)
-    monkeypatch.setattr(wave_fit, "_CONVERGED", 0.0)  # as long as anything is gained
-    device = Device(drift=Drift(shift_px=0))
-    start = true_parameters(PROFILE, device)
-    start[indices("in_phase")] += [0.03, 0.01, 1e-4, 0, 1e-4, 0]
-    seen_by(device, 1).fit(start, device.homodyne.turn_rad, ("in_phase", "quadrature"))
-    assert len(looked) > wave_fit._CHORD  # rounds enough for a second derivative
-    assert looked[3] > (1 - wave_fit._NEARLY) * looked[2]
-    assert taken == [0]
-
-
 def test_a_fit_tells_of_every_round_and_derivative_and_ends_where_it_is_stopped() -> None:
     class Stopped(Exception):
         pass
@@ -126,12 +99,12 @@ def test_a_fit_tells_of_every_round_and_derivative_and_ends_where_it_is_stopped(
     fit, start = seen_by(device, 1), true_parameters(PROFILE, device)
     with pytest.raises(Stopped):
         fit.fit(start, device.homodyne.turn_rad, EVERY, progress=stop_in_the_derivative)
-    assert 0 < told[-1] < 1 / wave_fit._ROUNDS  # in the first round, a derivative of every parameter of the light
+    assert 0 < told[-1] < 1 / wave_fit.ROUNDS  # in the first round, a derivative of every parameter of the light
     shares = list[float]()
     fit.fit(start, device.homodyne.turn_rad, ("in_phase", "angle"), progress=shares.append)
     assert told == sorted(told)
     assert shares == sorted(shares)
-    assert {0, 1 / wave_fit._ROUNDS} <= set(shares) <= {n / wave_fit._ROUNDS for n in range(wave_fit._ROUNDS)}
+    assert {0, 1 / wave_fit.ROUNDS} <= set(shares) <= {n / wave_fit.ROUNDS for n in range(wave_fit.ROUNDS)}
 
 
 def test_how_much_path_real_lenses_add_comes_back() -> None:

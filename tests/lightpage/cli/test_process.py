@@ -8,7 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
+from click.shell_completion import ShellComplete
+
+from lightpage.cli import main
+from lightpage.cli.main import COMPLETE, THREADS, lightpage, run
+from tests.lightpage.small import small_profile
 
 
 def shell(script: str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -31,61 +37,74 @@ def shell(script: str, folder: Path, **variables: str) -> subprocess.CompletedPr
         ("lightpage --help 2>&-", 0),
         ("lightpage --help <&- >&- 2>&-", 0),
         ("lightpage --help > /dev/full", 2),
-        ("lightpage report no-such-file --out P.html 2> /dev/full", 2),
-        ("lightpage report no-such-file --out P.html 2>&-", 2),
+        ("lightpage nonsense 2> /dev/full", 2),
+        ("lightpage nonsense 2>&-", 2),
     ],
 )
 def test_streams_that_are_closed_full_or_absent(script: str, status: int, tmp_path: Path) -> None:
     assert shell(script, tmp_path).returncode == status
 
 
-def test_files_are_whole_when_the_process_began_without_streams(tmp_path: Path) -> None:
-    assert shell("lightpage simulate --profile bench --pages 1 --out R.h5 <&- >&- 2>&-", tmp_path).returncode == 0
-    assert shell("lightpage simulate --profile bench --pages 1 --out S.h5 2> /dev/full", tmp_path).returncode == 0
-    one, other = ((tmp_path / name).read_bytes() for name in ("R.h5", "S.h5"))
-    assert one[:8] == other[:8] == b"\x89HDF\r\n\x1a\n"
+def test_a_file_is_whole_when_the_process_began_without_streams(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(small_profile().to_toml())
+    script = "lightpage simulate --profile small.toml --pages 1 --out R.h5 <&- >&- 2>&-"
+    assert shell(script, tmp_path).returncode == 0
+    assert (tmp_path / "R.h5").read_bytes()[:8] == b"\x89HDF\r\n\x1a\n"
 
 
-def test_an_encoding_that_lacks_a_letter_stops_nothing(tmp_path: Path) -> None:
-    done = shell("lightpage evaluate --recording ä.h5 --bundle ß.zip", tmp_path, PYTHONIOENCODING="ascii")
-    assert done.returncode == 2
-    assert ".zip: got nothing" in done.stderr
+@pytest.mark.parametrize("encoding", ["utf-8:strict", "ascii:strict"])
+def test_what_an_encoding_cannot_say_is_escaped(encoding: str) -> None:
+    code = (
+        "import sys, click; from lightpage.cli import main;"
+        "main.lightpage = click.Command('c', callback=lambda: print(sys.argv[1]));"
+        "main.run = lambda command: command.main([], standalone_mode=False) or 0; main.main()"
+    )
+    there = os.environ | {"PYTHONIOENCODING": encoding}
+    name = os.fsdecode(b"a\xff.h5")
+    done = subprocess.run([sys.executable, "-c", code, name], env=there, capture_output=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, b"a\\udcff.h5\n")
 
 
 WAITS = """
-import sys, time
+import signal, sys
 import click
 from lightpage.cli import main
 
 @click.command()
 def waits() -> None:
     print("ready", flush=True)
-    time.sleep(60)
+    signal.pause()
 
 sys.exit(main.run(waits, []))
 """
 
 
-@pytest.mark.parametrize(
-    ("number", "status"), [(signal.SIGHUP, 129), (signal.SIGTERM, 143), (signal.SIGINT, 130)], ids=lambda n: str(n)
-)
-def test_a_signal_ends_a_command_that_says_how_to_go_on(number: int, status: int) -> None:
+def test_a_signal_ends_a_command_that_says_how_to_go_on() -> None:
     with subprocess.Popen([sys.executable, "-c", WAITS], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"ready\n"
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=30)
-    assert (process.returncode, b"run the same command again" in told) == (status, True)
+    assert (process.returncode, b"run the same command" in told) == (130, True)
 
 
-def test_a_hangup_that_is_ignored_stays_so() -> None:
-    code = WAITS.replace("time.sleep(60)", "time.sleep(0.1)")
-    ignored = lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)  # noqa: E731
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, preexec_fn=ignored) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        process.send_signal(signal.SIGHUP)
-        assert process.wait(30) == 0
+@pytest.mark.parametrize(
+    ("number", "ignored", "status"),
+    [(signal.SIGTERM, False, 143), (signal.SIGHUP, False, 129), (signal.SIGHUP, True, 0)],
+)
+def test_sigterm_and_a_hangup_end_a_command_unless_they_are_ignored(
+    number: signal.Signals, ignored: bool, status: int
+) -> None:
+    @click.command()
+    def called() -> None:
+        os.kill(os.getpid(), number)
+
+    before = signal.signal(number, signal.SIG_IGN) if ignored else signal.getsignal(number)
+    try:
+        assert run(called, []) == status
+        assert signal.getsignal(number) == (signal.SIG_IGN if ignored else before)
+    finally:
+        signal.signal(number, before)
 
 
 HELP = """
@@ -123,26 +142,27 @@ def test_every_command_shows_its_help_without_extras_and_required_options() -> N
     assert {"train", "calibrate", "export", "models list", "bulk recover"} <= set(done.stdout.splitlines())
 
 
-@pytest.mark.parametrize("kind", ["bash", "zsh", "fish"])
-def test_shells_complete_commands_and_options(kind: str, tmp_path: Path) -> None:
-    script = shell("lightpage", tmp_path, _LIGHTPAGE_COMPLETE=f"{kind}_source").stdout
-    assert f"_LIGHTPAGE_COMPLETE={kind}_complete" in script
-    for words, place, found in (("lightpage sim", 1, "simulate"), ("lightpage bulk recover --ho", 3, "--holes")):
-        asked = {"COMP_WORDS": words, "COMP_CWORD": str(place) if kind != "fish" else words.split()[-1]}
-        assert found in shell("lightpage", tmp_path, _LIGHTPAGE_COMPLETE=f"{kind}_complete", **asked).stdout
+def test_shells_complete_commands_and_options(tmp_path: Path) -> None:
+    complete = ShellComplete(lightpage, {}, "lightpage", COMPLETE)
+    assert [item.value for item in complete.get_completions([], "sim")] == ["simulate"]
+    assert "--holes" in [item.value for item in complete.get_completions(["bulk", "recover"], "--ho")]
+    asked = {"COMP_WORDS": "lightpage sim", "COMP_CWORD": "1", COMPLETE: "bash_complete"}
+    assert shell("lightpage", tmp_path, **asked).stdout == "plain,simulate\n"
 
 
-def test_libraries_of_linear_algebra_do_not_spin_unless_they_are_told_to(tmp_path: Path) -> None:
-    from lightpage.cli.main import THREADS
-
-    code = (
-        "import os; from lightpage.cli import main;"
-        "main.run = lambda _: print(os.environ.get('OPENBLAS_NUM_THREADS')); main.main()"
-    )
-    for own, seen in (({}, THREADS["OPENBLAS_NUM_THREADS"]), ({"OMP_NUM_THREADS": "3"}, "None")):
-        kept = {name: value for name, value in os.environ.items() if name not in (*THREADS, "OMP_NUM_THREADS")}
-        done = subprocess.run([sys.executable, "-c", code], env=kept | own, capture_output=True, text=True, timeout=60)
-        assert done.stdout == f"{seen}\n"
+def test_libraries_of_linear_algebra_do_not_spin_unless_they_are_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    for stream in ("stdin", "stdout", "stderr"):
+        monkeypatch.setattr(sys, stream, getattr(sys, stream))
+    monkeypatch.setattr(main, "run", lambda _: 0)
+    for own, seen in ((None, THREADS["OPENBLAS_NUM_THREADS"]), ("3", None)):
+        for name in (*THREADS, "OMP_NUM_THREADS", "OMP_WAIT_POLICY"):
+            monkeypatch.setenv(name, "")  # so that it is set back
+            monkeypatch.delenv(name)
+        if own is not None:
+            monkeypatch.setenv("OMP_NUM_THREADS", own)
+        with pytest.raises(SystemExit):
+            main.main()
+        assert os.environ.get("OPENBLAS_NUM_THREADS") == seen
 
 
 @pytest.mark.parametrize(
@@ -150,11 +170,11 @@ def test_libraries_of_linear_algebra_do_not_spin_unless_they_are_told_to(tmp_pat
     [
         "evaluate --recording R.h5 --json {long}",
         "bulk decode {long} --recordings R.h5",
-        "encode F --bundle bench --out {long}",
-        "encode - --bundle bench --out P.h5 <&-",
     ],
 )
-def test_names_that_are_too_long_and_absent_streams_are_named(asked: str, tmp_path: Path) -> None:
-    done = shell(f"lightpage {asked.format(long='n' * 300)}", tmp_path)
-    assert done.returncode in (0, 2)
-    assert done.stderr.startswith("lightpage: ") or done.returncode == 0
+def test_names_that_are_too_long_are_named(
+    asked: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(lightpage, asked.format(long="n" * 300).split()) == 2
+    assert capsys.readouterr().err.startswith("lightpage: error: ")

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
+import tqdm.std
 
 from lightpage.cli import progress_bar
+from tests.clock import HandClock
 
 
-def test_progress_is_plain_lines_where_stderr_is_no_terminal(
+def test_progress_is_plain_lines_now_and_then_where_stderr_is_no_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(progress_bar, "LINE_S", 0.05)
+    clock = HandClock()
+    monkeypatch.setattr(tqdm.std, "time", clock.now)
     with progress_bar.percent_bar() as progress:
         for step in range(4):
-            time.sleep(0.06)
+            clock.advance(progress_bar.LINE_S)
             progress("fit", step / 4)
-    for _ in progress_bar.Bars().track(range(3), "pages", "page", None, 0, lambda: "AIR 5"):
-        time.sleep(0.06)
+    for _ in progress_bar.Bars().track(range(30), "pages", "page", None, 0, lambda: "AIR 5"):
+        clock.advance(progress_bar.LINE_S / 10 + 1e-3)
     told = capsys.readouterr()
     assert told.out == ""
     lines = [line for line in told.err.splitlines() if line]
     assert lines[0].startswith("lightpage: fit: ")
-    assert any(line.startswith("lightpage: done: 100% after ") for line in lines)
-    assert any(line.startswith("lightpage: pages: ") and line.endswith("left, AIR 5") for line in lines)
+    assert any(line.startswith("lightpage: done: 100% after 02:00") for line in lines)
+    pages = [line for line in lines if line.startswith("lightpage: pages: ")]
+    assert 2 <= len(pages) <= 4
+    assert pages[0].endswith(", AIR 5")
     assert "\r" not in told.err
 
 

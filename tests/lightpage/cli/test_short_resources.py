@@ -37,15 +37,6 @@ def test_a_short_resource_is_one_line(error: Exception, named: str, capsys: pyte
     assert named in told
 
 
-def test_an_error_that_nobody_foresaw_keeps_its_traceback() -> None:
-    @click.command()
-    def command() -> None:
-        raise RuntimeError("dictionary changed size during iteration")
-
-    with pytest.raises(RuntimeError):
-        run(command, [])
-
-
 def test_words_of_a_library_name_a_resource_where_it_has_no_number() -> None:
     error = os_failure(
         "recording R", OSError("Unable to open file (memory allocation failed)"), "a file", RecordingError

@@ -122,13 +122,13 @@ def test_pages_of_another_device_are_not_mixed_in(
         interrupt_after(1, patch)
         with pytest.raises(click.Abort):
             run(profile_file, out)
-    with pytest.raises(InvalidInputError, match="pages begun with other settings"):
+    with pytest.raises(InvalidInputError, match="other settings"):
         run(profile_file, out, *other)
-    with pytest.raises(InvalidInputError, match="pages begun with other settings"):
+    with pytest.raises(InvalidInputError, match="other settings"):
         run(profile_file, out, "--no-truth")
     with monkeypatch.context() as patch:
         patch.setattr(recording_job, "LIGHT", LIGHT + 1)
-        with pytest.raises(InvalidInputError, match="pages begun with other settings"):
+        with pytest.raises(InvalidInputError, match="other settings"):
             run(profile_file, out)
     run(profile_file, out, *other, "--force", pages=1)
     with h5py.File(out) as file:
@@ -140,7 +140,7 @@ def test_pages_that_are_being_written_are_not_destroyed_even_if_forced(profile_f
     frame = np.ones(profile.frame_shape, np.uint8)
     with RecordingWriter(out, profile, 16, 8, FramePair(frame, frame)) as running:
         running.append(None, FramePair(frame, frame))
-        with pytest.raises(RecordingError, match="another process is writing now"):
+        with pytest.raises(RecordingError, match="another process"):
             run(profile_file, out, "--force", pages=1)
     with Recording.open(out) as recording:
         assert recording.pages == 1
@@ -149,7 +149,7 @@ def test_pages_that_are_being_written_are_not_destroyed_even_if_forced(profile_f
 def test_a_profile_that_cannot_be_simulated_leaves_nothing_behind(profile_file: Path, tmp_path: Path) -> None:
     coarse = tmp_path / "coarse.toml"
     coarse.write_text(profile_file.read_text().replace("pitch_m = 2.4e-06", "pitch_m = 4.8e-06"))
-    with pytest.raises(ProfileError, match=r"camera\.pitch_m: got 4\.8e-06 m"):
+    with pytest.raises(ProfileError, match=r"camera\.pitch_m"):
         run(coarse, tmp_path / "R.h5")
     assert list(tmp_path.iterdir()) == [coarse]
 
@@ -167,15 +167,8 @@ def test_a_file_that_exists_is_kept_unless_forced(profile_file: Path, tmp_path: 
 
 def test_settings_and_a_device_file_make_the_device(profile_file: Path, tmp_path: Path) -> None:
     (tmp_path / "device.toml").write_text("[sensor]\nbit_depth = 12\n[drift]\npiston_rad = 0.4\n")
-    run(
-        profile_file,
-        tmp_path / "R.h5",
-        "--device",
-        str(tmp_path / "device.toml"),
-        "--set",
-        "drift.piston_rad=0.0",
-        pages=2,
-    )
+    device = ("--device", str(tmp_path / "device.toml"), "--set", "drift.piston_rad=0.0")
+    run(profile_file, tmp_path / "R.h5", *device, pages=2)
     with Recording.open(tmp_path / "R.h5") as recording:
         assert recording.bit_depth == 12
     assert np.ptp(contents(tmp_path / "R.h5")["truth/piston"]) == 0

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
 import pytest
-from pydantic import ValidationError
 
 from lightpage.codec.checksum import crc16
 from lightpage.codec.code import Code, load_code, parse_code
-from lightpage.errors import InvalidInputError
+from tests.lightpage.refused import refused
 
 CODE = Code(levels=64, coded_bits=2, rate_per_mille=755, corrections=3, needed_information=0.8125)
 TEXT = CODE.to_toml()
@@ -44,54 +42,51 @@ def test_what_may_be_left_out_has_a_default() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "complaint"),
+    ("key", "value"),
     [
-        ("levels", "1", "levels: .*greater than or equal to 2"),
-        ("levels", "512", "levels: .*less than or equal to 256"),
-        ("levels", "48", "48 levels are not a power of two"),
-        ("levels", "64.5", "levels: .*integer"),
-        ("levels", '"many"', "levels: .*integer"),
-        ("coded_bits", "0", "coded_bits: .*greater than or equal to 1"),
-        ("coded_bits", "9", "coded_bits: .*less than or equal to 8"),
-        ("coded_bits", "7", "7 coded bits are more than the 6 of 64 levels"),
-        ("rate_per_mille", "339", "rate_per_mille: .*greater than or equal to 340"),
-        ("rate_per_mille", "961", "rate_per_mille: .*less than or equal to 960"),
-        ("corrections", "-1", "corrections: .*greater than or equal to 0"),
-        ("corrections", "33", "corrections: .*less than or equal to 32"),
-        ("needed_information", "0.0", "needed_information: .*greater than 0"),
-        ("needed_information", "1.01", "needed_information: .*less than or equal to 1"),
-        ("needed_information", "nan", "needed_information: "),
-        ("needed_information", "inf", "needed_information: "),
+        ("levels", "1"),
+        ("levels", "512"),
+        ("levels", "48"),
+        ("levels", "64.5"),
+        ("levels", '"many"'),
+        ("coded_bits", "0"),
+        ("coded_bits", "9"),
+        ("coded_bits", "7"),  # of 6
+        ("rate_per_mille", "339"),
+        ("rate_per_mille", "961"),
+        ("corrections", "-1"),
+        ("corrections", "33"),
+        ("needed_information", "0.0"),
+        ("needed_information", "1.01"),
+        ("needed_information", "nan"),
+        ("needed_information", "inf"),
     ],
 )
-def test_each_bad_value_is_refused_by_name(key: str, value: str, complaint: str) -> None:
-    with pytest.raises(InvalidInputError, match=f"^my code: got .*{complaint}"):
+def test_each_bad_value_is_refused_by_name(key: str, value: str) -> None:
+    with refused("my code", value.strip('"') if value in ("48", "7") else key):
         parse_code(changed(key, value), "my code")
 
 
 def test_missing_and_unknown_keys_are_refused_by_name() -> None:
-    with pytest.raises(InvalidInputError, match=r"my code: got rate: .*not permitted"):
+    with refused("my code", "rate: "):
         parse_code(TEXT + "rate = 1\n", "my code")
-    with pytest.raises(InvalidInputError, match=r"my code: got rate_per_mille: .*required"):
+    with refused("my code", "rate_per_mille: "):
         parse_code("levels = 16\ncoded_bits = 2", "my code")
 
 
 def test_what_is_no_toml_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="my code: got text that is not TOML"):
+    with refused("my code", "TOML"):
         parse_code("levels: 16", "my code")
     path = tmp_path / "code.toml"
-    with pytest.raises(InvalidInputError, match=r"code .*code\.toml: got No such file"):
+    with refused("code.toml"):
         load_code(path)
     path.write_bytes(b"levels = \xff")
-    with pytest.raises(InvalidInputError, match=r"code .*code\.toml: got byte 0xff in line 1, column 10"):
+    with refused("code.toml", "line 1, column 10"):
         load_code(path)
     path.write_text("levels = 5")
-    with pytest.raises(InvalidInputError, match=r"code .*code\.toml: got coded_bits: "):
+    with refused("code.toml", "coded_bits: "):
         load_code(path)
-
-
-def test_a_path_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match=r"code .*wanted a path that can be written"):
+    with refused("code"):
         CODE.save(tmp_path / "no" / "code.toml")
 
 
@@ -104,21 +99,6 @@ def test_the_id_changes_with_every_parameter_that_the_page_depends_on() -> None:
     ids = [CODE.id, *(CODE.model_copy(update=change).id for change in changes)]
     assert len(set(ids)) == 5
     assert CODE.model_copy(update={"needed_information": 0.5}).id == CODE.id
-
-
-def test_few_codes_share_an_id() -> None:
-    """16 bits tell codes apart that a device may have had; among all codes some coincide."""
-    codes = itertools.product((16, 32, 64, 128, 256), (2,), range(500, 900, 5), (0, 1, 2, 4))
-    ids = [Code(levels=m, coded_bits=b, rate_per_mille=r, corrections=t).id for m, b, r, t in codes]
-    pairs = len(ids) * (len(ids) - 1) / 2
-    expected = pairs / 65536
-    assert len(ids) - len(set(ids)) < expected + 5 * expected**0.5
-
-
-def test_it_cannot_be_changed() -> None:
-    with pytest.raises(ValidationError):
-        CODE.levels = 4  # type: ignore[misc]
-    assert hash(CODE) == hash(CODE.model_copy())
 
 
 def test_it_describes_itself() -> None:

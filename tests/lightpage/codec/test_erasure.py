@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lightpage.codec.erasure import check_group, parity_of, restore
-from lightpage.errors import InvalidInputError
+from tests.lightpage.refused import refused
 
 
 def product(a: int, b: int) -> int:
@@ -57,55 +57,40 @@ def check_patterns(data_pages: int, parity_pages: int, patterns: int, size: int 
 
 @pytest.mark.parametrize(("data_pages", "parity_pages"), [(5, 3), (20, 6), (61, 3)])
 def test_any_losses_as_many_as_parity_pages_come_back(data_pages: int, parity_pages: int) -> None:
-    check_patterns(data_pages, parity_pages, 300)
+    check_patterns(data_pages, parity_pages, 60)
 
 
 def test_losses_of_the_largest_group_come_back() -> None:
     check_patterns(247, 8, 10)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("data_pages", "parity_pages"), [(20, 6), (30, 5), (12, 12), (61, 8), (120, 8)])
-def test_three_thousand_patterns_of_many_losses_come_back(data_pages: int, parity_pages: int) -> None:
-    check_patterns(data_pages, parity_pages, 3000)
-
-
 def test_every_pattern_of_a_small_group_comes_back() -> None:
     data, pages = group_of(5, 3, 10)
     for count in range(9):
         for kept in itertools.combinations(pages, count):
-            found = restore({place: pages[place] for place in kept}, 5, 3)
+            found = restore({place: pages[place] for place in reversed(kept)}, 5, 3)
             assert found == (data if count >= 5 or set(kept) >= set(range(5)) else None)
 
 
-@pytest.mark.parametrize("size", [1, 2, 15, 16, 17, 62, 724, 4099])
+@pytest.mark.parametrize("size", [1, 15, 16, 17, 724, 4099])
 def test_pages_of_any_length(size: int) -> None:
     data, pages = group_of(7, 2, size)
     assert [len(page) for page in pages.values()] == [size] * 9
     assert restore({place: page for place, page in pages.items() if place not in (0, 6)}, 7, 2) == data
 
 
-def test_the_order_in_which_pages_come_does_not_matter() -> None:
-    data, pages = group_of(6, 3, 20)
-    for order in itertools.islice(itertools.permutations([8, 5, 2, 7, 0, 3]), 100):
-        assert restore({place: pages[place] for place in order}, 6, 3) == data
-
-
-def test_without_parity_pages_nothing_is_restored() -> None:
+def test_without_parity_pages_or_pages_nothing_is_restored() -> None:
     data, pages = group_of(4, 0, 20)
     assert len(pages) == 4
     assert restore(pages, 4, 0) == data
     assert restore({0: data[0], 1: data[1], 3: data[3]}, 4, 0) is None
-
-
-def test_nothing_left_gives_nothing() -> None:
     assert restore({}, 3, 2) is None
 
 
 @pytest.mark.parametrize("group", [(0, 3), (-1, 2), (5, -1), (250, 6), (256, 0)])
 def test_groups_that_cannot_be_are_refused(group: tuple[int, int]) -> None:
     for call in (lambda: check_group(*group), lambda: restore({}, *group)):
-        with pytest.raises(InvalidInputError, match=f"group of pages: got {group[0]} data and {group[1]} parity pages"):
+        with refused("group of pages", f"{group[0]} data and {group[1]} parity"):
             call()
 
 

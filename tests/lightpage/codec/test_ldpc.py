@@ -7,16 +7,15 @@ import pytest
 import torch
 from ldpc import BpDecoder
 from scipy.sparse import csr_matrix
-from sionna.phy.fec.ldpc import LDPC5GDecoder, LDPC5GEncoder
+from sionna.phy.fec.ldpc import LDPC5GEncoder
 
 from lightpage.codec.ldpc.code import LdpcCode
 from lightpage.codec.ldpc.decoder import MOST_ITERATIONS, MOST_LLR, decode
-from lightpage.errors import InvalidInputError
+from tests.lightpage.refused import refused
 
 SIZES = [
     # K, n, Z
     (136, 204, 7),  # the header's: 18 fillers
-    (12, 36, 2),  # 32 fillers
     (44, 132, 2),  # none: Z = 2, lowest rate
     (66, 70, 3),  # hardly any parity bits: not even those of the four core rows are all sent
     (110, 200, 5),
@@ -24,12 +23,8 @@ SIZES = [
     (242, 600, 11),
     (280, 400, 13),
     (330, 348, 15),
-    (400, 700, 20),
-    (1000, 1053, 48),
     (1001, 1537, 48),
-    (3000, 5000, 144),
     (8448, 9000, 384),
-    (8000, 16001, 384),
 ]
 """Every family of lifting sizes, with and without fillers, rates from a third to 0.95."""
 
@@ -65,24 +60,10 @@ class TestEncoder:
         expected = theirs(torch.tensor(bits, dtype=torch.float32)).numpy()
         assert np.array_equal(code.encode(bits), expected)
 
-    @pytest.mark.parametrize(("information", "sent", "lifting"), SIZES)
-    def test_every_check_holds_for_the_whole_word(self, information: int, sent: int, lifting: int) -> None:
-        shorter = LdpcCode(information, sent)
-        everything = shorter.word_bits - 2 * lifting - (22 * lifting - information)
-        code = LdpcCode(information, everything)  # sends all that is not punctured or filler: the whole word is known
-        assert code.word_bits == shorter.word_bits
-        bits = random_bits((2, information), 1)
-        word = np.zeros((2, code.word_bits), np.uint8)
-        word[:, :information] = bits
-        word[:, code.sent] = code.encode(bits)
-        assert np.array_equal(word[:, :information], bits)  # systematic
-        assert not (parity_checks(code) @ word.T % 2).any()
-        assert np.array_equal(shorter.encode(bits), code.encode(bits)[:, :sent])
-
-    @pytest.mark.parametrize(("information", "sent"), [(0, 10), (8449, 20000), (-1, 5)])
-    def test_information_bits_out_of_range_are_refused(self, information: int, sent: int) -> None:
-        with pytest.raises(InvalidInputError, match=f"information bits: got {information}, wanted 1 to 8448"):
-            LdpcCode(information, sent)
+    @pytest.mark.parametrize("information", [0, 8449, -1])
+    def test_information_bits_out_of_range_are_refused(self, information: int) -> None:
+        with refused("information bits", information):
+            LdpcCode(information, 20_000)
 
     @pytest.mark.parametrize(("information", "longest"), [(44, 132), (40, 128), (8448, 25344)])
     def test_sent_bits_out_of_range_are_refused(self, information: int, longest: int) -> None:
@@ -90,14 +71,12 @@ class TestEncoder:
         assert len(LdpcCode(information, longest).sent) == longest
         assert LdpcCode(information, information + 1).rate < 1
         for sent in (information - 1, information, longest + 1, 10 * longest):
-            with pytest.raises(
-                InvalidInputError, match=f"sent bits: got {sent}, wanted {information + 1} to {longest}"
-            ):
+            with refused("sent bits", sent):
                 LdpcCode(information, sent)
 
     @pytest.mark.parametrize("shape", [(2, 135), (136,), (1, 2, 136)])
     def test_blocks_of_another_length_are_refused(self, shape: tuple[int, ...]) -> None:
-        with pytest.raises(InvalidInputError, match=r"information: got shape .*wanted \(blocks, 136\)"):
+        with refused("information", shape):
             LdpcCode(136, 204).encode(np.zeros(shape, np.uint8))
 
 
@@ -128,22 +107,14 @@ def by_ldpc_package(code: LdpcCode, llrs: np.ndarray) -> tuple[np.ndarray, np.nd
     return words, converged
 
 
-def by_sionna(code: LdpcCode, llrs: np.ndarray) -> np.ndarray:
-    """Information bits by Sionna's sum-product algorithm."""
-    encoder = LDPC5GEncoder(code.information_bits, code.sent_bits, bg="bg1")
-    decoder = LDPC5GDecoder(encoder, num_iter=50, hard_out=True)
-    # its ratios are ln P(1) / P(0)
-    return decoder(torch.tensor(-llrs, dtype=torch.float32)).numpy().astype(np.uint8)
-
-
 class TestNearTheLimit:
     """Light in which some of the blocks fail."""
 
     LOSS_DB = 0.2
     """That offset min-sum may cost against the sum-product algorithm, and again the bound on iterations. Measured on
     600 blocks of each of the codes below: 0, 0.07, 0.05, 0.12 dB, and 0.1, 0.09, 0.04, 0.14."""
-    BLOCKS = 120
-    CASES = ((136, 204, 0.6), (400, 800, -1.8), (440, 500, 2.9), (330, 960, -4.0))
+    BLOCKS = 60
+    CASES = ((136, 204, 0.6), (440, 500, 2.9), (330, 960, -4.0))
 
     @pytest.mark.parametrize(("information", "sent", "decibel"), CASES)
     def test_it_agrees_with_the_ldpc_package(self, information: int, sent: int, decibel: float) -> None:
@@ -161,20 +132,7 @@ class TestNearTheLimit:
         _, weaker = noisy(code, self.BLOCKS, decibel - self.LOSS_DB, 1)
         assert wrong <= failures(by_ldpc_package(code, weaker)[0][:, :information], bits)
 
-    @pytest.mark.parametrize(("information", "sent", "decibel"), [(136, 204, 0.6), (440, 500, 2.9)])
-    def test_it_agrees_with_sionna(self, information: int, sent: int, decibel: float) -> None:
-        code = LdpcCode(information, sent)
-        bits, llrs = noisy(code, self.BLOCKS, decibel, 2)
-        ours, theirs = decode(code, llrs, iterations=100), by_sionna(code, llrs)
-        right = (theirs == bits).all(axis=1)
-        assert np.count_nonzero(right & ours.converged) > 40
-        assert np.array_equal(ours.information[right & ours.converged], theirs[right & ours.converged])
-        wrong = failures(ours.information, bits)
-        assert wrong > 0
-        _, weaker = noisy(code, self.BLOCKS, decibel - self.LOSS_DB, 2)
-        assert wrong <= failures(by_sionna(code, weaker), bits)
-
-    @pytest.mark.parametrize(("information", "sent", "decibel"), CASES)
+    @pytest.mark.parametrize(("information", "sent", "decibel"), CASES[:2])
     def test_the_bound_on_iterations_costs_little(self, information: int, sent: int, decibel: float) -> None:
         code = LdpcCode(information, sent)
         bits, llrs = noisy(code, self.BLOCKS, decibel, 3)
@@ -186,7 +144,7 @@ class TestNearTheLimit:
 class TestDecoder:
     CODE = LdpcCode(136, 204)
 
-    @pytest.mark.parametrize(("information", "sent"), [(136, 204), (66, 70), (3000, 5000), (44, 132)])
+    @pytest.mark.parametrize(("information", "sent"), [(136, 204), (66, 70), (44, 132)])
     def test_it_stops_at_once_where_all_is_clear(self, information: int, sent: int) -> None:
         code = LdpcCode(information, sent)
         bits = random_bits((5, information))
@@ -238,12 +196,7 @@ class TestDecoder:
         encoded = self.CODE.encode(found.information)
         assert np.array_equal((encoded == found.sent).all(axis=1), found.converged)
         assert 0 < np.count_nonzero(found.converged) < 60
-
-    def test_the_number_of_iterations_is_bounded(self) -> None:
-        _, llrs = noisy(self.CODE, 20, 0.6, 8)
-        found = decode(self.CODE, llrs, iterations=3)
-        assert found.iterations.max() == 3
-        assert not found.converged.all()
+        assert decode(self.CODE, llrs, iterations=3).iterations.max() == 3
 
     def test_no_blocks_give_none(self) -> None:
         found = decode(self.CODE, np.zeros((0, 204)))
@@ -253,8 +206,8 @@ class TestDecoder:
     def test_nan_and_other_shapes_are_refused(self) -> None:
         llrs = np.ones((3, 204))
         llrs[1, 7] = np.nan
-        with pytest.raises(InvalidInputError, match="LDPC decoder: LLRs: got NaN, wanted numbers"):
+        with refused("LLRs", "NaN"):
             decode(self.CODE, llrs)
         for shape in ((204,), (3, 203), (1, 3, 204)):
-            with pytest.raises(InvalidInputError, match=r"LDPC decoder: LLRs: got shape .*wanted \(blocks, 204\)"):
+            with refused("LLRs", shape):
                 decode(self.CODE, np.ones(shape))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from lightpage.codec.page_bytes import Loss
 from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import InvalidInputError, PageError
 from tests.lightpage.codec.light import GROUP, SHAPE, codec_of, header_of, noisy, pilot_mask, written
+from tests.lightpage.refused import refused
 
 CODES = [
     # M, b, rate in thousandths, t
@@ -64,39 +66,9 @@ class TestRoundTrip:
             assert found.blocks == codec.blocks == 1
             assert found.iterations <= 3  # bits that are not sent must be found first
 
-    def test_pages_of_a_batch_are_those_made_alone(self) -> None:
-        codec, rng = codec_of(64, 2, 700, 2), np.random.default_rng(0)
-        headers = [header_of(codec, page) for page in range(4)]
-        data = rng.integers(0, 256, (4, codec.user_bytes), np.uint8)
-        levels = rng.integers(0, 64, np.count_nonzero(codec.pilots), np.uint8)
-        pages = codec.encode(headers, data, GROUP, levels)
-        assert pages.shape == (4, *SHAPE)
-        assert pages.dtype == np.uint8
-        assert (pages[:, codec.pilots] == levels).all()
-        for header, row, page in zip(headers, data, pages, strict=True):
-            assert np.array_equal(codec.encode([header], row[None], GROUP, levels)[0], page)
-
-    def test_equal_bytes_look_different_on_every_page_and_use_all_levels_alike(self) -> None:
-        """A page of zeros would be a flat wave front, which blinds the camera in one place."""
-        codec = codec_of(16, 2, 700, 2, shape=(28, 44))
-        pilots = np.zeros(np.count_nonzero(codec.pilots), np.uint8)
-        headers = [header_of(codec, page) for page in range(8)]
-        pages = codec.encode(headers, np.zeros((8, codec.user_bytes), np.uint8), GROUP, pilots)
-        body = pages.reshape(8, -1)[:, body_places(codec)]
-        counts = np.array([np.bincount(page, minlength=16) for page in body])
-        mean = body.shape[1] / 16
-        assert np.abs(counts - mean).max() < 5 * np.sqrt(mean)
-        assert np.mean(body[0] == body[1]) < 1 / 16 + 5 * np.sqrt(1 / 16 / body.shape[1])
-
     def test_several_blocks_and_words(self) -> None:
         codec, rng = codec_of(256, 2, 900, 2, shape=(100, 100)), np.random.default_rng(1)
-        coded = 2 * len(body_places(codec))
-        assert codec.blocks == -(-coded * 900 // (1000 * 8448)) == 3
-        assert coded % codec.blocks  # some coded bits belong to no block
-        total = codec.blocks * codec.ldpc.information_bits + 6 * len(body_places(codec))
-        words = -(-(total // 12) // 4095)
-        assert words == 2
-        assert codec.user_bytes == 12 * (total // 12 - 4 * words) // 8 - 10
+        assert codec.blocks == 3
         header = header_of(codec)
         data, symbols = written(codec, header, rng)
         phase, kappa = noisy(symbols, 256, kappa_of(256, 0.2), rng)
@@ -126,23 +98,21 @@ def changed_bits(codec: PageCodec, symbols: np.ndarray, which: np.ndarray) -> se
 
 
 class TestCorrections:
-    @pytest.mark.parametrize(("levels", "coded", "corrections"), [(64, 2, 4), (16, 2, 4), (256, 2, 16), (64, 1, 8)])
+    @pytest.mark.parametrize(("levels", "coded", "corrections"), [(64, 2, 4), (256, 2, 16), (64, 1, 8)])
     def test_wrong_upper_numbers_are_mended_and_counted(self, levels: int, coded: int, corrections: int) -> None:
         codec, rng = codec_of(levels, coded, 700, corrections), np.random.default_rng([levels, coded])
         step = 2 * np.pi / levels * (1 << coded)
         seen = set()
-        for _ in range(60):
+        for trial in range(30):
             data, symbols = written(codec, header_of(codec), rng)
             phase, kappa = noisy(symbols, levels, np.inf, rng)
-            which = rng.choice(len(body_places(codec)) - 12, rng.integers(0, corrections + 3), replace=False)
+            which = rng.choice(len(body_places(codec)) - 12, trial % (corrections + 3), replace=False)
             phase.flat[body_places(codec)[which]] += step
             bits = changed_bits(codec, symbols, which)
             wrong = len({bit // 12 for bit in bits})
             found = codec.decode(phase, kappa)
             assert found.failed_blocks == 0
-            if all(
-                bit >= 8 * (codec.user_bytes + 10) for bit in bits
-            ):  # none, or only parity: the body needs no mending
+            if all(bit >= 8 * (codec.user_bytes + 10) for bit in bits):  # the body, before the parity, needs no mending
                 assert (found.data, found.corrected, found.loss) == (data, 0, None)
             elif wrong <= corrections:
                 assert (found.data, found.corrected, found.loss) == (data, wrong, None)
@@ -159,11 +129,6 @@ class TestCorrections:
         phase.flat[body_places(codec)[0]] += 4 * 2 * np.pi / 64
         found = codec.decode(phase, kappa)
         assert (found.data, found.loss, found.failed_blocks) == (None, Loss.CHECKSUM, 0)
-
-    def test_corrections_cost_their_parity(self) -> None:
-        sizes = [codec_of(64, 2, 700, corrections).user_bytes for corrections in (1, 2, 6)]
-        assert sizes[0] - sizes[1] == 3  # two symbols of 12 bits each
-        assert sizes[1] - sizes[2] == 12
 
 
 def any_light(codec: PageCodec, symbols: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -192,15 +157,22 @@ def spoilt_region(codec: PageCodec, symbols: np.ndarray, rng: np.random.Generato
     return phase, concentration
 
 
-def never_other_bytes(pages: int, seed: int, draw: object) -> Counter[Loss | None]:
-    """Decode drawn pages, all of which must give the right bytes or none; how often which."""
-    rng, seen = np.random.default_rng(seed), Counter[Loss | None]()
+Draw = Callable[[PageCodec, np.ndarray, np.random.Generator], tuple[np.ndarray, np.ndarray]]
+
+
+@pytest.mark.parametrize(
+    ("pages", "some"),
+    [(80, 12), pytest.param(5000, 750, marks=pytest.mark.long)],  # rare failures show in many pages
+)
+@pytest.mark.parametrize("draw", [any_light, spoilt_region])
+def test_drawn_pages_give_the_right_bytes_or_none(pages: int, some: int, draw: Draw) -> None:
+    rng, seen = np.random.default_rng(2), Counter[Loss | None]()
     codecs = [codec_of(16, 2, 700, 0), codec_of(64, 2, 700, 2), codec_of(64, 1, 700, 4), codec_of(256, 2, 700, 16)]
     for trial in range(pages):
         codec = codecs[trial % len(codecs)]
         header = header_of(codec, int(rng.integers(1 << 24)), int(rng.integers(1 << 32)))
         data, symbols = written(codec, header, rng)
-        phase, concentration = draw(codec, symbols, rng)  # type: ignore[operator]
+        phase, concentration = draw(codec, symbols, rng)
         expected = [None, header, header_of(codec, header.page ^ 1, header.volume)][rng.integers(3)]
         found = codec.decode(phase, concentration, expected)
         assert found.data in (data, None)
@@ -211,27 +183,8 @@ def never_other_bytes(pages: int, seed: int, draw: object) -> Counter[Loss | Non
             assert found.loss is not None
             assert (found.file, found.corrected) == (None, 0)
         seen[found.loss] += 1
-    return seen
-
-
-class TestNeverOtherBytes:
-    def test_in_light_about_the_limit(self) -> None:
-        seen = never_other_bytes(320, 0, any_light)
-        assert seen[None] > 80
-        assert seen[Loss.BODY] > 80
-
-    def test_with_regions_of_anything(self) -> None:
-        seen = never_other_bytes(320, 1, spoilt_region)
-        assert seen[None] > 80
-        assert seen[Loss.BODY] > 50
-
-    @pytest.mark.long
-    @pytest.mark.parametrize("draw", [any_light, spoilt_region])
-    def test_in_ten_thousand_pages(self, draw: object) -> None:
-        seen = never_other_bytes(10_000, 2, draw)
-        assert seen[None] > 2000
-        assert seen[Loss.BODY] > 1500
-        assert seen[Loss.CHECKSUM] > 0  # some converge to words that are not those written
+    assert seen[None] > some
+    assert seen[Loss.BODY] > some
 
 
 class TestHeader:
@@ -248,22 +201,23 @@ class TestHeader:
             phase.flat[places] = rng.uniform(-np.pi, np.pi, len(places))
         return data, phase, kappa
 
-    def test_without_it_the_page_is_lost(self) -> None:
-        _, phase, kappa = self.page()
-        found = self.CODEC.decode(phase, kappa)
-        assert (found.header, found.data, found.loss, found.failed_blocks) == (None, None, Loss.HEADER, 0)
-
-    def test_without_it_the_page_that_was_expected_is_read(self) -> None:
+    @pytest.mark.parametrize(
+        ("change", "read"),
+        [
+            (None, False),
+            ({}, True),
+            ({"page": 4}, False),
+            ({"volume": 1}, False),
+            ({"volume_bytes": 999_999}, False),
+            ({"code_id": 1}, False),
+        ],
+    )
+    def test_without_it_only_the_page_expected_is_read(self, change: dict[str, int] | None, read: bool) -> None:
         data, phase, kappa = self.page()
         header = header_of(self.CODEC)
-        found = self.CODEC.decode(phase, kappa, header)
-        assert (found.header, found.data, found.loss) == (header, data, None)
-
-    @pytest.mark.parametrize("change", [{"page": 4}, {"volume": 1}, {"volume_bytes": 999_999}, {"code_id": 1}])
-    def test_without_it_another_page_is_not_taken_for_the_one_expected(self, change: dict[str, int]) -> None:
-        _, phase, kappa = self.page()
-        found = self.CODEC.decode(phase, kappa, replace(header_of(self.CODEC), **change))
-        assert (found.header, found.data, found.loss) == (None, None, Loss.HEADER)
+        found = self.CODEC.decode(phase, kappa, None if change is None else replace(header, **change))
+        assert (found.header, found.data, found.loss) == ((header, data, None) if read else (None, None, Loss.HEADER))
+        assert found.failed_blocks == 0
 
     def test_it_goes_before_what_was_expected(self) -> None:
         data, phase, kappa = self.page(damaged=False)
@@ -289,12 +243,6 @@ class TestHeader:
         assert (found.header.code_id, found.data, found.loss) == (other, None, Loss.CODE)
         assert found.margin_bits < 0  # its bits are not made for this code, whose need is all of them
 
-    def test_a_page_of_another_rate_is_known_as_such(self) -> None:
-        other, rng = codec_of(64, 2, 705, 2), np.random.default_rng(1)
-        _, symbols = written(other, header_of(other), rng)
-        found = self.CODEC.decode(*noisy(symbols, 64, np.inf, rng), header_of(self.CODEC))
-        assert (found.data, found.loss) == (None, Loss.CODE)
-
     def test_the_body_is_lost_and_the_header_tells_which(self) -> None:
         _, phase, kappa = self.page(damaged=False)
         places = body_places(self.CODEC)
@@ -304,24 +252,16 @@ class TestHeader:
         assert found.failed_blocks == found.blocks == 1
 
 
-@pytest.mark.parametrize(("levels", "coded", "rate", "corrections"), CODES)
-class TestNoise:
-    def test_a_dark_page_is_lost(self, levels: int, coded: int, rate: int, corrections: int) -> None:
-        codec = codec_of(levels, coded, rate, corrections, shape=(28, 44))
-        dark = np.zeros(codec.pilots.shape)
-        for expected in (None, header_of(codec)):
-            found = codec.decode(dark, dark, expected)
-            assert (found.header, found.data) == (None, None)
-            assert found.loss is not None
-            assert found.margin_bits == pytest.approx(-coded)  # no information, where the code needs one bit of each
-
-    @pytest.mark.parametrize("kappa", [3.0, 1e6])
-    def test_random_phases_are_lost_however_sure(
-        self, levels: int, coded: int, rate: int, corrections: int, kappa: float
-    ) -> None:
-        codec = codec_of(levels, coded, rate, corrections, shape=(28, 44))
-        phase = np.random.default_rng([levels, coded]).uniform(-np.pi, np.pi, codec.pilots.shape)
-        for expected in (None, header_of(codec)):
+@pytest.mark.parametrize(("levels", "coded", "rate", "corrections"), [CODES[0], CODES[5], CODES[9]])
+def test_darkness_and_noise_are_lost_however_sure(levels: int, coded: int, rate: int, corrections: int) -> None:
+    codec = codec_of(levels, coded, rate, corrections, shape=(28, 44))
+    phase = np.random.default_rng([levels, coded]).uniform(-np.pi, np.pi, codec.pilots.shape)
+    for expected in (None, header_of(codec)):
+        dark = codec.decode(0 * phase, 0 * phase, expected)
+        assert (dark.header, dark.data) == (None, None)
+        assert dark.loss is not None
+        assert dark.margin_bits == pytest.approx(-coded)  # no information, where the code needs one bit of each
+        for kappa in (3.0, 1e6):
             found = codec.decode(phase, np.full(phase.shape, kappa), expected)
             assert (found.header, found.data, found.loss) == (None, None, Loss.BODY)
 
@@ -345,26 +285,26 @@ class TestMargin:
         codec = codec_of(64, 2, 700, 2, self.SHAPE, self.needed(plain, rng))
         # loss of pages and the mean margin of those read and of those lost
         before, beginning = np.inf, []
-        for deviation in np.arange(0.2, 0.44, 0.02):
+        for deviation in np.arange(0.2, 0.44, 0.03):
             found = []
-            for _ in range(10):
+            for _ in range(6):
                 _, symbols = written(codec, header_of(codec), rng)
                 found.append(codec.decode(*noisy(symbols, 64, kappa_of(64, deviation), rng)))
             margin = float(np.mean([page.margin_bits for page in found]))
             lost = np.mean([page.data is None for page in found])
             assert margin < before
             before = margin
-            if margin > 0.06:
+            if margin > 0.12:
                 assert lost == 0
-            elif margin < -0.06:
+            elif margin < -0.12:
                 assert lost == 1
             if 0 < lost < 1:
                 beginning.append(margin)
             for page in found:
                 # a page's information deviates by 0.01 of each of two bits from that of the mean
-                assert page.margin_bits > -0.06 if page.data is not None else page.margin_bits < 0.06
+                assert page.margin_bits > -0.12 if page.data is not None else page.margin_bits < 0.12
         assert beginning
-        assert np.abs(beginning).max() < 0.06
+        assert np.abs(beginning).max() < 0.12
 
     def test_it_is_all_that_the_code_does_not_need_on_a_perfect_page(self) -> None:
         codec, rng = codec_of(64, 2, 700, 2, needed=0.75), np.random.default_rng(4)
@@ -387,57 +327,47 @@ class TestMargin:
 class TestRefusals:
     CODEC = codec_of(16, 2, 700, 0)
 
-    @pytest.mark.parametrize("shape", [(1, -1), (1, 1), (2, 0), (0, 0)])
-    def test_data_of_another_shape(self, shape: tuple[int, int]) -> None:
-        size, levels = self.CODEC.user_bytes, np.zeros(np.count_nonzero(self.CODEC.pilots), np.uint8)
-        data = np.zeros((shape[0], size + shape[1]), np.uint8)
-        with pytest.raises(PageError, match=rf"user data: got shape .*, wanted \(1, {size}\)"):
-            self.CODEC.encode([header_of(self.CODEC)], data, GROUP, levels)
-        with pytest.raises(PageError, match=rf"user data: got shape \({size},\), wanted \(1, {size}\)"):
-            self.CODEC.encode([header_of(self.CODEC)], np.zeros(size, np.uint8), GROUP, levels)
-
-    def test_pilots_that_are_not_as_many(self) -> None:
-        count = np.count_nonzero(self.CODEC.pilots)
-        data, levels = np.zeros((1, self.CODEC.user_bytes), np.uint8), np.zeros(count + 1, np.uint8)
-        with pytest.raises(PageError, match=rf"pilot levels: got shape \({count + 1},\), wanted \({count},\)"):
-            self.CODEC.encode([header_of(self.CODEC)], data, GROUP, levels)
+    def test_data_and_pilots_of_another_shape(self) -> None:
+        size, count = self.CODEC.user_bytes, np.count_nonzero(self.CODEC.pilots)
+        for shape in ((1, size - 1), (1, size + 1), (2, size), (0, size), (size,)):
+            with refused("user data", shape, PageError):
+                self.CODEC.encode([header_of(self.CODEC)], np.zeros(shape, np.uint8), GROUP, np.zeros(count, np.uint8))
+        for pilots in (count - 1, count + 1):
+            with refused("pilot levels", pilots, PageError):
+                data = np.zeros((1, size), np.uint8)
+                self.CODEC.encode([header_of(self.CODEC)], data, GROUP, np.zeros(pilots, np.uint8))
 
     @pytest.mark.parametrize("shape", [(24, 16), (16, 25), (384,), (1, 16, 24)])
     def test_a_page_of_another_shape(self, shape: tuple[int, ...]) -> None:
         for phase, kappa in ((shape, SHAPE), (SHAPE, shape)):
-            with pytest.raises(PageError, match=r"phase, concentration: got .*, wanted \(16, 24\) twice"):
+            with refused("phase, concentration", shape, PageError):
                 self.CODEC.decode(np.zeros(phase), np.ones(kappa))
 
-    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-    @pytest.mark.parametrize("of_header", [False, True])
-    def test_values_that_are_not_finite(self, value: float, of_header: bool) -> None:
-        place = (header_places if of_header else body_places)(self.CODEC)[5]
-        for phase, kappa in ((value, 1.0), (0.0, value)):
+    @pytest.mark.parametrize("place", [header_places(CODEC)[5], body_places(CODEC)[5]])
+    def test_values_that_are_not_finite(self, place: int) -> None:
+        for phase, kappa in ((np.nan, 1.0), (np.inf, 1.0), (0.0, np.nan), (0.0, -np.inf)):
             page = np.zeros(SHAPE), np.ones(SHAPE)
             page[0].flat[place], page[1].flat[place] = phase, kappa
-            with pytest.raises(PageError, match="phase, concentration: got NaN, infinity"):
+            with refused("phase, concentration", kind=PageError):
                 self.CODEC.decode(*page)
 
     @pytest.mark.parametrize("levels", [2, 16, 256])
     def test_a_page_without_room(self, levels: int) -> None:
-        code = Code(levels=levels, coded_bits=1, rate_per_mille=700)
+        code, sizes, last = Code(levels=levels, coded_bits=1, rate_per_mille=700), list[int](), 0
         count = header_symbols(levels)
-        for symbols in (1, count - 1, count):
-            with pytest.raises(InvalidInputError, match=f"page: got {symbols} data symbols, wanted more than"):
-                PageCodec(code, np.zeros((1, symbols), bool))
-        # the smallest page that holds a byte: no smaller one does, every larger one does
-        symbols = count + 1
-        while True:
+        for symbols in (1, count, *range(count + 1, count + 400)):
+            pilots = np.zeros((1, symbols), bool)
+            if symbols <= count:
+                with refused("page", f"{symbols} data symbols"):
+                    PageCodec(code, pilots)
+                continue
             with suppress(InvalidInputError):
-                sizes = [PageCodec(code, np.zeros((1, symbols), bool)).user_bytes]
-                break
-            with pytest.raises(InvalidInputError, match=f"page: got {symbols} data symbols, wanted more, to hold user"):
-                PageCodec(code, np.zeros((1, symbols), bool))
-            symbols += 1
-        sizes += [PageCodec(code, np.zeros((1, symbols + more), bool)).user_bytes for more in range(1, 50)]
+                sizes.append(PageCodec(code, pilots).user_bytes)
+                last = symbols
+        assert last == count + 399
         assert sizes[0] == 1
-        assert sizes == sorted(sizes)
+        assert np.all(np.diff(sizes) >= 0)
 
     def test_a_page_that_is_all_parity(self) -> None:
-        with pytest.raises(InvalidInputError, match=r"data symbols, wanted more, to hold user bytes \(16 levels, .*32"):
+        with refused("page", "data symbols"):
             PageCodec(Code(levels=16, coded_bits=2, rate_per_mille=700, corrections=32), pilot_mask())

@@ -18,8 +18,7 @@ def random_word(data: int, corrections: int, seed: int) -> np.ndarray:
     return np.concatenate([symbols, parity(symbols, corrections)], axis=1)[0]
 
 
-@pytest.mark.parametrize("corrections", [1, 2, 7, 32])
-@pytest.mark.parametrize("data", [1, 2, 100, 1000])
+@pytest.mark.parametrize(("data", "corrections"), [(1, 1), (2, 32), (100, 7), (1000, 2)])
 def test_parity_is_the_librarys(data: int, corrections: int) -> None:
     rng = np.random.default_rng([data, corrections])
     symbols = rng.integers(0, 4096, (3, data))
@@ -53,7 +52,7 @@ def spoil(word: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize(("data", "corrections"), [(1, 1), (30, 1), (30, 4), (200, 8), (60, 32)])
 def test_up_to_t_wrong_symbols_are_mended_wherever_they_are(data: int, corrections: int) -> None:
     rng = np.random.default_rng([data, corrections])
-    for trial in range(20):
+    for trial in range(5):
         word = random_word(data, corrections, trial)
         for count in {0, 1, corrections // 2, corrections}:
             found = repair(spoil(word, count, rng), corrections)
@@ -66,22 +65,7 @@ def test_up_to_t_wrong_symbols_are_mended_wherever_they_are(data: int, correctio
 def test_more_wrong_symbols_are_noticed(data: int, corrections: int) -> None:
     # a wrong repair needs another word within t symbols: 1 in t! x (4095 / length)^t, 1 in 7 x 10^9 at most
     rng = np.random.default_rng([data, corrections])
-    for trial in range(20):
+    for trial in range(5):
         word = random_word(data, corrections, trial)
         for count in (corrections + 1, corrections + 2, 2 * corrections, len(word)):
             assert repair(spoil(word, count, rng), corrections) is None
-
-
-def test_a_repair_beyond_t_is_never_more_than_another_word() -> None:
-    """One correction is often wrong about two wrong symbols: whoever mends must look at a checksum."""
-    rng, misled = np.random.default_rng(0), 0
-    for trial in range(200):
-        word = random_word(1000, 1, trial)
-        found = repair(spoil(word, 2, rng), 1)
-        if found is not None:
-            misled += 1
-            data, wrong = found
-            assert wrong == 1
-            assert not np.array_equal(data, word[:1000])
-    # a syndrome of two wrong symbols looks like one at any of 4095 places, of which the word has 1002
-    assert 20 <= misled <= 80

@@ -15,14 +15,15 @@ from lightpage.codec.header import MOST_BYTES
 from lightpage.codec.page_bytes import PageBytes
 from lightpage.codec.volume import Volume, encode_volume, restore_group
 from lightpage.codec.volume_file import MOST_VOLUMES, VolumeFile, VolumeFiles, ranges
-from lightpage.errors import InvalidInputError, LostDataError, SurroundingsError
+from lightpage.errors import LostDataError, SurroundingsError
 from tests.lightpage.codec.light import codec_of, noisy
 from tests.lightpage.full_disk import full_disk
+from tests.lightpage.refused import refused
 
 VOLUMES = [
     Volume(7, file_bytes, 10, *group)
-    for file_bytes in (0, 1, 9, 10, 11, 99, 100, 101, 249, 250, 251)
-    for group in ((1, 0), (1, 2), (5, 3), (4, 0), (10, 2), (25, 1), (200, 55))
+    for file_bytes in (0, 1, 10, 11, 249, 250, 251)
+    for group in ((1, 0), (1, 2), (5, 3), (10, 2), (200, 55))
 ]
 
 
@@ -51,38 +52,24 @@ class TestNumbers:
             assert volume.data_in(group) == sum(kind == "data" for _, kind, _ in mine)
         beyond = volume.groups * volume.group_pages
         assert [number for number in range(beyond + 300) if volume.holds(number)] == numbers
-
-    @pytest.mark.parametrize("volume", VOLUMES)
-    def test_each_page_is_followed_by_the_next_that_is_written(self, volume: Volume) -> None:
-        numbers = [number for number, _, _ in listing(volume)]
         assert [volume.following(number) for number in numbers] == [*numbers[1:], None]
 
     def test_it_says_what_a_file_of_pages_keeps(self) -> None:
-        assert Volume(7, 99, 10, 5, 3).to_json() == {
-            "volume": 7,
-            "file_bytes": 99,
-            "page_bytes": 10,
-            "data_pages": 5,
-            "parity_pages": 3,
-            "checksum": 0,
-        }
+        names = "volume", "file_bytes", "page_bytes", "data_pages", "parity_pages", "checksum"
+        assert Volume(7, 99, 10, 5, 3).to_json() == dict(zip(names, (7, 99, 10, 5, 3, 0), strict=True))
 
     @pytest.mark.parametrize(
-        ("change", "complaint"),
+        ("change", "subject", "got"),
         [
-            ({"id": -1}, "volume id: got -1"),
-            ({"id": 1 << 32}, "volume id: got 4294967296"),
-            ({"file_bytes": -1}, "file: got -1 bytes"),
-            ({"file_bytes": MOST_BYTES + 1}, f"file: got {MOST_BYTES + 1} bytes"),
-            ({"data_pages": 0}, "group of pages: got 0 data and 3 parity pages"),
-            ({"parity_pages": -1}, "group of pages: got 5 data and -1 parity pages"),
-            ({"data_pages": 253}, "group of pages: got 253 data and 3 parity pages"),
+            ({"id": -1}, "volume id", -1),
+            ({"file_bytes": MOST_BYTES + 1}, "file", MOST_BYTES + 1),
+            ({"data_pages": 0}, "group of pages", "0 data and 3 parity"),
             # 2^24 pages in groups of 8 hold 5 x 2^21 data pages
-            ({"file_bytes": 10 * 5 * (1 << 21) + 1}, f"file: got {(1 << 24) + 8} pages"),
+            ({"file_bytes": 10 * 5 * (1 << 21) + 1}, "file", (1 << 24) + 8),
         ],
     )
-    def test_what_cannot_be_numbered_is_refused(self, change: dict[str, int], complaint: str) -> None:
-        with pytest.raises(InvalidInputError, match=complaint):
+    def test_what_cannot_be_numbered_is_refused(self, change: dict[str, int], subject: str, got: object) -> None:
+        with refused(subject, got):
             replace(Volume(7, 99, 10, 5, 3), **change)
 
     def test_the_largest_volume_is_allowed(self) -> None:
@@ -146,22 +133,12 @@ def collect(path: Path, pages: Iterator[PageBytes] | list[PageBytes]) -> tuple[b
 
 
 class TestEncoding:
-    def test_pages_hold_the_file_and_its_parity(self, written: Written) -> None:
-        for number, kind, place in listing(written.volume):
-            page = written.pages[number]
-            assert page.header is not None
-            assert (page.header.volume, page.header.volume_bytes) == (0xCAFE, len(written.file))
-            assert page.header.code_id == CODEC.code.id
-            assert page.file == written.volume.facts
-            if kind == "data":
-                assert page.data == written.file[place * SIZE :][:SIZE].ljust(SIZE, b"\0")
-
     def test_each_group_is_restored_from_any_of_its_pages(self, written: Written) -> None:
         volume, rng = written.volume, np.random.default_rng(2)
         for group in range(volume.groups):
             numbers = volume.numbers_in(group)
             data = [written.pages[number].data for number in numbers[: volume.data_in(group)]]
-            for _ in range(20):
+            for _ in range(8):
                 lost = rng.choice(numbers, 3, replace=False)
                 left = {n: written.pages[n].data or b"" for n in numbers if n not in lost}
                 assert restore_group(volume, group, left) == data
@@ -170,41 +147,33 @@ class TestEncoding:
                     assert restore_group(volume, group, left) is None
 
     def test_a_file_is_read_from_where_it_stands(self, written: Written) -> None:
-        file = BytesIO(b"before" + written.file)
-        file.seek(6)
-        first = next(encode_volume(CODEC, written.volume, file, PILOTS))
-        again = next(encode_volume(CODEC, written.volume, BytesIO(written.file), PILOTS))
+        files = BytesIO(b"before" + written.file), BytesIO(written.file)
+        files[0].seek(6)
+        first, again = (next(encode_volume(CODEC, written.volume, file, PILOTS)) for file in files)
         assert np.array_equal(first, again)
 
-    @pytest.mark.parametrize("missing", [1, 5, 6, SIZE + 5, 22 * SIZE + 5])
+    @pytest.mark.parametrize("missing", [1, 5, 6, SIZE + 5])
     def test_a_file_that_shrank_is_noticed(self, written: Written, missing: int) -> None:
-        size = len(written.file)
-        with pytest.raises(InvalidInputError, match=rf"file: got {size - missing} bytes, wanted {size}, as it had"):
+        with refused("file", len(written.file) - missing):
             list(encode_volume(CODEC, written.volume, BytesIO(written.file[:-missing]), PILOTS))
 
-    @pytest.mark.parametrize("more", [1, SIZE, 1000])
+    @pytest.mark.parametrize("more", [1, SIZE])
     def test_a_file_that_grew_is_noticed(self, written: Written, more: int) -> None:
-        with pytest.raises(InvalidInputError, match=rf"file: got more bytes, wanted {len(written.file)}, as it had"):
+        with refused("file", "more bytes"):
             list(encode_volume(CODEC, written.volume, BytesIO(written.file + bytes(more)), PILOTS))
 
 
 class TestFile:
-    def test_pages_in_any_order_give_the_file(self, written: Written, tmp_path: Path) -> None:
+    def test_pages_in_any_order_and_repeated_give_the_file(self, written: Written, tmp_path: Path) -> None:
         pages = list(written.pages.values())
-        for seed in range(3):
-            order = np.random.default_rng(seed).permutation(len(pages))
-            got, volume_file = collect(tmp_path / "file", [pages[i] for i in order])
-            assert got == written.file
-            assert volume_file.volume == written.volume
-            assert volume_file.missing() == []
-
-    def test_repeated_pages_are_counted(self, written: Written, tmp_path: Path) -> None:
-        pages = list(written.pages.values())
-        got, volume_file = collect(tmp_path / "file", pages + pages[::2] + pages[::-1])
+        order = np.random.default_rng(0).permutation(len(pages))
+        got, volume_file = collect(tmp_path / "file", [*(pages[i] for i in order), *pages[::2], *pages[::-1]])
         assert got == written.file
+        assert volume_file.volume == written.volume
+        assert volume_file.missing() == []
         assert volume_file.repeated == len(pages[::2]) + len(pages)
 
-    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize("seed", range(2))
     def test_three_lost_pages_of_every_group_come_back(self, written: Written, tmp_path: Path, seed: int) -> None:
         rng, volume = np.random.default_rng(seed), written.volume
         lost = {int(n) for g in range(volume.groups) for n in rng.choice(volume.numbers_in(g), 3, replace=False)}
@@ -244,7 +213,7 @@ class TestFile:
             chosen(files).complete(lost)
         assert path.read_bytes() == written.file[:SIZE].ljust(len(written.file), b"\0")
 
-    @pytest.mark.parametrize("size", [0, 1, SIZE - 1, SIZE, SIZE + 1, 5 * SIZE, 5 * SIZE + 1])
+    @pytest.mark.parametrize("size", [0, 1, SIZE, SIZE + 1, 5 * SIZE])
     @pytest.mark.parametrize("group", [(5, 3), (1, 0), (3, 1)])
     def test_files_of_any_length(self, tmp_path: Path, size: int, group: tuple[int, int]) -> None:
         file = np.random.default_rng(size).bytes(size)
@@ -262,7 +231,7 @@ class TestFile:
                 assert {files.add(page) for page in case.pages.values()} == {case.volume}
             assert files.counts() == {case.volume: len(case.pages) for case in (others[0], written, others[1])}
             for asked in ((), (9,), (8,), (written.volume.id, 1)):
-                with pytest.raises(InvalidInputError, match=r"volume: got pages of 9:.* 51966:.*; 9:.*ID:CHECK"):
+                with refused("volume", f"{written.volume.id}:"):
                     files.chosen(*asked)
             assert files.chosen(9, others[1].volume.checksum).volume == others[1].volume
             files.chosen(written.volume.id).complete()
@@ -276,7 +245,7 @@ class TestFile:
             for number, page in written.pages.items():
                 files.add(page if number % 2 else replace(other.pages[number], file=page.file))
             assert chosen(files).restore().lost == ()
-            with pytest.raises(LostDataError, match="checksum as a file does not hold"):
+            with refused(kind=LostDataError):
                 chosen(files).complete()
         assert list(tmp_path.iterdir()) == []
 
@@ -284,7 +253,7 @@ class TestFile:
         path = tmp_path / "file"
         with VolumeFiles(path) as files, VolumeFiles(path) as second:
             files.add(written.pages[0])
-            with pytest.raises(InvalidInputError, match="a file that another process writes"):
+            with refused(".partial"):
                 second.add(written.pages[1])
             chosen(files).complete([1])
         assert path.exists()
@@ -294,7 +263,7 @@ class TestFile:
         other = replace(page, data=written.pages[5].data)
         with VolumeFiles(tmp_path / "file") as files:
             files.add(page)
-            with pytest.raises(InvalidInputError, match=r"volume 51966: page 6: got two pages of this number"):
+            with refused("volume 51966: page 6"):
                 files.add(other)
             assert chosen(files).repeated == 0
 
@@ -344,10 +313,7 @@ class TestFile:
         assert path.read_bytes() == b"earlier"
 
     def test_a_folder_that_is_not_there_is_refused(self, written: Written, tmp_path: Path) -> None:
-        with (
-            VolumeFiles(tmp_path / "no" / "file") as files,
-            pytest.raises(InvalidInputError, match=r"\.partial: got No such file.*wanted a file that can be w"),
-        ):
+        with VolumeFiles(tmp_path / "no" / "file") as files, refused(".partial", "No such file"):
             files.add(written.pages[0])
 
 
@@ -364,16 +330,13 @@ def make_file(path: Path, pages: list[PageBytes], room_for_pages: int, room_to_r
 class TestFullDisk:
     ENOUGH = 1 << 20
 
-    @pytest.mark.parametrize("room", [0, SIZE, 2 * SIZE + 10])
-    def test_pages_that_find_no_room_leave_nothing(self, written: Written, tmp_path: Path, room: int) -> None:
-        with pytest.raises(SurroundingsError, match=r"file .*file\..*partial: got .*wanted more room"):
-            make_file(tmp_path / "file", list(written.pages.values()), room, self.ENOUGH)
-        assert list(tmp_path.iterdir()) == []
-
-    def test_restored_pages_that_find_no_room_leave_nothing(self, written: Written, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("rooms", [(0, ENOUGH), (2 * SIZE + 10, ENOUGH), (ENOUGH, 5 * SIZE)])
+    def test_pages_that_find_no_room_leave_nothing(
+        self, written: Written, tmp_path: Path, rooms: tuple[int, int]
+    ) -> None:
         pages = [page for number, page in written.pages.items() if number not in (8, 9)]
-        with pytest.raises(SurroundingsError, match=r"file .*file\..*partial: got .*wanted more room"):
-            make_file(tmp_path / "file", pages, self.ENOUGH, 5 * SIZE)
+        with refused(".partial", kind=SurroundingsError):
+            make_file(tmp_path / "file", pages, *rooms)
         assert list(tmp_path.iterdir()) == []
 
     def test_a_file_that_cannot_be_completed_leaves_the_earlier_one(self, written: Written, tmp_path: Path) -> None:
@@ -381,7 +344,7 @@ class TestFullDisk:
         path.mkdir()  # no file can have this name
         with VolumeFiles(path) as files:
             files.add(written.pages[0])
-            with pytest.raises(InvalidInputError, match=r"file .*file: got .*wanted a file that can be completed"):
+            with refused("file"):
                 chosen(files).complete([1])
         assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from lightpage.device.profile import SHIPPED, Profile, load_profile, parse_profile
+from lightpage.device.profile import SHIPPED, load_profile, parse_profile
 from lightpage.errors import ProfileError
+from tests.lightpage.refused import refused
 
 
 @pytest.fixture
@@ -22,12 +23,9 @@ def test_a_shipped_profile_survives_the_round_trip_through_toml(name: str) -> No
     assert parse_profile(profile.to_toml()) == profile
 
 
-def test_a_name_with_quotes_and_backslashes_survives_the_round_trip() -> None:
-    profile = load_profile("bench").model_copy(update={"name": 'a "quoted\\" bench'})
-    assert parse_profile(profile.to_toml()) == profile
-
-
-@pytest.mark.parametrize("name", ["two\nlines", "tab\t", "delete\x7f", "bell\x07", "Ger\u00e4t \U0001f4bd"])
+@pytest.mark.parametrize(
+    "name", ['a "quoted\\"', "two\nlines", "tab\t", "delete\x7f", "bell\x07", "Ger\u00e4t \U0001f4bd"]
+)
 def test_a_name_of_any_characters_survives_it_too(name: str) -> None:
     profile = load_profile("bench").model_copy(update={"name": name})
     assert parse_profile(profile.to_toml()) == profile
@@ -45,16 +43,6 @@ def test_bench_is_the_paper_device_at_a_quarter_of_its_size() -> None:
     assert bench.pipe.width_m == pytest.approx(paper.pipe.width_m / 4, rel=2e-3)
     assert (bench.light, bench.slm) == (paper.light, paper.slm)
     assert (bench.page.rows, bench.page.columns, paper.page.rows, paper.page.columns) == (56, 87, 225, 350)
-
-
-@pytest.mark.parametrize("name", SHIPPED)
-def test_the_image_of_the_page_fits_on_the_camera(name: str) -> None:
-    profile = load_profile(name)
-    assert profile.page_width_m < profile.camera.columns_px * profile.camera.pitch_m
-    assert profile.page_height_m < profile.camera.rows_px * profile.camera.pitch_m
-    assert profile.page_width_m == pytest.approx(profile.page.columns * profile.symbol_pitch_m)
-    assert profile.page_shape == (profile.page.rows, profile.page.columns)
-    assert profile.frame_shape == (profile.camera.rows_px, profile.camera.columns_px)
 
 
 @pytest.mark.parametrize(
@@ -82,19 +70,20 @@ def test_the_image_of_the_page_fits_on_the_camera(name: str) -> None:
         ("[light]", "[lamp]", "light"),
         ("columns = 87", "columns = 100000", "page.columns"),
         ("length_m = 0.01875", "length_m = 1e300", "pipe.length_m"),
-        ("length_m = 0.01875", "length_m = 50.0", "pipe.length_m, pipe.width_m: .* wall .* times"),
+        ("length_m = 0.01875", "length_m = 50.0", "pipe.length_m, pipe.width_m"),
     ],
 )
 def test_a_bad_profile_is_refused_and_the_key_named(bench_text: str, old: str, new: str, key: str) -> None:
     assert bench_text.count(old) == 1
-    with pytest.raises(ProfileError, match=rf"my\.toml: .*{key}"):
+    with refused("my.toml", key, ProfileError):
         parse_profile(bench_text.replace(old, new), "my.toml")
 
 
 def test_every_offending_key_is_named_at_once(bench_text: str) -> None:
     bad = bench_text.replace("wavelength_m = 5.32e-07", "wavelength_m = nan").replace("rows = 56", "rows = -1")
-    with pytest.raises(ProfileError, match=r"light\.wavelength_m.*page\.rows"):
-        parse_profile(bad)
+    for key in ("light.wavelength_m", "page.rows"):
+        with refused(got=key, kind=ProfileError):
+            parse_profile(bad)
 
 
 @pytest.mark.parametrize("text", ["", "not = [toml", "\x00", "[light]\n[light]"])
@@ -113,11 +102,5 @@ def test_a_missing_file_an_unreadable_one_and_a_folder_are_refused(tmp_path: Pat
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe\x00")
     for path in (tmp_path / "none.toml", binary, tmp_path):
-        with pytest.raises(ProfileError, match="wanted a readable TOML file"):
+        with refused(str(path), kind=ProfileError):
             load_profile(path)
-
-
-def test_a_profile_cannot_be_changed_in_place() -> None:
-    profile: Profile = load_profile("bench")
-    with pytest.raises(ValueError, match="frozen"):
-        profile.name = "other"

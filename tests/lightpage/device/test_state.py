@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 from lightpage.device.profile import load_profile, to_toml
 from lightpage.device.state import Device, Geometry, draw_device, load_device, parse_device
 from lightpage.errors import ProfileError
+from tests.lightpage.refused import refused
 
 
 def test_device_survives_the_round_trip_through_toml(tmp_path: Path) -> None:
@@ -33,80 +33,61 @@ def test_settings_change_what_they_name_and_nothing_else() -> None:
     assert device.geometry.pipe_angle_deg == -0.3
     assert device.homodyne.quadrature_sign == -1
     assert device.sensor.bit_depth == 12
-    assert (
-        device.with_settings(["geometry.pipe_angle_deg=-0.6", "homodyne.quadrature_sign=1", "sensor.bit_depth=8"])
-        == Device()
-    )
+    back = ["geometry.pipe_angle_deg=-0.6", "homodyne.quadrature_sign=1", "sensor.bit_depth=8"]
+    assert device.with_settings(back) == Device().with_settings([]) == Device()
 
 
-def test_no_settings_change_nothing() -> None:
-    assert Device().with_settings([]) == Device()
+NO_SETTINGS = ["", "=", "geometry.pipe_angle_deg", "pipe_angle_deg=1", "geometry=1", "geometry.colour=1", "lamp=1"]
+BAD_VALUES = {
+    "geometry.pipe_angle_deg": ("", "one", "nan", "inf", "[1]", "60"),
+    "geometry.page_shift_x_px": ("1e6",),
+    "geometry.focal_length_relative_error": ("0.7",),
+    "homodyne.quadrature_sign": ("0",),
+    "homodyne.quadrature_gain": ("-1",),
+    "sensor.bit_depth": ("7", "17", "8.5"),
+    "sensor.full_well_e": ("0", "1e300"),
+    "sensor.read_noise_e": ("-1",),
+    "sensor.exposure_relative": ("0",),
+    "slm.falloff_relative": ("1.0",),
+    "drift.piston_rad": ("-0.1", "1e308"),
+    "reference.amplitude_ratio": ("0",),
+}
 
 
 @pytest.mark.parametrize(
-    "setting",
-    [
-        "geometry.pipe_angle_deg",
-        "pipe_angle_deg=1",
-        "geometry=1",
-        "geometry.colour=1",
-        "lamp.power=1",
-        "=",
-        "",
-        "geometry.pipe_angle_deg=",
-        "geometry.pipe_angle_deg=one",
-        "geometry.pipe_angle_deg=nan",
-        "geometry.pipe_angle_deg=inf",
-        "geometry.pipe_angle_deg=[1]",
-        "geometry.focal_length_relative_error=0.7",
-        "homodyne.quadrature_sign=0",
-        "homodyne.quadrature_gain=-1",
-        "sensor.bit_depth=7",
-        "sensor.bit_depth=17",
-        "sensor.bit_depth=8.5",
-        "sensor.full_well_e=0",
-        "sensor.read_noise_e=-1",
-        "sensor.exposure_relative=0",
-        "slm.falloff_relative=1.0",
-        "drift.piston_rad=-0.1",
-        "reference.amplitude_ratio=0",
-    ],
+    "setting", [*NO_SETTINGS, *(f"{key}={value}" for key in BAD_VALUES for value in BAD_VALUES[key])]
 )
-def test_a_bad_setting_is_refused_and_says_what_is_wrong(setting: str) -> None:
-    with pytest.raises(ProfileError, match="wanted"):
+def test_a_bad_setting_is_refused_and_named(setting: str) -> None:
+    with pytest.raises(ProfileError) as caught:
         Device().with_settings([setting])
+    assert setting.partition("=")[0] in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("setting", "told"),
     [
-        ("geometry.pipe_angel_deg=1", "perhaps geometry.pipe_angle_deg"),
-        ("pipe_angle_deg=1", "perhaps geometry.pipe_angle_deg"),
-        ("sensor.full_well=1", "perhaps sensor.full_well_e"),
-        ("drift.colour=1", "KEY being one of piston_rad, shift_px"),
-        ("weather=1", "TABLE being one of geometry, "),
+        ("geometry.pipe_angel_deg=1", "geometry.pipe_angle_deg"),
+        ("pipe_angle_deg=1", "geometry.pipe_angle_deg"),
+        ("sensor.full_well=1", "sensor.full_well_e"),
+        ("drift.colour=1", "piston_rad, shift_px"),
+        ("weather=1", "geometry, "),
     ],
 )
 def test_an_unknown_setting_names_what_may_have_been_meant(setting: str, told: str) -> None:
-    with pytest.raises(ProfileError, match=re.escape(told)) as caught:
+    with refused(kind=ProfileError, wanted=told):
         Device().with_settings([setting])
-    assert len(str(caught.value)) < 250
 
 
 @pytest.mark.parametrize(
     "text",
-    ["[geometry]\npipe_angle_deg = nan", "[geometry]\ncolour = 1", "[lamp]\npower = 1", "not toml"],
+    [None, "[geometry]\npipe_angle_deg = nan", "[geometry]\ncolour = 1", "[lamp]\npower = 1", "not toml"],
 )
-def test_a_bad_device_file_is_refused_and_named(tmp_path: Path, text: str) -> None:
+def test_a_bad_device_file_and_one_that_is_not_there_are_refused_and_named(tmp_path: Path, text: str | None) -> None:
     path = tmp_path / "device.toml"
-    path.write_text(text, "utf-8")
-    with pytest.raises(ProfileError, match=r"device\.toml"):
+    if text is not None:
+        path.write_text(text, "utf-8")
+    with refused("device.toml", kind=ProfileError):
         load_device(path)
-
-
-def test_a_missing_device_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ProfileError, match=r"none\.toml"):
-        load_device(tmp_path / "none.toml")
 
 
 def test_drawn_devices_fill_the_capture_range_and_stay_inside() -> None:
@@ -138,20 +119,6 @@ def test_drawn_devices_fill_the_capture_range_and_stay_inside() -> None:
 def test_the_same_seed_draws_the_same_device() -> None:
     assert draw_device(np.random.default_rng(7)) == draw_device(np.random.default_rng(7))
     assert draw_device(np.random.default_rng(7)) != draw_device(np.random.default_rng(8))
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        "geometry.pipe_angle_deg=60",
-        "geometry.page_shift_x_px=1e6",
-        "sensor.full_well_e=1e300",
-        "drift.piston_rad=1e308",
-    ],
-)
-def test_states_that_no_device_can_be_in_are_named(setting: str) -> None:
-    with pytest.raises(ProfileError, match=setting.partition("=")[0].replace(".", r"\.")):
-        Device().with_settings([setting])
 
 
 def test_a_pipe_deviates_from_the_angle_of_its_profile_unless_its_own_is_given() -> None:

@@ -8,6 +8,7 @@ import pytest
 from lightpage.errors import PageError
 from lightpage.metrics.information import achievable_rate, own_information
 from lightpage.page.pilots import Pilots, estimate_piston, estimate_trust, read_pilots, remove_piston, without_outliers
+from tests.lightpage.refused import refused
 from tests.runtime import toy
 
 
@@ -51,32 +52,30 @@ def test_phase_stays_within_half_a_turn() -> None:
 
 
 def test_pilots_of_another_page_shape_are_refused() -> None:
-    with pytest.raises(PageError, match="pilot positions"):
+    with refused("pilot positions", kind=PageError):
         estimate_piston(np.zeros((2, 3, 3)), Pilots.of_profile(toy.PROFILE, 8))
-    with pytest.raises(PageError, match="pilot positions"):
+    with refused("pilot positions", kind=PageError):
         Pilots.of_symbols(np.ones((3, 3), bool), np.zeros(toy.PAGE, np.uint8), 8)
-    with pytest.raises(PageError, match="pilots"):
+    with refused("pilots", kind=PageError):
         Pilots.of_symbols(np.zeros(toy.PAGE, bool), np.zeros(toy.PAGE, np.uint8), 8)
 
 
+def noisy(kappa: float, claim: float, seed: int) -> tuple[np.ndarray, Pilots]:
+    """p of a page of 16 levels whose errors have concentration `kappa` where `claim` is claimed."""
+    rng = np.random.default_rng(seed)
+    symbols = toy.symbols_of(16, seed)[0]
+    mask = np.zeros(toy.PAGE, bool)
+    mask.flat[rng.choice(mask.size, 54, replace=False)] = True
+    phase = 2 * np.pi / 16 * symbols + rng.vonmises(0, kappa, toy.PAGE)
+    return claim * np.stack([np.cos(phase), np.sin(phase)]), Pilots.of_symbols(mask, symbols, 16)
+
+
 class TestTrust:
-    LEVELS = 16
-
-    @staticmethod
-    def noisy(kappa: float, claim: float, seed: int) -> tuple[np.ndarray, Pilots]:
-        """p of a page whose errors have concentration `kappa` where `claim` is claimed."""
-        rng = np.random.default_rng(seed)
-        symbols = toy.symbols_of(16, seed)[0]
-        mask = np.zeros(toy.PAGE, bool)
-        mask.flat[rng.choice(mask.size, 54, replace=False)] = True
-        phase = 2 * np.pi / 16 * symbols + rng.vonmises(0, kappa, toy.PAGE)
-        return claim * np.stack([np.cos(phase), np.sin(phase)]), Pilots.of_symbols(mask, symbols, 16)
-
     @pytest.mark.parametrize(("kappa", "claim"), [(400, 400), (400, 4000), (40, 400), (4, 400)])
     def test_it_takes_an_over_claim_back(self, kappa: float, claim: float) -> None:
         found = []
         for seed in range(40):
-            p, pilots = self.noisy(kappa, claim, seed)
+            p, pilots = noisy(kappa, claim, seed)
             found.append(estimate_trust(p, pilots, estimate_piston(p, pilots).angle_rad))
         # n pilots show n - 1 times the over-claim; the credit of 20 more pulls that towards one
         over = 1 if claim == kappa else claim / (kappa - 0.5 if kappa > 4 else kappa * 0.86)
@@ -85,19 +84,17 @@ class TestTrust:
         assert max(found) <= 1
 
     def test_pilots_that_are_better_than_claimed_change_nothing(self) -> None:
-        p, pilots = self.noisy(4000, 40, 0)
+        p, pilots = noisy(4000, 40, 0)
         assert estimate_trust(p, pilots, estimate_piston(p, pilots).angle_rad) == 1
 
     def test_wrong_pilots_leave_no_trust(self) -> None:
-        p, pilots = self.noisy(400, 400, 0)
+        p, pilots = noisy(400, 400, 0)
         wrong = Pilots(pilots.mask, np.roll(pilots.phases, 1))
         assert estimate_trust(p, wrong, estimate_piston(p, wrong).angle_rad) < 0.01
 
-    @pytest.mark.parametrize("kappa", [100, 1000, 4000])
-    @pytest.mark.parametrize("outliers", [1, 2])
-    @pytest.mark.parametrize("off_rad", [1.5, 2.0, np.pi])
+    @pytest.mark.parametrize(("kappa", "outliers", "off_rad"), [(100, 1, 1.5), (1000, 2, np.pi), (4000, 2, 1.5)])
     def test_few_dead_places_cost_nothing(self, kappa: float, outliers: int, off_rad: float) -> None:
-        p, pilots = self.noisy(kappa, kappa, 0)
+        p, pilots = noisy(kappa, kappa, 0)
         phases = pilots.phases.copy()
         phases[:outliers] += off_rad
         broken = Pilots(pilots.mask, phases)
@@ -108,13 +105,13 @@ class TestTrust:
         before = estimate_trust(p, pilots, whole.angle_rad)
         assert estimate_trust(p, left, piston.angle_rad) == pytest.approx(before, abs=0.05)
 
-    @pytest.mark.parametrize(("kappa", "claim"), [(400, 400), (400, 4000), (40, 400), (4, 400)])
+    @pytest.mark.parametrize(("kappa", "claim"), [(400, 400), (4, 400)])
     def test_pilots_of_a_sound_page_all_count(self, kappa: float, claim: float) -> None:
-        kept = [len(without_outliers(*self.noisy(kappa, claim, seed)).phases) for seed in range(40)]
+        kept = [len(without_outliers(*noisy(kappa, claim, seed)).phases) for seed in range(40)]
         assert np.mean(kept) > 53.9
 
     def test_a_device_that_changed_in_part_is_not_excused(self) -> None:
-        p, pilots = self.noisy(400, 400, 0)
+        p, pilots = noisy(400, 400, 0)
         phases = pilots.phases.copy()
         phases[:10] += 2.0
         changed = Pilots(pilots.mask, phases)
@@ -126,12 +123,8 @@ class TestTrust:
 class TestCheck:
     """What a decoder claims of its pilots, held against what they are."""
 
-    @staticmethod
-    def page(kappa: float, claim: float, seed: int = 0) -> tuple[np.ndarray, Pilots]:
-        return TestTrust.noisy(kappa, claim, seed)
-
     def test_the_bits_are_those_of_the_metrics_at_levels_too_fine_to_matter(self) -> None:
-        p, pilots = self.page(30, 30)
+        p, pilots = noisy(30, 30, 0)
         check = read_pilots(p, pilots).check
         phase, kappa = np.arctan2(p[1], p[0])[pilots.mask], np.hypot(*p)[pilots.mask]
         assert check.claimed_bits == pytest.approx(float(own_information(phase, kappa, 256).mean()), abs=1e-6)
@@ -142,27 +135,27 @@ class TestCheck:
 
     @pytest.mark.parametrize("kappa", [3, 30, 300, 3000])
     def test_true_claims_are_confirmed_and_no_recalibration_is_due(self, kappa: float) -> None:
-        checks = [read_pilots(*self.page(kappa, kappa, seed)).check for seed in range(40)]
+        checks = [read_pilots(*noisy(kappa, kappa, seed)).check for seed in range(40)]
         assert all(check.confirmed for check in checks)
         assert np.mean([check.share for check in checks]) == pytest.approx(1, abs=0.05)
         if kappa >= 30:  # in dimmer light few pilots tell little
             assert all(check.sound and not check.recalibration_due for check in checks)
 
     def test_a_device_that_has_drifted_is_answered_and_a_recalibration_is_due(self) -> None:
-        checks = [read_pilots(*self.page(30, 3000, seed)).check for seed in range(40)]
+        checks = [read_pilots(*noisy(30, 3000, seed)).check for seed in range(40)]
         assert all(check.confirmed and check.recalibration_due for check in checks)
 
     def test_claims_of_which_little_is_left_are_not_confirmed(self) -> None:
-        checks = [read_pilots(*self.page(1.5, 3000, seed)).check for seed in range(40)]
+        checks = [read_pilots(*noisy(1.5, 3000, seed)).check for seed in range(40)]
         assert not any(check.confirmed for check in checks)
 
     @pytest.mark.parametrize("claim", [0.05, 1, 30, 3000])
     def test_noise_is_never_confirmed_whatever_it_claims(self, claim: float) -> None:
-        checks = [read_pilots(*self.page(0, claim, seed)).check for seed in range(400)]
+        checks = [read_pilots(*noisy(0, claim, seed)).check for seed in range(100)]
         assert not any(check.confirmed for check in checks)
 
     def test_a_page_that_claims_nothing_confirms_nothing(self) -> None:
-        _, pilots = self.page(1, 1)
+        _, pilots = noisy(1, 1, 0)
         check = read_pilots(np.zeros((2, *toy.PAGE)), pilots).check
         assert check.claimed_bits == check.share == 0
         assert not check.confirmed

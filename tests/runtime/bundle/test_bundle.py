@@ -59,7 +59,7 @@ def test_a_flipped_byte_in_any_file_of_a_folder_is_refused(toy_folder: Path, tmp
 def test_a_flipped_byte_anywhere_in_a_zip_is_refused_or_changes_nothing(toy_zip: Path, tmp_path: Path) -> None:
     data = toy_zip.read_bytes()
     refused = 0
-    places = range(0, len(data), max(1, len(data) // 400))
+    places = range(0, len(data), max(1, len(data) // 150))
     for place in places:
         damaged = bytearray(data)
         damaged[place] ^= 1 << (place % 8)
@@ -75,11 +75,12 @@ def test_a_flipped_byte_anywhere_in_a_zip_is_refused_or_changes_nothing(toy_zip:
     assert refused > 0.8 * len(places)
 
 
-def test_a_truncated_zip_is_refused(toy_zip: Path, tmp_path: Path) -> None:
-    data = toy_zip.read_bytes()
-    for size in (0, 10, len(data) // 2, len(data) - 1):
-        path = tmp_path / f"{size}.zip"
-        path.write_bytes(data[:size])
+def test_what_is_no_whole_zip_is_refused(toy_zip: Path, tmp_path: Path) -> None:
+    data, path = toy_zip.read_bytes(), tmp_path / "cut.zip"
+    with pytest.raises(BundleError, match="nothing"):
+        Bundle.open(path)
+    for content in (b"", data[:10], data[: len(data) // 2], data[:-1], b"not a zip at all", b"PK\x03\x04 but no more"):
+        path.write_bytes(content)
         with pytest.raises(BundleError, match="zip"):
             Bundle.open(path)
 
@@ -99,22 +100,19 @@ def test_an_unlisted_file_is_named(toy_zip: Path, toy_folder: Path, tmp_path: Pa
         Bundle.open(folder)
 
 
-def test_a_newer_schema_is_refused_by_number(toy_zip: Path, tmp_path: Path) -> None:
+def test_a_newer_schema_or_a_wrong_key_says_which(toy_zip: Path, tmp_path: Path) -> None:
     text = json.loads(zipfile.ZipFile(toy_zip).read(MANIFEST)) | {"schema_version": 2, "something_new": True}
     with pytest.raises(BundleError, match="schema_version: got 2"):
         Bundle.open(rewrite_zip(toy_zip, tmp_path / "newer.zip", {MANIFEST: json.dumps(text).encode()}))
+    manifest = toy.manifest().model_copy(update={"camera_bit_depth": 99})
+    with pytest.raises(BundleError, match="camera_bit_depth"):
+        parse_manifest(manifest.to_json(), "manifest")
 
 
 @pytest.mark.parametrize("text", [b"", b"[]", b"{", b"\xff\xfe", b'{"format": "other"}', b"[" * 100_000, b"NaN"])
 def test_a_foreign_manifest_is_refused(text: bytes) -> None:
     with pytest.raises(BundleError):
         parse_manifest(text, "manifest")
-
-
-def test_a_manifest_with_a_wrong_key_says_which() -> None:
-    manifest = toy.manifest().model_copy(update={"camera_bit_depth": 99})
-    with pytest.raises(BundleError, match="camera_bit_depth"):
-        parse_manifest(manifest.to_json(), "manifest")
 
 
 LITTER = [".DS_Store", "__MACOSX/._manifest.json", "._decoder.onnx", "Thumbs.db", "desktop.ini", ".hidden"]
@@ -176,25 +174,18 @@ def test_links_and_folders_inside_are_refused(toy_zip: Path, toy_folder: Path, t
     os.symlink(toy_folder / "twin.onnx", folder / "twin.onnx")
     with pytest.raises(BundleError, match="link"):
         Bundle.open(folder)
-    (folder / "twin.onnx").unlink()
-    (folder / "twin.onnx").mkdir()
-    with pytest.raises(BundleError, match=r"twin\.onnx"):
-        Bundle.open(folder)
+    for make in (os.mkdir, os.mkfifo):
+        os.unlink(folder / "twin.onnx") if make is os.mkdir else os.rmdir(folder / "twin.onnx")
+        make(folder / "twin.onnx")
+        with pytest.raises(BundleError, match=r"twin\.onnx"):
+            Bundle.open(folder)
     path = rewrite_zip(toy_zip, tmp_path / "points.zip", {"twin.onnx": None})
     with zipfile.ZipFile(path, "a") as archive:
         entry = zipfile.ZipInfo("twin.onnx")
         entry.external_attr = (stat.S_IFLNK | 0o777) << 16
         archive.writestr(entry, "/etc/passwd")
-    with pytest.raises(BundleError, match="a link or special file"):
+    with pytest.raises(BundleError, match="special file"):
         Bundle.open(path)
-
-
-def test_a_pipe_in_a_folder_does_not_hang_the_loader(toy_folder: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(toy_folder, tmp_path / "pipe")
-    (folder / "twin.onnx").unlink()
-    os.mkfifo(folder / "twin.onnx")
-    with pytest.raises(BundleError, match="plain file"):
-        Bundle.open(folder)
 
 
 def test_a_zip_bomb_is_stopped_at_the_limit(toy_zip: Path, tmp_path: Path) -> None:
@@ -207,40 +198,25 @@ def test_a_zip_bomb_is_stopped_at_the_limit(toy_zip: Path, tmp_path: Path) -> No
         read_files(many)
 
 
-@pytest.mark.parametrize("name", [TABLE, GOLDEN, PILOTS])
-def test_a_bomb_inside_a_file_is_stopped_before_it_unpacks(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("name", "member"), [(TABLE, "homodyne"), (GOLDEN, "p"), (PILOTS, "mask")])
+def test_a_bomb_inside_a_file_or_an_array_of_no_known_name_is_refused(
+    name: str, member: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    member = {TABLE: "homodyne", GOLDEN: "p", PILOTS: "mask"}[name]
+    odd = npz(mask=np.ones(toy.PAGE, bool), homodyne=np.zeros(2, np.float32), extra=np.zeros(2))
     bomb = npz(**{member: np.zeros(20_000_000, np.uint8)})
     assert len(bomb) < 100_000
-    bundle = Bundle.open(write_bundle(tmp_path / "bomb.zip", toy.manifest(), toy.files() | {name: bomb}))
-    monkeypatch.setattr("runtime.bundle.bundle.MAX_ARRAY_BYTES", 1_000_000)
-    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("unpacked"))
-    with pytest.raises(BundleError, match=rf"{name}: got 20000\d\d\d bytes unpacked, wanted at most 1000000"):
-        arrays_of(bundle, name)
-
-
-@pytest.mark.parametrize("name", [TABLE, GOLDEN, PILOTS])
-def test_an_array_of_no_known_name_is_refused(name: str, tmp_path: Path) -> None:
-    odd = npz(mask=np.ones(toy.PAGE, bool), homodyne=np.zeros(2, np.float32), extra=np.zeros(2))
-    bundle = Bundle.open(write_bundle(tmp_path / "odd.zip", toy.manifest(), toy.files() | {name: odd}))
-    with pytest.raises(BundleError, match="extra"):
-        arrays_of(bundle, name)
+    for content, named in ((odd, "extra"), (bomb, rf"{name}: got 20000\d\d\d")):
+        path = write_bundle(tmp_path / f"{named[:5]}.zip", toy.manifest(), toy.files() | {name: content})
+        bundle = Bundle.open(path)
+        if content is bomb:
+            monkeypatch.setattr("runtime.bundle.bundle.MAX_ARRAY_BYTES", 1_000_000)
+            monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("unpacked"))
+        with pytest.raises(BundleError, match=named):
+            arrays_of(bundle, name)
 
 
 def arrays_of(bundle: Bundle, name: str) -> object:
     return {TABLE: lambda: bundle.table, GOLDEN: lambda: bundle.golden, PILOTS: lambda: bundle.pilot_mask}[name]()
-
-
-@pytest.mark.parametrize("content", [b"", b"not a zip at all", b"PK\x03\x04 but no more"])
-def test_what_is_no_zip_is_refused(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "foreign.zip"
-    path.write_bytes(content)
-    with pytest.raises(BundleError, match="zip"):
-        Bundle.open(path)
-    with pytest.raises(BundleError, match="nothing"):
-        Bundle.open(tmp_path / "absent.zip")
 
 
 @pytest.mark.parametrize("name", ["twice.zip", "twice"])
@@ -281,16 +257,10 @@ def test_a_manifest_that_could_not_be_read_again_is_not_written(change: dict[str
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_table_may_hold_only_named_inputs(tmp_path: Path) -> None:
-    table = npz(other=np.zeros(2, np.float32))
-    path = write_bundle(tmp_path / "t.zip", toy.manifest(), toy.files() | {TABLE: table})
-    with pytest.raises(BundleError, match="other"):
-        _ = Bundle.open(path).table
-
-
-def test_pickled_arrays_are_never_loaded(tmp_path: Path) -> None:
+def test_a_table_may_hold_only_named_inputs_and_no_pickles(tmp_path: Path) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, homodyne=np.array([{"a": 1}], dtype=object))
-    path = write_bundle(tmp_path / "p.zip", toy.manifest(), toy.files() | {TABLE: buffer.getvalue()})
-    with pytest.raises(BundleError, match=r"table\.npz"):
-        _ = Bundle.open(path).table
+    for name, table in (("other", npz(other=np.zeros(2, np.float32))), (TABLE, buffer.getvalue())):
+        path = write_bundle(tmp_path / f"{name}.zip", toy.manifest(), toy.files() | {TABLE: table})
+        with pytest.raises(BundleError, match=name):
+            _ = Bundle.open(path).table

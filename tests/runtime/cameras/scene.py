@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +20,7 @@ from runtime.virtual_device.fake_camera import FakeCamera
 SENSOR = (96, 128)
 ADDRESS = "127.0.0.1"
 SERIAL = "CAM-I"
-WAIT_S = 5.0
+WAIT_S = 30.0
 """Bounds every wait for something that comes within milliseconds."""
 
 Counts = NDArray[np.unsignedinteger[Any]]
@@ -40,6 +39,7 @@ class Scene:
     fake: FakeCamera
     camera: AravisCamera
     seen: list[Counts]
+    pixel_format: str
 
     def take(self) -> Frame:
         """One edge, one frame."""
@@ -54,10 +54,11 @@ def scene(shape: tuple[int, int] = SENSOR, more_bytes: int = 0, **settings: Any)
     """A fake camera at ADDRESS, and a driver that is not armed yet."""
     given = {"address": ADDRESS, "trigger_source": "Line1", **settings}
     camera = AravisCamera(CameraSettings.model_validate(given), shape, "in-phase camera")
-    seen = [noise(camera._settings.pixel_format, 0)]
+    pixel_format = settings.get("pixel_format", "Mono8")
+    seen = [noise(pixel_format, 0)]
     with FakeCamera(ADDRESS, SERIAL, lambda: seen[0], SENSOR, more_bytes) as fake:
         try:
-            yield Scene(fake, camera, seen)
+            yield Scene(fake, camera, seen, pixel_format)
             fake.check()
         finally:
             camera.close()
@@ -68,11 +69,3 @@ def info_of(frame: Frame) -> FrameInfo:
     assert frame.status is FrameStatus.COMPLETE, frame.detail
     assert frame.info is not None
     return frame.info
-
-
-def until(true: Callable[[], bool]) -> None:
-    """Wait for it."""
-    end = time.monotonic() + WAIT_S
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.005)

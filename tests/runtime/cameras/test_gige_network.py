@@ -3,41 +3,67 @@
 from __future__ import annotations
 
 import socket
-import time
+import struct
+import threading
+from collections.abc import Iterator
 
 import pytest
 
 from runtime.cameras import gige_network
-from runtime.cameras.gige_network import CONTROL_PRIVILEGE, read_register, receive_buffer_problem, route_mtu
+from runtime.cameras.gige_network import CONTROL_PRIVILEGE, LARGEST_PACKET, read_register, receive_buffer_problem
 from runtime.errors import SourceError
-from tests.runtime.cameras.scene import ADDRESS, SENSOR, SERIAL, noise, scene
+
+LOCAL = "127.0.0.1"
 
 
-@pytest.mark.own_network
-def test_a_camera_says_whether_it_is_controlled() -> None:
-    with scene() as stage:
-        assert read_register(ADDRESS, CONTROL_PRIVILEGE) == 0
-        stage.camera.arm()
-        assert read_register(ADDRESS, CONTROL_PRIVILEGE)
-        stage.camera.close()
-        assert read_register(ADDRESS, CONTROL_PRIVILEGE) == 0
-        assert stage.fake.serial == SERIAL
-        assert noise("Mono8", 0).shape == SENSOR
+@pytest.fixture
+def camera(monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """A socket at which registers are asked for."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
+        made.bind((LOCAL, 0))
+        made.settimeout(60)
+        monkeypatch.setattr(gige_network, "PORT", made.getsockname()[1])
+        yield made
 
 
-@pytest.mark.own_network
-def test_silence_takes_no_longer_than_it_may() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as dumb:
-        dumb.bind((ADDRESS, gige_network.PORT))
-        started = time.monotonic()
-        assert read_register(ADDRESS, CONTROL_PRIVILEGE, timeout_s=0.05, tries=2) is None
-        assert 0.09 < time.monotonic() - started < 2
-    assert read_register(ADDRESS, CONTROL_PRIVILEGE) is None
+@pytest.mark.parametrize(
+    ("answer", "value"),
+    [
+        (struct.pack(">HHHHI", 0, 0x81, 4, 1, 0xABCD), 0xABCD),
+        (struct.pack(">HHHH", 0x8006, 0x81, 0, 1), 0),
+        (struct.pack(">HHHHI", 0, 0x83, 4, 1, 0xABCD), None),
+    ],
+)
+def test_a_register_is_asked_for_and_its_value_returned(
+    camera: socket.socket, answer: bytes, value: int | None
+) -> None:
+    asked: list[bytes] = []
+
+    def respond() -> None:
+        message, sender = camera.recvfrom(64)
+        asked.append(message)
+        camera.sendto(answer, sender)
+
+    other = threading.Thread(target=respond)
+    other.start()
+    assert read_register(LOCAL, CONTROL_PRIVILEGE, timeout_s=0.2 if value is None else 60, tries=1) == value
+    other.join(60)
+    assert asked == [bytes([0x42, 1]) + struct.pack(">HHHI", 0x80, 4, 1, 0x0A00)]
 
 
-@pytest.mark.own_network
+def test_silence_is_asked_three_times_and_is_no_answer(camera: socket.socket) -> None:
+    assert read_register(LOCAL, CONTROL_PRIVILEGE, timeout_s=0.01) is None
+    numbers = [struct.unpack(">H", camera.recv(64)[6:8])[0] for _ in range(3)]
+    assert numbers == [1, 2, 3]
+    camera.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        camera.recv(64)
+    camera.close()
+    assert read_register(LOCAL, CONTROL_PRIVILEGE) is None
+
+
 def test_packets_as_large_as_the_way_takes() -> None:
-    assert route_mtu(ADDRESS) == gige_network.LARGEST_PACKET
+    assert gige_network.route_mtu(LOCAL) == LARGEST_PACKET
 
 
 def test_a_name_that_nobody_knows_is_an_error() -> None:
@@ -46,8 +72,8 @@ def test_a_name_that_nobody_knows_is_an_error() -> None:
 
 
 def test_a_receive_buffer_that_is_too_small_names_the_setting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gige_network, "_may_read_packets", lambda: False)
+    monkeypatch.setattr(gige_network, "may_read_packets", lambda: False)
     assert receive_buffer_problem(2048) == ""
     assert "net.core.rmem_max=1000000000" in receive_buffer_problem(1_000_000_000)
-    monkeypatch.setattr(gige_network, "_may_read_packets", lambda: True)
+    monkeypatch.setattr(gige_network, "may_read_packets", lambda: True)
     assert receive_buffer_problem(1_000_000_000) == ""

@@ -4,22 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from lightpage.errors import FrameError, InvalidInputError
 from runtime.cameras.pixel_formats import bit_depth, pack, pixel_format, pixel_format_of, unpack, without_padding
 
-DEPTHS = {
-    "Mono8": 8,
-    "Mono10": 10,
-    "Mono12": 12,
-    "Mono14": 14,
-    "Mono16": 16,
-    "Mono10Packed": 10,
-    "Mono12Packed": 12,
-    "Mono10p": 10,
-    "Mono12p": 12,
-}
 BYTES = {
     "Mono8": [0x21, 0x43],
     "Mono10": [0x21, 0x03, 0x43, 0x02],
@@ -32,12 +20,8 @@ BYTES = {
     "Mono10p": [0x21, (0x321 >> 8) | (0x243 & 0x3F) << 2, 0x243 >> 6],
 }
 """Two pixels whose counts have the high bits of their place: of 12 bits 0xA21 and 0xB43."""
+DEPTHS = {name: int("".join(filter(str.isdigit, name))) for name in BYTES}
 FIRST_TWO = {8: (0x21, 0x43), 10: (0x321, 0x243), 12: (0xA21, 0xB43), 14: (0x2A21, 0x3B43), 16: (0xFA21, 0xEB43)}
-
-
-def bits_of(raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """All bits of a stream from the lowest one up."""
-    return np.unpackbits(raw, bitorder="little")
 
 
 def kind(depth: int) -> type[np.uint8] | type[np.uint16]:
@@ -65,14 +49,6 @@ def test_two_pixels_lie_where_the_standard_says(name: str) -> None:
     frame = np.array([FIRST_TWO[DEPTHS[name]]], kind(DEPTHS[name]))
     assert pack(frame, name).tolist() == BYTES[name]
     assert (unpack(np.array(BYTES[name], np.uint8), (1, 2), name) == frame).all()
-
-
-@pytest.mark.parametrize("name", ["Mono10p", "Mono12p"])
-def test_p_formats_are_a_stream_of_bits(name: str) -> None:
-    depth = DEPTHS[name]
-    raw = np.random.default_rng(1).integers(0, 256, 15 * depth, dtype=np.uint8)
-    places = bits_of(raw).reshape(-1, depth) @ (1 << np.arange(depth))
-    assert (unpack(raw, (1, places.size), name).ravel() == places).all()
 
 
 @pytest.mark.parametrize("pixels", [1, 2, 3, 5, 65_537, 65_539])

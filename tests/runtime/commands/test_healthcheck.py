@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import socket
-import threading
-import time
 from collections.abc import Iterator
 from concurrent import futures
 from dataclasses import dataclass
@@ -39,28 +37,23 @@ def server() -> Iterator[HealthServer]:
     grpc_server.stop(grace=None).wait(5)
 
 
-def test_a_serving_server_is_healthy(server: HealthServer) -> None:
+@pytest.mark.parametrize(
+    ("status", "service", "serving", "word"),
+    [
+        (SERVING, "", True, "SERVING"),
+        (NOT_SERVING, "", False, "NOT_SERVING"),
+        (NOT_SERVING, "lightpage.v1.Decoder", False, "NOT_SERVING"),
+        (None, "nobody.v1.Nothing", False, "NOT_FOUND"),
+    ],
+)
+def test_a_server_says_how_it_fares(
+    server: HealthServer, status: int | None, service: str, serving: bool, word: str
+) -> None:
     server.servicer.set("", SERVING)
-    assert is_serving(server.target) == (True, f"{server.target}: SERVING")
-
-
-def test_a_server_that_stopped_serving_is_not_healthy(server: HealthServer) -> None:
-    server.servicer.set("", NOT_SERVING)
-    serving, said = is_serving(server.target)
-    assert not serving
-    assert said.endswith("NOT_SERVING")
-
-
-def test_health_is_per_service(server: HealthServer) -> None:
-    server.servicer.set("lightpage.v1.Decoder", NOT_SERVING)
-    assert is_serving(server.target)[0]
-    assert not is_serving(server.target, service="lightpage.v1.Decoder")[0]
-
-
-def test_an_unknown_service_is_not_healthy(server: HealthServer) -> None:
-    serving, said = is_serving(server.target, service="nobody.v1.Nothing")
-    assert not serving
-    assert "NOT_FOUND" in said
+    if status is not None:
+        server.servicer.set(service, status)
+    found, said = is_serving(server.target, service=service)
+    assert (found, word in said) == (serving, True)
 
 
 def test_nobody_at_home_is_not_healthy() -> None:
@@ -73,14 +66,7 @@ def test_nobody_at_home_is_not_healthy() -> None:
 
 def test_a_silent_server_is_not_healthy_and_is_not_waited_for() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        hangup = threading.Timer(10.0, silent.close)
-        hangup.start()
-        began = time.monotonic()
-        serving, _ = is_serving(f"127.0.0.1:{silent.getsockname()[1]}", timeout_s=0.5)
-        took_s = time.monotonic() - began
-        hangup.cancel()
-    assert not serving
-    assert took_s < 5
+        assert not is_serving(f"127.0.0.1:{silent.getsockname()[1]}", timeout_s=0.2)[0]
 
 
 def test_the_exit_code_is_the_answer(server: HealthServer) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -14,25 +12,24 @@ import grpc
 import pytest
 from click.testing import CliRunner, Result
 
-from lightpage.errors import InvalidInputError
-from runtime.bundle.bundle import Bundle
+from lightpage.cli import main as cli_main
+from lightpage.cli.main import lightpage
+from lightpage.recording.reader import Recording
 from runtime.client.client import LightpageClient
 from runtime.commands.serve import serve
+from runtime.decoding.decoder import Decoder
+from runtime.errors import StoreError, UnconfirmedPageError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.service.settings import ServiceSettings
 from runtime.service.store import ModelStore
 from tests.runtime import toy
-from tests.runtime.commands.test_commands import ROOT, Served
+from tests.runtime.commands.test_commands import Served
 
 
 def printed(*arguments: str | Path, **environment: str) -> Result:
     return CliRunner().invoke(
-        serve,
-        [*map(str, arguments), "--print-config"],
-        env=environment,
-        standalone_mode=False,
-        catch_exceptions=False,
+        serve, [*map(str, arguments), "--print-config"], env=environment, standalone_mode=False, catch_exceptions=False
     )
 
 
@@ -47,9 +44,10 @@ def test_settings_come_from_the_file_the_environment_and_options(tmp_path: Path)
     assert (settings.service.threads, settings.service.tracking) == (2, False)
     assert (settings.metrics.port, settings.limits.stall_s) == (9100, 2.0)
     assert settings.self_calibration.pages == (3, 4)
-    assert "port = 9100  # option --metrics-port" in result.output
-    assert 'store = "models"  # environment LIGHTPAGE_STORE' in result.output
-    assert f"stall_s = 2.0  # file {file}" in result.output
+    lines = result.output.splitlines()
+    assert "port = 9100  # option --metrics-port" in lines
+    assert 'store = "models"  # environment LIGHTPAGE_STORE' in lines
+    assert f"stall_s = 2.0  # file {file}" in lines
 
 
 @pytest.mark.parametrize(
@@ -85,24 +83,24 @@ def test_every_option_is_above_the_environment(option: tuple[str, ...], table: s
     assert tomllib.loads(printed(*option, **environment).output)[table][key] == value
 
 
-def run(*arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "lightpage.cli.main", "serve", *map(str, arguments)]
-    env = {**os.environ, **environment}
-    return subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=60, check=False)
-
-
-def test_a_wrong_setting_ends_in_one_line_before_anything_is_opened(tmp_path: Path) -> None:
+def test_a_wrong_setting_ends_in_one_line_before_anything_is_opened(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "service.toml"
     file.write_text(f"[service]\nbundle = '{tmp_path}/none.zip'\nstore = '{tmp_path}/store'\n[limits]\nstal_s = 2")
-    done = run("--config", file)
-    assert (done.returncode, done.stdout) == (2, "")
-    (line,) = done.stderr.splitlines()
-    assert "unknown limits.stal_s, wanted limits.stall_s" in line
-    assert not (tmp_path / "store").exists()
-    done = run(LIGHTPAGE_LIMITS__STALL_S="soon")
-    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, "", 1)
-    with pytest.raises(InvalidInputError, match="--address"):
-        printed("--address", "nowhere")
+    for arguments, named in (
+        (["--config", str(file)], "limits.stal_s"),
+        ([], "LIGHTPAGE_LIMITS__STALL_S"),
+        (["--address", "nowhere"], "--address"),
+    ):
+        with monkeypatch.context() as patch:
+            if not arguments:
+                patch.setenv("LIGHTPAGE_LIMITS__STALL_S", "soon")
+            assert cli_main.run(lightpage, ["serve", *arguments]) == 2
+        out, err = capsys.readouterr()
+        (line,) = err.splitlines()
+        assert (out, named in line) == ("", True)
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_printed_settings_open_nothing(tmp_path: Path) -> None:
@@ -111,40 +109,47 @@ def test_printed_settings_open_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_service_keeps_to_its_limits_logs_json_and_writes_its_changes_down(toy_zip: Path, tmp_path: Path) -> None:
-    store = ModelStore(tmp_path / "store", Bundle.open(toy_zip))
+def test_a_service_keeps_to_its_limits_logs_json_and_writes_down_changes_and_lost_pages(
+    toy_zip: Path, decoder: Decoder, tmp_path: Path
+) -> None:
+    store = ModelStore(tmp_path / "store", decoder.bundle)
     store.remember(toy.write_toy_bundle(store.path_of("toy-1+r1"), version="toy-1+r1"))
+    toy.write_toy_recording(tmp_path / "lost.h5", toy.ToyDevice((60.0, 170.0)), 16, 4)
     file = tmp_path / "service.toml"
     file.write_text(
-        f"[service]\nbundle = '{toy_zip}'\nstore = '{tmp_path}/store'\n"
+        f"[service]\nbundle = '{toy_zip}'\nstore = '{tmp_path}/store'\nsource = 'recording:{tmp_path}/lost.h5'\n"
         "[inference]\nenabled = false\n[limits]\nrange_pages = 7\nchunk_bytes = 65536\n"
         "[logs]\nformat = 'json'\nlines_per_second = 1\n"
+        f"[flight_recorder]\nfolder = '{tmp_path}/flight'\npages = 2\n[self_calibration]\npages = [2, 3]\n"
     )
     served = Served("--config", file)
     try:
         target = served.target()
-        with LightpageClient(target, timeout_s=20) as client:
+        with pytest.raises(StoreError), store.locked():
+            raise AssertionError("two at once")
+        with LightpageClient(target, timeout_s=60) as client:
             assert client.describe().model.version == "toy-1+r1"
+            for page in range(3):
+                with pytest.raises(UnconfirmedPageError):
+                    client.read_page(page)
         with grpc.insecure_channel(target) as channel:
             stub = pb_grpc.LightpageStub(channel)
-            assert stub.Describe(pb.DescribeRequest(), timeout=10).limits.chunk_bytes == 65536
-            with pytest.raises(grpc.RpcError, match="Method not found"):
-                channel.unary_unary("/inference.GRPCInferenceService/ServerLive")(b"", timeout=10)
-            stub.Rollback(pb.RollbackRequest(correlation_id="shift 2"), timeout=10)
+            assert stub.Describe(pb.DescribeRequest(), timeout=60).limits.chunk_bytes == 65536
+            with pytest.raises(grpc.RpcError) as unknown:
+                channel.unary_unary("/inference.GRPCInferenceService/ServerLive")(b"", timeout=60)
+            assert unknown.value.code() is grpc.StatusCode.UNIMPLEMENTED
+            stub.Rollback(pb.RollbackRequest(correlation_id="shift 2"), timeout=60)
             for number in range(8):
                 with pytest.raises(grpc.RpcError, match="at most 7"):
-                    list(stub.ReadData(pb.ReadDataRequest(pages=8 + number), timeout=10))
+                    list(stub.ReadData(pb.ReadDataRequest(pages=8 + number), timeout=60))
         status, _, err = served.end(signal.SIGTERM)
     finally:
         served.process.kill()
         served.process.wait()
     assert status == 0, err
     lines = [json.loads(line) for line in err.splitlines()]
-    start = next(line for line in lines if line["message"].startswith("serving toy-1+r1 from no source at 127.0.0.1:"))
-    assert start["lightpage"]
-    assert start["python"] == sys.version.split()[0]
-    ends = [line["message"] for line in lines if line["logger"] == "runtime.commands.serve"][-2:]
-    assert ends == ["stopping with model toy-1", "stopped"]
+    start = next(line for line in lines if "lightpage" in line)
+    assert (start["python"], target in start["message"]) == (sys.version.split()[0], True)
     refused = [line for line in lines if line.get("method") == "ReadData"]
     assert {(line["code"], line["reason"]) for line in refused} == {("RESOURCE_EXHAUSTED", "TOO_LARGE")}
     left_out = sum(line.get("left_out", 0) for line in lines if line["message"].startswith("ReadData TOO_LARGE: "))
@@ -154,3 +159,7 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_its_changes_down(toy
     (entry,) = [json.loads(line) for line in (tmp_path / "store" / "audit.jsonl").read_text().splitlines()]
     assert (entry["what"], entry["from"], entry["to"]) == ("rollback", "toy-1+r1", "toy-1")
     assert (entry["correlation_id"], entry["outcome"]) == ("shift 2", "done")
+    kept = sorted((tmp_path / "flight").iterdir())
+    assert len(kept) == 2
+    with Recording.open(kept[0]) as recording:
+        assert recording.pages == 1

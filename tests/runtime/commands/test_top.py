@@ -9,7 +9,6 @@ import select
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import Thread
@@ -23,11 +22,11 @@ from lightpage.errors import LightpageError
 from runtime.commands.top import top
 from runtime.console.scrapes import Change, Scrape, Scrapes, scrape
 from runtime.console.server import ConsoleServer
+from runtime.decoding.decoder import Decoder
 from tests.runtime.commands.test_commands import ROOT
 from tests.runtime.console.stage import Stage, stage
 from tests.runtime.identity.authority import Authority
-
-WAIT_S = 20.0
+from tests.waiting import eventually
 
 
 def address(running: Stage) -> str:
@@ -39,25 +38,14 @@ def a_scrape(at: float, values: Mapping[str, float], started: float = 1.0) -> Sc
     return Scrape(at, samples | {(name, frozenset()): value for name, value in values.items()})
 
 
-def test_one_text_says_what_the_service_does(toy_zip: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with stage(toy_zip) as running:
+def test_one_text_says_what_the_service_does(decoder: Decoder, capsys: pytest.CaptureFixture[str]) -> None:
+    with stage(decoder) as running:
         running.plane.metrics.call_ended("ReadPage", "OK", "", 0.5)
-        thread = Thread(target=running.read, args=(10,))  # two of them are lost
         before = scrape(address(running))
-        thread.start()
-        thread.join()
+        running.read(10)  # two of them are lost
         assert cli_main.run(top, ["--address", address(running), "--interval", "0.1", "--once"]) == 0
         told = capsys.readouterr().out
-        for text in (
-            "model toy-1",
-            "recalibration",
-            "not due",
-            "cores",
-            "iB",
-            "inference",
-            "post processing",
-            "0 of 2",
-        ):
+        for text in ("model toy-1", "not due", "cores", "iB", "inference", "post processing", "0 of 2"):
             assert text in told, text
         assert "\x1b" not in told
         change = Change(before, scrape(address(running)))
@@ -67,15 +55,13 @@ def test_one_text_says_what_the_service_does(toy_zip: Path, capsys: pytest.Captu
         assert change.mean("lightpage_decode_seconds") * 8 == pytest.approx(change.rise("lightpage_decode_seconds_sum"))
 
 
-def test_a_wrong_address_is_named_with_what_to_do(toy_zip: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with stage(toy_zip) as running:
+def test_a_wrong_address_is_named_with_what_to_do(decoder: Decoder, capsys: pytest.CaptureFixture[str]) -> None:
+    with stage(decoder) as running:
         gone = address(running)
     assert cli_main.run(top, ["--address", gone, "--once"]) == EXIT_ERROR
-    told = capsys.readouterr().err
-    assert gone in told
-    assert "--metrics-port" in told
+    assert gone in capsys.readouterr().err
 
-    for text, told in ((b"up 1\n", "metrics of something else"), (b"<html>a page</html>\n", "got no metrics")):
+    for text, told in ((b"up 1\n", "something else"), (b"<html>a page</html>\n", "no metrics")):
 
         def other(_: object, start_response: Callable[..., object], text: bytes = text) -> list[bytes]:
             start_response("200 OK", [])
@@ -101,10 +87,11 @@ def test_what_is_no_http_and_no_port_is_named_in_a_line(
         listener.settimeout(10)
         Thread(target=answer, args=(listener,), daemon=True).start()
         other = f"127.0.0.1:{listener.getsockname()[1]}"
-        for place, got in ((other, "an answer that is not HTTP"), ("127.0.0.1:x", "nonnumeric port: 'x'")):
+        for place, got in ((other, "not HTTP"), ("127.0.0.1:x", "'x'")):
             assert cli_main.run(lightpage, [*arguments, "--address", place]) == EXIT_ERROR
             (told,) = capsys.readouterr().err.splitlines()
-            assert f"at {place}: got {got}" in told
+            assert place in told
+            assert got in told
 
 
 def test_quantiles_are_those_of_what_came_between() -> None:
@@ -117,6 +104,8 @@ def test_quantiles_are_those_of_what_came_between() -> None:
     assert change.quantile(0.5, "t") == pytest.approx(0.1 + 0.9 * 2 / 4)
     assert change.quantile(0.99, "t") == 1.0  # what lies beyond the last bound is not known
     assert math.isnan(Change(change.now, change.now).quantile(0.5, "t"))
+    new = Scrape(2.0, {("lost", frozenset({("reason", "dark")})): 3.0})
+    assert Change(Scrape(0.0, {}), new).rises("lost", "reason") == {"dark": 3.0}
 
 
 def test_a_restart_ends_what_was_counted_before() -> None:
@@ -148,13 +137,15 @@ class Terminal:
         os.close(other)
 
     def shows(self, text: str) -> bool:
-        """Whether it comes to show a text."""
-        seen, until = "", time.monotonic() + WAIT_S
-        while time.monotonic() < until and text not in seen:
-            ready, _, _ = select.select([self._own], [], [], 0.2)
-            if ready:
-                seen += os.read(self._own, 65536).decode("utf-8", "replace")
-        return text in seen
+        """Wait until it shows a text."""
+        seen = bytearray()
+
+        def found() -> bool:
+            if select.select([self._own], [], [], 0.1)[0]:
+                seen.extend(os.read(self._own, 65536))
+            return text.encode() in seen
+
+        return eventually(found)
 
     def press(self, key: str) -> None:
         os.write(self._own, key.encode())
@@ -165,41 +156,39 @@ class Terminal:
         os.close(self._own)
 
 
-def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(toy_zip: Path) -> None:
-    with stage(toy_zip) as running:
+def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(decoder: Decoder) -> None:
+    with stage(decoder) as running:
         running.read(3)
         port = running.server.port
         terminal = Terminal(address(running))
         try:
             assert terminal.shows("toy-1")
             running.server.close()
-            assert terminal.shows("no answer since")
+            assert terminal.shows("no answer")
             running.plane.metrics.in_service("toy-2")
             with ConsoleServer(running.console, port):
                 assert terminal.shows("toy-2")
                 terminal.press("x")
                 terminal.press("q")
                 assert terminal.shows("\x1b[?1049l")  # the screen is as it was
-                assert terminal.process.wait(WAIT_S) == 0
+                assert terminal.process.wait(60) == 0
         finally:
             terminal.close()
 
 
 def test_a_service_with_tls_is_scraped_with_a_certificate(
-    toy_zip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    decoder: Decoder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     authority = Authority(tmp_path)
-    with stage(toy_zip, authority.service()) as running:
+    with stage(decoder, authority.service()) as running:
         own = authority.caller("watcher", ["read"])
         files = [word for name, path in vars(own).items() for word in (f"--{name}", str(path))]
         place = ["--address", f"localhost:{running.server.port}", "--interval", "0.1", "--once"]
         assert cli_main.run(top, [*place, *files]) == 0
         assert "model toy-1" in capsys.readouterr().out
         assert cli_main.run(top, place) == EXIT_ERROR
-        told = capsys.readouterr().err
-        assert "metrics at localhost" in told
-        assert "--ca, --certificate and --key" in told
+        assert "--certificate" in capsys.readouterr().err
         nobody = authority.caller("nobody")
         files = [word for name, path in vars(nobody).items() for word in (f"--{name}", str(path))]
         assert cli_main.run(top, [*place, *files]) == EXIT_ERROR
-        assert "403 Forbidden: a page of the console: got nobody with no role" in capsys.readouterr().err
+        assert "403 Forbidden" in capsys.readouterr().err

@@ -2,66 +2,77 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
-from runtime.virtual_device.namespace import INSIDE
+from lightpage.errors import InvalidInputError
+from runtime.commands import virtual_device
+from tests.lightpage.small import small_profile
 
 pytestmark = pytest.mark.own_network
 
 
 def started(folder: Path, *command: str) -> subprocess.Popen[str]:
-    argv = [
-        sys.executable,
-        "-m",
-        "lightpage.cli.main",
-        "virtual-device",
-        "--out",
-        str(folder / "device"),
-        "--",
-        *command,
-    ]
-    return subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-@pytest.fixture(autouse=True)
-def inside(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(INSIDE, "1")  # the test is in a private network already
+    (folder / "small.toml").write_text(small_profile().to_toml())
+    argv = [sys.executable, "-m", "lightpage.cli.main", "virtual-device", "--profile", str(folder / "small.toml")]
+    return subprocess.Popen(
+        [*argv, "--out", str(folder / "device"), "--", *command],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 def test_its_status_is_that_of_the_command(tmp_path: Path) -> None:
     running = started(tmp_path, "sh", "-c", f"test -S {tmp_path}/device/modulator.sock && exit 7")
-    out, err = running.communicate(timeout=60)
-    assert running.returncode == 7
-    assert out == ""
-    assert "simulated device at camera:" in err
-
-
-def test_a_command_that_is_not_there_is_named(tmp_path: Path) -> None:
-    running = started(tmp_path, "no-such-command")
-    _, err = running.communicate(timeout=60)
-    assert running.returncode == 2
-    assert "command no-such-command" in err
-    assert "Traceback" not in err
+    out, err = running.communicate(timeout=300)
+    assert (running.returncode, out) == (7, "")
+    assert f"camera:{tmp_path}/device/device.toml" in err
 
 
 def test_sigterm_ends_the_command_too(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
-    running = started(
-        tmp_path, "sh", "-c", f"trap 'kill $!; echo ended > {mark}; exit' TERM; sleep 60 & echo ready; wait"
-    )
+    # `read` waits for an end of input that does not come.
+    running = started(tmp_path, "sh", "-c", f"trap 'echo ended > {mark}; exit' TERM; echo ready; read nothing")
     assert running.stdout is not None
     assert running.stdout.readline() == "ready\n"
     running.send_signal(signal.SIGTERM)
-    running.communicate(timeout=60)
-    assert running.returncode == 143
-    for _ in range(100):
-        if mark.exists():
-            break
-        time.sleep(0.05)
+    assert running.wait(300) == 143
     assert mark.read_text() == "ended\n"
+    running.communicate()
+
+
+def test_a_command_that_is_not_there_is_named() -> None:
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    with pytest.raises(InvalidInputError, match="no-such-command"):
+        virtual_device.run_to_its_end(["no-such-command"])
+    assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
+
+
+def test_a_signal_that_comes_while_the_command_is_started_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def interrupted(command: list[str]) -> subprocess.Popen[bytes]:
+        made.append(popen(command, stdin=subprocess.PIPE))
+        os.kill(os.getpid(), signal.SIGTERM)
+        return made[0]
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", interrupted)
+    before = signal.signal(signal.SIGTERM, interrupt)  # as the program does
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            virtual_device.run_to_its_end(["cat"])
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert made[0].returncode == -signal.SIGTERM
+    made[0].communicate()

@@ -19,6 +19,4 @@ def test_a_folder_that_cannot_be_made_or_written_is_named(
     (tmp_path / "file").touch()
     folder = tmp_path / "file" / "device" if place == "file" else Path("/proc/self")  # read-only for root too
     assert cli_main.run(lightpage, ["virtual-device", "--out", str(folder), "--", "true"]) == EXIT_ERROR
-    told = capsys.readouterr().err
-    assert f"--out {folder}: got " in told
-    assert "wanted a folder that can be made and written" in told
+    assert f"error: --out {folder}:" in capsys.readouterr().err

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 from runtime.acquisition.source import SHOT_S, Shot
-from runtime.bundle.bundle import Bundle
 from runtime.console.actions import Actions
 from runtime.console.history import History
 from runtime.console.server import Console, ConsoleServer
@@ -54,9 +52,9 @@ class Stage:
 
 
 @contextmanager
-def stage(bundle: Path, tls: TlsFiles | None = None) -> Iterator[Stage]:
+def stage(decoder: Decoder, tls: TlsFiles | None = None) -> Iterator[Stage]:
     history, monitor, metrics = History(), Monitor(), ServiceMetrics()
-    registry = ModelRegistry(Decoder(Bundle.open(bundle), threads=1))
+    registry = ModelRegistry(decoder)
     plane = DataPlane(registry, Losing(toy.ToyDevice()), metrics=metrics, observers=[history], monitor=monitor)
     recalibrator = Recalibrator(plane, toy.fit_references)
     console = Console(metrics, history, registry, monitor, "toy:device", Actions(plane, recalibrator))

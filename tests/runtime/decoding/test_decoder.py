@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from onnx import TensorProto
 
 from lightpage.errors import BundleError, FrameError, InvalidInputError, PageError
 from lightpage.metrics.measures import measure
@@ -124,7 +124,7 @@ def test_what_may_differ_from_page_to_page_is_fed_and_stays_as_it_was_without(
     decoder = Decoder.load(write_bundle(tmp_path / "t.zip", toy.manifest(), contents), threads=1)
     for table, gain in ((None, bundled), ({"homodyne": fed}, fed), (None, bundled)):
         np.testing.assert_allclose(decoder.infer(pair, table).p, p * (gain[0] / default[0]), rtol=1e-5, atol=1e-3)
-    with pytest.raises(InvalidInputError, match=r"table of a page: got reference_in_phase, wanted only homodyne"):
+    with pytest.raises(InvalidInputError, match=r"^table of"):
         decoder.infer(pair, {"reference_in_phase": np.full(toy.SHAPE, 150, np.float32)})
 
 
@@ -152,21 +152,16 @@ def test_the_table_in_a_bundle_is_used_and_its_golden_page_belongs_to_it(tmp_pat
         ({"homodyne": np.array([1, np.nan], np.float32)}, "NaN"),
     ],
 )
-def test_a_table_that_does_not_fit_is_refused(table: dict[str, np.ndarray], named: str, decoder: Decoder) -> None:
+def test_a_table_that_does_not_fit_is_refused(
+    table: dict[str, np.ndarray], named: str, decoder: Decoder, tmp_path: Path
+) -> None:
     with pytest.raises(InvalidInputError, match=named):
         decoder.decode(pair_of()[1], 16, table)
     with pytest.raises(InvalidInputError, match=named):
         decoder.with_table(table)
-
-
-def test_a_bundled_table_that_does_not_fit_is_refused(tmp_path: Path) -> None:
-    contents = toy.files() | {TABLE: npz(homodyne=np.zeros(3, np.float32))}
-    with pytest.raises(BundleError, match="homodyne"):
-        Decoder.load(write_bundle(tmp_path / "t.zip", toy.manifest(), contents))
-
-
-def damaged(pair: FramePair, **frames: np.ndarray) -> FramePair:
-    return FramePair(frames.get("in_phase", pair.in_phase), frames.get("quadrature", pair.quadrature))
+    if "homodyne" in table:
+        with pytest.raises(BundleError, match=named):
+            Decoder.load(write_bundle(tmp_path / "t.zip", toy.manifest(), toy.files() | {TABLE: npz(**table)}))
 
 
 @pytest.mark.parametrize(
@@ -183,11 +178,17 @@ def damaged(pair: FramePair, **frames: np.ndarray) -> FramePair:
 )
 def test_a_bad_frame_is_named(frames: dict[str, np.ndarray], named: str, decoder: Decoder) -> None:
     with pytest.raises(FrameError, match=named):
-        decoder.decode(damaged(pair_of()[1], **frames), 16)
+        decoder.decode(replace(pair_of()[1], **frames), 16)
+
+
+def test_swapped_frames_are_noticed_by_their_residual(decoder: Decoder) -> None:
+    pair = pair_of()[1]
+    with pytest.raises(FrameError, match="swapped"):
+        decoder.decode(FramePair(pair.quadrature, pair.in_phase), 16)
 
 
 def test_counts_beyond_the_bit_depth_are_refused(tmp_path: Path) -> None:
-    contents = toy.files() | {DECODER: toy.decoder_onnx(frame_type=TensorProto.UINT16)}
+    contents = toy.files() | {DECODER: toy.decoder_onnx(frame_type="uint16")}
     pair = pair_of()[1]
     wide = FramePair(pair.in_phase.astype(np.uint16), pair.quadrature.astype(np.uint16))
     contents[GOLDEN] = npz(in_phase=wide.in_phase, quadrature=wide.quadrature, p=toy.expected_p(pair))
@@ -195,15 +196,8 @@ def test_counts_beyond_the_bit_depth_are_refused(tmp_path: Path) -> None:
     decoder = Decoder.load(write_bundle(tmp_path / "twelve.zip", manifest, contents), threads=1)
     decoder.check(wide)
     wide.quadrature[3, 4] = 4096
-    with pytest.raises(FrameError, match="quadrature frame: got a count of 4096"):
+    with pytest.raises(FrameError, match=r"quadrature frame: .*4096"):
         decoder.check(wide)
-
-
-def test_swapped_frames_are_noticed_by_their_residual(decoder: Decoder) -> None:
-    pair = pair_of()[1]
-    decoder.decode(pair, 16)
-    with pytest.raises(FrameError, match="swapped"):
-        decoder.decode(FramePair(pair.quadrature, pair.in_phase), 16)
 
 
 @pytest.mark.parametrize("levels", [0, 1, 257, -4])
@@ -224,7 +218,7 @@ def foreign_models() -> dict[str, tuple[dict[str, bytes], dict[str, object], str
         "empty": (good | {DECODER: b""}, {}, "ONNX"),
         "a twin": (good | {DECODER: toy.twin_onnx()}, {"table_inputs": ()}, r"decoder\.onnx: inputs"),
         "another camera": (good | {DECODER: toy.decoder_onnx(shape=(64, 128))}, {}, "input in_phase"),
-        "another type": (good | {DECODER: toy.decoder_onnx(frame_type=TensorProto.UINT16)}, {}, "input in_phase"),
+        "another type": (good | {DECODER: toy.decoder_onnx(frame_type="uint16")}, {}, "input in_phase"),
         "other tables": (good, {"table_inputs": ("homodyne",)}, "table inputs"),
         "no residual": (good, {"residual_output": "rest"}, "rest"),
         "other weights": (good | {DECODER: toy.decoder_onnx(kappa=401)}, {}, "golden"),

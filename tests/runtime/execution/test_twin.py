@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnx.parser
 import pytest
-from onnx import TensorProto, helper, numpy_helper
 
 from lightpage.calibration.parameters import NAMES
 from lightpage.errors import BundleError
@@ -16,39 +16,30 @@ from runtime.bundle.manifest import TWIN
 from runtime.execution.twin import OnnxTwin
 from tests.runtime import toy
 
+TWIN_TEXT = """
+<ir_version: 9, opset_import: ["" : 18]>
+twin (double[PARAMETERS] parameters, double[n, 2] points, double[n, 2] anchors, double[m, 2] camera_places)
+  => (double[1, n, 2] places, double[1, n] phases, double[n, 2] positions, double[2, m, 2] pixels)
+<int64[2] two = {0, 1}, int64 zero = {0}, int64[1] front = {0}>
+{
+  shift = Gather(parameters, two)
+  moved = Add(points, shift)
+  places = Unsqueeze(moved, front)
+  x = Gather<axis = 1>(anchors, zero)
+  phases = Unsqueeze(x, front)
+  positions = Identity(points)
+  seen = Add(camera_places, shift)
+  one = Unsqueeze(seen, front)
+  pixels = Concat<axis = 0>(one, one)
+}"""
+
 
 def twin_graph(parameters: int = len(NAMES), left_out: str = "") -> bytes:
     """Places are points plus the first two parameters, phases the anchors' x, pixels places of both cameras."""
-    double = TensorProto.DOUBLE
-    shapes = {"places": [1, "n", 2], "phases": [1, "n"], "positions": ["n", 2], "pixels": [2, "m", 2]}
-    graph = helper.make_graph(
-        [
-            helper.make_node("Gather", ["parameters", "two"], ["shift"]),
-            helper.make_node("Add", ["points", "shift"], ["moved"]),
-            helper.make_node("Unsqueeze", ["moved", "front"], ["places"]),
-            helper.make_node("Gather", ["anchors", "zero"], ["x"], axis=1),
-            helper.make_node("Unsqueeze", ["x", "front"], ["phases"]),
-            helper.make_node("Identity", ["points"], ["positions"]),
-            helper.make_node("Add", ["camera_places", "shift"], ["seen"]),
-            helper.make_node("Unsqueeze", ["seen", "front"], ["one"]),
-            helper.make_node("Concat", ["one", "one"], ["pixels"], axis=0),
-        ],
-        "twin",
-        [
-            helper.make_tensor_value_info("parameters", double, [parameters]),
-            helper.make_tensor_value_info("points", double, ["n", 2]),
-            helper.make_tensor_value_info("anchors", double, ["n", 2]),
-            helper.make_tensor_value_info("camera_places", double, ["m", 2]),
-        ],
-        [helper.make_tensor_value_info(name, double, shape) for name, shape in shapes.items() if name != left_out],
-        [
-            numpy_helper.from_array(np.array([0, 1], np.int64), "two"),
-            numpy_helper.from_array(np.array(0, np.int64), "zero"),
-            numpy_helper.from_array(np.array([0], np.int64), "front"),
-        ],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
-    onnx.checker.check_model(model)
+    model = onnx.parser.parse_model(TWIN_TEXT.replace("PARAMETERS", str(parameters)))
+    kept = [output for output in model.graph.output if output.name != left_out]
+    del model.graph.output[:]
+    model.graph.output.extend(kept)
     return bytes(model.SerializeToString())
 
 

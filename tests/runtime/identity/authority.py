@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import ipaddress
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,17 +18,8 @@ from runtime.identity.roles import ROLE_URI
 from runtime.wire.tls import TlsFiles
 
 _DAY = timedelta(days=1)
-_SIGNS_CERTIFICATES = x509.KeyUsage(
-    digital_signature=False,
-    content_commitment=False,
-    key_encipherment=False,
-    data_encipherment=False,
-    key_agreement=False,
-    key_cert_sign=True,
-    crl_sign=True,
-    encipher_only=False,
-    decipher_only=False,
-)
+_USES = inspect.signature(x509.KeyUsage).parameters
+_SIGNS_CERTIFICATES = x509.KeyUsage(**{name: name in ("key_cert_sign", "crl_sign") for name in _USES})
 
 
 @dataclass

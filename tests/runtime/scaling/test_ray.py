@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from lightpage.cli.main import run as run_command
-from lightpage.errors import SurroundingsError
+from lightpage.errors import LightpageError
 from runtime.commands import bulk as command
 from runtime.errors import WorkerError
 from runtime.scaling import ray_engine
@@ -66,7 +66,7 @@ class FakeRay:
         self.ends: dict[int, float] = {}
         self.cancelled: list[int] = []
 
-    def monotonic(self) -> float:
+    def clock(self) -> float:
         return self.now
 
     def nodes(self) -> list[dict[str, Any]]:
@@ -132,8 +132,7 @@ class Hanging:
 
 def outcomes_by(ray: FakeRay, ranges: int, monkeypatch: pytest.MonkeyPatch) -> tuple[RayEngine, list[Outcome]]:
     monkeypatch.setattr(ray_engine, "connected", lambda address: nullcontext(ray))
-    monkeypatch.setattr(ray_engine, "time", ray)
-    engine = RayEngine(threads=1)
+    engine = RayEngine(threads=1, clock=ray.clock)
     return engine, list(engine.run(map(a_range, range(ranges))))
 
 
@@ -156,8 +155,7 @@ def test_a_range_at_which_all_workers_hang_is_given_up_and_those_that_wait_for_a
     assert takes.tries == {0: ATTEMPTS, 1: 1, 2: 1}
     assert engine.restarts == ATTEMPTS
     (failed,) = [outcome for outcome in outcomes if isinstance(outcome, Failed)]
-    expected = f"wanted a result; {ATTEMPTS} workers died at it"
-    assert str(failed.problem) == f"recording a.h5: pages 0-0: got no answer in time, {expected}"
+    assert (failed.problem.subject, failed.problem.got) == ("recording a.h5: pages 0-0", "no answer in time")
     assert sorted(outcome.task.pages[0] for outcome in outcomes) == [0, 1, 2]
 
 
@@ -167,13 +165,13 @@ def test_a_cluster_without_any_workers_ends_the_run(monkeypatch: pytest.MonkeyPa
         return math.inf
 
     ray = FakeRay(1, lost)
-    with pytest.raises(WorkerError, match="no workers any more"):
+    with pytest.raises(WorkerError, match="the Ray cluster"):
         outcomes_by(ray, 3, monkeypatch)
     assert ray.now <= longest_s(a_range(0))
     assert sorted(ray.cancelled) == [0, 1]  # nothing is left behind
 
 
-@pytest.mark.long
+@pytest.mark.long  # a cluster takes ten seconds to start; what its engine does is shown without one
 def test_a_worker_and_a_node_die_and_nothing_is_missing_twice_or_different(
     toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -261,17 +259,8 @@ def test_a_cluster_of_this_machine_is_started_whatever_the_surroundings_say(
         assert ray.settings["address"] == "auto"
 
 
-@pytest.mark.parametrize(
-    ("error", "kind", "said"),
-    [
-        (FileNotFoundError(2, "No such file or directory", "/nowhere"), WorkerError, "HOME"),
-        (RuntimeError("Could not determine home directory."), WorkerError, "HOME"),
-        (OSError(24, "Too many open files"), SurroundingsError, "ulimit -n"),
-    ],
-)
-def test_a_cluster_that_does_not_start_says_what_it_needs(
-    error: Exception, kind: type[Exception], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "ray", UnstartedRay(error))
-    with pytest.raises(kind, match=f"Ray cluster of this machine: got .*{said}"), ray_engine.connected(None):
-        pass
+def test_a_cluster_that_does_not_start_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    for error, said in ((FileNotFoundError(2, "no home"), "HOME"), (OSError(24, "Too many open files"), "ulimit -n")):
+        monkeypatch.setitem(sys.modules, "ray", UnstartedRay(error))
+        with pytest.raises(LightpageError, match=said), ray_engine.connected(None):
+            pass

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import threading
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +15,9 @@ from click.testing import CliRunner
 from lightpage.codec.page_bytes import Loss, PageBytes
 from lightpage.errors import InvalidInputError, LimitError
 from lightpage.recording.reader import Recording
-from runtime.bundle.bundle import Bundle
 from runtime.commands.evaluate import evaluate
 from runtime.decoding.decoder import Decoder
-from runtime.errors import LostShotError, Reason, UnconfirmedPageError
+from runtime.errors import Reason, UnconfirmedPageError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.file_ring import FileRing
@@ -30,13 +27,14 @@ from runtime.service.monitor import Monitor
 from runtime.service.observation import Observation
 from runtime.service.registry import ModelRegistry
 from tests.runtime import toy
+from tests.waiting import eventually
 
 LOST = (230.0, 20.0)
 
 
 @pytest.fixture
-def registry(toy_zip: Path) -> ModelRegistry:
-    return ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1))
+def registry(decoder: Decoder) -> ModelRegistry:
+    return ModelRegistry(decoder)
 
 
 def kept(folder: Path) -> list[Path]:
@@ -75,10 +73,9 @@ def test_a_lost_page_is_kept_with_why_and_evaluate_opens_it(
     assert note["reason"] == "PILOTS_DISAGREE"
     assert note["subject"] == "page 2 of toy:device"
     assert (note["model_version"], note["page_index"]) == ("toy-1", 2)
-    assert "bits a symbol confirmed" in note["detail"]
     assert note["time_s"] > 1e9
     told = CliRunner().invoke(evaluate, ["--bundle", str(toy_zip), "--recording", str(path)])
-    assert "pilots" in str(told.exception or told.output)
+    assert "pilots" in str(told.exception or told.output)  # it opens, and is lost there too
 
 
 @pytest.fixture
@@ -92,45 +89,29 @@ def with_bytes(seen: Observation, loss: Loss | None, margin: float) -> Observati
     return replace(seen, user_data=PageBytes(None, None if loss else b"x", None, loss, 1.0, 3, 4, 0, margin))
 
 
-def reasons(folder: Path) -> list[str]:
-    return [path.stem.partition("Z-")[2] or path.stem.rpartition("-")[2] for path in kept(folder)]
-
-
 def test_what_is_kept_and_what_not(registry: ModelRegistry, seen: Observation, tmp_path: Path) -> None:
     monitor, metrics = Monitor(), ServiceMetrics()
+
+    def at(step: float, loss: Loss | None = None, margin: float = 1.0) -> Observation:
+        return with_bytes(replace(seen, time_s=1e9 + step), loss, margin)
+
     with FlightRecorder(tmp_path, registry, monitor=monitor, metrics=metrics) as recorder:
-        wait = _waiter(recorder, metrics)
-        recorder.observe(seen)
-        recorder.observe(with_bytes(seen, None, 0.2))
-        recorder.observe(replace(seen, lost=Reason.MISSING_FRAME, pair=None, page=None))
-        wait(0)
-        recorder.observe(with_bytes(replace(seen, time_s=1e9 + 1), Loss.BODY, 0.0))
-        wait(1)
-        for step in (2, 3):
-            recorder.observe(with_bytes(replace(seen, time_s=1e9 + step), None, 0.01))
-        wait(2)  # one of the two
+        for one in (seen, at(0), replace(seen, lost=Reason.MISSING_FRAME, pair=None, page=None)):
+            recorder.observe(one)
+        recorder.observe(at(1, Loss.BODY))
+        recorder.observe(at(2, None, 0.05))
+        recorder.observe(at(3, None, 0.049))
+        eventually(lambda: count(metrics, "kept") == 2)
         for _ in range(8):
             monitor.follow("toy-1", {"unread": 1.0})
-        for step in (70, 71, 140):
-            recorder.observe(replace(seen, time_s=1e9 + step))
-        wait(4)
-    assert [name.split("-", 2)[2].removesuffix(".h5") for name in map(lambda p: p.name, kept(tmp_path))] == [
-        "BODY_LOST",
-        "LOW_MARGIN",
-        "RECALIBRATION_DUE",
-        "RECALIBRATION_DUE",
-    ]
+        for one in (at(62.9), at(63), at(122.9), replace(at(200), of_device=False), at(123)):
+            recorder.observe(one)
+    assert count(metrics, "dropped") == 0
+    kept_at = ["014641.000000-BODY_LOST", "014643.000000-LOW_MARGIN"]
+    kept_at += ["014743.000000-RECALIBRATION_DUE", "014843.000000-RECALIBRATION_DUE"]
+    assert [path.stem.partition("T")[2] for path in kept(tmp_path)] == kept_at
     with h5py.File(kept(tmp_path)[1]) as file:
-        assert file["flight"].attrs["margin_bits"] == 0.01
-
-
-def _waiter(recorder: FlightRecorder, metrics: ServiceMetrics) -> Callable[[int], None]:
-    from tests.runtime.rpc.test_service import wait_until
-
-    def wait(pages: int) -> None:
-        assert wait_until(lambda: recorder._waiting.empty() and count(metrics, "kept") == pages)
-
-    return wait
+        assert file["flight"].attrs["margin_bits"] == 0.049
 
 
 def test_the_ring_is_bounded_and_goes_on_after_a_restart(registry: ModelRegistry, tmp_path: Path) -> None:
@@ -159,7 +140,7 @@ def test_the_ring_is_bounded_in_bytes(tmp_path: Path) -> None:
     assert [path.name[:22] for path in ring.files()] == ["page-19700101T000002.0", "page-19700101T000003.0"]
     same = ring.add(3, "A", lambda path: path.write_bytes(bytes(100)) and None)
     assert same.name.endswith("-A-1.h5")
-    with pytest.raises(LimitError, match="at most 250"):
+    with pytest.raises(LimitError, match="file"):
         ring.add(9, "A", lambda path: path.write_bytes(bytes(300)) and None)
     assert len(ring.files()) == 2
 
@@ -178,16 +159,14 @@ def test_a_disk_that_takes_nothing_is_told_of_once_and_hurts_no_read(
         source.device.offsets = toy.OFFSETS
         plane.read_page(None, None, Caller())
     assert count(metrics, "failed") + count(metrics, "dropped") == 3
-    assert [record.message for record in caplog.records if "flight recorder" in record.message] == [
-        next(record.message for record in caplog.records if "pages are not kept" in record.message)
-    ]
+    assert [record.levelname for record in caplog.records if "flight recorder" in record.message] == ["WARNING"]
 
 
 def test_pages_are_dropped_where_the_disk_is_behind(
     registry: ModelRegistry, seen: Observation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go, metrics = threading.Event(), ServiceMetrics()
-    monkeypatch.setattr(FileRing, "add", lambda *_: go.wait(10))
+    monkeypatch.setattr(FileRing, "add", lambda *_: go.wait())
     with FlightRecorder(tmp_path, registry, metrics=metrics) as recorder:
         for _ in range(20):
             recorder.observe(replace(seen, lost=Reason.PILOTS_DISAGREE))
@@ -198,17 +177,5 @@ def test_pages_are_dropped_where_the_disk_is_behind(
 
 def test_a_folder_that_cannot_be_made_is_refused(registry: ModelRegistry, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InvalidInputError, match="one that can be made"):
+    with pytest.raises(InvalidInputError, match="folder"):
         FlightRecorder(tmp_path / "file" / "folder", registry)
-
-
-def test_a_lost_shot_has_no_frames_to_keep(registry: ModelRegistry, tmp_path: Path) -> None:
-    class Losing(toy.ToySource):
-        def shot(self, timeout_s: float = 1.0, page: int | None = None) -> object:  # type: ignore[override]
-            raise LostShotError("page", "no frame", "two", Reason.MISSING_FRAME)
-
-    with FlightRecorder(tmp_path, registry) as recorder:
-        plane = DataPlane(registry, Losing(toy.ToyDevice()), observers=[recorder])
-        with pytest.raises(LostShotError):
-            plane.read_page(None, None, Caller())
-    assert os.listdir(tmp_path) == []

@@ -7,10 +7,10 @@ import json
 import logging
 import re
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,6 @@ import grpc
 import pytest
 
 from lightpage.errors import BundleError, InvalidInputError, RecalibrationRefusedError
-from runtime.bundle.bundle import Bundle
-from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
 from runtime.errors import CallerLeft, LostShotError, OverloadedError, Reason
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -37,8 +35,10 @@ from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
 from runtime.service.self_calibration import SelfCalibration
 from runtime.service.store import ModelStore
+from tests.clock import HandClock
 from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
+from tests.waiting import eventually
 
 _Code = grpc.StatusCode
 
@@ -61,7 +61,7 @@ def test_a_call_is_logged_with_who_called_why_it_ended_and_how_long_it_took() ->
         CallLog().ended(call(), _Code.INVALID_ARGUMENT, InvalidInputError("levels", 1, "2..256"))
     (line,) = lines
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}\+00:00", line.pop("time"))
-    assert 0 <= line.pop("seconds") < 1
+    assert line.pop("seconds") >= 0
     assert line == {
         "level": "INFO",
         "logger": "runtime.rpc.call_log",
@@ -83,10 +83,7 @@ def test_a_call_is_logged_with_who_called_why_it_ended_and_how_long_it_took() ->
         ("ReadPage", _Code.DEADLINE_EXCEEDED, GeneratorExit(), "INFO", None),
         ("ReadPage", _Code.RESOURCE_EXHAUSTED, OverloadedError("a", 1, 2, retry_s=1.0), "WARNING", "OVERLOADED"),
         ("ReadPage", _Code.RESOURCE_EXHAUSTED, OverloadedError("a", 1, 2), "WARNING", "DEADLINE_TOO_SHORT"),
-        (
-            *("Recalibrate", _Code.FAILED_PRECONDITION, RecalibrationRefusedError("a", 1, 2)),
-            *("WARNING", "RECALIBRATION_REFUSED"),
-        ),
+        ("X", _Code.FAILED_PRECONDITION, RecalibrationRefusedError("a", 1, 2), "WARNING", "RECALIBRATION_REFUSED"),
         ("ReadPage", _Code.INTERNAL, ValueError("odd"), "ERROR", "INTERNAL"),
     ],
 )
@@ -98,16 +95,7 @@ def test_how_a_call_ends_says_how_loud_it_is(
     (line,) = lines
     assert (line["level"], line["code"], line.get("reason")) == (level, code.name, reason)
     assert ("traceback" in line) == (level == "ERROR")
-
-
-def test_only_what_nobody_foresaw_has_a_traceback() -> None:
-    with json_lines() as lines:
-        try:
-            raise KeyError("gone")
-        except KeyError as error:
-            CallLog().ended(call(), _Code.INTERNAL, error)
-    assert "raise KeyError" in lines[0]["traceback"]
-    assert "gone" not in lines[0]["message"]
+    assert "odd" not in line["message"]  # what nobody foresaw is not told in its own words
 
 
 @pytest.mark.parametrize("format", ["text", "json"])
@@ -126,7 +114,7 @@ def test_a_thread_that_breaks_is_logged() -> None:
     with json_lines() as lines:
         thread = threading.Thread(target=lambda: [][0], name="odd")
         thread.start()
-        thread.join(10)
+        thread.join()
     assert lines[0]["message"] == "thread odd broke"
     assert "IndexError" in lines[0]["traceback"]
 
@@ -144,8 +132,8 @@ def test_a_caller_cannot_write_lines_of_its_own() -> None:
 
 
 def test_of_one_kind_only_so_many_lines_come_in_a_second_and_the_others_are_counted() -> None:
-    seconds, stream = [0.0], io.StringIO()
-    handler = LimitedHandler(stream, 3, lambda: seconds[0])
+    clock, stream = HandClock(), io.StringIO()
+    handler = LimitedHandler(stream, 3, clock)
     handler.setFormatter(TextFormatter())
     log = logging.Logger("tests.limited", logging.INFO)
     log.addHandler(handler)
@@ -160,39 +148,24 @@ def test_of_one_kind_only_so_many_lines_come_in_a_second_and_the_others_are_coun
     for number in range(5):
         log.info("something else %d", number)
     assert len(stream.getvalue().splitlines()) == 3 + 2 + 3 + 3
-    seconds[0] = 1.5
-    flood(1, "ReadPage", "OVERLOADED")
-    last = stream.getvalue().splitlines()[-2:]
-    assert "ReadPage OVERLOADED: 7 more of these were left out in 2 s left_out=7" in last[0]
-    assert "call 0" in last[1]
+    clock.advance(1.5)  # what was left out is told of, whether anything is logged or not
+    lines = eventually(lambda: stream.getvalue().count("left_out=") == 3 and stream.getvalue().splitlines()[11:])
+    told = sorted((line.rpartition("left_out=")[2], line.split()[3]) for line in lines)
+    assert told == [("1", "Describe"), ("2", "something"), ("7", "ReadPage")]
+    flood(4, "ReadPage", "OVERLOADED")
+    assert len(stream.getvalue().splitlines()) == 3 + 2 + 3 + 3 + 3 + 3
     handler.close()
-    told = stream.getvalue()
-    assert "Describe OVERLOADED: 1 more of these" in told
-    assert "tests.limited: something else 0: 2 more of these" in told
-    assert told.count("left_out=") == 3
-
-
-def test_what_was_left_out_is_told_though_nothing_else_happens() -> None:
-    stream = io.StringIO()
-    with logging_to_stderr("text", "info", 1, stream):
-        for _ in range(4):
-            logging.getLogger("tests.limited").warning("again")
-        until = time.monotonic() + 10
-        while "left_out=3" not in stream.getvalue() and time.monotonic() < until:
-            time.sleep(0.02)
-        assert "left_out=3" in stream.getvalue()
+    assert stream.getvalue().count("left_out=") == 4
 
 
 def test_lost_pages_are_logged_and_others_are_not() -> None:
-    lost = Observation(
-        "page 1 of toy:device", 1, "toy-1", 0.0, 0.25, Reason.MISSING_FRAME, "page 1 of toy:device: dark"
-    )
+    lost = Observation("page 1 of toy", 1, "toy-1", 0.0, 0.25, Reason.MISSING_FRAME, "page 1 of toy: dark")
     with json_lines() as lines:
         PageLog().observe(lost)
-        PageLog().observe(Observation("page 2 of toy:device", 2, "toy-1", 0.0, 0.25))
+        PageLog().observe(replace(lost, lost=None))
     (line,) = lines
     assert (line["level"], line["reason"], line["seconds"]) == ("WARNING", "MISSING_FRAME", 0.25)
-    assert line["message"] == "lost with model toy-1: page 1 of toy:device: dark"
+    assert line["message"].count("page 1 of toy") == 1
 
 
 class Losing(toy.ToySource):
@@ -207,31 +180,20 @@ class Breaking:
         raise ZeroDivisionError("nobody foresaw this")
 
 
-class Service:
-    def __init__(self, bundle: Path, store: Path, source: toy.ToySource, *more: object) -> None:
-        registry = ModelRegistry(Decoder(Bundle.open(bundle), threads=1))
-        models, self.file = ModelStore(store, registry.current.decoder.bundle), store / "audit.jsonl"
-        self.plane = DataPlane(registry, source, models, observers=[PageLog()], audit=AuditLog(self.file))
-        self.recalibrator = Recalibrator(self.plane, toy.fit_references)
-        self.server = LightpageServer(self.plane, self.recalibrator, more=more).start()
-
-    def entries(self) -> list[dict[str, Any]]:
-        return [json.loads(line) for line in self.file.read_text("utf-8").splitlines()]
-
-
-def test_calls_of_a_service_are_logged(toy_zip: Path, tmp_path: Path) -> None:
+def test_calls_of_a_service_are_logged(decoder: Decoder) -> None:
     with json_lines("info") as lines:
-        service = Service(toy_zip, tmp_path, Losing(toy.ToyDevice()), Breaking())
-        with grpc.insecure_channel(service.server.target) as channel:
+        plane = DataPlane(ModelRegistry(decoder), Losing(toy.ToyDevice()), observers=[PageLog()])
+        server = LightpageServer(plane, Recalibrator(plane, toy.fit_references), more=[Breaking()]).start()
+        with grpc.insecure_channel(server.target) as channel:
             stub = pb_grpc.LightpageStub(channel)
-            stub.Describe(pb.DescribeRequest(), timeout=10)
+            stub.Describe(pb.DescribeRequest(), timeout=60)
             for method, request in (
                 (stub.ReadPage, pb.ReadPageRequest(correlation_id="order 8")),
                 (stub.ListModels, pb.ListModelsRequest()),
             ):
                 with pytest.raises(grpc.RpcError):
-                    method(request, timeout=10)
-        service.server.stop(0.5)
+                    method(request, timeout=60)
+        server.stop(0.5)
     by_method = {line.get("method"): line for line in lines}
     assert "Describe" not in by_method
     assert by_method["page"]["reason"] == "MISSING_FRAME"
@@ -239,39 +201,38 @@ def test_calls_of_a_service_are_logged(toy_zip: Path, tmp_path: Path) -> None:
     assert (read["code"], read["reason"], read["correlation_id"]) == ("DATA_LOSS", "SHOT_LOST", "order 8")
     assert read["peer"].startswith(("ipv4:127.0.0.1:", "ipv4:127.0.0.1%3A", "ipv6:"))
     assert "traceback" not in read
-    assert "ZeroDivisionError: nobody foresaw this" in by_method["ListModels"]["traceback"]
+    assert "ZeroDivisionError" in by_method["ListModels"]["traceback"]
 
 
-def test_every_change_of_models_is_written_down_with_who_made_it(toy_zip: Path, tmp_path: Path) -> None:
-    service = Service(toy_zip, tmp_path, toy.ToySource(toy.ToyDevice()))
-    try:
-        with LightpageClient(service.server.target, timeout_s=20) as client:
-            client.recalibrate(count=2)
-        with grpc.insecure_channel(service.server.target) as channel:
-            stub = pb_grpc.LightpageStub(channel)
-            stub.Rollback(pb.RollbackRequest(correlation_id="shift 2"), timeout=10)
-            with pytest.raises(grpc.RpcError):
-                stub.Rollback(pb.RollbackRequest(correlation_id="shift 3"), timeout=10)
-    finally:
-        service.server.stop(0.5)
-    first, second, third = service.entries()
-    assert (first["what"], first["from"], first["to"], first["outcome"]) == ("recalibrate", "toy-1", "toy-1+r1", "done")
-    assert first["who"].startswith(("ipv4:127.0.0.1", "ipv6:"))
-    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}\+00:00", first["time"])
-    assert (second["what"], second["from"], second["to"]) == ("rollback", "toy-1+r1", "toy-1")
-    assert second["correlation_id"] == "shift 2"
-    assert (third["outcome"], third["correlation_id"], third["from"]) == ("failed", "shift 3", "toy-1")
-    assert "an earlier model to go back to" in third["detail"]
-
-
-def test_self_calibration_signs_its_changes(toy_zip: Path, tmp_path: Path) -> None:
-    service = Service(toy_zip, tmp_path, toy.ToySource(toy.ToyDevice()))
-    try:
-        loop = SelfCalibration(service.plane, Monitor(), service.recalibrator)
-        loop._recalibrated()
-    finally:
-        service.server.stop(0.5)
-    assert [entry["who"] for entry in service.entries()] == ["self-calibration"]
+def test_every_change_of_models_is_written_down_with_who_made_it(decoder: Decoder, tmp_path: Path) -> None:
+    file, monitor = tmp_path / "audit.jsonl", Monitor()
+    store = ModelStore(tmp_path / "store", decoder.bundle)
+    plane = DataPlane(
+        ModelRegistry(decoder), toy.ToySource(toy.ToyDevice()), store, monitor=monitor, audit=AuditLog(file)
+    )
+    for _ in range(8):
+        monitor.follow("toy-1", {"unread": 1.0})
+    SelfCalibration(plane, monitor, Recalibrator(plane, toy.fit_references)).look()
+    plane.models.rollback(actor=Actor("ipv4:127.0.0.1:9", "shift 2"))
+    with pytest.raises(BundleError):
+        plane.models.rollback(actor=Actor("ipv4:127.0.0.1:9", "shift 3"))
+    plane.models.pin("toy-1", True, Actor("one"))
+    plane.models.pin("toy-1", False, Actor("two"))
+    plane.models.roll_forward(actor=Actor("three"))
+    plane.models.activate("toy-1", actor=Actor("four"))
+    entries = [json.loads(line) for line in file.read_text("utf-8").splitlines()]
+    peer, keys = "ipv4:127.0.0.1:9", ("what", "who", "correlation_id", "from", "to", "outcome")
+    assert [[entry[key] for key in keys] for entry in entries] == [
+        ["recalibrate", "self-calibration", "", "toy-1", "toy-1+r1", "done"],
+        ["rollback", peer, "shift 2", "toy-1+r1", "toy-1", "done"],
+        ["rollback", peer, "shift 3", "toy-1", "", "failed"],
+        ["pin", "one", "", "toy-1", "toy-1", "done"],
+        ["unpin", "two", "", "toy-1", "toy-1", "done"],
+        ["roll forward", "three", "", "toy-1", "toy-1+r1", "done"],
+        ["activate", "four", "", "toy-1+r1", "toy-1", "done"],
+    ]
+    assert [bool(entry.get("detail")) for entry in entries].index(True) == 2
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}\+00:00", entries[0]["time"])
 
 
 def test_the_record_is_put_aside_when_it_is_large_and_only_so_many_stay(tmp_path: Path) -> None:
@@ -300,41 +261,16 @@ def test_a_full_disk_is_logged_and_leaves_whole_lines(tmp_path: Path) -> None:
     assert kept == ["a", "c"]
 
 
-def test_a_change_comes_about_though_it_cannot_be_written_down(toy_zip: Path, tmp_path: Path) -> None:
-    registry = ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1))
-    (tmp_path / "file").write_text("in the way")
-    plane = DataPlane(registry, audit=AuditLog(tmp_path / "file" / "audit.jsonl"))
-    other = toy.write_toy_bundle(tmp_path / "other.zip", version="toy-2")
-    with json_lines() as lines:
-        plane.adopt(Decoder(Bundle.open(other), 1))
-    assert registry.current.version == "toy-2"
-    assert any("not written down" in line["message"] for line in lines)
-    with pytest.raises(BundleError):
-        plane.adopt(Decoder(Bundle.open(other), 1))
-
-
-def test_a_folder_that_has_gone_is_not_made_again(tmp_path: Path) -> None:
-    """It may be the place where a disk was mounted."""
+def test_a_change_comes_about_though_it_cannot_be_written_down(decoder: Decoder, tmp_path: Path) -> None:
+    """A folder that has gone is not made again: it may be the place where a disk was mounted."""
     folder = tmp_path / "store"
-    audit = AuditLog(folder / "audit.jsonl")
+    plane = DataPlane(ModelRegistry(decoder), audit=AuditLog(folder / "audit.jsonl"))
     folder.rename(tmp_path / "away")
+    other = Decoder.load(toy.write_toy_bundle(tmp_path / "other.zip", version="toy-2"), 1)
     with json_lines() as lines:
-        audit.record("activate", "a", "b")
-    assert not folder.exists()
+        plane.adopt(other)
+    assert plane.registry.current.version == "toy-2"
     assert any("not written down" in line["message"] for line in lines)
-
-
-def test_changes_at_once_are_written_down_whole(tmp_path: Path) -> None:
-    audit = AuditLog(tmp_path / "audit.jsonl", 5000, 50)
-
-    def change(name: str) -> None:
-        for _ in range(20):
-            audit.record("pin", name, name)
-
-    threads = [threading.Thread(target=change, args=(str(number),)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(30)
-    entries = [json.loads(line) for path in tmp_path.iterdir() for line in path.read_text().splitlines()]
-    assert len(entries) == 80
+    assert not folder.exists()
+    with pytest.raises(BundleError):
+        plane.adopt(other)

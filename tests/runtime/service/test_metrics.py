@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import pytest
 from prometheus_client import generate_latest
 
 from runtime.decoding.decoder import Decoder
+from runtime.decoding.page import DecodedPage
 from runtime.service.metrics import VERSIONS, ServiceMetrics
 from tests.runtime import toy
 
 
-def test_the_figures_are_in_the_format_of_prometheus(decoder: Decoder) -> None:
+@pytest.fixture
+def page(decoder: Decoder) -> DecodedPage:
+    return decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
+
+
+def test_the_figures_are_in_the_format_of_prometheus(page: DecodedPage) -> None:
     metrics = ServiceMetrics()
-    page = decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
     metrics.in_service("toy-1")
     metrics.page(page, "toy-1")
     metrics.in_service("toy-2")
@@ -20,11 +26,12 @@ def test_the_figures_are_in_the_format_of_prometheus(decoder: Decoder) -> None:
     assert 'lightpage_model_info{version="toy-2"} 1.0' in text
     assert 'version="toy-1"} 1.0' not in text.replace("model_version", "")
     assert "lightpage_decode_seconds_count 1.0" in text
+    for name in ("process_resident_memory_bytes", "process_open_fds", "python_gc_collections_total", "python_info"):
+        assert f"\n{name}" in text
 
 
-def test_pages_are_told_apart_by_the_newest_models_only(decoder: Decoder) -> None:
+def test_pages_are_told_apart_by_the_newest_models_only(page: DecodedPage) -> None:
     metrics = ServiceMetrics()
-    page = decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
     for number in range(3 * VERSIONS):
         metrics.in_service(f"toy-{number}")
         metrics.pages.labels(f"toy-{number}").inc()
@@ -33,9 +40,3 @@ def test_pages_are_told_apart_by_the_newest_models_only(decoder: Decoder) -> Non
     told = {sample.labels["model_version"] for family in metrics.pages.collect() for sample in family.samples}
     assert len(told) <= VERSIONS
     assert {"toy-0", f"toy-{3 * VERSIONS - 1}"} <= told
-
-
-def test_the_process_is_told_of() -> None:
-    text = generate_latest(ServiceMetrics().registry).decode()
-    for name in ("process_resident_memory_bytes", "process_open_fds", "python_gc_collections_total", "python_info"):
-        assert f"\n{name}" in text

@@ -1,8 +1,12 @@
-"""The monitor says that a recalibration is due by many pages, once, and takes it back only when it is well again."""
+"""The monitor says that a recalibration is due by many pages, once, and takes it back only when it is well again.
+
+Signs belong to whose pages show them: a caller's frames say nothing of the service's own device.
+"""
 
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +14,7 @@ import numpy as np
 import pytest
 
 from lightpage.codec.page_bytes import Loss, PageBytes
-from runtime.bundle.bundle import Bundle
+from lightpage.recording.frame_pair import FramePair
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_position import ImagePosition
 from runtime.decoding.page import DecodedPage
@@ -18,18 +22,20 @@ from runtime.errors import Reason, UnconfirmedPageError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.metrics import ServiceMetrics
-from runtime.service.monitor import Monitor, MonitorSettings, PageFigures
+from runtime.service.monitor import Monitor, MonitorSettings, MonitorState, PageFigures, SessionMonitors
 from runtime.service.observation import Observation
 from runtime.service.registry import ModelRegistry
+from runtime.service.sessions import named_session
+from runtime.service.settings import ServiceSettings
 from tests.runtime import toy
+from tests.waiting import eventually
 
 MARGIN, NOISE = 0.126, 0.019
 """Of a quiet bench device."""
 
 
 @pytest.fixture(scope="module")
-def page(toy_zip: Path) -> DecodedPage:
-    decoder = Decoder(Bundle.open(toy_zip), threads=1)
+def page(decoder: Decoder) -> DecodedPage:
     return decoder.decode(toy.ToyDevice().page(toy.symbols_of(16, 1)[0], 16, 0.5), 16)
 
 
@@ -71,13 +77,10 @@ def test_a_gradual_drift_is_told_before_the_margin_is_gone() -> None:
     assert monitor.state().reasons[0].startswith("margin_bits 0.0")
 
 
-def test_a_knock_is_told_within_a_few_pages() -> None:
+def test_a_knock_is_told_within_a_few_pages_and_a_device_that_reads_nothing_is_due_at_once() -> None:
     monitor = Monitor()
     followed(monitor, quiet(25))
     assert followed(monitor, [-0.5] * 6).index(True) <= 3
-
-
-def test_a_device_that_reads_nothing_from_the_start_is_due() -> None:
     assert followed(Monitor(), [-0.5] * 10).index(True) == 7
 
 
@@ -91,6 +94,16 @@ def test_hysteresis_it_is_taken_back_only_well_within_the_threshold() -> None:
     assert all(followed(monitor, [0.6 * MARGIN] * 20))
     assert not followed(monitor, [0.8 * MARGIN] * 10)[-1]
     assert monitor.state().reasons == ()
+
+
+def test_where_pages_differ_much_a_sign_is_raised_further_off() -> None:
+    monitor, (sign,) = Monitor(), [sign for sign in MonitorSettings().signs if sign.name == "margin_bits"]
+    followed(monitor, [0.1, 0.5] * 10)
+    (found,) = [found for found in monitor.state().signs if found.name == "margin_bits"]
+    noise = 1.25 * 1.4826 * 0.4 / math.sqrt(2 * sign.window)
+    assert found.baseline == 0.5
+    assert found.raise_at == pytest.approx(0.5 - sign.deviations * noise)
+    assert found.clear_at == pytest.approx(0.5 - sign.deviations * noise * sign.clear_by / sign.raise_by)
 
 
 def test_a_new_model_starts_anew_and_pages_of_the_old_one_say_nothing() -> None:
@@ -126,18 +139,26 @@ def test_a_restless_piston_is_shown_and_asks_for_no_recalibration() -> None:
     assert value("lightpage_monitor_due") == 0
 
 
+def test_the_state_that_is_shown_last_is_the_newest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that was held up before it showed what it saw."""
+    metrics, pages = ServiceMetrics(), iter([0.0])
+    monitor = Monitor(metrics=metrics)
+    state = monitor.state
+
+    def others_come_between() -> MonitorState:
+        found = state()
+        for _ in pages:
+            threading.Thread(target=followed, args=(monitor, [-1.0] * 8)).start()
+            threading.Event().wait(0.02)  # they would be shown by now, and then hidden by what was found before
+        return found
+
+    monkeypatch.setattr(monitor, "state", others_come_between)
+    followed(monitor, [0.1])
+    assert eventually(lambda: metrics.registry.get_sample_value("lightpage_monitor_due")) == 1
+
+
 def observation(page: DecodedPage | None, **changes: object) -> Observation:
-    return Observation(
-        **{
-            "subject": "p",
-            "page_index": 1,
-            "model_version": "m",
-            "time_s": 0.0,
-            "seconds": 0.1,
-            "page": page,
-            **changes,
-        }
-    )  # type: ignore[arg-type]
+    return replace(Observation("p", 1, "m", 0.0, 0.1, page=page), **changes)  # type: ignore[arg-type]
 
 
 def found(loss: Loss | None, margin: float) -> PageBytes:
@@ -169,8 +190,7 @@ def test_what_a_page_says_of_the_device(page: DecodedPage) -> None:
     assert figures.of(observation(None, lost=Reason.MISSING_FRAME)) == {}
 
 
-def test_answers_and_lost_pages_carry_it(toy_zip: Path) -> None:
-    decoder = Decoder(Bundle.open(toy_zip), threads=1)
+def test_answers_and_lost_pages_carry_it(decoder: Decoder) -> None:
     settings = MonitorSettings(baseline_pages=3)
     source, monitor = toy.ToySource(toy.ToyDevice()), Monitor(settings)
     plane = DataPlane(ModelRegistry(decoder), source, monitor=monitor)
@@ -190,3 +210,128 @@ def test_answers_and_lost_pages_carry_it(toy_zip: Path) -> None:
     for _ in range(8):
         answer = plane.read_page(None, None, Caller()).answer
     assert not answer.recalibration_due
+
+
+PAGES = 8
+"""Of another device, after which there is no doubt."""
+
+
+def another_devices(seed: int) -> FramePair:
+    return toy.ToyDevice((230.0, 20.0), seed=seed).page(toy.symbols_of(16, seed)[0], 16)
+
+
+def own(seed: int) -> FramePair:
+    return toy.ToyDevice(seed=seed).page(toy.symbols_of(16, seed)[0], 16)
+
+
+def plane_of(decoder: Decoder, *device_sessions: str) -> DataPlane:
+    monitor, source = Monitor(MonitorSettings(3)), toy.ToySource(toy.ToyDevice())
+    return DataPlane(ModelRegistry(decoder), source, monitor=monitor, device_sessions=device_sessions)
+
+
+def send(plane: DataPlane, pair: FramePair, session: str, stateless: bool = False) -> bool:
+    """Whether a caller hears that a recalibration is due."""
+    try:
+        return plane.decode(pair, 16, Caller(session=session, stateless=stateless)).recalibration_due
+    except UnconfirmedPageError as error:
+        return error.recalibration_due
+
+
+def due_sessions(plane: DataPlane) -> float | None:
+    return plane.metrics.registry.get_sample_value("lightpage_sessions_due")
+
+
+@pytest.mark.parametrize("session", ["session other", "connection ipv4:127.0.0.1:4000"])
+def test_another_devices_frames_raise_their_own_sessions_flag_alone(session: str, decoder: Decoder) -> None:
+    plane, woken = plane_of(decoder), list[bool]()
+    assert plane.monitor is not None
+    plane.monitor.listen(lambda: woken.append(True))
+    for seed in range(PAGES):
+        send(plane, another_devices(seed), session)
+    assert send(plane, own(50), session)
+    assert due_sessions(plane) == 1
+    assert not send(plane, own(50), "session third")
+    assert not plane.monitor.due
+    assert not woken
+    assert not plane.read_page(None, None, Caller()).answer.recalibration_due
+    assert plane.monitor.state().pages == 1
+
+
+def test_pages_of_the_source_feed_the_monitor_and_what_is_decoded_as_if_it_were_the_first_page_none(
+    decoder: Decoder,
+) -> None:
+    plane = plane_of(decoder)
+    assert plane.monitor is not None
+    for caller in (Caller(), Caller(session="session a"), Caller(stateless=True)):
+        plane.read_page(None, None, caller)
+    assert plane.monitor.state().pages == 3
+    for seed in range(PAGES):
+        send(plane, another_devices(seed), "session a", stateless=True)
+    assert not send(plane, own(50), "session a", stateless=True)
+    assert due_sessions(plane) == 0
+
+
+def test_a_session_that_is_named_as_the_device_feeds_the_monitor(decoder: Decoder) -> None:
+    plane = plane_of(decoder, "session press-1")
+    assert plane.monitor is not None
+    for seed in range(PAGES):
+        send(plane, another_devices(seed), "session press-1")
+    assert plane.monitor.due
+    assert due_sessions(plane) == 0
+    assert plane.read_page(None, None, Caller()).answer.recalibration_due
+    assert not send(plane, own(50), "session press-2")
+
+
+def test_sessions_begin_anew_with_a_model_and_are_bounded() -> None:
+    monitors = SessionMonitors(MonitorSettings(3), most=5)
+    monitors.begin("m")
+    first = monitors.of("0")
+    for number in range(20):
+        for _ in range(PAGES):
+            monitors.of(str(number)).follow("m", {"unread": 1.0})
+    assert monitors.due() == 5
+    assert monitors.of("19") is monitors.of("19")
+    assert monitors.of("0") is not first
+    monitors.begin("n")
+    assert monitors.due() == 0
+    monitors.of("19").follow("m", {"unread": 1.0})
+    assert monitors.of("19").state().pages == 0
+
+
+def test_the_setting_names_sessions_as_callers_do(tmp_path: Path) -> None:
+    plain = ServiceSettings.model_validate({"self_calibration": {"device_sessions": ["press-1"]}})
+    assert plain.device_sessions == [named_session("press-1", "")]
+    tls = {name: str(tmp_path / name) for name in ("ca", "certificate", "key")}
+    named = {"tls": tls, "self_calibration": {"device_sessions": ["controller/press-1"]}}
+    assert ServiceSettings.model_validate(named).device_sessions == [named_session("press-1", "controller")]
+    named["self_calibration"] = {"device_sessions": ["press-1"]}
+    with pytest.raises(ValueError, match="device_sessions"):
+        ServiceSettings.model_validate(named)
+
+
+def test_frames_of_a_session_that_is_due_are_not_kept_as_the_devices(decoder: Decoder) -> None:
+    plane = plane_of(decoder)
+    seen = list[bool]()
+
+    class Notes:
+        def observe(self, observation: object) -> None:
+            seen.append(observation.of_device)  # type: ignore[attr-defined]
+
+    plane.observers = (Notes(),)
+    send(plane, own(1), "session a")
+    plane.read_page(None, None, Caller())
+    assert seen == [False, True]
+
+
+def test_figures_of_the_last_page_show_the_device(decoder: Decoder) -> None:
+    plane = plane_of(decoder, "session press-1")
+    value = plane.metrics.registry.get_sample_value
+    plane.read_page(None, None, Caller())
+    shown = value("lightpage_confidence_mean")
+    dim = toy.ToyDevice(noise=60.0, seed=9).page(toy.symbols_of(16, 9)[0], 16)
+    send(plane, dim, "session other")
+    send(plane, another_devices(1), "session other")
+    assert (value("lightpage_confidence_mean"), value("lightpage_recalibration_due")) == (shown, 0)
+    assert value("lightpage_pages_total", {"model_version": "toy-1"}) == 2
+    send(plane, dim, "session press-1")
+    assert value("lightpage_confidence_mean") != shown

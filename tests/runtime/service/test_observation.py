@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,14 +9,14 @@ from lightpage.errors import FrameError
 from lightpage.page.pilots import Pilots
 from lightpage.von_mises import information
 from runtime.acquisition.source import SHOT_S, Shot
-from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.errors import LostShotError, Reason, SourceError, UnconfirmedPageError
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.monitor import PageFigures
-from runtime.service.observation import Observation
+from runtime.service.observation import Observation, Seen
 from runtime.service.registry import ModelRegistry
+from tests.clock import HandClock
 from tests.runtime import toy
 
 
@@ -40,9 +38,9 @@ class LosingSource(toy.ToySource):
         return super().shot(timeout_s, page)
 
 
-def test_pages_given_out_and_lost_are_observed(toy_zip: Path) -> None:
+def test_pages_given_out_and_lost_are_observed(decoder: Decoder) -> None:
     broken, notebook = Notebook(broken=True), Notebook()
-    registry = ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1))
+    registry = ModelRegistry(decoder)
     plane = DataPlane(registry, LosingSource(toy.ToyDevice()), observers=[broken, notebook])
     plane.read_page(0, None, Caller())
     with pytest.raises(LostShotError):
@@ -68,13 +66,13 @@ def test_pages_given_out_and_lost_are_observed(toy_zip: Path) -> None:
     assert unconfirmed.page is not None
     assert not unconfirmed.tells
     assert len(broken.seen) == 3
-    lost = plane.metrics.lost_pages.labels("MISSING_FRAME")._value.get()
+    lost = plane.metrics.registry.get_sample_value("lightpage_pages_lost_total", {"reason": "MISSING_FRAME"})
     assert lost == 1
 
 
-def test_pages_of_the_source_whose_frames_contradict_each_other_are_observed_as_lost(toy_zip: Path) -> None:
+def test_pages_of_the_source_whose_frames_contradict_each_other_are_observed_as_lost(decoder: Decoder) -> None:
     notebook, source = Notebook(), toy.ToySource(toy.ToyDevice((180.0, 30.0)))
-    plane = DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1)), source, observers=[notebook])
+    plane = DataPlane(ModelRegistry(decoder), source, observers=[notebook])
     with pytest.raises(SourceError, match="contradict"):
         plane.read_page(0, None, Caller())
     with pytest.raises(FrameError, match="contradict"):  # a caller's frames may be swapped
@@ -84,3 +82,13 @@ def test_pages_of_the_source_whose_frames_contradict_each_other_are_observed_as_
     assert seen.pair is not None
     assert "contradict" in seen.detail
     assert PageFigures().of(seen) == {"unread": 1}
+
+
+def test_a_page_is_timed_from_its_begin_to_its_end() -> None:
+    since_1970, lap = HandClock(1e9), HandClock(5.0)
+    seen = Seen("page 3", 3, "toy-1", since_1970.now, lap.now)
+    since_1970.advance(7.0)
+    lap.advance(0.25)
+    seen.note(subject="page 4", levels=16)
+    ended = seen.ended(Reason.MISSING_FRAME, "dark")
+    assert ended == Observation("page 4", 3, "toy-1", 1e9 + 7.0, 0.25, Reason.MISSING_FRAME, "dark", levels=16)

@@ -29,7 +29,7 @@ def test_a_pair_lies_where_one_lay_before_that_nobody_looks_at() -> None:
     second = received(budget, 2)
     assert address(second) == before
     assert (second.pair().in_phase == 2).all()
-    assert budget.used == held.size
+    assert (budget.used, budget.taken) == (held.size, 2 * held.size)
 
 
 def test_frames_that_are_still_held_stay_as_they_are() -> None:

@@ -39,43 +39,39 @@ def refuse(model: Model, history: History) -> None:
     raise BundleError("note", "disk full", "room")
 
 
-def test_a_model_that_was_rolled_back_stays_and_is_gone_to_again(decoder: Decoder, tmp_path: Path) -> None:
+def test_a_model_that_was_rolled_back_stays_until_a_new_one_drops_what_lies_ahead(
+    decoder: Decoder, tmp_path: Path
+) -> None:
     registry = a_registry(decoder, tmp_path, "toy-2", "toy-3")
     later = registry.current
     assert [model.version for model in registry.rollback()] == ["toy-2", "toy-3"]
     assert (registry.current.version, loaded(registry)) == ("toy-2", ["toy-1", "toy-2", "toy-3"])
     assert registry.step(1) == (later, registry.models[1])
-    with pytest.raises(BundleError, match="wanted a later model"):
+    with pytest.raises(BundleError, match="later"):
         registry.step(1)
-
-
-def test_a_new_model_drops_those_that_lie_ahead(decoder: Decoder, tmp_path: Path) -> None:
-    registry = a_registry(decoder, tmp_path, "toy-2", "toy-3")
     registry.rollback()
     registry.swap(Decoder.load(a_place(tmp_path, "toy-4").path, threads=1))
     assert order(registry) == loaded(registry) == ["toy-1", "toy-2", "toy-4"]
     assert registry.rollback()[0].version == "toy-2"
 
 
-def test_models_beyond_those_kept_are_loaded_again(decoder: Decoder, tmp_path: Path) -> None:
+def test_models_beyond_those_kept_are_loaded_again_where_they_can_be(decoder: Decoder, tmp_path: Path) -> None:
     registry = a_registry(decoder, tmp_path, "toy-2", "toy-3", "toy-4", kept=2)
     assert loaded(registry) == ["toy-3", "toy-4"]
-    assert [registry.rollback()[0].version for _ in range(3)] == ["toy-3", "toy-2", "toy-1"]
-    assert loaded(registry) == ["toy-1", "toy-2"]
-    assert registry.current.decoder.threads == 1
-
-
-def test_a_model_that_cannot_be_loaded_again_leaves_the_one_in_service(decoder: Decoder, tmp_path: Path) -> None:
-    registry = a_registry(decoder, tmp_path, "toy-2", "toy-3", "toy-4", kept=2)
     registry.rollback()
+    good = (tmp_path / "toy-2.zip").read_bytes()
     (tmp_path / "toy-2.zip").write_bytes(b"damaged")
-    with pytest.raises(BundleError, match="sound zip"):
+    with pytest.raises(BundleError, match="bundle"):
         registry.rollback()
     (tmp_path / "toy-2.zip").unlink()
     toy.write_toy_bundle(tmp_path / "toy-2.zip", version="toy-9")
-    with pytest.raises(BundleError, match="got toy-9, wanted toy-2"):
+    with pytest.raises(BundleError, match="got toy-9"):
         registry.rollback()
     assert registry.current.version == "toy-3"
+    (tmp_path / "toy-2.zip").write_bytes(good)
+    assert [registry.rollback()[0].version for _ in range(2)] == ["toy-2", "toy-1"]
+    assert loaded(registry) == ["toy-1", "toy-2"]
+    assert registry.current.decoder.threads == 1
 
 
 def test_a_step_is_made_only_from_the_version_that_is_expected(decoder: Decoder, tmp_path: Path) -> None:
@@ -85,7 +81,7 @@ def test_a_step_is_made_only_from_the_version_that_is_expected(decoder: Decoder,
         lambda: registry.step(1, "toy-1"),
         lambda: registry.go_to(registry.base, "toy-1"),
     ):
-        with pytest.raises(OtherModelError, match="got toy-2, wanted toy-1"):
+        with pytest.raises(OtherModelError, match="got toy-2"):
             change()
     assert registry.rollback("toy-2")[0].version == "toy-1"
 
@@ -112,7 +108,7 @@ def test_what_cannot_be_noted_changes_nothing(decoder: Decoder, tmp_path: Path) 
         lambda: registry.go_to(place, "", refuse),
         lambda: registry.swap(Decoder.load(place.path, 1), None, refuse),
     ):
-        with pytest.raises(BundleError, match="disk full"):
+        with pytest.raises(BundleError, match="note"):
             change()
         assert (registry.history, registry.models) == before
 
@@ -147,9 +143,9 @@ def test_other_devices_and_bundles_that_cannot_be_tracked_are_refused(decoder: D
             raise CalibrationError("calibration", "no table", "a calibration document")
         return NoTracker(made)
 
-    with pytest.raises(BundleError, match="no table"):
+    with pytest.raises(BundleError, match="calibration"):
         ModelRegistry(decoder, tracker).check(same)
-    with pytest.raises(BundleError, match="got 10 bits, wanted 8 bits"):
+    with pytest.raises(BundleError, match="got 10 bits"):
         ModelRegistry(decoder).check(deep)
     ModelRegistry(decoder).check(same)
 

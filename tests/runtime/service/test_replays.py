@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import gc
+import threading
 import weakref
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from pathlib import Path
 
 import grpc
 import numpy as np
 import pytest
 
-from lightpage.errors import LightpageError, StorageError, SurroundingsError
+from lightpage.errors import LightpageError, StorageError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
-from runtime.acquisition.source import FrameSource, Shot
-from runtime.bundle.bundle import Bundle
+from runtime.acquisition.source import Shot
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.page import DecodedPage
 from runtime.decoding.tracking import NoTracker
 from runtime.errors import (
+    CallerLeft,
     LostShotError,
-    NoSourceError,
-    OtherModelError,
     Reason,
+    RequestIdError,
     SlotsTakenError,
     SourceError,
     UnconfirmedPageError,
@@ -36,28 +35,11 @@ from runtime.rpc.page_calls import PageCalls
 from runtime.service.caller import Caller
 from runtime.service.dataplane import DataPlane
 from runtime.service.monitor import Monitor
-from runtime.service.registry import ModelRegistry, TrackerFactory
+from runtime.service.registry import ModelRegistry
 from runtime.service.replays import Replays
 from runtime.wire.status import status_of
+from tests.clock import HandClock
 from tests.runtime import toy
-
-
-def test_requests_of_calls_that_failed_take_of_the_room_too() -> None:
-    replays, tried = Replays(600, 1 << 20), list[str]()
-
-    def ask(number: int) -> None:
-        def fail() -> bytes:
-            tried.append(str(number))
-            raise NoSourceError("source", "none", "one")
-
-        with pytest.raises(NoSourceError):
-            replays.once(f"{number}{'x' * (1 << 17)}", bytes(1 << 17), Caller(), fail)
-
-    for number in range(8):
-        ask(number)
-    ask(0)  # forgotten
-    ask(7)  # not yet
-    assert tried == [*"01234567", "0"]
 
 
 class Losing(NoTracker):
@@ -91,15 +73,11 @@ def collected_by_nobody() -> Iterator[None]:
     gc.enable()
 
 
-def lost_plane(toy_zip: Path, tracker: TrackerFactory, source: FrameSource) -> DataPlane:
-    return DataPlane(ModelRegistry(Decoder(Bundle.open(toy_zip), threads=1), tracker), source, monitor=Monitor())
-
-
 @pytest.mark.usefixtures("collected_by_nobody")
 @pytest.mark.parametrize("request_id", ["", "shift-1"])
-def test_nothing_holds_the_frames_of_a_lost_page(request_id: str, toy_zip: Path) -> None:
+def test_nothing_holds_the_frames_of_a_lost_page(request_id: str, decoder: Decoder) -> None:
     source = Watching()
-    plane = lost_plane(toy_zip, Losing, source)
+    plane = DataPlane(ModelRegistry(decoder, Losing), source, monitor=Monitor())
     calls, request = PageCalls(plane), pb.ReadPageRequest(request_id=request_id)
     for _ in range(3 if request_id else 1):
         with suppress(UnconfirmedPageError):  # `pytest.raises` would keep it
@@ -109,16 +87,15 @@ def test_nothing_holds_the_frames_of_a_lost_page(request_id: str, toy_zip: Path)
     assert not any(frame() is not None for frame in source.frames)
 
 
-FAILURES = [
-    LostShotError("page 1", "no frame", "one", Reason.MISSING_FRAME),
-    UnconfirmedPageError("pilots", "none", "some", Reason.PILOTS_DISAGREE, recalibration_due=True),
-    SourceError("source", "black", "light"),
-    OtherModelError("model in service", "bench-9", "bench-8"),
-    SurroundingsError("service", "too little memory", "more"),
-]
-
-
-@pytest.mark.parametrize("failure", FAILURES, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize(
+    "failure",
+    [
+        LostShotError("page 1", "no frame", "one", Reason.MISSING_FRAME),
+        UnconfirmedPageError("pilots", "none", "some", Reason.PILOTS_DISAGREE, recalibration_due=True),
+        SourceError("source", "black", "light"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
 def test_a_failure_that_is_kept_comes_again_as_it_was_and_is_counted(failure: LightpageError) -> None:
     replays, done = Replays(600, 1 << 20), list[bytes]()
 
@@ -165,7 +142,7 @@ def test_what_failed_before_a_shot_is_tried_again(failure: LightpageError) -> No
     assert replays.once("a", b"", Caller(), work) == (b"page", False)
 
 
-def test_the_oldest_go_where_lost_pages_fill_the_budget() -> None:
+def test_the_oldest_go_where_the_budget_is_full() -> None:
     replays = Replays(600, 20_000)
 
     def lost() -> bytes:
@@ -173,13 +150,68 @@ def test_the_oldest_go_where_lost_pages_fill_the_budget() -> None:
 
     for number in range(200):
         with pytest.raises(LostShotError):
-            replays.once(str(number), b"", Caller(), lost)
+            replays.once(str(number), bytes(number), Caller(), lost)
     assert 10_000 < replays.held_bytes <= 22_000
+    assert replays.once("0", b"", Caller(), lambda: b"anew") == (b"anew", False)
+    with pytest.raises(LostShotError):
+        replays.once("199", bytes(199), Caller(), bytes)
 
 
 def test_answers_go_when_their_time_is_up() -> None:
-    now = [0.0]
-    replays = Replays(600, 1 << 20, lambda: now[0])
+    clock = HandClock()
+    replays = Replays(600, 1 << 20, clock)
     assert replays.once("a", b"", Caller(), lambda: b"1") == (b"1", False)
-    now[0] = 601
+    clock.advance(600)
+    assert replays.once("a", b"", Caller(), lambda: b"2") == (b"1", True)
+    clock.advance(0.1)
     assert replays.once("a", b"", Caller(), lambda: b"2") == (b"2", False)
+
+
+class Asked:
+    """An answer that takes as long as it is let, and who waits for it."""
+
+    def __init__(self) -> None:
+        self.clock, self.go, self.begun = HandClock(), threading.Event(), threading.Event()
+        self.replays = Replays(600, 1 << 20, self.clock)
+        self.pool = ThreadPoolExecutor(2)
+        self.first = self.ask(Caller())
+        assert self.begun.wait(60)
+
+    def ask(self, caller: Caller) -> Future[tuple[bytes, bool]]:
+        return self.pool.submit(self.replays.once, "a", b"request", caller, self._work)
+
+    def _work(self) -> bytes:
+        self.begun.set()
+        self.go.wait()
+        return b"page"
+
+
+@pytest.fixture
+def asked() -> Iterator[Asked]:
+    made = Asked()
+    yield made
+    made.go.set()
+    made.pool.shutdown()
+
+
+def test_who_asks_meanwhile_waits_for_the_first_ones_answer(asked: Asked) -> None:
+    second = asked.ask(Caller())
+    asked.clock.until_somebody_waits()
+    asked.go.set()
+    assert (asked.first.result(60), second.result(60)) == ((b"page", False), (b"page", True))
+
+
+def test_who_waits_goes_when_its_time_is_up_or_it_leaves(asked: Asked) -> None:
+    late = asked.ask(Caller(lambda: 2.0))
+    asked.clock.until_somebody_waits()
+    asked.clock.advance(2.0)
+    with pytest.raises(SlotsTakenError):
+        late.result(60)
+    leaving = Caller()
+    left = asked.ask(leaving)
+    asked.clock.until_somebody_waits()
+    leaving.leave()
+    with pytest.raises(CallerLeft):
+        left.result(60)
+    with pytest.raises(RequestIdError):
+        asked.replays.once("a", b"another request", Caller(), bytes)

@@ -93,79 +93,75 @@ def test_the_short_name_of_the_store_counts_less_than_the_long_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "got", "wanted"),
     [
-        (
-            "[limits]\nconcurent_decodes = 1",
-            r"unknown limits\.concurent_decodes, wanted limits\.concurrent_decodes",
-        ),
-        ("[limts]\nstall_s = 1", r"got unknown limts, wanted table \[limits\]"),
-        ("[service]\nport = 9100", r"got unknown service\.port, wanted metrics\.port"),
-        ("limits = 3", r"got limits = 3, wanted a table"),
-        ("[limits]\nconcurrent_decodes = 0", r"got limits\.concurrent_decodes = 0, wanted at least 1"),
-        ("[limits]\nconcurrent_decodes = true", r"got limits\.concurrent_decodes = true, wanted a whole number"),
-        ("[limits]\nstall_s = '5'", r"got limits\.stall_s = '5', wanted a number"),
-        ("[limits]\nstall_s = nan", r"got limits\.stall_s = nan, wanted a finite number"),
-        ("[limits]\nchunk_bytes = 4194304", r"chunk_bytes = 4194304, wanted at least 1024 less than limits\.message_"),
-        ("[limits]\npair_bytes = 2000000000", r"wanted at least limits\.pair_bytes"),
-        ("[limits]\nstall_s = 31", r"stall_s = 31\.0, wanted at most limits\.receive_s, which is 30"),
-        ("[limits]\nconnection_grace_s = 9", r"connection_grace_s = 9\.0, wanted limits\.connection_age_s too"),
-        ("[service]\naddress = 'here'", r"got service\.address = 'here', wanted HOST:PORT"),
-        ("[service]\nstore = ''", r"service\.store = '', wanted a path that is not empty"),
-        ("[service]\npages = 'p.h5'", r"service\.pages = 'p\.h5', wanted service\.source"),
-        ("[logs]\nlevel = 'loud'", r"logs\.level = 'loud', wanted debug, info, warning or error"),
-        (
-            "[self_calibration]\npages = [1, -2]",
-            r"calibration\.pages\.1 = -2, wanted at least 0",
-        ),
-        ("[self_calibration]\npages = [1]", r"pages = \[1\], wanted at least 2 that differ"),
-        ("[self_calibration]\nenabled = true", r"enabled = True, wanted service\.source"),
-        ("[self_calibration]\nlongest_s = 5", r"longest_s = 5\.0, wanted at least self_calibration\.least_s"),
-        ("[traces]\nendpoint = 'collector:4317'", r"traces\.endpoint = 'collector:4317', wanted http://HOST:PORT or"),
-        ("[traces]\nendpoint = 'http://collector'", r"traces\.endpoint = 'http://collector', wanted http://HOST:PORT"),
-        ("[traces]\nshare = 1.5", r"traces\.share = 1\.5, wanted at most 1"),
-        ("[service", "wanted a TOML file that can be read"),
+        ("[limits]\nconcurent_decodes = 1", "limits.concurent_decodes", "limits.concurrent_decodes"),
+        ("[limts]\nstall_s = 1", "limts", "[limits]"),
+        ("[service]\nport = 9100", "service.port", "metrics.port"),
+        ("limits = 3", "limits = 3", "table"),
+        ("[limits]\nconcurrent_decodes = 0", "limits.concurrent_decodes = 0", "at least 1"),
+        ("[limits]\nconcurrent_decodes = true", "limits.concurrent_decodes = true", "whole"),
+        ("[limits]\nstall_s = '5'", "limits.stall_s = '5'", "number"),
+        ("[limits]\nstall_s = nan", "limits.stall_s = nan", "finite"),
+        ("[limits]\nchunk_bytes = 4194304", "chunk_bytes = 4194304", "limits.message_bytes"),
+        ("[limits]\npair_bytes = 2000000000", "", "limits.pair_bytes"),
+        ("[limits]\nstall_s = 31", "stall_s = 31.0", "limits.receive_s"),
+        ("[limits]\nconnection_grace_s = 9", "connection_grace_s = 9.0", "limits.connection_age_s"),
+        ("[service]\naddress = 'here'", "service.address = 'here'", "HOST:PORT"),
+        ("[service]\nstore = ''", "service.store = ''", "path"),
+        ("[service]\npages = 'p.h5'", "service.pages = 'p.h5'", "service.source"),
+        ("[logs]\nlevel = 'loud'", "logs.level = 'loud'", "warning"),
+        ("[self_calibration]\npages = [1, -2]", "calibration.pages.1 = -2", "at least 0"),
+        ("[self_calibration]\npages = [1]", "pages = [1]", "at least 2"),
+        ("[self_calibration]\nenabled = true", "enabled = True", "service.source"),
+        ("[self_calibration]\nlongest_s = 5", "longest_s = 5.0", "self_calibration.least_s"),
+        ("[traces]\nendpoint = 'collector:4317'", "traces.endpoint = 'collector:4317'", "http://HOST:PORT"),
+        ("[traces]\nendpoint = 'http://collector'", "traces.endpoint = 'http://collector'", "http://HOST:PORT"),
+        ("[traces]\nshare = 1.5", "traces.share = 1.5", "at most 1"),
+        ("[service", "", "TOML"),
     ],
 )
-def test_a_wrong_setting_is_named_with_what_came_and_what_was_wanted(text: str, told: str, tmp_path: Path) -> None:
-    error = str(refused(tmp_path, text))
-    assert re.search(told, error), error
-    assert "service.toml" in error
-    assert "\n" not in error
+def test_a_wrong_setting_is_named_with_what_came_and_what_was_wanted(
+    text: str, got: str, wanted: str, tmp_path: Path
+) -> None:
+    error = refused(tmp_path, text)
+    assert got in str(error.got)
+    assert wanted in str(error.expected)
+    assert "service.toml" in str(error)
+    assert "\n" not in str(error)
 
 
 def test_all_wrong_settings_are_named_at_once_with_where_they_come_from(tmp_path: Path) -> None:
     option = Option("--threads", ("service", "threads"), 0)
-    told = str(refused(tmp_path, "[limits]\nstall_s = -1", option, LIGHTPAGE_LOGS__FORMAT="xml"))
-    assert told.startswith("LIGHTPAGE_LOGS__FORMAT: got 'xml', wanted text or json")
+    error = refused(tmp_path, "[limits]\nstall_s = -1", option, LIGHTPAGE_LOGS__FORMAT="xml")
+    assert (error.subject, "'xml'" in str(error.got)) == ("LIGHTPAGE_LOGS__FORMAT", True)
     told = str(refused(tmp_path, "[limits]\nstall_s = -1", option))
-    assert "limits.stall_s = -1 (file " in told
-    assert "service.threads = 0 (option --threads), wanted at least 1" in told
+    assert "limits.stall_s = -1 (file" in told
+    assert "(option --threads)" in told
 
 
 @pytest.mark.parametrize(
-    ("variable", "value", "told"),
+    ("variable", "value", "wanted"),
     [
-        (DECODES, "many", "wanted a whole number"),
-        (DECODES, "0", "wanted at least 1"),
-        ("LIGHTPAGE_LIMITS__CONCURENT_DECODES", "1", "wanted limits.concurrent_decodes"),
-        ("LIGHTPAGE_LIMIT__STALL_S", "1", "wanted table [limits]"),
+        ("CONCURRENT_DECODES", "many", "whole"),
+        ("CONCURRENT_DECODES", "0", "at least 1"),
+        ("CONCURENT_DECODES", "1", "limits.concurrent_decodes"),
     ],
 )
-def test_a_wrong_variable_is_named(variable: str, value: str, told: str, tmp_path: Path) -> None:
-    error = str(refused(tmp_path, "", **{variable: value}))
-    assert variable in error
-    assert told in error
+def test_a_wrong_variable_is_named(variable: str, value: str, wanted: str, tmp_path: Path) -> None:
+    error = refused(tmp_path, "", **{f"LIGHTPAGE_LIMITS__{variable}": value})
+    assert variable in str(error)
+    assert wanted in str(error.expected)
 
 
 def test_a_missing_file_and_missing_paths_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="No such file"):
+    with pytest.raises(InvalidInputError, match=re.escape(str(tmp_path / "none.toml"))):
         service_settings(tmp_path / "none.toml", {})
     text = f"[service]\nsource = 'simulator:bench'\nrecordings = '{tmp_path}/gone'"
-    with pytest.raises(InvalidInputError, match=r"service\.recordings.*wanted a folder"):
-        of_file(tmp_path, text).settings.check_paths()
-    with pytest.raises(InvalidInputError, match=r"service\.pages.*wanted a file"):
-        of_file(tmp_path, text.replace("recordings", "pages")).settings.check_paths()
+    for key, kind in (("recordings", "folder"), ("pages", "file")):
+        with pytest.raises(InvalidInputError, match=rf"service\.{key}") as error:
+            of_file(tmp_path, text.replace("recordings", key)).settings.check_paths()
+        assert kind in str(error.value.expected)
 
 
 def test_printed_settings_are_the_settings_and_say_where_each_comes_from(tmp_path: Path) -> None:
@@ -212,31 +208,32 @@ TLS = {"ca": "ca.pem", "certificate": "service.pem", "key": "service.key"}
 """What may be set for TLS."""
 
 
+def with_tls(*names: str) -> str:
+    return "[tls]\n" + "".join(f"{name} = '{TLS[name]}'\n" for name in names)
+
+
 @pytest.mark.parametrize("lacking", list(TLS))
 def test_certificates_go_together(tmp_path: Path, lacking: str) -> None:
-    text = "".join(f"{name} = '{path}'\n" for name, path in TLS.items() if name != lacking)
-    assert refused(tmp_path, f"[tls]\n{text}").expected == f"tls.{lacking} too"
+    assert refused(tmp_path, with_tls(*TLS.keys() - {lacking})).expected == f"tls.{lacking} too"
 
 
 @pytest.mark.parametrize(
-    ("text", "key"),
+    ("key", "table", "value"),
     [
-        ("[service]\naddress = '0.0.0.0:50051'\n", "service.address"),
-        ("[service]\naddress = 'device.example:50051'\n", "service.address"),
-        ("[service]\naddress = '[::]:50051'\n", "service.address"),
-        ("[service]\nhealth_address = '0.0.0.0:50052'\n", "service.health_address"),
-        ("[metrics]\nhost = '0.0.0.0'\nport = 9100\n", "metrics.host"),
+        *(("service.address", "[service]\naddress = ", at) for at in ("0.0.0.0:1", "device.example:1", "[::]:1")),
+        ("service.health_address", "[service]\nhealth_address = ", "0.0.0.0:50052"),
+        ("metrics.host", "[metrics]\nport = 9100\nhost = ", "0.0.0.0"),
     ],
 )
-def test_what_others_reach_needs_certificates(tmp_path: Path, text: str, key: str) -> None:
+def test_what_others_reach_needs_certificates(tmp_path: Path, key: str, table: str, value: str) -> None:
+    text = f"{table}'{value}'\n"
     error = refused(tmp_path, text)
     assert key in error.got
     assert "[tls]" in error.expected
-    secured = of_file(tmp_path, text + "[tls]\n" + "".join(f"{name} = '{path}'\n" for name, path in TLS.items()))
-    assert secured.settings.tls.files() is not None
+    assert of_file(tmp_path, text + with_tls(*TLS)).settings.tls.files() is not None
     assert of_file(tmp_path, text, LIGHTPAGE_SERVICE__INSECURE="true").settings.service.insecure
 
 
-@pytest.mark.parametrize("address", ["127.0.0.1:0", "localhost:50051", "[::1]:50051", "127.3.2.1:50051", "unix:/run/a"])
-def test_this_machine_alone_needs_none(tmp_path: Path, address: str) -> None:
-    assert of_file(tmp_path, f"[service]\naddress = '{address}'\n").settings.service.address == address
+def test_this_machine_alone_needs_none(tmp_path: Path) -> None:
+    for address in ("127.0.0.1:0", "localhost:50051", "[::1]:50051", "127.3.2.1:50051", "unix:/run/a"):
+        assert of_file(tmp_path, f"[service]\naddress = '{address}'\n").settings.service.address == address

@@ -5,35 +5,21 @@ from __future__ import annotations
 from itertools import pairwise
 
 from runtime.service.stages import CallTimes, Lap, Stage, Stages
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-    def passes(self, seconds: float) -> None:
-        self.now += seconds
+from tests.clock import HandClock
 
 
 def test_the_stages_are_the_whole_way() -> None:
-    clock = Clock()
-    stages = Stages(clock=clock)
-    clock.passes(0.25)
-    stages.begin(Stage.RECEIVE)
-    clock.passes(1.0)
-    stages.begin(Stage.QUEUE)
-    clock.passes(2.0)
-    stages.begin(Stage.INFERENCE)
-    clock.passes(4.0)
+    clock = HandClock(100.0)
+    stages = Stages(clock=clock.now)
+    clock.advance(0.25)
+    for stage, seconds in ((Stage.RECEIVE, 1.0), (Stage.QUEUE, 2.0), (Stage.INFERENCE, 4.0)):
+        stages.begin(stage)
+        clock.advance(seconds)
     stages.begin(Stage.POST_PROCESSING, after_s=3.0)
-    clock.passes(8.0)
-    stages.begin(Stage.CODE)
-    clock.passes(16.0)
-    stages.begin(Stage.RESPOND)
-    clock.passes(32.0)
+    for stage, seconds in ((None, 8.0), (Stage.CODE, 16.0), (Stage.RESPOND, 32.0)):
+        if stage is not None:
+            stages.begin(stage)
+        clock.advance(seconds)
     assert stages.seconds()[Stage.RESPOND] == 32.0
     stages.end()
     assert stages.seconds() == {
@@ -50,25 +36,25 @@ def test_the_stages_are_the_whole_way() -> None:
 
 
 def test_a_stage_is_never_longer_than_the_time_that_has_passed() -> None:
-    clock = Clock()
-    stages = Stages(clock=clock)
+    clock = HandClock(100.0)
+    stages = Stages(clock=clock.now)
     stages.begin(Stage.INFERENCE)
-    clock.passes(1.0)
+    clock.advance(1.0)
     stages.begin(Stage.POST_PROCESSING, after_s=5.0)
-    clock.passes(1.0)
+    clock.advance(1.0)
     stages.begin(Stage.POST_PROCESSING)
-    clock.passes(1.0)
+    clock.advance(1.0)
     stages.end()
     assert stages.laps == (Lap(Stage.INFERENCE, 100.0, 101.0), Lap(Stage.POST_PROCESSING, 101.0, 103.0))
 
 
 def test_what_has_ended_changes_no_more() -> None:
-    clock = Clock()
-    stages = Stages(clock=clock)
+    clock = HandClock(100.0)
+    stages = Stages(clock=clock.now)
     stages.begin(Stage.QUEUE)
-    clock.passes(1.0)
+    clock.advance(1.0)
     stages.end()
-    clock.passes(1.0)
+    clock.advance(1.0)
     stages.begin(Stage.RESPOND)
     stages.end()
     assert stages.seconds() == {Stage.QUEUE: 1.0}

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import logging
 import os
 import shutil
-import subprocess
-import sys
 import threading
-import time
 from collections import namedtuple
 from pathlib import Path
 
@@ -21,26 +19,27 @@ from lightpage.files import new_file
 from runtime.bundle.bundle import Bundle
 from runtime.decoding.decoder import Decoder
 from runtime.errors import StoreError
-from runtime.service import metrics as metrics_module
-from runtime.service import store as store_module
 from runtime.service.dataplane import DataPlane
 from runtime.service.registry import ModelRegistry
-from runtime.service.store import CURRENT, DAMAGED, KEPT_BUNDLES, LOCK, ModelStore, Note, Origin, Reason
+from runtime.service.store import CURRENT, DAMAGED, KEPT_BUNDLES, LOCK, PROBE_S, ModelStore, Note, Origin, Reason
+from tests.clock import HandClock
 from tests.runtime import toy
-
-ROOT = Path(__file__).resolve().parents[3]
+from tests.waiting import eventually
 
 Usage = namedtuple("Usage", "total used free")
 
 
 @pytest.fixture
 def store(decoder: Decoder, tmp_path: Path) -> ModelStore:
-    return ModelStore(tmp_path / "store", decoder.bundle)
+    """It is tried whenever somebody asks."""
+    return ModelStore(tmp_path / "store", decoder.bundle, clock=itertools.count(0.0, PROBE_S).__next__)
 
 
-def a_plane(decoder: Decoder, store: ModelStore) -> DataPlane:
+def a_plane(decoder: Decoder, store: ModelStore, **options: object) -> DataPlane:
     """A service as it is after a restart."""
-    plane = DataPlane(ModelRegistry(decoder), store=ModelStore(store.folder, decoder.bundle))
+    clock = itertools.count(0.0, PROBE_S).__next__
+    again = ModelStore(store.folder, decoder.bundle, **{"clock": clock, **options})  # type: ignore[arg-type]
+    plane = DataPlane(ModelRegistry(decoder), store=again)
     plane.models.resume()
     return plane
 
@@ -50,7 +49,8 @@ def put(store: ModelStore, *versions: str) -> None:
         toy.write_toy_bundle(store.path_of(version), version=version)
 
 
-def a_worn_plane(decoder: Decoder, store: ModelStore) -> DataPlane:
+@pytest.fixture
+def worn(decoder: Decoder, store: ModelStore) -> DataPlane:
     """A service with a history: base, r1, r2, r3."""
     put(store, "toy-1+r1", "toy-1+r2", "toy-1+r3")
     store.remember(store.path_of("toy-1+r1"))
@@ -64,46 +64,42 @@ def figure(plane: DataPlane, name: str, **labels: str) -> float | None:
     return plane.metrics.registry.get_sample_value(name, labels)
 
 
-def test_the_history_survives_a_restart(decoder: Decoder, store: ModelStore) -> None:
-    before = a_worn_plane(decoder, store)
-    before.rollback()
+def test_the_history_survives_a_restart(worn: DataPlane, decoder: Decoder, store: ModelStore) -> None:
+    worn.rollback()
     after = a_plane(decoder, store)
-    assert after.registry.history == before.registry.history
+    assert after.registry.history == worn.registry.history
     assert after.registry.current.version == "toy-1+r2"
     assert after.models.roll_forward()[0].version == "toy-1+r3"
     again = a_plane(decoder, store)
     assert [again.rollback()[0].version for _ in range(3)] == ["toy-1+r2", "toy-1+r1", "toy-1"]
-    assert a_plane(decoder, store).registry.current.version == "toy-1"
     assert a_plane(decoder, store).models.roll_forward()[0].version == "toy-1+r1"
     assert again.store_trouble() == ""
 
 
 def test_pins_and_origins_survive_a_restart_and_another_base(
-    decoder: Decoder, store: ModelStore, tmp_path: Path
+    worn: DataPlane, decoder: Decoder, store: ModelStore, tmp_path: Path
 ) -> None:
-    plane = a_worn_plane(decoder, store)
-    assert plane.models.pin("toy-1+r1", True).pinned
-    store.change(origins={"toy-1+r2": Origin.UPLOADED})
+    assert worn.models.pin("toy-1+r1", True).pinned
+    assert worn.store is not None
+    worn.store.change(origins={"toy-1+r2": Origin.UPLOADED})
     other = Bundle.open(toy.write_toy_bundle(tmp_path / "other.zip", version="other"))
-    for note in (ModelStore(store.folder, decoder.bundle).read(), ModelStore(store.folder, other).read()):
-        assert note.origins == {"toy-1+r2": Origin.UPLOADED}
-    plane = a_plane(decoder, store)
-    plane.models.pin("toy-1+r1", True)
-    assert a_plane(decoder, store).store.note.pinned == {"toy-1+r1"}  # type: ignore[union-attr]
-    assert ModelStore(store.folder, other).read().history == (None,)
-    assert ModelStore(store.folder, other).read().pinned == {"toy-1+r1"}
+    for base, places in ((decoder.bundle, 4), (other, 1)):
+        note = ModelStore(store.folder, base).read()
+        assert (note.origins, note.pinned) == ({"toy-1+r2": Origin.UPLOADED}, {"toy-1+r1"})
+        assert len(note.history) == places
 
 
 def test_a_note_of_an_earlier_program_is_read_and_one_of_this_names_what_that_reads(
     decoder: Decoder, store: ModelStore
 ) -> None:
     put(store, "toy-1+r1")
-    base = store._base
+    store.change()
+    base = json.loads((store.folder / CURRENT).read_text())["base"]
     (store.folder / CURRENT).write_text(json.dumps({"base": base, "bundle": "toy-1+r1.zip"}))
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1+r1"
     assert plane.rollback()[0].version == "toy-1"
-    assert json.loads((store.folder / CURRENT).read_text()) == {
+    written = {
         "base": base,
         "bundle": None,
         "history": [None, "toy-1+r1.zip"],
@@ -111,45 +107,36 @@ def test_a_note_of_an_earlier_program_is_read_and_one_of_this_names_what_that_re
         "pinned": [],
         "origins": {},
     }
+    assert json.loads((store.folder / CURRENT).read_text()) == written
     (store.folder / CURRENT).write_text(json.dumps({"base": base, "bundle": None}))
     assert store.read() == Note()
 
 
-def test_a_second_service_is_kept_out(toy_zip: Path, store: ModelStore, decoder: Decoder) -> None:
-    with store.locked():
-        with pytest.raises(StoreError, match="a store in use"), ModelStore(store.folder, decoder.bundle).locked():
-            pass
-        serve = [sys.executable, "-m", "lightpage.cli.main", "serve", "--address", "127.0.0.1:0"]
-        second = subprocess.run(
-            [*serve, "--bundle", toy_zip, "--store", store.folder], cwd=ROOT, capture_output=True, text=True, timeout=60
-        )
-        assert (second.returncode, second.stdout) == (2, "")
-        assert "a store in use, wanted one that no other service uses" in second.stderr
-    with ModelStore(store.folder, decoder.bundle).locked():
-        pass
-
-
-def test_what_a_killed_program_left_is_swept_and_nothing_else(store: ModelStore) -> None:
+def test_a_second_service_is_kept_out_and_what_a_killed_one_left_is_swept(decoder: Decoder, store: ModelStore) -> None:
     put(store, "toy-1+r1")
     (store.folder / ".toy-1+r2.zip-abc").mkdir()
     (store.folder / ".toy-1+r2.zip-abc" / "bundle.zip").write_bytes(b"half")
     for name in (".upload-x", ".probe-x", f".{CURRENT}-x", ".nfs1", "notes.txt"):
         (store.folder / name).write_bytes(b"half")
     (store.folder / ".upload-link").symlink_to(store.path_of("toy-1+r1"))
+    again = ModelStore(store.folder, decoder.bundle)
     with store.locked():
         left = sorted(path.name for path in store.folder.iterdir())
+        with pytest.raises(StoreError, match="model store"), again.locked():
+            raise AssertionError("two at once")
     assert left == sorted([".nfs1", LOCK, "notes.txt", "toy-1+r1.zip"])
+    with again.locked():
+        pass
 
 
 def test_a_damaged_bundle_is_said_and_the_newest_before_it_serves(
-    decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
+    worn: DataPlane, decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
 ) -> None:
-    a_worn_plane(decoder, store)
     store.path_of("toy-1+r3").write_bytes(b"damaged")
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1+r2"
     assert "toy-1+r3.zip" in plane.store_trouble()
-    assert "serving toy-1+r2: bundle" in caplog.text
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert figure(plane, "lightpage_store_ok") == 0
     assert figure(plane, "lightpage_store_trouble", reason="bundle") == 1
     assert figure(plane, "lightpage_model_info", version="toy-1+r2") == 1
@@ -160,34 +147,24 @@ def test_a_damaged_bundle_is_said_and_the_newest_before_it_serves(
     assert figure(plane, "lightpage_store_ok") == 1
 
 
-def test_without_any_bundle_that_can_be_used_the_base_serves(decoder: Decoder, store: ModelStore) -> None:
-    a_worn_plane(decoder, store)
-    for number in (1, 2, 3):
+@pytest.mark.parametrize(("gone", "serves"), [((1, 2, 3), "toy-1"), ((2,), "toy-1+r3")])
+def test_bundles_of_the_history_that_are_gone_are_said_and_stepped_over(
+    gone: tuple[int, ...], serves: str, worn: DataPlane, decoder: Decoder, store: ModelStore
+) -> None:
+    for number in gone:
         store.path_of(f"toy-1+r{number}").unlink()
     plane = a_plane(decoder, store)
-    assert plane.registry.current.version == "toy-1"
-    assert "toy-1+r3.zip" in plane.store_trouble()
-
-
-def test_a_bundle_of_the_history_that_is_gone_is_said_and_stepped_over(
-    decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
-) -> None:
-    a_worn_plane(decoder, store)
-    store.path_of("toy-1+r2").unlink()
-    plane = a_plane(decoder, store)
-    assert plane.registry.current.version == "toy-1+r3"
-    assert "toy-1+r2.zip" in plane.store_trouble()
-    assert "toy-1+r2.zip: got nothing" in caplog.text
-    assert plane.rollback()[0].version == "toy-1+r1"
+    assert plane.registry.current.version == serves
+    assert f"toy-1+r{gone[-1]}.zip" in plane.store_trouble()
+    if serves != "toy-1":
+        assert plane.rollback()[0].version == "toy-1+r1"
 
 
 def test_nothing_is_deleted_while_it_is_not_settled_what_is_to_be_in_service(
-    decoder: Decoder, store: ModelStore
+    worn: DataPlane, decoder: Decoder, store: ModelStore
 ) -> None:
-    a_worn_plane(decoder, store)
     (store.folder / CURRENT).unlink()
-    plane = DataPlane(ModelRegistry(decoder), store=ModelStore(store.folder, decoder.bundle, kept=0))
-    plane.models.resume()
+    plane = a_plane(decoder, store, kept=0)
     assert plane.store is not None
     plane.models.prune(plane.store)
     assert plane.store.versions() == ["toy-1+r1", "toy-1+r2", "toy-1+r3"]
@@ -198,33 +175,31 @@ def test_nothing_is_deleted_while_it_is_not_settled_what_is_to_be_in_service(
 
 @pytest.mark.parametrize("content", [None, "junk", "[]", '{"bundle": null}', '{"bundle": "../x", "base": "BASE"}'])
 def test_a_note_that_is_damaged_or_gone_is_said(
-    content: str | None, decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
+    content: str | None, worn: DataPlane, decoder: Decoder, store: ModelStore, caplog: pytest.LogCaptureFixture
 ) -> None:
-    a_worn_plane(decoder, store)
     note = store.folder / CURRENT
+    content = content and content.replace("BASE", json.loads(note.read_text())["base"])
     note.unlink()
     if content is not None:
-        note.write_text(content.replace("BASE", store._base))
+        note.write_text(content)
     plane = a_plane(decoder, store)
     assert plane.registry.current.version == "toy-1"
-    assert f"{CURRENT}: got" in plane.store_trouble()
-    assert "serving the base" in caplog.text
+    assert CURRENT in plane.store_trouble()
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert figure(plane, "lightpage_store_trouble", reason="note") == 1
     assert note.exists() == (content is not None)  # the next start says it again
     plane.models.activate("toy-1+r2")
     kept = store.folder / DAMAGED
-    assert (kept.read_text() if kept.exists() else None) == (content and content.replace("BASE", store._base))
+    assert (kept.read_text() if kept.exists() else None) == content
     assert plane.store_trouble() == ""
     assert a_plane(decoder, store).registry.current.version == "toy-1+r2"
 
 
+@pytest.mark.usefixtures("worn")
 @pytest.mark.parametrize(
     "change", [{"cursor": 7}, {"cursor": -1}, {"cursor": 0}, {"history": [None, 3]}, {"history": 1}]
 )
-def test_a_note_that_contradicts_itself_is_damaged(
-    change: dict[str, object], decoder: Decoder, store: ModelStore
-) -> None:
-    a_worn_plane(decoder, store)
+def test_a_note_that_contradicts_itself_is_damaged(change: dict[str, object], store: ModelStore) -> None:
     note = store.folder / CURRENT
     note.write_text(json.dumps(json.loads(note.read_text()) | change))
     with pytest.raises(BundleError, match=CURRENT):
@@ -241,9 +216,8 @@ def test_pinned_loaded_and_foreign_bundles_are_never_pruned_and_pruned_ones_leav
 ) -> None:
     names = [f"toy-1+r{number}" for number in range(1, KEPT_BUNDLES + 8)]
     put(store, *names[:6])
-    for name in names[6:]:
+    for name in ("bench", *names[6:]):
         store.path_of(name).write_bytes(b"")
-    (store.folder / "bench.zip").write_bytes(b"")
     for age, name in enumerate(["bench", *names]):
         os.utime(store.path_of(name), (age, age))
     store.remember(store.path_of(names[0]))
@@ -253,26 +227,27 @@ def test_pinned_loaded_and_foreign_bundles_are_never_pruned_and_pruned_ones_leav
     plane.models.pin(names[1], True)
     assert plane.store is not None
     plane.models.prune(plane.store)
-    left = set(plane.store.versions())
-    loaded = [model.version for model in plane.registry.models]
-    assert loaded == names[2:6]
-    assert {"bench", names[1], *loaded} <= left
-    assert names[0] not in left
+    assert [model.version for model in plane.registry.models] == names[2:6]
+    assert set(plane.store.versions()) == {"bench", *names[1:6], *names[-KEPT_BUNDLES:]}
     assert [place.version for place in plane.registry.history.places] == ["toy-1", *names[1:6]]
     assert ModelStore(store.folder, decoder.bundle).read().history == (None, *(f"{name}.zip" for name in names[1:6]))
+
+
+def test_what_was_in_service_last_is_told(store: ModelStore, caplog: pytest.LogCaptureFixture) -> None:
+    put(store, "toy-1+r1")
+    for path in (store.path_of("toy-1+r1"), None):
+        store.remember(path)
+        assert store.last() == path
+    assert not caplog.records
+    store.remember(store.path_of("toy-1+r2"))
+    assert store.last() is None
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
 def _read_only(*_: object, **__: object) -> None:
     raise OSError(errno.EROFS, "Read-only file system")
 
 
-@pytest.fixture
-def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The store is tried whenever somebody asks."""
-    monkeypatch.setattr(store_module, "PROBE_S", 0.0)
-
-
-@pytest.mark.usefixtures("hasty")
 def test_a_full_disk_is_noticed_and_said_until_there_is_room(
     decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -280,42 +255,39 @@ def test_a_full_disk_is_noticed_and_said_until_there_is_room(
     size = sum(map(len, decoder.bundle.files.values()))
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 2 * size - 1))
-        with pytest.raises(StoreError, match="bytes free"):
+        with pytest.raises(StoreError, match="model store"):
             plane.models.check_store()
-        assert f"{2 * size} needed" in plane.store_trouble()
+        assert str(2 * size) in plane.store_trouble()
         assert figure(plane, "lightpage_store_ok") == 0
         assert figure(plane, "lightpage_store_trouble", reason="full") == 1
         patch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 2 * size))
         assert plane.store_trouble() == ""
-        with pytest.raises(StoreError, match="bytes free"):
+        with pytest.raises(StoreError, match="model store"):
             plane.models.check_store(2 * size + 1)
     assert figure(plane, "lightpage_store_ok") == 1
     assert [record.levelno for record in caplog.records] == [logging.WARNING] * 2
     assert sorted(path.name for path in store.folder.iterdir()) == [CURRENT]
 
 
-@pytest.mark.usefixtures("hasty")
 def test_a_store_that_cannot_be_written_is_noticed_and_nothing_changes(
-    decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch
+    worn: DataPlane, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plane = a_worn_plane(decoder, store)
+    models = worn.models
     with monkeypatch.context() as patch:
         for module in ("runtime.service.store", "lightpage.files"):
             patch.setattr(f"{module}.new_file", _read_only)
-        for change in (plane.rollback, lambda: plane.models.pin("toy-1", True), lambda: plane.models.activate("toy-1")):
-            with pytest.raises(StoreError, match="Read-only"):
+        for change in (worn.rollback, lambda: models.pin("toy-1", True), lambda: models.activate("toy-1")):
+            with pytest.raises(StoreError, match="model store"):
                 change()
-        assert "Read-only" in plane.store_trouble()
-        assert figure(plane, "lightpage_store_trouble", reason="read_only") == 1
-    assert plane.registry.current.version == "toy-1+r3"
-    assert not plane.models.entry(plane.registry.models[0]).pinned
-    assert plane.store_trouble() == ""
-    assert plane.rollback()[0].version == "toy-1+r2"
+        assert "Read-only" in worn.store_trouble()
+        assert figure(worn, "lightpage_store_trouble", reason="read_only") == 1
+    assert worn.registry.current.version == "toy-1+r3"
+    assert not models.entry(worn.registry.models[0]).pinned
+    assert worn.store_trouble() == ""
+    assert worn.rollback()[0].version == "toy-1+r2"
 
 
-@pytest.mark.usefixtures("hasty")
-def test_a_folder_that_is_gone_or_another_is_noticed(decoder: Decoder, tmp_path: Path) -> None:
-    store = ModelStore(tmp_path / "store", decoder.bundle)
+def test_a_folder_that_is_gone_or_another_is_noticed(decoder: Decoder, store: ModelStore, tmp_path: Path) -> None:
     plane = DataPlane(ModelRegistry(decoder), store=store)
     with store.locked():
         plane.models.resume()
@@ -336,39 +308,42 @@ def test_a_folder_that_is_gone_or_another_is_noticed(decoder: Decoder, tmp_path:
 def test_the_store_is_tried_now_and_then_and_not_whenever_somebody_asks(
     decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plane = a_plane(decoder, store)
-    now = time.monotonic()
-    monkeypatch.setattr(time, "monotonic", lambda: now)
+    clock = HandClock()
+    plane = a_plane(decoder, store, clock=clock.now)
     assert plane.store_trouble() == ""
     monkeypatch.setattr("runtime.service.store.new_file", _read_only)
+    clock.advance(PROBE_S - 0.1)
     assert plane.store_trouble() == ""
-    now += 29
-    assert plane.store_trouble() == ""
-    now += 2
+    clock.advance(0.1)
     assert "Read-only" in plane.store_trouble()
     assert plane.models.trouble().reason is Reason.READ_ONLY  # type: ignore[union-attr]
 
 
-@pytest.mark.usefixtures("hasty")
+class Passing(HandClock):
+    """Time passes by itself while somebody waits."""
+
+    def wait(self, event: threading.Event, seconds: float) -> bool:
+        self.advance(seconds)
+        return event.is_set()
+
+
 def test_a_disk_that_hangs_is_shown_and_holds_no_scrape_up(
     decoder: Decoder, store: ModelStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plane, answers, made = a_plane(decoder, store), threading.Event(), new_file
+    answers, clock = threading.Event(), Passing()
+    plane = DataPlane(ModelRegistry(decoder), store=store, clock=clock)
+    plane.models.resume()
 
     def hung(folder: Path, name: str) -> tuple[int, Path]:
-        answers.wait(10)
-        return made(folder, name)
+        answers.wait()
+        return new_file(folder, name)
 
-    with monkeypatch.context() as patch:
-        patch.setattr("runtime.service.store.new_file", hung)
-        patch.setattr(metrics_module, "_LOOK_S", 0.01)
-        patch.setattr(plane.store_health, "_longest_s", 0.0)
-        for _ in range(3):
-            assert figure(plane, "lightpage_store_ok") == 0
-            assert figure(plane, "lightpage_store_trouble", reason="hung") == 1
-        answers.set()
-    plane.store_health.is_well(10)  # the end of the look that hung
-    assert figure(plane, "lightpage_store_ok") == 1
+    monkeypatch.setattr("runtime.service.store.new_file", hung)
+    shown = [(figure(plane, "lightpage_store_ok"), clock.now() - 1000.0) for _ in range(4)]
+    assert shown == [(1, 2.0), (1, 4.0), (0, 6.0), (0, 6.0)]  # 2 s are waited for, not longer than 5 s in all
+    assert figure(plane, "lightpage_store_trouble", reason="hung") == 1
+    answers.set()
+    assert eventually(lambda: figure(plane, "lightpage_store_ok") == 1)
     assert figure(plane, "lightpage_store_trouble", reason="hung") == 0
 
 

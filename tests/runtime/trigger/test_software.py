@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
 from runtime.errors import LostShotError, Reason
 from runtime.trigger.software import SoftwareTrigger
 from runtime.trigger.trigger import Trigger
+from tests.clock import HandClock
 from tests.runtime.acquisition.lab import LabCamera
 
 
-def test_every_camera_is_fired_once() -> None:
-    cameras = [LabCamera(name, lambda: np.zeros((4, 4), np.uint8)) for name in ("first", "second")]
-    trigger: Trigger = SoftwareTrigger(cameras)
+class SlowCamera(LabCamera):
+    def fire(self) -> None:
+        super().fire()
+        self.clock.advance(0.25)
+
+
+def test_every_camera_is_fired_once_and_the_shot_was_in_the_middle() -> None:
+    clock = HandClock()
+    cameras = [SlowCamera(name, lambda: np.zeros((4, 4), np.uint8), clock) for name in ("first", "second")]
+    trigger: Trigger = SoftwareTrigger(cameras, clock.now)
     trigger.arm()
-    before = time.monotonic()
-    assert before <= trigger.fire() <= time.monotonic()
+    begun = clock.now()
+    assert trigger.fire() - begun == 0.25
     assert [camera.frame(1.0) is not None for camera in cameras] == [True, True]
     assert [camera.frame(0.0) for camera in cameras] == [None, None]
-    trigger.disarm()
-    trigger.close()
-
-
-def test_a_camera_that_has_gone_is_told() -> None:
-    class Gone(LabCamera):
-        def fire(self) -> None:
-            raise LostShotError(self.name, "no answer", "a camera", Reason.CAMERA_GONE)
-
-    trigger = SoftwareTrigger([Gone("gone", lambda: np.zeros((4, 4), np.uint8))])
+    cameras[1].gone = True
     with pytest.raises(LostShotError) as raised:
         trigger.fire()
     assert raised.value.reason is Reason.CAMERA_GONE
+    trigger.disarm()
+    trigger.close()

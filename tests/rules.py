@@ -1,0 +1,135 @@
+"""Rules that the tests keep, as a part of lint: `python -m tests.rules` names each line that breaks one.
+
+- A claim is never about wall-clock time: what waits is given a clock (`tests.clock`), and what other threads and
+  processes do is awaited by `tests.waiting.eventually`, which alone compares times.
+- Nobody sleeps longer than 0.2 s to let something happen. Who must hang waits for a signal or for his input.
+- An error is known by its class, subject and status. Sentences are kept in one snapshot (`tests/messages`), so that
+  they can be improved.
+- Private attributes of what is tested are left alone.
+- There are no more lines than `limits.toml` allows.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+HERE = Path(__file__).parent
+CLOCKS = {"monotonic", "perf_counter", "time", "monotonic_ns", "perf_counter_ns", "time_ns", "process_time"}
+OWN_CLOCK = {"clock.py", "waiting.py"}
+LONGEST_SLEEP_S = 0.2
+MOST_WORDS = 3
+TEXTS = {"output", "stdout", "stderr", "message", "details", "text"}
+"""Attributes that hold what a program tells people."""
+_SLEEP_IN_A_SCRIPT = re.compile(r"\bsleep\((\d+(?:\.\d*)?)\)")
+
+
+def broken(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield line number and rule of everything in a file that breaks one."""
+    tree = ast.parse(path.read_text("utf-8"))
+    for function in ast.walk(tree):
+        if isinstance(function, ast.Module | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield from _of_times(function)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and _name(node.func) == "sleep" and node.args:
+            if isinstance(seconds := node.args[0], ast.Constant) and seconds.value > LONGEST_SLEEP_S:
+                yield node.lineno, f"sleeps {seconds.value} s"
+        elif isinstance(node, ast.Call) and _name(node.func) == "setattr" and len(node.args) == 3:
+            if isinstance(name := node.args[1], ast.Constant) and re.match("_[^_]", str(name.value)):
+                yield node.lineno, f"replaces {name.value}"
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            if any(float(found) > LONGEST_SLEEP_S for found in _SLEEP_IN_A_SCRIPT.findall(node.value)):
+                yield node.lineno, "sleeps, in a script"
+        elif isinstance(node, ast.keyword) and node.arg == "match" and len(_text(node.value).split()) > MOST_WORDS:
+            yield node.value.lineno, f"freezes a sentence: {_text(node.value)!r}"
+        elif isinstance(node, ast.Compare) and _told(node.comparators[-1]) and isinstance(node.ops[0], ast.In | ast.Eq):
+            if len(_text(node.left).split()) > MOST_WORDS:
+                yield node.lineno, f"freezes a sentence: {_text(node.left)!r}"
+        elif isinstance(node, ast.Attribute) and _private(node):
+            yield node.lineno, f"reaches for {node.attr}"
+
+
+def _of_times(function: ast.Module | ast.FunctionDef | ast.AsyncFunctionDef) -> Iterator[tuple[int, str]]:
+    """Comparisons, in the body of a function, of what a clock says."""
+    own = [node for statement in function.body for node in _without_functions(statement)]
+    times = {
+        target.id
+        for node in own
+        if isinstance(node, ast.Assign | ast.NamedExpr) and _reads_clock(node.value)
+        for top in (node.targets if isinstance(node, ast.Assign) else [node.target])
+        for target in ast.walk(top)
+        if isinstance(target, ast.Name)
+    }
+    for node in own:
+        if isinstance(node, ast.Compare) and any(
+            _reads_clock(part) or (isinstance(part, ast.Name) and part.id in times) for part in ast.walk(node)
+        ):
+            yield node.lineno, "compares wall-clock time"
+
+
+def _without_functions(node: ast.AST) -> Iterator[ast.AST]:
+    if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        yield node
+        for child in ast.iter_child_nodes(node):
+            yield from _without_functions(child)
+
+
+def _reads_clock(node: ast.AST) -> bool:
+    calls = (part.func for part in ast.walk(node) if isinstance(part, ast.Call))
+    return any(
+        isinstance(call, ast.Attribute) and call.attr in CLOCKS and _name(call.value) == "time" for call in calls
+    )
+
+
+def _private(node: ast.Attribute) -> bool:
+    """Whether it is an attribute of another's that its name calls private."""
+    named = node.attr.startswith("_") and not node.attr.startswith("__")
+    return named and _name(node.value) not in {"self", "cls", "os", "sys", "ctypes"}
+
+
+def _told(node: ast.AST) -> bool:
+    """Whether it is what a program or an error tells people."""
+    if isinstance(node, ast.Call):
+        return _name(node.func) in {"str", "details"}
+    return isinstance(node, ast.Attribute) and node.attr in TEXTS
+
+
+def _text(node: ast.AST) -> str:
+    """What of a string stands in the source."""
+    return " ".join(
+        part.value for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)
+    )
+
+
+def _name(node: ast.AST) -> str:
+    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+
+
+def main() -> int:
+    """Print what breaks a rule, and return the exit status."""
+    paths = sorted(HERE.rglob("*.py"))
+    found = [
+        f"{path.relative_to(HERE.parent)}:{line}: {what}"
+        for path in paths
+        if path.relative_to(HERE).as_posix() not in OWN_CLOCK
+        for line, what in broken(path)
+    ]
+    lines, most = sum(len(path.read_bytes().splitlines()) for path in paths), _limits()["lines"]
+    if lines > most:
+        found.append(f"tests: {lines} lines, wanted {most} or fewer (tests/limits.toml)")
+    print(*found, sep="\n", end="\n" if found else "")
+    print(f"tests: {lines} of {most} lines; {len(found)} break a rule")
+    return bool(found)
+
+
+def _limits() -> dict[str, int]:
+    limits: dict[str, int] = tomllib.loads((HERE / "limits.toml").read_text("utf-8"))
+    return limits
+
+
+if __name__ == "__main__":
+    sys.exit(main())
