@@ -121,15 +121,6 @@ class TestCorrections:
             seen.add(wrong - corrections)
         assert {-1, 0, 1} <= seen
 
-    def test_without_corrections_one_wrong_upper_number_loses_the_page(self) -> None:
-        codec, rng = codec_of(64, 2, 700, 0), np.random.default_rng(0)
-        data, symbols = written(codec, header_of(codec), rng)
-        phase, kappa = noisy(symbols, 64, np.inf, rng)
-        assert codec.decode(phase, kappa).data == data
-        phase.flat[body_places(codec)[0]] += 4 * 2 * np.pi / 64
-        found = codec.decode(phase, kappa)
-        assert (found.data, found.loss, found.failed_blocks) == (None, Loss.CHECKSUM, 0)
-
 
 def any_light(codec: PageCodec, symbols: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Phases and concentrations of a page in light about the code's limit and below, claims right or wrong."""
