@@ -334,14 +334,6 @@ class TestRefusals:
             with refused("phase, concentration", shape, PageError):
                 self.CODEC.decode(np.zeros(phase), np.ones(kappa))
 
-    @pytest.mark.parametrize("place", [header_places(CODEC)[5], body_places(CODEC)[5]])
-    def test_values_that_are_not_finite(self, place: int) -> None:
-        for phase, kappa in ((np.nan, 1.0), (np.inf, 1.0), (0.0, np.nan), (0.0, -np.inf)):
-            page = np.zeros(SHAPE), np.ones(SHAPE)
-            page[0].flat[place], page[1].flat[place] = phase, kappa
-            with refused("phase, concentration", kind=PageError):
-                self.CODEC.decode(*page)
-
     @pytest.mark.parametrize("levels", [2, 16, 256])
     def test_a_page_without_room(self, levels: int) -> None:
         code, sizes, last = Code(levels=levels, coded_bits=1, rate_per_mille=700), list[int](), 0

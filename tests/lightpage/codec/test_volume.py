@@ -310,15 +310,6 @@ class TestFullDisk:
             make_file(tmp_path / "file", pages, *rooms)
         assert list(tmp_path.iterdir()) == []
 
-    def test_a_file_that_cannot_be_completed_leaves_the_earlier_one(self, written: Written, tmp_path: Path) -> None:
-        path = tmp_path / "file"
-        path.mkdir()  # no file can have this name
-        with VolumeFiles(path) as files:
-            files.add(written.pages[0])
-            with refused("file"):
-                chosen(files).complete([1])
-        assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
-
 
 @pytest.mark.parametrize(
     ("numbers", "text"),

@@ -295,18 +295,6 @@ class TestExternalFiles:
         assert "source.h5" in told
         assert "frames.raw" in told
 
-    def test_the_environment_says_where_they_are(self, foreign: Path) -> None:
-        def put(file: h5py.File, data: np.ndarray) -> None:
-            file.create_dataset("in_phase", data=data, external=[("beside.raw", 0, UNLIMITED)])
-
-        program = "import sys; from lightpage.recording.reader import Recording; Recording.open(sys.argv[1]).frames(0)"
-        with pytest.MonkeyPatch.context() as patch:
-            patch.chdir(foreign.parent)
-            replace(foreign, "in_phase", put)
-        # HDF5 reads the variable once in a process
-        environment = {**os.environ, "HDF5_EXTFILE_PREFIX": "${ORIGIN}"}
-        subprocess.run([sys.executable, "-c", program, foreign], env=environment, check=True, timeout=60)
-
 
 class TestLinks:
     def test_what_links_lead_to_is_read_and_checked(self, foreign: Path) -> None:

@@ -47,11 +47,6 @@ def test_axes_are_uniform_centred_and_reach_past_the_page(profile: Profile, step
     assert grid.shape == (len(grid.y_m), len(grid.x_m))
 
 
-def test_the_grid_samples_the_field_above_its_rate(profile: Profile, grid: FieldGrid) -> None:
-    assert grid.pitch_m == pytest.approx(2 * profile.camera.pitch_m)
-    assert 1 / grid.pitch_m > 4 * band_edge(profile)
-
-
 def test_a_grid_too_coarse_for_the_pipes_light_or_finer_than_the_usual_one_is_refused(profile: Profile) -> None:
     for step_px in (1, 4):
         with refused("common grid", step_px, wanted="2 to 3"):
