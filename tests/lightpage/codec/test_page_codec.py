@@ -210,11 +210,6 @@ class TestHeader:
         assert (found.header, found.data, found.loss) == ((header, data, None) if read else (None, None, Loss.HEADER))
         assert found.failed_blocks == 0
 
-    def test_it_goes_before_what_was_expected(self) -> None:
-        data, phase, kappa = self.page(damaged=False)
-        found = self.CODEC.decode(phase, kappa, header_of(self.CODEC, 4))
-        assert (found.header, found.data) == (header_of(self.CODEC), data)
-
     def test_it_is_believed_with_its_own_body_only(self) -> None:
         """A header that can be read on the body of another page: the body's checksum says which page it is."""
         data, phase, kappa = self.page(damaged=False)
@@ -336,18 +331,13 @@ class TestRefusals:
 
     @pytest.mark.parametrize("levels", [2, 16, 256])
     def test_a_page_without_room(self, levels: int) -> None:
-        code, sizes, last = Code(levels=levels, coded_bits=1, rate_per_mille=700), list[int](), 0
+        code, sizes = Code(levels=levels, coded_bits=1, rate_per_mille=700), list[int]()
         count = header_symbols(levels)
-        for symbols in (1, count, *range(count + 1, count + 400)):
-            pilots = np.zeros((1, symbols), bool)
-            if symbols <= count:
-                with refused("page", f"{symbols} data symbols"):
-                    PageCodec(code, pilots)
-                continue
+        with refused("page", f"{count} data symbols"):
+            PageCodec(code, np.zeros((1, count), bool))
+        for symbols in range(count + 1, count + 400):
             with suppress(InvalidInputError):
-                sizes.append(PageCodec(code, pilots).user_bytes)
-                last = symbols
-        assert last == count + 399
+                sizes.append(PageCodec(code, np.zeros((1, symbols), bool)).user_bytes)
         assert sizes[0] == 1
         assert np.all(np.diff(sizes) >= 0)
 

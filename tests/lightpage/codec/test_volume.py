@@ -13,7 +13,7 @@ import pytest
 
 from lightpage.codec.header import MOST_BYTES
 from lightpage.codec.page_bytes import PageBytes
-from lightpage.codec.volume import Volume, encode_volume, restore_group
+from lightpage.codec.volume import Volume, encode_volume
 from lightpage.codec.volume_file import MOST_VOLUMES, VolumeFile, VolumeFiles, ranges
 from lightpage.errors import LostDataError, SurroundingsError
 from tests.lightpage.codec.light import codec_of, noisy
@@ -129,19 +129,6 @@ def collect(path: Path, pages: Iterator[PageBytes] | list[PageBytes]) -> tuple[b
 
 
 class TestEncoding:
-    def test_each_group_is_restored_from_any_of_its_pages(self, written: Written) -> None:
-        volume, rng = written.volume, np.random.default_rng(2)
-        for group in range(volume.groups):
-            numbers = volume.numbers_in(group)
-            data = [written.pages[number].data for number in numbers[: volume.data_in(group)]]
-            for _ in range(8):
-                lost = rng.choice(numbers, 3, replace=False)
-                left = {n: written.pages[n].data or b"" for n in numbers if n not in lost}
-                assert restore_group(volume, group, left) == data
-                if set(numbers[: len(data)]) - set(left):
-                    left.pop(next(iter(left)))
-                    assert restore_group(volume, group, left) is None
-
     def test_a_file_that_shrank_or_grew_is_noticed(self, written: Written) -> None:
         for size in (-1, -5, -6, -SIZE - 5):
             with refused("file", len(written.file) + size):

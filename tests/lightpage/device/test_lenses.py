@@ -81,11 +81,6 @@ def test_a_thick_lens_obeys_the_lensmaker() -> None:
     assert focal_distances_m(lens) == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_flat_side_is_one_of_infinite_radius() -> None:
-    lens = LensPrescription("flat in front", (Surface(math.inf, 4e-3, 1.5), Surface(-25e-3, 0, 1)), 20e-3)
-    assert focal_distances_m(lens) == pytest.approx((50e-3, 50e-3, 50e-3 - 4e-3 / 1.5), rel=1e-12)
-
-
 def test_reversed_it_has_its_focal_planes_swapped_and_keeps_its_conics() -> None:
     lens = LensPrescription("asphere", (Surface(30e-3, 9e-3, 1.7, conic=-0.6), Surface(-70e-3, 0, 1)), 20e-3)
     turned = lens.reversed()

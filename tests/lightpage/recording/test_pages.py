@@ -78,16 +78,6 @@ class TestWriting:
             write(tmp_path / "p.h5", symbols)
         assert list(tmp_path.iterdir()) == []
 
-    def test_pages_that_are_being_written_are_not_destroyed(self, tmp_path: Path) -> None:
-        path = tmp_path / "p.h5"
-        with PagesWriter(path, PROFILE, LEVELS, CODE) as writer:
-            writer.append(SYMBOLS[:3])
-            with refused("p.h5.partial", kind=RecordingError):
-                PagesWriter(path, PROFILE, LEVELS, CODE)
-            writer.append(SYMBOLS[3:])
-        with Pages.open(path) as pages:
-            assert np.array_equal(list(pages), SYMBOLS)
-
 
 class TestReading:
     @pytest.mark.parametrize(

@@ -179,14 +179,6 @@ class TestReading:
                 with refused("page", page, RecordingError):
                     recording.frames(page)
 
-    def test_page_hash_tells_pages_and_the_places_of_frames_apart(self, foreign: Path) -> None:
-        with Recording.open(foreign) as recording:
-            hashes = {recording.page_hash(page) for page in range(PAGES)}
-        with h5py.File(foreign, "r+") as file:
-            file["in_phase"][0], file["quadrature"][0] = file["quadrature"][0], file["in_phase"][0]
-        with Recording.open(foreign) as recording:
-            assert len(hashes | {recording.page_hash(0)}) == PAGES + 1
-
     def test_a_profile_of_another_camera_or_page_is_refused(self, foreign: Path) -> None:
         profile = small_profile()
         camera = profile.camera.model_copy(update={"rows_px": 15})
@@ -321,9 +313,6 @@ class TestWriting:
         path = tmp_path / "own.h5"
         write_own(path)
         before = path.read_bytes()
-        with pytest.raises(KeyboardInterrupt):
-            interrupted(path, 1)
-        assert path.read_bytes() == before
         with RecordingWriter(path, small_profile(), LEVELS, 12, random_frames(9)) as writer:
             writer.append(None, random_frames(0))
             assert path.read_bytes() == before
@@ -366,8 +355,6 @@ class TestWriting:
         path, profile, references = tmp_path / "own.h5", small_profile(), random_frames(9)
         with refused("bit depth", 17, RecordingError):
             RecordingWriter(path, profile, LEVELS, 17, references)
-        with refused("levels", 1, PageError):
-            RecordingWriter(path, profile, 1, 12, references)
         with refused("pilots", (9, 6), RecordingError):
             RecordingWriter(path, profile, LEVELS, 12, references, np.zeros((9, 6), np.bool_))
         with refused("reference_in_phase", kind=RecordingError):

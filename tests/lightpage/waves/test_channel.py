@@ -194,19 +194,11 @@ class TestChannel:
 
     def test_the_pixel_envelope_is_that_of_square_pixels(self) -> None:
         pitch, fine = 9.2e-6, 5
+        seen = axis(9, pitch), axis(9, pitch)
         page = noise(16, 20)
-        coarse = WaveChannel(
-            device(-2.0), axis(20, pitch), axis(16, pitch), axis(9, pitch), axis(9, pitch), CELLS, 1, pitch
-        )
-        finer = WaveChannel(
-            device(-2.0),
-            axis(20 * fine, pitch / fine),
-            axis(16 * fine, pitch / fine),
-            axis(9, pitch),
-            axis(9, pitch),
-            CELLS,
-            1,
-            pitch / fine,
+        coarse, finer = (
+            WaveChannel(device(-2.0), axis(20 * n, pitch / n), axis(16 * n, pitch / n), *seen, CELLS, 1, pitch / n)
+            for n in (1, fine)
         )
         split = np.kron(page, np.ones((fine, fine))) / fine
         assert off(coarse.exit_field(page), finer.exit_field(split)) < 1e-5

@@ -7,7 +7,7 @@ import pytest
 
 from lightpage.device.profile import Profile, load_profile
 from lightpage.errors import ProfileError
-from lightpage.waves.grid import FieldGrid, check_camera, field_grid
+from lightpage.waves.grid import FieldGrid, check_camera, field_grid, splitting_steps
 from tests.lightpage.refused import refused
 from tests.lightpage.small import small_profile
 
@@ -103,3 +103,7 @@ def test_a_camera_that_does_not_see_the_whole_page_is_refused_with_the_pixels_th
         check_camera(with_camera(**{key: least}))
         with refused(f"camera.{key}", least - 1, ProfileError, wanted=least):
             field_grid(with_camera(**{key: least - 1}))
+
+
+def test_a_longer_pipe_takes_more_steps() -> None:
+    assert [splitting_steps(profile) for profile in PROFILES] == [32, 32, 127]
