@@ -126,12 +126,6 @@ class TestRandomness:
         neighbours = np.mean(steps[1:] * steps[:-1], axis=0)
         assert np.abs(neighbours).max() < within
 
-    def test_knocks_add_up_on_both_cameras(self) -> None:
-        simulator = Simulator(TINY, gentle(drift=Drift(piston_rad=0, shift_px=0)), levels=16, seed=2, steps=8)
-        simulator.knock((3.0, -2.0))
-        simulator.knock((1.0, 0.0))
-        assert [simulator.simulate(symbols(TINY)).shift_px for _ in range(2)] == [(4.0, -2.0)] * 2
-
     def test_a_reference_that_stays_is_not_moved_by_a_knock_and_one_that_comes_along_is(self) -> None:
         seen = {}
         for stays in (False, True):
