@@ -244,33 +244,6 @@ def test_a_difference_is_found(root: Path, document: dict[str, Any], name: str) 
     assert subjects(inventory.differences(inventory.take(root), document)) == expected
 
 
-def test_an_environment_as_venv_and_pip_make_it_is_in_order(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    base, environment = Path(sys._base_executable), root / "opt/lightpage"  # type: ignore[attr-defined]  # of the venv
-    shutil.rmtree(environment)
-    subprocess.run([base, "-m", "venv", "--without-pip", environment], check=True, timeout=60)
-    wheel = root / "tool-1.0-py3-none-any.whl"
-    files = {
-        "tool.py": b"def main():\n    print('hello')\n",
-        "tool-1.0.data/scripts/tool.sh": b"#!/bin/sh\n",
-        "tool-1.0.dist-info/METADATA": b"Metadata-Version: 2.4\nName: tool\nVersion: 1.0\n",
-        "tool-1.0.dist-info/WHEEL": b"Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
-        "tool-1.0.dist-info/entry_points.txt": b"[console_scripts]\ntool = tool:main\n",
-    }
-    files["tool-1.0.dist-info/RECORD"] = "\n".join(listed(*each) for each in files.items()).encode()
-    with zipfile.ZipFile(wheel, "w") as archive:
-        for name, content in files.items():
-            archive.writestr(name, content)
-    pip = (sys.executable, "-m", "pip", "--python", environment / "bin/python")
-    subprocess.run([*pip, "install", "--quiet", "--no-index", "--no-deps", wheel], check=True, timeout=60)
-    write(environment / "wheels.sha256", f"{64 * '1'}  {wheel.name}\n".encode())
-    monkeypatch.setattr(inventory, "PYTHON_FOLDER", base.parent)
-    found = inventory.take(root)
-    assert [package.name for package in found.python] == ["tool"]
-    assert found.faults == ()
-    (environment / "bin/tool").write_text("")
-    assert subjects(inventory.take(root).faults) == ["tool: ../../../bin/tool"]
-
-
 def test_a_file_and_its_checksum_changed_together_are_found(root: Path, document: dict[str, Any]) -> None:
     install(root / SITE, "Click", "8.5.1", "BSD-3-Clause", {"click/__init__.py": b"import socket\n"})
     found = inventory.differences(inventory.take(root), document)

@@ -73,38 +73,6 @@ def test_the_command_compares_methods_and_says_what_the_device_is(tmp_path: Path
     assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
-@pytest.mark.long  # trains six decoders
-def test_the_command_keeps_what_it_trained_and_takes_it_up(tmp_path: Path) -> None:
-    out, kept = tmp_path / "out", tmp_path / "kept"
-    words = prepared(out, Device(), "-0.6deg-32e-4px")
-    words += [word for name in ("coherent", "refined", "oracle", "fast", "none") for word in ("--method", name)]
-    words += [
-        "--arm",
-        "wave-refined",
-        "--steps",
-        "20",
-        "--size",
-        "8x1x0",
-        "--published-channels",
-        "4",
-        "--published-steps",
-        "12",
-    ]
-    words += ["--levels", "16", "--trained", str(kept), "--keep"]
-    first = CliRunner().invoke(decoders.main, words, catch_exceptions=False)
-    assert first.exit_code == 0, first.output
-    figures = json.loads((out / "figures.json").read_text())
-    elsewhere = tmp_path / "elsewhere"
-    words[words.index(str(out))] = str(elsewhere)
-    again = CliRunner().invoke(decoders.main, words, catch_exceptions=False)
-    assert again.exit_code == 0, again.output
-    assert not list(elsewhere.rglob("checkpoints"))  # nothing was trained
-    outcomes = json.loads((elsewhere / "figures.json").read_text())["lights"][0]["outcomes"]
-    for one, other in zip(outcomes, figures["lights"][0]["outcomes"], strict=True):
-        assert one["air"] == pytest.approx(other["air"], abs=0.01)  # large tensors are kept in half precision
-        assert one["validation_curve"] == other["validation_curve"]
-
-
 def test_weights_that_were_kept_are_taken_up_for_their_options_alone(tmp_path: Path) -> None:
     kept = TRAINED / "bench" / "-0.6deg-32e-4px"
     for name in (BEGUN, CALIBRATION):

@@ -18,12 +18,10 @@ from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.device.profile import Profile, load_profile
 from lightpage.device.state import Device
-from lightpage.errors import CalibrationError, FrameError, InvalidInputError, LightpageError, RecordingError
-from lightpage.page.symbols import random_symbols
+from lightpage.errors import CalibrationError, FrameError, LightpageError, RecordingError
 from lightpage.progress import reporting
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, RecordingWriter
-from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import true_parameters
 from tests.told import Told
 from train.commands.calibrate import calibrate
@@ -160,26 +158,6 @@ def test_a_recording_that_cannot_serve_is_refused_by_name(
     recording = flat_recording(tmp_path / "R.h5", 100, pages, with_symbols)
     with pytest.raises(RecordingError, match=complaint):
         run(recording, tmp_path / "calibration.toml", profile=profile)
-
-
-def test_a_folder_that_is_not_there_is_named_before_the_work(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="nowhere"):
-        run(tmp_path / "R.h5", tmp_path / "nowhere" / "calibration.toml")
-
-
-@pytest.mark.long  # a whole search
-def test_a_device_outside_the_capture_range_is_not_guessed_at(tmp_path: Path) -> None:
-    """At 4.5 degrees all light but that of the y walls lies where it would at 0."""
-    profile, rng = load_profile("bench"), np.random.default_rng(0)
-    device = Device().with_settings(["geometry.pipe_angle_deg=4.5"])
-    simulator = Simulator(profile, device, 256, 0)
-    with RecordingWriter(tmp_path / "R.h5", profile, 256, device.sensor.bit_depth, simulator.references()) as writer:
-        symbols = random_symbols(profile, 256, 1, rng)[0]
-        writer.append(symbols, simulator.page(symbols))
-    out = tmp_path / "calibration.toml"
-    with pytest.raises(CalibrationError, match="along y"):
-        run(tmp_path / "R.h5", out, "--pages", "1")
-    assert not out.exists()
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt(), CalibrationError("calibration", "nothing", "something")])

@@ -193,18 +193,6 @@ class TestPaths:
         assert abs(own - at_left) > 100
         assert abs(of_left - at_left) < 10
 
-    def test_many_devices_at_once_equal_one_at_a_time(self) -> None:
-        profile = small_profile()
-        twin, points = TorchTwin(RayTwin(profile)), page_points(profile, 30)
-        anchors = points + 5e-6
-        many = np.stack([some_device(seed) for seed in range(4)])
-        together, pixels = twin.trace(many, points, anchors), twin.pixels(many, points)
-        for index, parameters in enumerate(many):
-            alone = twin.trace(parameters, points, anchors)
-            for one, all_of_them in zip(alone, together, strict=True):
-                np.testing.assert_allclose(all_of_them[index], one, rtol=1e-13, atol=1e-9)
-            np.testing.assert_allclose(pixels[index], twin.pixels(parameters, points), rtol=1e-13)
-
     def test_no_parameter_is_dead(self) -> None:
         profile = small_profile().model_copy(update={"lens_path": THICK})
         twin, points = TorchTwin(RayTwin(profile)), page_points(profile, 50)

@@ -27,14 +27,6 @@ FOCUSED_MM: list[list[float]] = [
     [-0.088919473627, 0.066689605220],
 ]
 """Where optiland 0.6.3 has them behind the achromat, on its back focal plane (traced once, written down here)."""
-FOCUSED_REVERSED_MM: list[list[float]] = [
-    [0, 0],
-    [-0.013697614808, 0],
-    [0.048403117041, -0.028601841888],
-    [-0.158091058955, -0.101277084643],
-    [-1.257424826346, 0.943068619759],
-]
-"""The same behind the reversed achromat."""
 OBLIQUE_MM: list[list[float]] = [[0, 0], [1.1, -0.7], [-1.6, 1.3], [0.4, 1.7]]
 OBLIQUE_SINES: list[list[float]] = [[0.06, 0.03], [-0.08, 0.05], [0.07, 0.06], [0.02, -0.05]]
 LANDED_REVERSED_MM: list[list[float]] = [
@@ -147,10 +139,8 @@ class TestLenses:
 
     def test_rays_land_where_another_program_has_them(self) -> None:
         level = [[0.0, 0.0]] * len(PARALLEL_MM)
-        turned = ACHROMAT.reversed()
         np.testing.assert_allclose(self._landed_mm(ACHROMAT, PARALLEL_MM, level), FOCUSED_MM, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(self._landed_mm(turned, PARALLEL_MM, level), FOCUSED_REVERSED_MM, rtol=0, atol=1e-9)
-        oblique = self._landed_mm(turned, OBLIQUE_MM, OBLIQUE_SINES)
+        oblique = self._landed_mm(ACHROMAT.reversed(), OBLIQUE_MM, OBLIQUE_SINES)
         np.testing.assert_allclose(oblique, LANDED_REVERSED_MM, rtol=0, atol=1e-9)
 
     def test_behind_a_hyperboloid_all_rays_meet_in_one_point(self) -> None:
@@ -161,13 +151,6 @@ class TestLenses:
         lens = replace(ACHROMAT, surfaces=(flat, end))
         landed = self._landed_mm(lens, [[2, 0], [5, -3], [-7, 8]], [[0.0, 0.0]] * 3)
         np.testing.assert_allclose(landed, 0, atol=1e-12)
-        sphere = replace(lens, surfaces=(flat, replace(end, conic=0.0)))
-        assert np.abs(self._landed_mm(sphere, [[5, -3]], [[0.0, 0.0]])).max() > 0.1
-
-    def test_the_image_of_the_axis_neighbourhood_is_the_page_itself(self) -> None:
-        near = np.array([[10e-6, 0], [-7e-6, 4e-6]])
-        places = trace(RayTracer(load_profile("paper"), ACHROMAT), near).places.numpy()
-        np.testing.assert_allclose(places, near, rtol=1e-6, atol=1e-15)
 
 
 class TestAgainstSingleRays:
@@ -190,35 +173,7 @@ class TestAgainstSingleRays:
         assert walls >= 10
 
 
-class TestClosedForms:
-    def test_a_square_pipe_unfolds(self) -> None:
-        small = small_profile()
-        profile = with_pipe(small, length_m=7.3 * small.pipe.length_m)
-        points = page_points(profile, 500)
-        tracer, w = RayTracer(profile), profile.pipe.width_m
-        traced = trace(tracer, points)
-        sines = -points / profile.lens.focal_length_m
-        slopes = sines / np.sqrt(profile.pipe.refractive_index**2 - (sines**2).sum(1, keepdims=True))
-        unfolded = slopes * profile.pipe.length_m / w
-        cells = np.round(unfolded)
-        assert np.abs(cells).max() > 8
-        np.testing.assert_array_equal(traced.reflections.numpy(), np.abs(cells))
-        triangle = (-1) ** cells * (unfolded - cells) * w
-        np.testing.assert_allclose(path(tracer, points)[-3, :, :2], triangle, rtol=0, atol=1e-15)
-        np.testing.assert_allclose(traced.places.numpy(), (-1) ** cells * points, rtol=0, atol=1e-15)
-
-
 class TestLostRays:
-    def test_it_is_the_critical_angle_to_nine_digits(self) -> None:
-        profile = with_pipe(small_profile(), refractive_index=1.0008)
-        critical = profile.lens.focal_length_m * np.sqrt(1.0008**2 - 1)
-        for axis in range(2):
-            points = np.zeros((2, 2))
-            points[:, axis] = critical * np.array([1 - 1e-9, 1 + 1e-9])
-            traced = trace(RayTracer(profile), points)
-            assert traced.valid.tolist() == [True, False]
-            assert traced.reflections.sum(1).tolist() == [1, 0]
-
     def test_in_a_sheared_pipe_single_rays_are_lost_alike(self) -> None:
         profile = with_pipe(small_profile(), refractive_index=1.0008)
         points = page_points(profile, 300, seed=2)
@@ -241,10 +196,9 @@ class TestLostRays:
 
 
 class TestDerivatives:
-    @pytest.mark.parametrize("lens", [None, ACHROMAT], ids=["ideal", "thick"])
-    def test_gradients_equal_finite_differences(self, lens: LensPrescription | None) -> None:
+    def test_gradients_equal_finite_differences(self) -> None:
         paper = load_profile("paper")
-        tracer = RayTracer(with_pipe(paper, length_m=3 * paper.pipe.length_m), lens)
+        tracer = RayTracer(with_pipe(paper, length_m=3 * paper.pipe.length_m), ACHROMAT)
         extent = paper.page_width_m / 2
 
         def places(angle: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
@@ -264,11 +218,9 @@ class TestInput:
     @pytest.mark.parametrize(
         ("points", "angle", "got"),
         [
-            (torch.zeros(3, 3, dtype=torch.float64), scalar(0), r"\(3, 3\)"),
             (torch.zeros(3, 2), scalar(0), "float32"),
             (torch.full((3, 2), torch.nan, dtype=torch.float64), scalar(0), "NaN"),
             (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(1, dtype=torch.float64), r"\(1,\)"),
-            (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(()), "float32"),
             (torch.zeros(3, 2, dtype=torch.float64), scalar(-0.6), r"-0\.6 rad"),
             (torch.zeros(3, 2, dtype=torch.float64), scalar(np.nan), "nan rad"),
         ],
@@ -278,10 +230,6 @@ class TestInput:
         for trace in (tracer, tracer.path):
             with pytest.raises(InvalidInputError, match=got):
                 trace(points, angle)
-
-    def test_no_points_are_no_rays(self) -> None:
-        traced = trace(RayTracer(small_profile(), ACHROMAT), np.zeros((0, 2)))
-        assert [len(value) for value in traced] == [0, 0, 0]
 
     def test_a_lens_that_spreads_light_is_refused(self) -> None:
         surfaces = tuple(replace(surface, radius_m=-surface.radius_m) for surface in ACHROMAT.surfaces)
