@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -83,9 +82,7 @@ def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
     assert options("--preset", "standard", "--localizer", "coherent") == ("coherent", Hyperparameters())
     assert options("--preset", "fast", "--channels", "8") == ("coherent", replace(PRESETS["fast"].choices, channels=8))
     assert options("--levels", "2")[1].depth == options("--depth", "2")[1].depth == 2  # its earlier name
-    words = "--binning 2 --field-step 3 --samples 3 --interpolation bilinear --field-rounds 0 --patch 20 --batch 3"
-    single = {"binning": 2, "field_step": 3, "samples": 3, "interpolation": "bilinear", "field_rounds": 0, "patch": 20}
-    assert options(*words.split()) == ("coherent", Hyperparameters(refinements=1, batch=3, **single))
+    assert options("--field-rounds", "0") == ("coherent", Hyperparameters(refinements=1, field_rounds=0))
     assert options("--localizer", "ray", "--channels", "8")[1] == PublishedChoices(channels=(8, 16))
 
 
@@ -93,10 +90,8 @@ def test_a_preset_is_what_it_says_and_single_options_change_it() -> None:
     "words",
     [
         ("--samples", "3", "--localizer", "wave"),
-        ("--lenses", "paraxial", "--localizer", "wave"),
         ("--preset", "fast", "--localizer", "wave"),
-        *((option, "2", "--localizer", "ray") for option in ("--blocks", "--depth", "--synthetic-pages", "--start")),
-        ("--learning-rate", "nan"),
+        *((option, "2", "--localizer", "ray") for option in ("--blocks", "--start")),
         ("--learning-rate", "0"),
     ],
 )
@@ -111,8 +106,6 @@ def test_what_is_no_option_is_refused(device: list[str], tmp_path: Path) -> None
         run(*device, "--out", tmp_path / "file")
     with pytest.raises(click.BadParameter, match="nan"):
         run(*device, "--test-share", "nan", "--out", tmp_path / "run")
-    with pytest.raises(click.BadParameter, match="bf16-mixed"):
-        run(*device, "--precision", "foo", "--out", tmp_path / "run")
     with pytest.raises(InvalidInputError, match="4 validation"):
         run(*device, "--validation-share", "0.5", "--test-share", "0.5", "--out", tmp_path / "run")
 
@@ -163,22 +156,21 @@ def test_training_that_is_stopped_loses_nothing_and_the_same_command_goes_on(
 
 
 @pytest.mark.long  # a process that trains for seconds, to be sent signals
-@pytest.mark.parametrize(("kind", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_stops_training(kind: signal.Signals, status: int, device: list[str], tmp_path: Path) -> None:
+def test_a_signal_stops_training(device: list[str], tmp_path: Path) -> None:
     arguments = [*device, "--steps", "3600", "--out", str(tmp_path / "run")]
     command = [sys.executable, "-m", "lightpage.cli.main", "train", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         eventually(lambda: process.poll() is not None or (tmp_path / "run" / LAST).exists(), SECONDS)
-        process.send_signal(kind)
+        process.terminate()
         output, _ = process.communicate(timeout=SECONDS)
     finally:
         process.kill()
-    assert process.returncode == status, output
+    assert process.returncode == 143, output
     assert not (tmp_path / "run" / "run.json").exists()
 
 
-def test_a_finished_run_is_told_again_and_not_touched_and_its_options_and_symbols_stay(
+def test_a_finished_run_is_told_again_and_its_options_and_symbols_stay(
     device: list[str], recording: Path, tmp_path: Path
 ) -> None:
     arguments = [*device[:3], recording, *device[4:], "--out", tmp_path / "run"]
@@ -250,17 +242,11 @@ def test_pilots_of_the_devices_own_are_found(recording: Path) -> None:
     assert len(told.notes) == 1
 
 
-@pytest.mark.parametrize("off", ["turn", "angle"])
-def test_a_calibration_of_another_device_is_refused(off: str, device: list[str], tmp_path: Path) -> None:
+def test_a_calibration_of_another_device_is_refused(device: list[str], tmp_path: Path) -> None:
     calibration = load_calibration(device[5])
     angle = calibration.parameters["pipe_angle_rad"] + float(np.deg2rad(1))
-    parameters = calibration.parameters | ({"pipe_angle_rad": angle} if off == "angle" else {})
-    changed = calibration.model_copy(update={"parameters": parameters})
-    changed.save(tmp_path / "C.toml")
-    if off == "turn":
-        text = (tmp_path / "C.toml").read_text()
-        start = text.index("turn_rad = ")
-        (tmp_path / "C.toml").write_text(text[:start] + "turn_rad = -1.6" + text[text.index("\n", start) :])
+    parameters = calibration.parameters | {"pipe_angle_rad": angle}
+    calibration.model_copy(update={"parameters": parameters}).save(tmp_path / "C.toml")
     with pytest.raises(CalibrationError, match="coherence of 0"):
         run(*device[:5], tmp_path / "C.toml", *device[6:], "--out", tmp_path / "run")
 
@@ -326,35 +312,32 @@ def test_a_second_training_in_the_same_folder_is_refused(device: list[str], tmp_
         pass
 
 
-@pytest.fixture
-def git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
-    """Put a program in git's place that says this; asked again in this test, and in those after it."""
-    origin.commit.cache_clear()
-    monkeypatch.setenv("PATH", str(tmp_path / "programs"))
+def test_what_a_training_is_of_is_what_was_there_when_it_began(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree, program = Path(origin.__file__).parents[2], tmp_path / "programs" / "git"
+    program.parent.mkdir()
+    monkeypatch.setenv("PATH", str(program.parent))
 
-    def says(tree: object, commit: str, status: str = "") -> None:
-        (tmp_path / "programs").mkdir(exist_ok=True)
-        text = f'case "$*" in *rev-parse*) printf "{tree}\\n{commit}" ;; *) printf "{status}" ;; esac'
-        (tmp_path / "programs" / "git").write_text(f"#!/bin/sh\n{text}\n")
-        (tmp_path / "programs" / "git").chmod(0o755)
+    def git_says(tree: object, commit: str, status: str = "") -> None:
+        answers = f'case "$*" in *rev-parse*) printf "{tree}\\n{commit}" ;; *) printf "{status}" ;; esac'
+        program.write_text(f"#!/bin/sh\n{answers}\n")
+        program.chmod(0o755)
 
-    yield says
-    origin.commit.cache_clear()
+    def from_now_on() -> dict[str, str]:
+        """What another process finds."""
+        origin.commit.cache_clear()
+        return provenance()
 
-
-def test_without_git_there_is_no_commit_and_no_error(git: Callable[..., None]) -> None:
-    assert provenance()["commit"] == ""
-
-
-def test_what_a_training_is_of_is_what_was_there_when_it_began(git: Callable[..., None], tmp_path: Path) -> None:
-    tree = Path(origin.__file__).parents[2]
-    git(tree, "abc")
-    first = provenance_of(tmp_path)
-    assert first["commit"] == "abc"
-    git(tree, "abcd", " M train/fitting/fit.py")
-    assert provenance_of(tmp_path) == first  # another commit while it works
-    origin.commit.cache_clear()  # another process goes on with it
-    assert provenance_of(tmp_path) == first | {"commit": f"abcd{origin.CHANGED}", "begun_at_commit": "abc"}
-    git("/elsewhere", "abc")
-    origin.commit.cache_clear()
-    assert provenance()["commit"] == ""
+    try:
+        assert from_now_on()["commit"] == ""  # there is no git
+        origin.commit.cache_clear()
+        git_says(tree, "abc")
+        first = provenance_of(tmp_path)
+        assert first["commit"] == "abc"
+        git_says(tree, "abcd", " M train/fitting/fit.py")
+        assert provenance_of(tmp_path) == first  # another commit while it works
+        origin.commit.cache_clear()  # another process goes on with it
+        assert provenance_of(tmp_path) == first | {"commit": f"abcd{origin.CHANGED}", "begun_at_commit": "abc"}
+        git_says("/elsewhere", "abc")
+        assert from_now_on()["commit"] == ""
+    finally:
+        origin.commit.cache_clear()

@@ -191,7 +191,7 @@ class TestDarkness:
             recorded.turn,
         )
         field, residual = solve(dimmed)
-        assert np.isfinite(field).all() and np.isfinite(residual).all()
+        assert np.isfinite([*np.abs(field).ravel(), *residual.ravel()]).all()
         columns = field.shape[1]
         lit, plain = field[:, columns // 2 + 30 :], solve(recorded)[0][:, columns // 2 + 30 :]
         assert np.abs(field[:, : columns // 2 - 30]).max() < 0.05 * np.abs(lit).max()
