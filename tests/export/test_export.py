@@ -178,13 +178,6 @@ def test_an_interrupted_export_leaves_nothing_and_works_again(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["F", "small.zip"]
 
 
-def test_a_version_that_is_none_is_refused_before_the_work(small_run: Path, tmp_path: Path) -> None:
-    steps: list[str] = []
-    with pytest.raises(BundleError, match="'v 2'"):
-        export_run(small_run, tmp_path / "n.zip", version="v 2", progress=lambda step, share: steps.append(step))
-    assert steps == []
-
-
 @pytest.mark.parametrize("name", [GOLDEN, REFERENCES, WEIGHTS])
 def test_a_run_file_that_was_cut_off_is_named(small_run: Path, tmp_path: Path, name: str) -> None:
     cut = tmp_path / "run"
