@@ -14,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 import analysis
+from tests.lightpage.small import small_profile
 
 ELSEWHERE = ("on_ray", "on_kserve", "on_mlserver", "__main__", "triton_checks")
 """What runs in environments of other servers."""
@@ -27,6 +28,8 @@ SMALL: dict[str, tuple[str, ...]] = {
     "service.outgoing": (),
     "service.overload": ("--times", "2", "--rounds", "1", "--seconds", "2", "--threads", "1"),
     "service.transport": ("--profile", "bench", "--repeats", "3"),
+    "speed.footprint": ("--profile", "small.toml", "--decoder", "fast", "--pages", "2", "--threads", "1"),
+    "speed.scaling": ("--profile", "small.toml", "--factor", "1", "--factor", "2", "--repeats", "1"),
     "scaling.second_run": ("--pages", "40", "--repeats", "1", "--out", "out"),
 }
 
@@ -46,6 +49,7 @@ def test_every_benchmark_says_how_it_is_called() -> None:
 @pytest.mark.long  # the service, shipped bundles and bulk runs in processes of their own, half a minute each
 @pytest.mark.parametrize("name", SMALL)
 def test_it_runs_small_and_writes_its_figures(name: str, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(small_profile().to_toml())
     command = [sys.executable, "-m", f"analysis.{name}", *SMALL[name], "--json", "F.json"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stdout + done.stderr

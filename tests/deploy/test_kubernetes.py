@@ -204,8 +204,6 @@ def words_of(name: str) -> list[str]:
 def test_the_service_understands_its_command_line() -> None:
     arguments = manifests.container(manifests.manifest("StatefulSet", "lightpage"))["args"]
     assert parsed(["lightpage", "serve", *arguments])["config"] == Path("/settings/service.toml")
-    with pytest.raises(click.NoSuchOption):
-        parsed(["lightpage", "serve", "--confg=/settings/service.toml"])
 
 
 @pytest.mark.parametrize("name", JOBS)
@@ -218,8 +216,6 @@ def test_every_index_of_a_job_does_its_part_and_they_are_all(name: str) -> None:
         parts.append(Part.parse(options["part"]))
         assert options["workers"] * options["threads"] == container["resources"]["limits"]["cpu"]
     assert parts == [Part(index=index, count=len(parts)) for index in range(len(parts))]
-    with pytest.raises(click.NoSuchOption):
-        parsed([*words_of(name), "--prt=0/1"])
     mounted = [mount["mountPath"] for mount in container["volumeMounts"]]
     files = [str(options[key]) for key in ("out", "bundle", "fleet") if options[key]]
     assert all(f"/{path.split('/')[1]}" in mounted for path in (*files, *options["recordings"]))
@@ -245,13 +241,11 @@ def test_the_ray_job_is_understood_and_tells_nobody_of_itself() -> None:
     assert (options["engine"], options["address"]) == ("ray", "auto")
     assert job["backoffLimit"] == 0  # whatever the exit status is, which may say that nothing is left to do
     cluster = job["rayClusterSpec"]
-    for pod in manifests.templates(job):
-        for container in pod["spec"]["containers"]:
-            assert {"name": "RAY_USAGE_STATS_ENABLED", "value": "0"} in container["env"]
+    containers = [container for pod in manifests.templates(job) for container in pod["spec"]["containers"]]
+    assert all({"name": "RAY_USAGE_STATS_ENABLED", "value": "0"} in container["env"] for container in containers)
     assert f"ray=={cluster['rayVersion']}\n" in (ROOT / "constraints.txt").read_text()
     for group in cluster["workerGroupSpecs"]:
         (container,) = group["template"]["spec"]["containers"]
         assert container["resources"]["limits"]["cpu"] % options["threads"] == 0
-    pods = [cluster["headGroupSpec"]["template"], *(group["template"] for group in cluster["workerGroupSpecs"])]
     files = {f"/{str(options[key]).split('/')[1]}" for key in ("out", "fleet")}
-    assert all(files <= {m["mountPath"] for m in pod["spec"]["containers"][0]["volumeMounts"]} for pod in pods)
+    assert all(files <= {mount["mountPath"] for mount in container["volumeMounts"]} for container in containers)

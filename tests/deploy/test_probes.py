@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import http.client
 import os
 import re
 import shutil
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,11 +18,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
-from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.wire.tls import TlsFiles
 from tests.deploy import manifests
-from tests.runtime import toy
 from tests.runtime.identity.authority import Authority
 from tests.waiting import eventually
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
 
-from analysis.service import dashboard, outgoing
+from analysis.service import outgoing
 from analysis.service.other_servers.environments import NAMES, requirements
 from analysis.service.other_servers.figures import Comparison, Figure
 from lightpage.errors import LightpageError
@@ -35,27 +31,6 @@ def test_addresses_of_other_machines_and_name_servers_are_outgoing(tmp_path: Pat
     trace.write_text("71 1764100000.100000 io_uring_setup(8, {flags=0}) = 4\n")
     with pytest.raises(LightpageError):
         list(outgoing.calls(trace))
-
-
-class Answers:
-    """Answers as Prometheus does, of the store's trouble with nothing."""
-
-    def over(self, expression: str, start: float, end: float, step_s: float) -> list[dict[str, Any]]:
-        if "store_trouble" in expression or "flight" in expression:
-            return []
-        named = {"stage": "queue", "code": "OK", "version": "bench-9"}
-        values = [(at, str(number % 7)) for number, at in enumerate(np.arange(start, end, step_s))]
-        return [{"metric": named, "values": values}]
-
-
-def test_every_panel_of_the_dashboard_is_drawn_and_empty_ones_are_named(tmp_path: Path) -> None:
-    out, drawing = tmp_path / "dashboard.png", dashboard.Drawing(Answers(), 1_000_000.0, 1_000_060.0)  # type: ignore[arg-type]
-    assert drawing.draw(json.loads(dashboard.DASHBOARD.read_text()), out) == ["Store and flight recorder"]
-    assert Image.open(out).width > 500
-    shown = [
-        dashboard.formatted(unit)(value, None) for unit, value in (("s", 0.0123), ("bytes", 3 << 20), ("ops", 1.5))
-    ]
-    assert shown == ["12.3 ms", "3 MiB", "1.5/s"]
 
 
 # ---- other servers --------------------------------------------------------------------------------------------------

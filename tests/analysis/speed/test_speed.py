@@ -11,12 +11,11 @@ import pytest
 from click.testing import CliRunner
 from onnx import parser
 
-from analysis.speed import footprint, provider, roofline, scaling, speed
+from analysis.speed import provider, roofline, speed
 from analysis.speed.fidelity import FORMS, HALF, measured, name_of
 from analysis.speed.roofline import LAYOUT, POINTWISE, PRODUCTS, Gpu, Load
 from lightpage.recording.reader import Recording
 from runtime.decoding.decoder import Decoder
-from tests.lightpage.small import small_profile
 from tests.runtime import toy
 
 GRAPH = """<ir_version: 10, opset_import: ["" : 20]>
@@ -39,33 +38,13 @@ def figures(command: click.Command, folder: Path, *words: object) -> dict[str, A
     return found
 
 
-@pytest.fixture
-def small(tmp_path: Path) -> Path:
-    (tmp_path / "small.toml").write_text(small_profile().to_toml())
-    return tmp_path / "small.toml"
-
-
-def test_a_decoder_is_timed_part_by_part(small: Path, tmp_path: Path) -> None:
-    found = figures(speed.main, tmp_path, "--profile", small, "--decoder", "coherent", "--repeats", 1, "--threads", 1)
+def test_a_decoder_is_timed_part_by_part(small_device: list[str], tmp_path: Path) -> None:
+    words = ["--decoder", "coherent", "--repeats", "1", "--threads", "1"]
+    found = figures(speed.main, tmp_path, *small_device[:2], *words)
     (coherent,) = found["decoders"]
     assert (coherent["decoder"], coherent["ratio"]) == ("coherent", 1.0)
     assert [part["name"] for part in found["parts"]["coherent"]] == ["field", "sampling", "network", "answers"]
     assert all(part["seconds"] > 0 and part["floor_s"] > 0 for part in found["parts"]["coherent"])
-
-
-@pytest.mark.long  # exports two decoders to time them
-def test_pages_grow_by_the_square_of_the_factor(small: Path, tmp_path: Path) -> None:
-    found = figures(scaling.main, tmp_path, "--profile", small, "--factor", 1, "--factor", 2, "--repeats", 1)
-    assert [page["symbols"] for page in found["pages"]] == [44 * 28, 4 * 44 * 28]
-
-
-@pytest.mark.long  # exports a decoder and starts two processes
-def test_every_file_of_a_bundle_is_weighed(small: Path, tmp_path: Path) -> None:
-    asked = ("--profile", small, "--decoder", "fast", "--pages", 2, "--threads", 1)
-    (bundle,) = figures(footprint.main, tmp_path, *asked)["bundles"]
-    assert bundle["unpacked_bytes"] == sum(file["unpacked_bytes"] for file in bundle["files"])
-    assert (len(bundle["loading"]["pages_s"]), len(bundle["decoding"]["pages_s"])) == (0, 2)
-    assert bundle["loading"]["peak_bytes"] > 20e6
 
 
 def test_a_provider_is_compared_with_the_cpu(tmp_path: Path) -> None:
