@@ -241,11 +241,12 @@ def test_the_ray_job_is_understood_and_tells_nobody_of_itself() -> None:
     assert (options["engine"], options["address"]) == ("ray", "auto")
     assert job["backoffLimit"] == 0  # whatever the exit status is, which may say that nothing is left to do
     cluster = job["rayClusterSpec"]
-    containers = [container for pod in manifests.templates(job) for container in pod["spec"]["containers"]]
-    assert all({"name": "RAY_USAGE_STATS_ENABLED", "value": "0"} in container["env"] for container in containers)
+    for pod in manifests.templates(job):
+        assert {"name": "RAY_USAGE_STATS_ENABLED", "value": "0"} in pod["spec"]["containers"][0]["env"]
     assert f"ray=={cluster['rayVersion']}\n" in (ROOT / "constraints.txt").read_text()
     for group in cluster["workerGroupSpecs"]:
         (container,) = group["template"]["spec"]["containers"]
         assert container["resources"]["limits"]["cpu"] % options["threads"] == 0
     files = {f"/{str(options[key]).split('/')[1]}" for key in ("out", "fleet")}
-    assert all(files <= {mount["mountPath"] for mount in container["volumeMounts"]} for container in containers)
+    pods = [cluster["headGroupSpec"]["template"], *(group["template"] for group in cluster["workerGroupSpecs"])]
+    assert all(files <= {m["mountPath"] for m in pod["spec"]["containers"][0]["volumeMounts"]} for pod in pods)

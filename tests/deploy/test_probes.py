@@ -34,7 +34,7 @@ def free_port() -> int:
 
 
 class Pod:
-    """The container of the manifest on this machine: its command line and settings, with folders and ports of its own."""
+    """The container of the manifest on this machine: its settings, with folders and ports of its own."""
 
     def __init__(self, folder: Path, bundle: Path) -> None:
         whole = manifests.manifest("StatefulSet", "lightpage")

@@ -144,17 +144,3 @@ def spoiled(folder: Path, old: str, new: str) -> Path:
 def test_a_line_that_is_no_pin_with_hashes_is_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
     with pytest.raises(lock.LockError, match=re.escape(said)):
         lock.read_lock(spoiled(tmp_path, old, new))
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "name"),
-    [
-        (r"^click==\S+", "click==8.5.0", "click"),
-        (r"^pydantic-core==\S+ \\\n(    --hash=\S+( \\)?\n)+", "", "pydantic-core"),
-        (r"^click==", "idna==3.20 --hash=sha256:" + 64 * "0" + "\nclick==", "idna"),
-    ],
-)
-def test_a_version_and_a_package_that_do_not_agree_are_named(tmp_path: Path, old: str, new: str, name: str) -> None:
-    locked = lock.read_lock(spoiled(tmp_path, old, new))
-    [line] = disagreements(locked, constrained(), closure(asked("runtime"), "x86_64"))
-    assert line.startswith(f"{name} is ")

@@ -16,9 +16,7 @@ from analysis.studies import (
     angle,
     cross_section,
     drift,
-    imaging_condition,
     pipe_length,
-    rays,
     scaling,
 )
 from analysis.studies.command import study
@@ -92,34 +90,6 @@ def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) 
 
 
 # ---- what they say --------------------------------------------------------------------------------------------------
-
-
-def test_single_pixels_are_too_fine_for_the_full_size_pipe_and_pairs_are_not() -> None:
-    assert imaging_condition.needed_width_m(PAPER, 1) * 1e3 == pytest.approx(4.63, abs=0.01)
-    assert imaging_condition.needed_width_m(PAPER, 2) < PAPER.pipe.width_m < imaging_condition.needed_width_m(PAPER, 1)
-
-
-def test_a_square_pipe_makes_one_two_or_four_spots_and_a_round_one_smears(tmp_path: Path) -> None:
-    settings = Settings(PAPER, quick=True)
-    spots: dict[str, list[int]] = {"square": [], "round": []}
-    for case in cross_section.STUDY.cases(settings):
-        result = cross_section.STUDY.measure(settings, case, tmp_path, lambda what, share: None)
-        spots[case["shape"]].append(result["spots"])
-    assert set(spots["square"]) <= {1, 2, 4}
-    assert max(spots["round"]) > 10
-
-
-def test_a_square_pipe_lays_no_zone_on_another_and_a_sheared_one_does() -> None:
-    settings, shared = Settings(BENCH), {}
-    for case in rays.STUDY.cases(settings):
-        result = rays.STUDY.measure(settings, case, Path(), lambda what, share: None)
-        for _, x, y, _, share in rays.STUDY.rows([case], [result]):
-            if x != "lost":
-                shared[case["angle_deg"], x, y] = share
-    assert max(share for (angle, _, _), share in shared.items() if angle == 0) == 0
-    sheared = {(x, y): share for (angle, x, y), share in shared.items() if angle != 0}
-    assert max(sheared, key=lambda zone: sheared[zone]) == (1, 1)  # the diagonal zones suffer most
-    assert sheared[1, 1] > 0.03
 
 
 def test_what_a_drift_costs_is_counted_over_all_pages() -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,11 +24,9 @@ from lightpage.progress import Progress, reporting
 from lightpage.recording.reader import Recording
 from tests.lightpage.small import small_profile
 from tests.told import Told
-from tests.waiting import eventually
 from train.commands import train as cli_train
 from train.commands.options import CHOICES, chosen_localizer, chosen_trainer, given_choices
 from train.commands.train import train
-from train.data.feature_store import FeatureStore
 from train.fitting import provenance as origin
 from train.fitting.curves import curves_of
 from train.fitting.modules import SymbolTraining
@@ -42,7 +38,6 @@ from train.runs import FORMAT, begin, check_begun, load_run, sole_writer
 from train.trainers.whole_run import own_pilots
 
 LAST = Path("checkpoints") / "last.ckpt"
-SECONDS = 240
 
 
 @pytest.fixture(scope="module")
@@ -155,21 +150,6 @@ def test_training_that_is_stopped_loses_nothing_and_the_same_command_goes_on(
     assert (out / "run.json").exists()
 
 
-@pytest.mark.long  # a process that trains for seconds, to be sent signals
-def test_a_signal_stops_training(device: list[str], tmp_path: Path) -> None:
-    arguments = [*device, "--steps", "3600", "--out", str(tmp_path / "run")]
-    command = [sys.executable, "-m", "lightpage.cli.main", "train", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    try:
-        eventually(lambda: process.poll() is not None or (tmp_path / "run" / LAST).exists(), SECONDS)
-        process.terminate()
-        output, _ = process.communicate(timeout=SECONDS)
-    finally:
-        process.kill()
-    assert process.returncode == 143, output
-    assert not (tmp_path / "run" / "run.json").exists()
-
-
 def test_a_finished_run_is_told_again_and_its_options_and_symbols_stay(
     device: list[str], recording: Path, tmp_path: Path
 ) -> None:
@@ -204,20 +184,6 @@ def test_dark_pages_are_left_out_of_recorded_and_synthetic_ones(
     assert (described.pages, described.synthetic_pages) == ((4, 1, 1), 2)
     with Recording.open(recording) as pages:
         assert list(described.trained_pages) == [pages.page_hash(page) for page in (1, 2, 3, 4, 5)]
-
-
-@pytest.mark.long  # two processes that each load torch; that they train as one does is tested by itself
-def test_two_processes_train_one_run_and_its_refinement(small_device: list[str], tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    size = f"--channels 8 --blocks 1 --synthetic-pages 0 --steps 60 --devices 2 --out {out}"
-    command = [sys.executable, "-m", "lightpage.cli.main", "train", *small_device, *size.split()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS)
-    assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) == 1
-    assert load_run(out).validation_air > 0.5
-    assert len(curves_of(out)["val_air"]) == 60  # as many as one process takes
-    kept = FeatureStore(out / "refinement-1" / "features")
-    assert all(bool(light.any()) for light, *_ in (kept[index] for index in range(len(kept))))
 
 
 def test_pilots_of_the_devices_own_are_found(recording: Path) -> None:
