@@ -33,6 +33,7 @@ SMALL: dict[str, tuple[str, ...]] = {
     "service.overload": ("--times", "2", "--rounds", "1", "--seconds", "2", "--threads", "1"),
     "service.transport": ("--profile", "bench", "--repeats", "3"),
     "speed.footprint": ("--profile", "small.toml", "--decoder", "fast", "--pages", "2", "--threads", "1"),
+    "speed.speed": ("--profile", "small.toml", "--decoder", "coherent", "--repeats", "1", "--threads", "1"),
     "speed.scaling": ("--profile", "small.toml", "--factor", "1", "--factor", "2", "--repeats", "1"),
     "scaling.second_run": ("--pages", "40", "--repeats", "1", "--out", "out"),
 }

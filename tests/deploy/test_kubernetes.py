@@ -65,10 +65,6 @@ def test_what_kustomize_makes_of_the_folders_is_valid() -> None:
         made = list(yaml.safe_load_all(kubectl("kustomize", kustomization.parent)))
         assert made
         assert [problem for each in made for problem in manifests.problems(each)] == []
-    made = list(yaml.safe_load_all(kubectl("kustomize", FOLDER / "overlays/gpu")))
-    (gpu,) = [each for each in made if each["kind"] == "StatefulSet"]
-    container = manifests.container(gpu)
-    assert (container["image"], container["resources"]["limits"]["nvidia.com/gpu"]) == ("lightpage:gpu", 1)
 
 
 # ---- what belongs together ------------------------------------------------------------------------------------------

@@ -171,10 +171,6 @@ PLANTED: dict[str, tuple[Callable[[Path], object], list[str]]] = {
         lambda root: write(root / SITE / "socket.pyc", b""),
         [f"{OWN}/socket.pyc"],
     ),
-    "byte code of nobody beside a source": (
-        lambda root: write(root / SITE / "click/__pycache__/__init__.cpython-312.pyc", b""),
-        [f"{OWN}/click/__pycache__/__init__.cpython-312.pyc"],
-    ),
     "a linked package": (
         lambda root: (root / SITE / "extra").symlink_to("../../../../../usr/lib"),
         [f"{OWN}/extra"],

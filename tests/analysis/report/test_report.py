@@ -140,7 +140,6 @@ def test_levels_are_read_off_phases() -> None:
 def test_what_is_no_source_is_refused(
     small_run: Path, ray_run: Path, evaluation: Path, small_device: list[str], tmp_path: Path
 ) -> None:
-    (tmp_path / "unfinished").mkdir()
     (tmp_path / "notes.txt").write_text("AIR was fine")
     (tmp_path / "other.json").write_text(json.dumps({"bundle_version": "1", "pages": 3}))
     (tmp_path / "none.json").write_text(json.dumps({"pages": 0, "pages_left_out": 0, "refused_pages": [{"page": 0}]}))
@@ -150,7 +149,7 @@ def test_what_is_no_source_is_refused(
     bad |= {"maps": maps | {"air": maps["air"][:-1]}}
     recording: tuple[object, ...] = ("--recording", small_device[3])
     for source, options, named in (
-        *((tmp_path / name, (), name) for name in ("unfinished", "notes.txt", "other.json", "none.json")),
+        *((tmp_path / name, (), name) for name in ("notes.txt", "other.json", "none.json")),
         *((changed(evaluation, tmp_path / f"{n}.json", **{n: value}), (), n) for n, value in bad.items()),
         (ray_run, (), "--recording"),
         (evaluation, recording, "--recording"),

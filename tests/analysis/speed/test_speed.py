@@ -10,7 +10,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from analysis.speed import provider, speed
+from analysis.speed import provider
 from analysis.speed.fidelity import FORMS, HALF, measured, name_of
 from lightpage.recording.reader import Recording
 from runtime.decoding.decoder import Decoder
@@ -23,15 +23,6 @@ def figures(command: click.Command, folder: Path, *words: object) -> dict[str, A
     CliRunner().invoke(command, asked, catch_exceptions=False, standalone_mode=False)
     found: dict[str, Any] = json.loads((folder / "F.json").read_text())
     return found
-
-
-def test_a_decoder_is_timed_part_by_part(small_device: list[str], tmp_path: Path) -> None:
-    words = ["--decoder", "coherent", "--repeats", "1", "--threads", "1"]
-    found = figures(speed.main, tmp_path, *small_device[:2], *words)
-    (coherent,) = found["decoders"]
-    assert (coherent["decoder"], coherent["ratio"]) == ("coherent", 1.0)
-    assert [part["name"] for part in found["parts"]["coherent"]] == ["field", "sampling", "network", "answers"]
-    assert all(part["seconds"] > 0 and part["floor_s"] > 0 for part in found["parts"]["coherent"])
 
 
 def test_a_provider_is_compared_with_the_cpu(tmp_path: Path) -> None:

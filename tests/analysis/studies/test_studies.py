@@ -15,7 +15,6 @@ from analysis.studies import (
     STUDIES,
     angle,
     cross_section,
-    drift,
     pipe_length,
     scaling,
 )
@@ -90,15 +89,6 @@ def test_a_case_is_measured_once_and_comes_back_with_its_arrays(tmp_path: Path) 
 
 
 # ---- what they say --------------------------------------------------------------------------------------------------
-
-
-def test_what_a_drift_costs_is_counted_over_all_pages() -> None:
-    assert drift.recalibrate_at([(1.0, 0.99), (2.0, 0.97)], 0.98) == pytest.approx(1.5)
-    assert drift.recalibrate_at([(1.0, 0.96)], 0.98) == pytest.approx(0.5)
-    assert drift.recalibrate_at([(1.0, 0.999)], 0.98) is None
-    evaluation = {"air_bits_per_symbol": 6.0, "pages": 3, "refused_pages": [{"page": 1}]}
-    assert drift.air_of_all_pages(evaluation) == 4.5
-    assert drift.air_of_all_pages({"pages": 0, "refused_pages": [{"page": 0}]}) == 0
 
 
 def test_enlarged_and_shortened_devices_have_the_zones_of_the_full_one() -> None:

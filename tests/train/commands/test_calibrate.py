@@ -126,10 +126,10 @@ def test_symbols_whose_light_misses_a_camera_are_counted(tmp_path: Path, monkeyp
     assert json.loads(figures.read_text())["symbols_beside_cameras"] == 5 * 56
 
 
-def test_the_table_is_for_people_and_the_json_for_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_found_is_written_as_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_registration(monkeypatch, REGISTERED)
     out, figures = tmp_path / "calibration.toml", tmp_path / "figures.json"
-    text = run(flat_recording(tmp_path / "R.h5", 100), out, "--json", str(figures))
+    run(flat_recording(tmp_path / "R.h5", 100), out, "--json", str(figures))
     data = json.loads(figures.read_text())
     calibration = load_calibration(out)
     assert data["angle_deg"] == pytest.approx(-0.6)
@@ -137,9 +137,6 @@ def test_the_table_is_for_people_and_the_json_for_machines(tmp_path: Path, monke
     assert (data["pages_used"], data["coherence_before"], data["coherence_after"]) == (2, 0.02, 0.71)
     assert data["parameters"] == calibration.parameters
     assert data["symbols_beside_cameras"] == 0
-    rows = {line[:32].strip(): line[32:].split() for line in text.splitlines()}
-    assert rows["pipe angle, degree"][0] == "-0.6"
-    assert rows["focal length, mm"] == ["20", "0.0008", "20"]
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from train.commands.train import train
 from train.fitting import provenance as origin
 from train.fitting.curves import curves_of
 from train.fitting.modules import SymbolTraining
-from train.fitting.provenance import provenance, provenance_of
+from train.fitting.provenance import provenance_of
 from train.models.hyperparameters import Hyperparameters
 from train.models.presets import PRESETS
 from train.published.training import PublishedChoices
@@ -283,27 +283,23 @@ def test_what_a_training_is_of_is_what_was_there_when_it_began(tmp_path: Path, m
     program.parent.mkdir()
     monkeypatch.setenv("PATH", str(program.parent))
 
+    def another_process() -> dict[str, str]:
+        origin.commit.cache_clear()
+        return provenance_of(tmp_path)
+
     def git_says(tree: object, commit: str, status: str = "") -> None:
         answers = f'case "$*" in *rev-parse*) printf "{tree}\\n{commit}" ;; *) printf "{status}" ;; esac'
         program.write_text(f"#!/bin/sh\n{answers}\n")
         program.chmod(0o755)
 
-    def from_now_on() -> dict[str, str]:
-        """What another process finds."""
-        origin.commit.cache_clear()
-        return provenance()
-
     try:
-        assert from_now_on()["commit"] == ""  # there is no git
-        origin.commit.cache_clear()
         git_says(tree, "abc")
-        first = provenance_of(tmp_path)
+        first = another_process()
         assert first["commit"] == "abc"
         git_says(tree, "abcd", " M train/fitting/fit.py")
         assert provenance_of(tmp_path) == first  # another commit while it works
-        origin.commit.cache_clear()  # another process goes on with it
-        assert provenance_of(tmp_path) == first | {"commit": f"abcd{origin.CHANGED}", "begun_at_commit": "abc"}
+        assert another_process() == first | {"commit": f"abcd{origin.CHANGED}", "begun_at_commit": "abc"}
         git_says("/elsewhere", "abc")
-        assert from_now_on()["commit"] == ""
+        assert another_process()["commit"] == ""
     finally:
         origin.commit.cache_clear()
