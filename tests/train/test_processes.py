@@ -23,15 +23,11 @@ ROUNDING = 1e-5
 """Of float32: sums of four pages and of twice two come in another order. Weights were found to differ by 2e-7."""
 
 
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
-
-
 def on_two_nodes(out: Path) -> list[str]:
     """What training prints on either of two nodes that meet on this machine."""
-    meeting = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        meeting = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(found.getsockname()[1])}
     command = [sys.executable, "-m", "tests.train.node", str(out), "2"]
     nodes = [
         subprocess.Popen(command, env=meeting | {"NODE_RANK": node}, text=True, stdout=subprocess.PIPE) for node in "01"

@@ -117,7 +117,6 @@ def test_long_lists_end_and_text_is_escaped(tmp_path: Path) -> None:
     text, seen = page_of(written(many, tmp_path / "r.json"), tmp_path / "r.html")
     assert text.count("<td>body</td>") == 200 + 1  # one of them counts the cause
     assert all(picture.startswith("data:image/png") for picture in seen.pictures["pages"])
-    assert len(text) < 500_000
     assert "script" not in seen.tags
     assert html.escape(evil).replace("&quot;", "&#34;") in text
 

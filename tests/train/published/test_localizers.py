@@ -28,12 +28,6 @@ def aligned(localizer: Localizer, profile: Profile) -> Localizer:
     return localizer
 
 
-def test_samples_cover_the_page_evenly() -> None:
-    places = page_places((2, 4))
-    assert places[..., 0].tolist() == [[-0.75, -0.25, 0.25, 0.75]] * 2
-    assert places[..., 1].tolist() == [[-0.5] * 4, [0.5] * 4]
-
-
 def test_without_a_localizer_samples_lie_where_the_page_would_be_imaged() -> None:
     profile = small_profile()
     grid = aligned(NoLocalizer(profile, SAMPLES), profile).grid()
