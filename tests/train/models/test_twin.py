@@ -126,7 +126,8 @@ class TestClosedForms:
             update={"pipe": small.pipe.model_copy(update={"length_m": 7.3 * small.pipe.length_m})}
         )
         points = page_points(profile, 400)
-        rays = TorchTwin(RayTwin(profile)).trace(nominal(), points)
+        twin = TorchTwin(RayTwin(profile))
+        rays = twin.trace(nominal(), points)
         k0, w = 2 * np.pi / profile.light.wavelength_m, profile.pipe.width_m
         nk = profile.pipe.refractive_index * k0
         k = -k0 / profile.lens.focal_length_m * points
@@ -134,6 +135,9 @@ class TestClosedForms:
         unfolded = k / kz[:, None] * profile.pipe.length_m / w
         assert np.abs(unfolded).max() > 8
         np.testing.assert_allclose(rays.positions, unfolded, rtol=1e-12, atol=1e-12)
+        sheared = np.stack([unfolded[:, 0], unfolded @ [np.sin(0.01), np.cos(0.01)]], axis=-1)
+        found = twin.trace(only(pipe_angle_rad=0.01), points).positions
+        np.testing.assert_allclose(found, sheared, rtol=1e-12, atol=1e-12)
         even = 2 * np.round(unfolded / 2)
         odd = 2 * np.floor(unfolded / 2) + 1
         for b, branch in enumerate(BRANCHES):
