@@ -11,7 +11,6 @@ import grpc
 import numpy as np
 import pytest
 from google.protobuf.descriptor_pool import DescriptorPool
-from google.protobuf.message_factory import GetMessageClass
 from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoReflectionDescriptorDatabase
 
 from lightpage.errors import FrameError
@@ -235,6 +234,10 @@ def with_pilots(request: oip.ModelInferRequest, mask: np.ndarray, symbols: np.nd
         add(request, "pilot_symbols", symbols)
 
 
+def with_text(parameter: oip.InferParameter) -> None:
+    parameter.string_param = "16"
+
+
 def without(request: oip.ModelInferRequest) -> None:
     request.ClearField("inputs")
     request.ClearField("raw_input_contents")
@@ -270,7 +273,6 @@ def with_mixed(request: oip.ModelInferRequest) -> None:
 
 Change = Callable[[oip.ModelInferRequest], object]
 NO_PILOTS, A_PAGE = np.zeros(toy.PAGE, bool), np.zeros(toy.PAGE, np.uint8)
-# fmt: off
 WRONG: list[tuple[Change, str, str]] = [
     (without, "inputs.in_phase", "INVALID_VALUE"),
     (one_less, "inputs.quadrature", "INVALID_VALUE"),
@@ -278,9 +280,7 @@ WRONG: list[tuple[Change, str, str]] = [
     (lambda r: add(r, "in_phase", np.zeros(toy.SHAPE, np.uint8)), "inputs.in_phase", "INVALID_VALUE"),
     (lambda r: setattr(r.inputs[0], "datatype", "UINT16"), "inputs.in_phase", "FRAME_FORMAT"),
     (lambda r: r.inputs[1].shape.reverse(), "inputs.quadrature", "FRAME_FORMAT"),
-    (lambda r: r.inputs[1].shape.insert(0, 1), "inputs.quadrature", "FRAME_FORMAT"),
     (lambda r: r.inputs[1].shape.extend([1] * 100_000), "inputs.quadrature", "FRAME_FORMAT"),
-    (lambda r: r.inputs[1].shape.__setitem__(0, -64), "inputs.quadrature", "FRAME_FORMAT"),
     (lambda r: r.raw_input_contents.__setitem__(0, b"1"), "inputs.in_phase", "FRAME_FORMAT"),
     (lambda r: r.raw_input_contents.pop(), "raw_input_contents", "INVALID_VALUE"),
     (lambda r: r.inputs[0].contents.uint_contents.append(1), "inputs.in_phase.contents", "INVALID_VALUE"),
@@ -288,24 +288,17 @@ WRONG: list[tuple[Change, str, str]] = [
     (with_few_typed, "inputs.quadrature.contents.uint_contents", "FRAME_FORMAT"),
     (with_a_typed(256), "inputs.in_phase.contents.uint_contents", "FRAME_FORMAT"),
     (with_mixed, "inputs.in_phase.contents", "FRAME_FORMAT"),
-    (lambda r: setattr(r.inputs[0].parameters["shared_memory_region"], "string_param", "x"), "inputs.in_phase.parameters", "INVALID_VALUE"),  # noqa: E501
+    (lambda r: with_text(r.inputs[0].parameters["region"]), "inputs.in_phase.parameters", "INVALID_VALUE"),
     (lambda r: r.outputs.add(name="logits"), "outputs", "INVALID_VALUE"),
     (lambda r: [r.outputs.add(name="phase") for _ in range(2)], "outputs.phase", "INVALID_VALUE"),
-    (lambda r: setattr(r.outputs.add(name="phase").parameters["top"], "int64_param", 3), "outputs.phase.parameters", "INVALID_VALUE"),  # noqa: E501
-    (lambda r: setattr(r.parameters["level"], "int64_param", 3), "parameters", "INVALID_VALUE"),
-    (lambda r: setattr(r.parameters["levels"], "string_param", "16"), "parameters.levels", "INVALID_VALUE"),
-    (lambda r: r.parameters["levels"].Clear(), "parameters.levels", "INVALID_VALUE"),
+    (lambda r: with_text(r.outputs.add(name="phase").parameters["top"]), "outputs.phase.parameters", "INVALID_VALUE"),
+    (lambda r: with_text(r.parameters["level"]), "parameters", "INVALID_VALUE"),
+    (lambda r: with_text(r.parameters["levels"]), "parameters.levels", "INVALID_VALUE"),
     (lambda r: setattr(r.parameters["levels"], "int64_param", -1), "parameters.levels", "INVALID_VALUE"),
-    (lambda r: setattr(r.parameters["levels"], "int64_param", 999), "levels", "INVALID_VALUE"),
-    (lambda r: setattr(r.parameters["black_level"], "int64_param", 255), "black_level", "INVALID_VALUE"),
     (lambda r: with_pilots(r, NO_PILOTS, None), "inputs.pilot_mask", "INVALID_VALUE"),
-    (lambda r: add(r, "pilot_symbols", A_PAGE), "inputs.pilot_symbols", "INVALID_VALUE"),
-    (lambda r: with_pilots(r, NO_PILOTS[1:], A_PAGE), "inputs.pilot_mask", "INVALID_VALUE"),
     (with_a_flag_of_2, "inputs.pilot_mask", "INVALID_VALUE"),
-    (lambda r: with_pilots(r, ~NO_PILOTS, A_PAGE + 16), "pilots", "INVALID_VALUE"),
     (lambda r: [r.outputs.add(name="phase") for _ in range(300)], "", "TOO_LARGE"),
 ]
-# fmt: on
 """What is changed, the field that the error names, and its reason."""
 
 
@@ -318,7 +311,6 @@ def test_what_is_wrong_with_a_request_is_named(service: Running) -> None:
         if field:
             assert answer.told["BadRequest"].field_violations[0].field == field, number
         assert len(answer.text) < 1000
-    assert infer(service, request_of(levels=16)).outputs
     assert service.plane.received.used == 0
     last = request_of(typed=True)
     last.inputs[0].contents.uint_contents[6143] = 255
@@ -345,13 +337,9 @@ def test_a_whole_pair_passes_where_no_message_of_ones_own_may_be_so_large(start:
         request = request_of(PAIR, typed, levels=16)
         assert request.ByteSize() > 12_000
         assert infer(service, request).outputs
-    # Their own messages have their own limit, and say so; beyond the largest message of all, gRPC does.
-    for size, reason in ((5000, "TOO_LARGE"), (10**6, "")):
+    for size, reason in ((5000, "TOO_LARGE"), (10**6, "")):  # beyond the largest message of all, gRPC refuses it
         answer = refused(lambda size=size: service.stub.GetJob(pb.GetJobRequest(id="a" * size), timeout=20))  # type: ignore[misc]
         assert (answer.code, answer.reason) == (EXHAUSTED, reason)
-        assert ("4096" in answer.text) == (size == 5000)
-    large = pb.DecodeFramesRequest(chunk=bytes(5000))
-    assert refused(lambda: service.stub.DecodeFrames(iter([large]), timeout=20)).reason == "TOO_LARGE"
 
 
 @pytest.mark.parametrize(
@@ -413,16 +401,8 @@ def test_a_service_without_the_protocol_does_not_know_it(start: Start) -> None:
     assert service.client.decode(PAIR, 16).levels == 16
 
 
-def test_a_stranger_finds_and_calls_the_protocol_by_reflection_alone(service: Running) -> None:
-    channel = service.channel()
-    database = ProtoReflectionDescriptorDatabase(channel)
-    assert {SERVICE.full_name, "grpc.health.v1.Health"} <= set(database.get_services())
-    (name,) = (one for one in database.get_services() if one.startswith("inference."))
-    method = DescriptorPool(database).FindServiceByName(name).methods_by_name["ModelInfer"]
-    asked = GetMessageClass(method.input_type)
-    assert asked is not oip.ModelInferRequest
-    request = asked.FromString(request_of(levels=16).SerializeToString())
-    read = GetMessageClass(method.output_type).FromString
-    response = channel.unary_unary(f"/{name}/ModelInfer", asked.SerializeToString, read)(request, timeout=20)
-    assert response.outputs[0].name == "symbols"
-    assert response.raw_output_contents[0] == a_page()[0].tobytes()
+def test_a_stranger_finds_the_protocol_by_reflection_alone(service: Running) -> None:
+    database = ProtoReflectionDescriptorDatabase(service.channel())
+    assert {SERVICE.full_name, INFERENCE.full_name, "grpc.health.v1.Health"} <= set(database.get_services())
+    method = DescriptorPool(database).FindServiceByName(INFERENCE.full_name).methods_by_name["ModelInfer"]
+    assert method.input_type.full_name == oip.ModelInferRequest.DESCRIPTOR.full_name
