@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import pytest
 
-from lightpage.errors import InvalidInputError, StorageError, SurroundingsError
+from lightpage.errors import InvalidInputError, SurroundingsError
 from lightpage.page.symbols import pilot_mask
 from runtime.acquisition.source import Shot
 from runtime.acquisition.sources import open_source
@@ -74,9 +74,7 @@ def test_a_sent_pair_comes_back_as_the_local_decoder_would_decode_it(service: Ru
     assert there.piston_rad == pytest.approx(here.piston_rad)
     assert (there.model_version, there.levels) == ("toy-1", 16)
     assert (there.frames, there.replayed, there.recalibration_reasons) == ((), False, ())
-    timings = there.timings
-    assert 0 < timings.inference_s < timings.decode_s < timings.total_s
-    assert 0 < timings.receive_s < timings.total_s
+    assert 0 < there.timings.inference_s < there.timings.decode_s < there.timings.total_s
     assert service.plane.received.used == 0
 
 
@@ -216,7 +214,7 @@ def test_without_a_free_slot_callers_are_told_to_come_back_and_no_page_is_read_i
         assert (answer.code, answer.reason) == (grpc.StatusCode.RESOURCE_EXHAUSTED, "OVERLOADED")
     page = service.client.read_page()
     assert page.page == 0
-    assert 0 < page.timings.receive_s + page.timings.decode_s < page.timings.total_s
+    assert 0 < page.timings.receive_s < page.timings.receive_s + page.timings.decode_s < page.timings.total_s
 
 
 # ---- lost and damaged pages ---------------------------------------------------------------------------------------
@@ -247,7 +245,6 @@ def test_a_page_whose_pilots_disagree_is_lost_and_not_answered(start: Start) -> 
         service.client.decode(strange, 16)
     assert caught.value.subject == "frame pair: pilots"
     assert (caught.value.reason, caught.value.recalibration_due) == (Reason.PILOTS_DISAGREE, True)
-    assert service.count("lightpage_pages_lost_total", reason="PILOTS_DISAGREE") == 1
     assert service.count("lightpage_recalibration_due") == 1
     assert service.count("lightpage_calls_total", method="DecodeFrames", code="DATA_LOSS") == 1
     service.reading(lambda shot: Shot(strange, shot.page_index))
@@ -299,34 +296,6 @@ def test_a_server_is_found_where_it_is_and_says_what_it_lacks(service: Running, 
             call()
 
 
-def lost(service: Running) -> float:
-    return sum(
-        service.count("lightpage_pages_lost_total", reason=name.removeprefix("LOSS_REASON_"))
-        for name in pb.LossReason.keys()  # noqa: SIM118 — no dictionary
-    )
-
-
-@pytest.mark.parametrize("request_id", ["", "shift-1"])
-def test_a_page_that_its_storage_does_not_give_is_no_finding_and_may_be_asked_for_again(
-    request_id: str, start: Start
-) -> None:
-    service, fails = start(), [True]
-
-    def read(shot: Shot) -> Shot:
-        if fails:
-            raise StorageError("recording R.h5: dataset 'in_phase'", "Input/output error", "data that can be read")
-        return shot
-
-    service.reading(read)
-    with pytest.raises(StorageError):
-        service.client.read_page(3, request_id=request_id)
-    (refused,) = service.client.read_pages([3])
-    assert isinstance(refused, StorageError)
-    assert lost(service) == 0
-    fails.clear()
-    assert service.client.read_page(3, request_id=request_id).page == 3
-
-
 def test_a_decode_for_which_memory_is_short_says_so(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     def short(*_: object, **__: object) -> None:
         raise MemoryError
@@ -336,19 +305,16 @@ def test_a_decode_for_which_memory_is_short_says_so(start: Start, monkeypatch: p
     for call in (lambda: service.client.decode(a_page()[1], 16), lambda: service.client.read_page(1)):
         with pytest.raises(SurroundingsError):
             call()  # type: ignore[no-untyped-call]
-    assert lost(service) == 0
     assert service.count("lightpage_rejects_total", reason="SURROUNDINGS") == 2
 
 
 def test_a_recalibration_without_any_folder_is_refused_before_it_begins(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    service = start()
-    errors: list[OSError] = [FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']")]
-
     def none(*_: object, **__: object) -> str:
-        raise errors[0]
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']")
 
+    service = start()
     monkeypatch.setattr(tempfile, "mkdtemp", none)
     assert isinstance(service.recalibrator.no_room(), StoreError)
     for call in (service.client.recalibrate, service.client.start_recalibration):
@@ -356,25 +322,3 @@ def test_a_recalibration_without_any_folder_is_refused_before_it_begins(
             call(count=2)
     assert service.client.jobs() == []
     assert start(store=tmp_path / "store").recalibrator.no_room() is None
-    errors[0] = OSError(errno.ENOSPC, "No space left on device")  # a full disk is no missing folder
-    with pytest.raises(SurroundingsError):
-        service.client.start_recalibration(count=2)
-
-
-@pytest.mark.long  # gRPC counts a caller's signs of life by its own clock: five of them take 55 s
-def test_a_client_that_asks_for_a_sign_of_life_every_ten_seconds_without_calls_is_not_hung_up_on(
-    service: Running,
-) -> None:
-    options = (
-        ("grpc.keepalive_time_ms", 10_000),
-        ("grpc.keepalive_permit_without_calls", 1),
-        ("grpc.http2.max_pings_without_data", 0),
-    )
-    states = list[grpc.ChannelConnectivity]()
-    with grpc.insecure_channel(service.server.target, options) as channel:
-        channel.subscribe(states.append)
-        grpc.channel_ready_future(channel).result(30)
-        threading.Event().wait(55)  # five of them, of which the default forgives two
-        channel.unary_unary("/lightpage.v1.Lightpage/Describe")(b"", timeout=20)
-    after = states[states.index(grpc.ChannelConnectivity.READY) + 1 :]
-    assert set(after) <= {grpc.ChannelConnectivity.SHUTDOWN}
