@@ -68,8 +68,9 @@ def bytes_of(pair: FramePair) -> bytes:
 
 
 def header(**changes: object) -> pb.RecalibrateFramesRequest:
-    usual = {"rows_px": 64, "columns_px": 96, "pixel_type": 1, "bit_depth": 8, "levels": 16, "pages": 2, **changes}
-    return pb.RecalibrateFramesRequest(header=pb.RecalibrateFramesHeader(**usual))  # type: ignore[arg-type]
+    usual = {"rows_px": 64, "columns_px": 96, "pixel_type": pb.PIXEL_TYPE_UINT8, "bit_depth": 8}
+    given = {**usual, "levels": 16, "pages": 2, **changes}
+    return pb.RecalibrateFramesRequest(header=pb.RecalibrateFramesHeader(**given))  # type: ignore[arg-type]
 
 
 def reference(data: bytes) -> pb.RecalibrateFramesRequest:
