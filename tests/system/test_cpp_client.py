@@ -149,7 +149,7 @@ def test_a_wrong_command_line_is_explained_and_no_service_is_an_error_at_the_dea
 
 
 class Told(pb_grpc.LightpageServicer):
-    """A job that breaks off or goes on until it is cancelled; a page whose first answer is late, and the second lost."""
+    """A job that breaks off or goes on until it is cancelled; a page whose first two answers are late or lost."""
 
     def __init__(self, *, steps: int | None = 3, refusals: int = 0, breaks: int = 0) -> None:
         self.steps, self.refusals, self.breaks = steps, refusals, breaks

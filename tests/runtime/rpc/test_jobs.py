@@ -147,7 +147,7 @@ def test_a_cancelled_job_changes_nothing_and_makes_room(start: Start) -> None:
     assert cancelled.state is JobState.CANCELLED
     assert isinstance(cancelled.error, JobCancelledError)
     assert service.version == "toy-1"
-    assert service.client.cancel_job(job.id) == cancelled
+    assert service.client.cancel_job(job.id).ended_s == cancelled.ended_s
     fit.go.set()
     done = service.last(service.client.start_recalibration(count=2))
     assert done.state is JobState.DONE
@@ -206,7 +206,7 @@ def test_a_job_that_ends_badly_says_why_as_a_call_would(start: Start, tmp_path: 
             service.client.start_recalibration(**options)
     answer = refused(lambda: service.stub.StartRecalibration(pb.StartRecalibrationRequest(), timeout=20))
     assert (answer.code, answer.subject) == (grpc.StatusCode.INVALID_ARGUMENT, "pages")
-    assert len(service.client.jobs()) == 3
+    assert len(service.client.jobs()) == 2
 
 
 def test_the_model_in_service_must_be_the_one_expected(start: Start) -> None:
