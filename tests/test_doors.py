@@ -10,8 +10,6 @@ from pathlib import Path
 import pytest
 from grpc_tools import protoc
 
-from tests.runtime import toy
-
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"onnxruntime", "scipy", "matplotlib", "h5py", "pydantic", "torch", "PIL", "reedsolo", "click", "google_crc32c"}
 
@@ -22,19 +20,6 @@ def test_every_name_of_a_door_is_there(package: str) -> None:
     assert [name for name in module.__all__ if getattr(module, name, None) is None] == []
     with pytest.raises(AttributeError):
         _ = module.nothing_of_that_name
-
-
-def test_a_notebook_opens_decodes_and_measures_in_four_lines(toy_zip: Path, tmp_path: Path) -> None:
-    toy.write_toy_recording(tmp_path / "r.h5", toy.ToyDevice(), 16, 1)
-    names = {"path": str(tmp_path / "r.h5"), "bundle": str(toy_zip)}
-    script = """
-import lightpage, runtime
-recording, decoder = lightpage.Recording.open(path), runtime.load(bundle)
-page = decoder.decode(recording.frames(0), recording.levels)
-air = lightpage.measure(page.phase, page.concentration, recording.symbols(0), recording.levels).air_bits_per_symbol
-"""
-    exec(script, names)
-    assert 2 < float(names["air"]) < 4
 
 
 def test_a_callers_own_stubs_work_beside_the_installed_package_and_the_client_is_light(tmp_path: Path) -> None:

@@ -140,18 +140,6 @@ def test_no_name_of_a_session_is_that_of_a_connection() -> None:
         assert Call("ReadPage", Caller(), pool, "unix:", identity=identity).connection_session == ""
 
 
-def test_a_certificate_that_cannot_be_read_is_refused_and_counted(
-    secured: Running, authority: Authority, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def damaged(_: bytes) -> Identity:
-        raise NotAllowedError("certificate of the caller", "nonsense", "one that can be read")
-
-    monkeypatch.setattr("runtime.rpc.call.identity_of", damaged)
-    tls = authority.caller("good", ["admin"])
-    assert ended(secured.server.target, tls) is grpc.StatusCode.PERMISSION_DENIED
-    assert secured.count("lightpage_calls_total", method="ReadPage", code="PERMISSION_DENIED") == 1
-
-
 def test_new_certificates_count_without_a_restart(start: Start, authority: Authority, tmp_path: Path) -> None:
     files = authority.service()
     target = start(certificates=Certificates(files)).server.target

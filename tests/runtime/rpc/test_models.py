@@ -116,15 +116,12 @@ def test_bundles_that_could_not_serve_are_refused_and_leave_nothing(stored: Star
         return NoTracker(made)
 
     service = stored(tracker=tracker)
-    (tmp_path / "noise.zip").write_bytes(bytes(5000))
-    files = toy.files()
-    golden = write_bundle(
-        tmp_path / "golden.zip", toy.manifest(version="toy-3"), files | {DECODER: toy.decoder_onnx(9)}
-    )
+    files = toy.files() | {DECODER: toy.decoder_onnx(9)}
+    golden = write_bundle(tmp_path / "golden.zip", toy.manifest(version="toy-3"), files)
     untracked = toy.write_toy_bundle(tmp_path / "untracked.zip", version="toy-8")
     narrow = toy.PROFILE_TOML.replace("columns = 24", "columns = 20")
-    foreign = write_bundle(tmp_path / "foreign.zip", toy.manifest(version="toy-4", profile=narrow), files)
-    for bundle in (tmp_path / "noise.zip", golden, untracked, foreign):
+    foreign = write_bundle(tmp_path / "foreign.zip", toy.manifest(version="toy-4", profile=narrow), toy.files())
+    for bundle in (golden, untracked, foreign):
         with pytest.raises(BundleError) as error:
             service.client.upload_model(bundle)
         assert ".upload-" not in str(error.value)
