@@ -23,7 +23,7 @@ from tests.packaging.scripts import script
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT, DATA = SETTINGS["project"], SETTINGS["tool"]["setuptools"]["package-data"]
-COMMANDS: list[str] = [*PROJECT["scripts"].values(), *(x for y in PROJECT["entry-points"].values() for x in y.values())]
+NAMED: list[dict[str, str]] = [PROJECT["scripts"], *PROJECT["entry-points"].values()]
 LOCKS = ROOT / "packaging" / "locks"
 # What a wheel is made of, and what the image build is given beside that.
 PACKAGES = ("lightpage", "train", "export", "runtime", "analysis")
@@ -63,9 +63,9 @@ def defined(module: str) -> set[str]:
 
 
 def test_every_command_and_plug_in_is_there() -> None:
-    for value in COMMANDS:
+    for name, value in (item for names in NAMED for item in names.items()):
         module, _, attribute = value.partition(":")
-        assert attribute in defined(module), value
+        assert attribute in defined(module), name
 
 
 def test_data_files_of_the_packages_travel_with_the_wheel() -> None:

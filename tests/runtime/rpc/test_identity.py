@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -22,15 +21,14 @@ from runtime.client.client import LightpageClient
 from runtime.commands.healthcheck import is_serving
 from runtime.errors import NotAllowedError
 from runtime.identity.certificates import Certificates
-from runtime.identity.roles import LOCAL, NEEDED, Identity, Role
+from runtime.identity.roles import NEEDED, Role
 from runtime.pb.inference import open_inference_pb2_grpc as oip_grpc
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
-from runtime.rpc.call import SERVICE, Call
+from runtime.rpc.call import SERVICE
 from runtime.rpc.health_server import HealthServer
 from runtime.rpc.inference_calls import INFERENCE, PREFIX
 from runtime.rpc.server import LightpageServer
 from runtime.service.audit import AuditLog
-from runtime.service.caller import Caller
 from runtime.wire.channel import open_channel
 from runtime.wire.tls import TlsFiles
 from tests.runtime.identity.authority import Authority
@@ -128,16 +126,6 @@ def test_callers_of_other_names_share_no_session_and_no_request_id(secured: Runn
     assert pistons == [1, 1, 2]
     assert [answer.replayed for answer in answers] == [False, False, True]
     assert answers[0].page == answers[2].page != answers[1].page
-
-
-def test_no_name_of_a_session_is_that_of_a_connection() -> None:
-    pool = ThreadPoolExecutor(1)
-    for identity, whose in ((Identity("line", frozenset(Role)), "4:line/"), (LOCAL, "")):
-        call = Call("ReadPage", Caller(), pool, "ipv4:127.0.0.1:9", identity=identity)
-        assert call.connection_session == f"connection {whose}ipv4:127.0.0.1:9"
-        assert call.session(call.connection_session) == f"session {whose}{call.connection_session}"
-        assert (call.own("job"), call.own(""), call.session("")) == (f"{whose}job", "", "")
-        assert Call("ReadPage", Caller(), pool, "unix:", identity=identity).connection_session == ""
 
 
 def test_new_certificates_count_without_a_restart(start: Start, authority: Authority, tmp_path: Path) -> None:

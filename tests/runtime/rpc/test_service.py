@@ -206,12 +206,10 @@ def test_waiting_for_a_slot_is_not_stalling(start: Start) -> None:
 def test_without_a_free_slot_callers_are_told_to_come_back_and_no_page_is_read_in_vain(start: Start) -> None:
     service = start(limits=Limits(concurrent_decodes=1, deadline_s=0.05))
     with service.plane.decodes.held(Caller()):
-        for call in (lambda: service.client.decode(PAIR, 16), service.client.read_page, service.client.read_page):
+        for call in (lambda: service.client.decode(PAIR, 16), service.client.read_page):
             with pytest.raises(SlotsTakenError) as error:
                 call()
             assert error.value.retry_s is not None
-        answer = refused(lambda: service.stub.ReadPage(pb.ReadPageRequest(), timeout=20))
-        assert (answer.code, answer.reason) == (grpc.StatusCode.RESOURCE_EXHAUSTED, "OVERLOADED")
     page = service.client.read_page()
     assert page.page == 0
     assert 0 < page.timings.receive_s < page.timings.receive_s + page.timings.decode_s < page.timings.total_s
@@ -309,7 +307,7 @@ def test_a_decode_for_which_memory_is_short_says_so(start: Start, monkeypatch: p
 
 
 def test_a_recalibration_without_any_folder_is_refused_before_it_begins(
-    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def none(*_: object, **__: object) -> str:
         raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']")
@@ -317,8 +315,6 @@ def test_a_recalibration_without_any_folder_is_refused_before_it_begins(
     service = start()
     monkeypatch.setattr(tempfile, "mkdtemp", none)
     assert isinstance(service.recalibrator.no_room(), StoreError)
-    for call in (service.client.recalibrate, service.client.start_recalibration):
-        with pytest.raises(StoreError):
-            call(count=2)
+    with pytest.raises(StoreError):
+        service.client.start_recalibration(count=2)
     assert service.client.jobs() == []
-    assert start(store=tmp_path / "store").recalibrator.no_room() is None
