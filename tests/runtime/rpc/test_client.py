@@ -23,20 +23,6 @@ from tests.runtime import coded, toy
 from tests.runtime.rpc.stage import Running, Start, a_page
 
 
-def test_many_pairs_in_one_call(service: Running) -> None:
-    symbols, pair = a_page()
-    one = service.client.decode(pair, frame_id=2**60, captured_s=1.5, correlation_id="mine")
-    assert (one.frame_id, one.captured_s, one.correlation_id) == (2**60, 1.5, "mine")
-    dark = FramePair(np.zeros_like(pair.in_phase), pair.quadrature)
-    found = list(service.client.decode_pages([pair, dark, pair], correlation_id="mine"))
-    assert isinstance(found[1], FrameError)
-    for number in (0, 2):
-        page = found[number]
-        assert isinstance(page, RemotePage)
-        assert (page.frame_id, page.correlation_id) == (number, "mine")
-        assert (page.symbols == symbols).all()
-
-
 def test_pairs_that_fail_on_the_callers_side_end_the_call_with_their_error(service: Running) -> None:
     def pairs() -> Iterator[FramePair]:
         yield a_page()[1]

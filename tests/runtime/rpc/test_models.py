@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import shutil
 import threading
-from collections import namedtuple
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -29,8 +27,6 @@ from runtime.service.registry import KEPT_MODELS
 from tests.runtime import toy
 from tests.runtime.rpc.stage import Running, Start, refused, until_told
 from tests.waiting import eventually
-
-Usage = namedtuple("Usage", "total used free")
 
 
 @pytest.fixture
@@ -203,21 +199,6 @@ def test_without_a_store_there_is_nowhere_to_put_a_model(stored: Start, new: Pat
     with pytest.raises(StoreError):
         service.client.upload_model(new)
     assert service.client.pin_model("toy-1").pinned
-
-
-def test_a_full_disk_takes_no_upload_and_no_recalibration(
-    stored: Start, new: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    service = stored()
-    service.reading(lambda shot: pytest.fail("a page was read") if service.plane.store_trouble() else shot)
-    with monkeypatch.context() as patch:
-        patch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 1000))
-        for change in (lambda: service.client.upload_model(new), lambda: service.client.recalibrate(count=2)):
-            with pytest.raises(StoreError):
-                change()
-    assert service.store.versions() == []
-    assert service.client.recalibrate(count=2).model_version == "toy-1+r1"
-    assert service.plane.store_trouble() == ""
 
 
 def test_a_disk_that_fails_during_an_upload_leaves_nothing(

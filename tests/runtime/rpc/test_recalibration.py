@@ -13,7 +13,6 @@ import h5py
 import numpy as np
 import pytest
 
-from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import (
     BundleError,
     InvalidInputError,
@@ -25,8 +24,6 @@ from lightpage.errors import (
 from lightpage.metrics.measures import measure
 from runtime.acquisition.source import Shot
 from runtime.acquisition.sources import open_source
-from runtime.decoding.decoder import Decoder
-from runtime.decoding.tracking import NoTracker
 from runtime.errors import OtherModelError, SourceError, StoppingError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.recalibration.outcome import RefitResult
@@ -95,31 +92,6 @@ def test_without_a_store_it_goes_on_after_a_rollback_and_keeps_only_the_models_h
 
 
 # ---- refused ------------------------------------------------------------------------------------------------------
-
-
-class DriftTracker(NoTracker):
-    """Has learnt where the drifted device's offsets are."""
-
-    def __init__(self, decoder: Decoder) -> None:
-        references = toy.ToyDevice(DRIFTED).references()
-        table: SamplingTable = {
-            "reference_in_phase": references.in_phase.astype(np.float32),
-            "reference_quadrature": references.quadrature.astype(np.float32),
-        }
-        super().__init__(decoder.with_table(table))
-
-
-def test_a_re_fit_is_judged_against_what_the_tracker_makes_of_the_old_model(start: Start) -> None:
-    def half_way(*arguments: object) -> RefitResult:
-        good = toy.fit_references(*arguments)  # type: ignore[arg-type]
-        table = {name: values - 8 for name, values in good.table.items()}
-        return RefitResult(table, good.calibration_toml, good.report)
-
-    service = start(fit=half_way, tracker=DriftTracker)
-    service.device.offsets = DRIFTED
-    with pytest.raises(RecalibrationRefusedError):
-        service.client.recalibrate(count=2)
-    assert service.version == "toy-1"
 
 
 def test_a_re_fit_is_not_judged_by_the_page_that_it_was_fitted_on(start: Start, tmp_path: Path) -> None:
@@ -191,21 +163,6 @@ def test_one_runs_at_a_time_beside_decoding_and_the_end_of_the_service_cuts_it_o
     assert fit.ended.is_set()
     with pytest.raises(StoppingError):
         service.recalibrator.check_start()
-
-
-def test_one_that_is_stopped_reads_no_more_pages(start: Start) -> None:
-    service, read = start(), list[int]()
-
-    def leaving(shot: Shot) -> Shot:
-        read.append(len(read))
-        if len(read) == 2:
-            service.recalibrator.close(0.0)
-        return shot
-
-    service.reading(leaving)
-    with pytest.raises(StoppingError):
-        service.client.recalibrate(count=5)
-    assert read == [0, 1]
 
 
 def test_the_service_ends_beside_one_that_does_not_stop_and_it_changes_nothing_any_more(start: Start) -> None:

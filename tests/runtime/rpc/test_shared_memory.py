@@ -112,14 +112,6 @@ def test_whoever_says_nothing_or_too_much_is_hung_up_on(target: str, said: bytes
     eventually(lambda: all_is_free(target))
 
 
-def test_what_lies_where_the_socket_would_be_stays(tmp_path: Path) -> None:
-    path = tmp_path / "s.memory"
-    path.write_text("mine")
-    with pytest.raises(InvalidInputError), SharedMemory(str(path), 1, 1, 1.0):
-        pass
-    assert path.read_text() == "mine"
-
-
 # ---- frames in them -----------------------------------------------------------------------------------------------
 
 
