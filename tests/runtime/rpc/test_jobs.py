@@ -341,4 +341,4 @@ def test_the_client_refuses_what_it_cannot_send(service: Running) -> None:
         (PAGES.pairs, (PAGES.symbols[0], PAGES.symbols[1] + np.uint16(300)), PageError),
     ):
         with pytest.raises(kind):
-            send(service.client, KnownPages(pairs, symbols_, 16, PAGES.references))  # type: ignore[arg-type]
+            send(service.client, KnownPages(pairs, symbols_, 16, PAGES.references))

@@ -14,15 +14,11 @@ import pytest
 from lightpage.errors import InvalidInputError, LightpageError
 from runtime.client.answers import JobState
 from runtime.client.client import LightpageClient
-from runtime.client.shared_memory import SharedMemory
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
 from runtime.pb.lightpage.v1 import lightpage_pb2_grpc as pb_grpc
 from runtime.rpc.call import SERVICE
-from runtime.rpc.health_server import HealthServer, next_port
-from runtime.service.shared_memory import SharedMemory as SharedRegions
 from runtime.wire.address import check_address, check_free, host_and_port, names_machine
 from runtime.wire.channel import REPEATABLE
-from runtime.wire.shared_memory import memory_path
 from tests.clock import HandClock
 from tests.waiting import eventually
 
@@ -74,15 +70,6 @@ def test_a_socket_path_longer_than_the_system_has_room_for_is_named(tmp_path: Pa
     for size in (108, 300):
         for check in (check_address, check_free):
             assert f"{size} bytes" in refused(check, "address", path(size)).got
-    # sockets beside the service's own are looked at too
-    target = path(105)
-    check_address("target", target)
-    for make in (
-        lambda: SharedMemory(target, 10),
-        lambda: SharedRegions(memory_path(target), 10, 1, 1.0).__enter__(),
-        lambda: HealthServer(next_port(target), dict),
-    ):
-        assert "112 bytes" in refused(make).got
 
 
 def test_names_that_a_stranger_can_choose_name_no_machine() -> None:
