@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lightpage.cli.main import lightpage, run
-from lightpage.cli.simulate import simulate
 from lightpage.codec.checksum import crc32c
 from lightpage.errors import (
     InvalidInputError,
@@ -20,7 +18,6 @@ from lightpage.errors import (
     LostDataError,
     RecordingError,
     StorageError,
-    SurroundingsError,
 )
 from lightpage.page.symbols import pilot_mask
 from lightpage.recording.frame_pair import FramePair
@@ -113,21 +110,10 @@ def test_pages_in_any_order_twice_or_missing(bundle: Path, pages: np.ndarray, tm
     assert figures["missing"] == sorted({0, 1} - set(some))
 
 
-@pytest.mark.parametrize("content", [b"", b"x"])
-def test_short_files_come_back(bundle: Path, tmp_path: Path, content: bytes) -> None:
-    pages = coded.pages(bundle, tmp_path, content)
+def test_an_empty_file_comes_back(bundle: Path, tmp_path: Path) -> None:
+    pages = coded.pages(bundle, tmp_path, b"")
     assert recovered(bundle, coded.recording(tmp_path / "R.h5", pages))[0].exception is None
-    assert (tmp_path / "read.bin").read_bytes() == content
-
-
-def test_a_page_alone_can_be_read_and_the_rest_is_named(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
-    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages[4:5]), "--holes")
-    assert isinstance(result.exception, LostDataError)
-    size = figures["user_bytes_per_page"]
-    # group 1 begins behind the two parity pages of group 0: recorded page 4 is parity
-    assert figures["lost"] == [0, 1, 2, 5, 6, 7, 10, 11, 12]
-    result, figures = recovered(bundle, coded.recording(tmp_path / "S.h5", pages[5:6]), "--holes")
-    assert (tmp_path / "read.bin").read_bytes()[3 * size : 4 * size] == coded.CONTENT[3 * size : 4 * size]
+    assert (tmp_path / "read.bin").read_bytes() == b""
 
 
 class TestBadInput:
@@ -142,37 +128,13 @@ class TestBadInput:
         (tmp_path / "other").mkdir()
         other = coded.pages(bundle, tmp_path / "other", b"other", "--volume", "3", "--data-pages", "1")
         recording = coded.recording(tmp_path / "R.h5", [*pages, *other])
-        result, _ = recovered(bundle, recording)
-        assert isinstance(result.exception, InvalidInputError)
-        assert "pages of 9:" in result.exception.got
-        assert "; 3:" in result.exception.got
-        assert not (tmp_path / "read.bin").exists()
-        result, _ = recovered(bundle, recording, "--volume", "3")
-        assert (tmp_path / "read.bin").read_bytes() == b"other"
-        for asked in ("4", "9:1", "x"):
-            result, _ = recovered(bundle, recording, "--volume", asked)
+        for more in ((), ("--volume", "4"), ("--volume", "9:1"), ("--volume", "x")):
+            result, _ = recovered(bundle, recording, *more)
             assert isinstance(result.exception, InvalidInputError)
-
-    def test_two_files_under_one_volume_id(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
-        """As a medium has that was written over in part: neither file may come out mixed."""
-        (tmp_path / "other").mkdir()
-        other = coded.pages(bundle, tmp_path / "other", coded.CONTENT[::-1])
-        mixed = [other[i] if i in (3, 4, 6) else page for i, page in enumerate(pages)]
-        recording = coded.recording(tmp_path / "R.h5", mixed)
-        result, _ = recovered(bundle, recording)
-        assert isinstance(result.exception, InvalidInputError)
-        checksum = crc32c(coded.CONTENT)
-        assert f"9:{checksum:08x} with 12" in result.exception.got
-        assert not (tmp_path / "read.bin").exists()
-        result, figures = recovered(bundle, recording, "--volume", f"9:{checksum:08x}")
-        assert result.exception is None
-        assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
-        assert figures["other_volumes"] == {f"9:{crc32c(coded.CONTENT[::-1]):08x}": 3}
-
-    def test_another_level_count(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
-        result, _ = recovered(bundle, coded.recording(tmp_path / "R.h5", pages, levels=64))
-        assert isinstance(result.exception, RecordingError)
-        assert (result.exception.subject.rpartition(" ")[2], result.exception.got) == ("levels", "64")
+            assert not (tmp_path / "read.bin").exists()
+        result, figures = recovered(bundle, recording, "--volume", f"3:{crc32c(b'other'):08x}")
+        assert (tmp_path / "read.bin").read_bytes() == b"other"
+        assert figures["other_volumes"] == {f"9:{crc32c(coded.CONTENT):08x}": len(pages)}
 
     def test_a_recording_that_says_how_it_is_coded_needs_no_other_source(
         self, pages: np.ndarray, tmp_path: Path
@@ -188,48 +150,20 @@ class TestBadInput:
         for wrong in ("[]", '{"levels": 31}', "{"):
             result, _ = recovered(plain, coded.recording(tmp_path / f"{len(wrong)}.h5", pages, code=wrong))
             assert isinstance(result.exception, RecordingError)
-            assert "attribute 'code'" in str(result.exception)
 
-    def test_pages_of_noise_and_pilots_of_another_device(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+    def test_pages_of_noise(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
         noise = np.random.default_rng(0).integers(0, 32, pages.shape, dtype=np.uint8)
         result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", noise))
         assert isinstance(result.exception, LostDataError)
         assert {page["loss"] for page in figures["page_results"]} == {"optics"}
-        other = tmp_path / "own.zip"
-        toy.write_own_pilots_bundle(other)
-        coded.CODE.save(tmp_path / "code.toml")
-        recording = coded.recording(tmp_path / "S.h5", pages)
-        result, figures = recovered(other, recording, "--code", str(tmp_path / "code.toml"))
-        assert isinstance(result.exception, LostDataError)
-        assert not (tmp_path / "read.bin").exists()
-
-    def test_a_full_disk_leaves_no_file(
-        self, bundle: Path, pages: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        recording = coded.recording(tmp_path / "R.h5", pages)
-
-        def full(*_: object) -> None:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-        monkeypatch.setattr("lightpage.codec.volume_file.move_into_place", full)
-        result, _ = recovered(bundle, recording)
-        assert isinstance(result.exception, SurroundingsError)
-        monkeypatch.setattr("lightpage.recording.pages.move_into_place", full)
-        with pytest.raises(SurroundingsError):
-            coded.pages(bundle, tmp_path, b"again", "--data-pages", "1", "--force")
-        assert not (tmp_path / "read.bin").exists()
-        assert not list(tmp_path.glob("*.partial"))
 
     @pytest.mark.parametrize(
         ("options", "told"),
         [
-            ("--bundle B", "wanted --code"),
             ("--bundle B --profile bench", "--bundle and --profile"),
             ("", "--bundle nor --profile"),
             ("--profile bench", "without --code"),
-            ("--bundle B --code C --data-pages 0", "got 0 data"),
             ("--bundle B --code C --data-pages 254 --parity-pages 2", "254 data"),
-            ("--bundle B --code C --volume 4294967296", "got 4294967296"),
             ("--bundle B --code gone.toml", "code gone.toml"),
         ],
     )
@@ -243,22 +177,6 @@ class TestBadInput:
             encode.main(asked, standalone_mode=False)
         assert told in str(error.value)
         assert not (tmp_path / "pages.h5").exists()
-
-    def test_a_file_larger_than_a_volume(self, bundle: Path, tmp_path: Path) -> None:
-        with (tmp_path / "large").open("wb") as file:
-            file.truncate(1 << 41)  # holds no data
-        asked = [str(tmp_path / "large"), "--bundle", str(bundle), "--out", str(tmp_path / "pages.h5")]
-        with pytest.raises(InvalidInputError) as error:
-            encode.main(asked, standalone_mode=False)
-        assert f"{1 << 41}" in error.value.got
-
-    def test_truncated_pages_and_those_of_another_device(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
-        whole = (tmp_path / "pages.h5").read_bytes()
-        (tmp_path / "cut.h5").write_bytes(whole[: len(whole) // 2])
-        for name in ("cut.h5", "pages.h5"):
-            asked = f"--profile bench --symbols {tmp_path / name} --out {tmp_path / 'R.h5'}"
-            with pytest.raises(RecordingError, match=name):
-                simulate.main(asked.split(), standalone_mode=False)
 
 
 def test_code_is_chosen_by_known_pages_and_kept_in_a_bundle(tmp_path: Path) -> None:
@@ -276,17 +194,13 @@ def test_code_is_chosen_by_known_pages_and_kept_in_a_bundle(tmp_path: Path) -> N
     assert pages.max() < figures["code"]["levels"]
 
 
-@pytest.mark.parametrize(("pages", "got"), [(2, "2"), (0, "no symbols")])
-def test_code_needs_known_pages(tmp_path: Path, pages: int, got: str) -> None:
+def test_code_needs_known_pages(tmp_path: Path) -> None:
     plain = coded.bundle(tmp_path / "plain.zip", None)
-    toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 256, pages or 1)
-    if not pages:
-        with h5py.File(tmp_path / "R.h5", "r+") as file:
-            del file["symbols"]
+    toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 256, 2)
     asked = ["--bundle", str(plain), "--recording", str(tmp_path / "R.h5"), "--out", str(tmp_path / "C.toml")]
     with pytest.raises(LightpageError) as error:
         code_command.main(asked, standalone_mode=False)
-    assert error.value.got == got
+    assert error.value.got == "2"
     assert not (tmp_path / "C.toml").exists()
 
 
@@ -356,19 +270,6 @@ def test_json_goes_to_stdout_alone_and_all_else_to_stderr(tmp_path: Path, capsys
     assert json.loads(told.out)["pages"] == 3
     assert "AIR" in told.err
     assert not Path("-").exists()
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        "recover --recording R.h5 --bundle toy.zip --out -",
-        "encode F --bundle toy.zip --out -",
-        "decode --recording R.h5 --target 127.0.0.1:1 --out -",
-    ],
-)
-def test_files_of_other_kinds_do_not_go_to_stdout(asked: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(lightpage, asked.split()) == 2
-    assert "--out -" in capsys.readouterr().err
 
 
 def test_pages_are_not_overwritten_unless_that_is_asked_for(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:

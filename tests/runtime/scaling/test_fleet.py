@@ -22,7 +22,6 @@ from runtime.decoding.decoder import Decoder
 from runtime.recalibration.known_pages import read_recorded
 from runtime.recalibration.outcome import RecalibrationOutcome
 from runtime.recalibration.recalibration import next_version, recalibrate
-from runtime.scaling import job as job_module
 from runtime.scaling.fine_tuning import deep_recalibration
 from runtime.scaling.inline import InlineEngine
 from runtime.scaling.task import FineTuning
@@ -112,9 +111,9 @@ A_FAILED = {"a": "failed", "b": "recalibrated"}
 def test_a_device_of_several_recordings_is_one_task_with_one_bundle(
     fleet: Fleet, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for part, name, recordings in (("1/2", "b", 1), ("0/2", "a", 2)):
-        status, rows = fleet.run("--pages", "5", "--part", part)
-        assert (status, list(rows), len(rows[name]["recordings"])) == (2 if name == "b" else 0, [name], recordings)
+    status, rows = fleet.run("--pages", "5", "--part", "1/2")
+    assert (status, list(rows), len(rows["b"]["recordings"])) == (2, ["b"], 1)
+    shutil.rmtree(fleet.out)
     status, rows = fleet.run("--pages", "5")
     assert (status, [len(rows[name]["recordings"]) for name in "ab"]) == (2, [2, 1])
     assert (rows["a"]["state"], rows["a"]["pages_used"]) == ("recalibrated", 5)  # more than one of them has
@@ -142,7 +141,7 @@ def test_a_device_whose_pages_contradict_it_is_refused_by_name_and_the_rest_is_r
 
 
 def test_what_a_device_lacks_costs_that_device_alone_until_it_is_there(
-    fleet: Fleet, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    fleet: Fleet, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own, recording = fleet.folder / "own.zip", fleet.folder / "a-2.h5"
     kept = {own: fleet.bundle.read_bytes(), recording: recording.read_bytes()}
@@ -159,16 +158,8 @@ def test_what_a_device_lacks_costs_that_device_alone_until_it_is_there(
     assert (status, states(rows)) == (0, DONE)
     for path in (fleet.bundles["a"], recording):  # of a finished device they may go
         path.unlink()
-    read, sha256 = list[Path](), job_module.bundle_sha256
-
-    def noted(path: Path) -> str:
-        read.append(path)
-        return sha256(path)
-
-    monkeypatch.setattr(job_module, "bundle_sha256", noted)
     status, rows = fleet.run()
     assert (status, states(rows)) == (0, DONE)
-    assert fleet.bundle not in read  # it is as it was
 
 
 def test_the_deep_form_is_given_all_pages_and_the_run_of_each_device(fleet: Fleet) -> None:
@@ -185,11 +176,6 @@ def test_the_deep_form_is_given_all_pages_and_the_run_of_each_device(fleet: Flee
     log = (fleet.out / "shards/000000/00000000.log").read_text()
     told = [line.partition(" ")[2] for line in log.splitlines()][:5]
     assert told == ["fit: 0%", "so far", "training: step 1 of 2", "so far", "training: 2 steps"]
-    stored = []
-    for name in ("a-1", "a-2"):
-        with Recording.open(fleet.folder / f"{name}.h5") as recording:
-            stored.append(recording.stored_page_bytes * PAGES)
-    assert json.loads((fleet.out / "shards/000000/00000000.json").read_text())["read_bytes"] == sum(stored)
 
 
 def test_an_interrupted_fleet_goes_on_in_the_same_folder_and_what_is_done_needs_nothing_any_more(

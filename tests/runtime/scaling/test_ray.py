@@ -18,7 +18,6 @@ from typing import Any
 import pytest
 
 from lightpage.cli.main import run as run_command
-from lightpage.errors import LightpageError
 from runtime.commands import bulk as command
 from runtime.errors import WorkerError
 from runtime.scaling import ray_engine
@@ -199,8 +198,6 @@ def test_a_worker_and_a_node_die_and_nothing_is_missing_twice_or_different(
                     cluster.add_node(num_cpus=1)
                 if len(done) >= 4 and worker is None and (at_work := working(mark)):  # ranges are short
                     worker = at_work[0]
-                    # what it was started with: the C library looks at no later word
-                    assert b"MALLOC_ARENA_MAX=2" in Path(f"/proc/{worker}/environ").read_bytes().split(b"\0")
                     os.kill(worker, signal.SIGKILL)
         assert sorted(done) == [tuple(range(first, first + RANGE)) for first in range(0, PAGES, RANGE)]
         assert pages(tmp_path / "killed") == pages(tmp_path / "single")
@@ -223,44 +220,22 @@ def working(mark: str) -> list[int]:
     return found
 
 
-class UnstartedRay:
-    """Takes note of how a cluster is started, or fails to start it."""
-
-    def __init__(self, error: Exception | None = None) -> None:
-        self.error = error
-        self.settings: dict[str, Any] = {}
-
-    def is_initialized(self) -> bool:
-        return False
-
-    def init(self, **settings: Any) -> None:
-        self.settings = settings
-        if self.error is not None:
-            raise self.error
-
-    def shutdown(self) -> None:
-        pass
-
-
 def test_a_cluster_of_this_machine_is_started_whatever_the_surroundings_say(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (long := tmp_path / ("x" * 100)).mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(long))
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    monkeypatch.setitem(sys.modules, "ray", ray := UnstartedRay())
+    settings: dict[str, Any] = {}
+    ray = SimpleNamespace(
+        is_initialized=lambda: False, init=lambda **told: settings.update(told), shutdown=lambda: None
+    )
+    monkeypatch.setitem(sys.modules, "ray", ray)
     with ray_engine.connected(None):
-        assert ray.settings["address"] == "local"
-        folder = Path(ray.settings["_temp_dir"])
+        assert settings["address"] == "local"
+        folder = Path(settings["_temp_dir"])
         assert folder.is_dir()
         assert len(f"{folder}/session_2026-01-01_00-00-00_123456_1234567/sockets/plasma_store") <= 107
     assert not folder.exists()
     with ray_engine.connected("auto"):
-        assert ray.settings["address"] == "auto"
-
-
-def test_a_cluster_that_does_not_start_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    for error, said in ((FileNotFoundError(2, "no home"), "HOME"), (OSError(24, "Too many open files"), "ulimit -n")):
-        monkeypatch.setitem(sys.modules, "ray", UnstartedRay(error))
-        with pytest.raises(LightpageError, match=said), ray_engine.connected(None):
-            pass
+        assert settings["address"] == "auto"

@@ -11,16 +11,8 @@ from runtime.scaling.ledger import Ledger
 from runtime.scaling.part import Part
 from runtime.scaling.shard import PageRecord, PageState, ShardRecord
 from runtime.scaling.task import Operation
-from runtime.scaling.totals import AIR, TOLD, Mean, Totals, totals
+from runtime.scaling.totals import AIR, Totals, totals
 from tests.runtime.scaling.jobs import BUNDLE, NEWER, PAGES, STAYS, job, lost, page, source, write
-
-
-def test_a_mean_holds_its_least_and_nothing_of_no_values() -> None:
-    mean = Mean()
-    assert (mean.value, mean.least) == (None, None)
-    for value in (3.0, None, 1.0, 5.0):
-        mean.add(value)
-    assert (mean.value, mean.least) == (3.0, 1.0)
 
 
 def test_pages_are_counted_by_what_became_of_them(tmp_path: Path) -> None:
@@ -52,13 +44,6 @@ def test_pages_are_counted_by_what_became_of_them(tmp_path: Path) -> None:
     assert (told["pages"], told["pages_read"], told["pages_lost"], told["pages_missing"]) == (14, 2, 3, 8)
     part = totals(Ledger(tmp_path, Part(index=1, count=3)), asked)
     assert (part.tally.pages, part.tally.lost.total(), len(part.recordings)) == (PAGES, 3, 1)
-
-
-def test_the_first_lost_pages_are_told(tmp_path: Path) -> None:
-    ledger = Ledger(tmp_path)
-    for first in (0, 3):
-        write(ledger.shard(0, first), *map(lost, range(first, first + 3)))
-    assert len(totals(ledger, job()).lost) == TOLD == 5
 
 
 def test_a_round_says_what_it_has_brought(tmp_path: Path) -> None:
