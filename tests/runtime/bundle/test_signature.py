@@ -16,23 +16,16 @@ from runtime.bundle.signature import BundleKey
 from runtime.bundle.signature_file import signature_path
 
 
-class Signer:
-    """A private key, and the public one in a file."""
-
-    def __init__(self, folder: Path, name: str = "signing") -> None:
-        self._key = ec.generate_private_key(ec.SECP256R1())
-        self.path = folder / f"{name}.pem"
-        self.path.write_bytes(_pem(self._key.public_key()))
-
-    def signature(self, bundle: Path) -> bytes:
-        return self._key.sign(bundle.read_bytes(), ec.ECDSA(hashes.SHA256()))
-
-    def sign(self, bundle: Path) -> None:
-        signature_path(bundle).write_bytes(self.signature(bundle))
-
-
 def _pem(key: ec.EllipticCurvePublicKey | ed25519.Ed25519PublicKey) -> bytes:
     return key.public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
+
+
+@pytest.fixture
+def key(tmp_path: Path) -> ec.EllipticCurvePrivateKey:
+    """A private key, and the public one in a file."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    (tmp_path / "key.pem").write_bytes(_pem(key.public_key()))
+    return key
 
 
 @pytest.fixture
@@ -40,31 +33,23 @@ def bundle(toy_zip: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(toy_zip, tmp_path / "mine.zip"))
 
 
-def test_a_signed_bundle_is_loaded(bundle: Path, tmp_path: Path) -> None:
-    signer = Signer(tmp_path)
-    signer.sign(bundle)
-    assert Bundle.open(bundle, key=BundleKey(signer.path)).version == "toy-1"
-    signature_path(bundle).unlink()
+def test_a_bundle_is_loaded_if_it_is_signed_with_the_key_and_no_other(
+    bundle: Path, key: ec.EllipticCurvePrivateKey, toy_folder: Path, tmp_path: Path
+) -> None:
+    signature, public = key.sign(bundle.read_bytes(), ec.ECDSA(hashes.SHA256())), BundleKey(tmp_path / "key.pem")
+    assert Bundle.open(bundle, key=public, signature=signature).version == "toy-1"
     with pytest.raises(BundleError, match=r"mine\.zip: signature"):
-        Bundle.open(bundle, key=BundleKey(signer.path))
-    assert Bundle.open(bundle, key=BundleKey(signer.path), signature=signer.signature(bundle)).version == "toy-1"
-    assert Bundle.open(bundle).version == "toy-1"
-
-
-def test_another_key_and_another_bundle_are_refused(bundle: Path, tmp_path: Path) -> None:
-    signer, other = Signer(tmp_path), Signer(tmp_path, "other")
-    signer.sign(bundle)
+        Bundle.open(bundle, key=public)
+    signature_path(bundle).write_bytes(signature)
+    assert Bundle.open(bundle, key=public).version == "toy-1"
+    (tmp_path / "other.pem").write_bytes(_pem(ec.generate_private_key(ec.SECP256R1()).public_key()))
     with pytest.raises(BundleError, match="signature"):
-        Bundle.open(bundle, key=BundleKey(other.path))
+        Bundle.open(bundle, key=BundleKey(tmp_path / "other.pem"))
     with bundle.open("ab") as file:
         file.write(b"\0")
-    with pytest.raises(BundleError, match="signature"):
-        Bundle.open(bundle, key=BundleKey(signer.path))
-
-
-def test_a_folder_is_refused(toy_folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(BundleError, match="signature"):
-        Bundle.open(toy_folder, key=BundleKey(Signer(tmp_path).path))
+    for path in (bundle, toy_folder):
+        with pytest.raises(BundleError, match="signature"):
+            Bundle.open(path, key=public)
 
 
 def test_what_openssl_signs_is_confirmed(bundle: Path, tmp_path: Path) -> None:

@@ -227,9 +227,7 @@ def test_a_cluster_of_this_machine_is_started_whatever_the_surroundings_say(
     monkeypatch.setattr(tempfile, "tempdir", str(long))
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     settings: dict[str, Any] = {}
-    ray = SimpleNamespace(
-        is_initialized=lambda: False, init=lambda **told: settings.update(told), shutdown=lambda: None
-    )
+    ray = SimpleNamespace(is_initialized=bool, init=lambda **told: settings.update(told), shutdown=lambda: None)
     monkeypatch.setitem(sys.modules, "ray", ray)
     with ray_engine.connected(None):
         assert settings["address"] == "local"
