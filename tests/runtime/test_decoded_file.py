@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
@@ -22,32 +21,13 @@ class Page:
     page: int | None = None
 
 
-def page(seed: int) -> Page:
-    rng = np.random.default_rng(seed)
-    return Page(rng.integers(0, 16, (40, 50), dtype=np.uint8), rng.random((40, 50), np.float32))
-
-
-def write(path: Path, pages: int = 3) -> None:
-    with DecodedWriter(path, 16) as writer:
-        for seed in range(pages):
-            writer.append(page(seed))
-
-
-def test_pages_come_back(tmp_path: Path) -> None:
-    write(tmp_path / "d.h5")
-    assert [path.name for path in tmp_path.iterdir()] == ["d.h5"]
-    with h5py.File(tmp_path / "d.h5") as file:
-        for seed in range(3):
-            np.testing.assert_array_equal(file["symbols"][seed], page(seed).symbols)
-            np.testing.assert_array_equal(file["confidence"][seed], page(seed).confidence)
-        assert file["pages"][()].tolist() == [0, 1, 2]
-
-
 @pytest.mark.parametrize("room", [0, 3_000, 20_000])
 def test_a_full_disk_leaves_the_earlier_file_and_no_other(tmp_path: Path, room: int) -> None:
     path = tmp_path / "d.h5"
     path.write_text("earlier")
-    with full_disk(room), pytest.raises(SurroundingsError, match=r"d\.h5"):
-        write(path)
+    with full_disk(room), pytest.raises(SurroundingsError, match=r"d\.h5"), DecodedWriter(path, 16) as writer:
+        for seed in range(3):
+            rng = np.random.default_rng(seed)
+            writer.append(Page(rng.integers(0, 16, (40, 50), dtype=np.uint8), rng.random((40, 50), np.float32)))
     assert path.read_text() == "earlier"
     assert list(tmp_path.iterdir()) == [path]
