@@ -25,7 +25,8 @@ class Page:
 def test_a_full_disk_leaves_the_earlier_file_and_no_other(tmp_path: Path, room: int) -> None:
     path = tmp_path / "d.h5"
     path.write_text("earlier")
-    with full_disk(room), pytest.raises(SurroundingsError, match=r"d\.h5"), DecodedWriter(path, 16) as writer:
+    writing = pytest.raises(SurroundingsError, match=r"d\.h5")
+    with full_disk(room), writing, DecodedWriter(path, 16) as writer:
         for seed in range(3):
             rng = np.random.default_rng(seed)
             writer.append(Page(rng.integers(0, 16, (40, 50), dtype=np.uint8), rng.random((40, 50), np.float32)))
