@@ -11,30 +11,22 @@ import pytest
 from click.testing import CliRunner
 
 from lightpage.cli.simulate import simulate
-from lightpage.device.profile import Camera, PageLayout, load_profile
+from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, load_device
 from lightpage.errors import InvalidInputError, RecordingError
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording, RecordingWriter
 from lightpage.simulator import recording_job
 from lightpage.simulator.simulator import LIGHT, SimulatedPage, Simulator
+from tests.lightpage.small import small_profile
 
 PAGES = 3
 
 
 @pytest.fixture(scope="module")
 def profile_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A corner of the bench device's page, quick to compute."""
-    bench = load_profile("bench")
-    tiny = bench.model_copy(
-        update={
-            "name": "tiny",
-            "page": PageLayout(columns=12, rows=9, symbol_size_px=4),
-            "camera": Camera(columns_px=240, rows_px=180, pitch_m=bench.camera.pitch_m),
-        }
-    )
-    path = tmp_path_factory.mktemp("profile") / "tiny.toml"
-    path.write_text(tiny.to_toml())
+    path = tmp_path_factory.mktemp("profile") / "small.toml"
+    path.write_text(small_profile().to_toml())
     return path
 
 

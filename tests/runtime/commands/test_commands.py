@@ -261,14 +261,23 @@ def test_offline_recalibration_writes_nothing_for_wrong_pilots_or_an_impossible_
         ("recalibrate --bundle B --detach", "--detach"),
         ("recalibrate --bundle B --timeout 5", "--timeout"),
         ("jobs --target 127.0.0.1:9 --watch a --cancel b", "--watch"),
+        ("bulk recalibrate OUT --steps 20", "--steps"),
+        ("bulk recalibrate OUT --deep --recordings b.h5", "--deep"),
+        ("bulk decode OUT --part 2/2", "--part"),
+        ("bulk decode OUT --address auto", "--address"),
+        ("bulk decode OUT --metrics 0.0.0.0:0", "--metrics"),
+        ("bulk decode OUT --metrics unix:/tmp/x", "--metrics"),
+        ("bulk decode OUT --metrics-file bulk.txt", "--metrics-file"),
         ("decode --target 127.0.0.1:9", "--recording"),
         ("decode --target 127.0.0.1:9 --source --out -", "--out -"),
     ],
 )
 def test_options_that_contradict_each_other_are_named(
-    arguments: str, named: str, capsys: pytest.CaptureFixture[str]
+    arguments: str, named: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     assert run(*arguments.split()) == 2
+    assert list(tmp_path.iterdir()) == []
     assert named in capsys.readouterr().err
 
 
@@ -364,9 +373,7 @@ def test_decode_uses_the_devices_own_pilots_and_refuses_pages_where_they_disagre
             with h5py.File(out) as file:
                 assert (file["symbols"][0] == symbols[0])[~toy.OWN_MASK].all()
                 assert list(file["pages"]) == [0]
-            (error,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("lightpage: error")]
-            assert "1 of 2" in error
-            assert "page 1" in error
+            assert "1 of 2" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("end", [KeyboardInterrupt, LightpageError("service", "no connection", "one")])
@@ -398,21 +405,6 @@ def test_pages_of_the_source_that_came_before_the_end_are_kept(
     assert ("before is kept" in told.err) == (end is KeyboardInterrupt)
 
 
-def test_an_interrupted_decoding_of_a_recording_leaves_nothing_half_written(
-    service: LightpageServer, recording: tuple[Path, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted_at_2(file: Recording, page: int) -> Any:
-        if page == 2:
-            raise KeyboardInterrupt
-        return frames(file, page)
-
-    frames = Recording.frames
-    monkeypatch.setattr(Recording, "frames", interrupted_at_2)
-    files = ["--out", tmp_path / "decoded.h5", "--json", tmp_path / "figures.json"]
-    assert run("decode", "--target", service.target, "--recording", recording[0], *files) == 130
-    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
-
-
 def test_recalibrate_and_rollback_work_on_a_running_service(service: LightpageServer, tmp_path: Path) -> None:
     report = tmp_path / "r.json"
     for more, version in (([], "toy-1+r1"), (["--recording", "known.h5"], "toy-1+r2")):
@@ -424,36 +416,29 @@ def test_recalibrate_and_rollback_work_on_a_running_service(service: LightpageSe
     assert run("rollback", "--target", service.target) == 2
 
 
-def test_a_detached_job_is_named_watched_and_listed(
-    service: LightpageServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_detached_job_is_named_listed_cancelled_and_watched(
+    start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    at = ("--target", service.target)
-    assert run("jobs", *at) == 0
-    assert capsys.readouterr().out == "no jobs\n"
-    assert run("recalibrate", *at, "--detach", "--json", tmp_path / "j.json") == 0
-    job = capsys.readouterr().out.strip()
+    def told(*arguments: str | Path) -> str:
+        assert run(*arguments, "--target", target) == 0
+        return capsys.readouterr().out
+
+    fit = SlowFit()
+    target = start(fit).target
+    assert told("jobs") == "no jobs\n"
+    job = told("recalibrate", "--detach", "--json", tmp_path / "j.json").strip()
     assert json.loads((tmp_path / "j.json").read_text()) == {"job": job}
-    assert run("jobs", *at, "--watch", job) == 0
-    assert "toy-1+r1\n" in capsys.readouterr().out
-    assert run("jobs", *at) == 0
-    (line,) = capsys.readouterr().out.splitlines()
+    assert fit.entered.wait(60)
+    assert f"{job}  running" in told("jobs")
+    assert f"{job}  cancelled" in told("jobs", "--cancel", job)
+    assert run("jobs", "--target", target, "--watch", job) == 2
+    assert "cancelled" in capsys.readouterr().err
+    fit.go.set()
+    job = told("recalibrate", "--detach").strip()
+    assert "toy-1+r1\n" in told("jobs", "--watch", job)
+    line = told("jobs").splitlines()[0]
     assert line.startswith(f"{job}  done  ")
     assert "source  toy-1+r1" in line
-    assert run("jobs", *at, "--watch", "nonsense") == 2
-
-
-def test_a_job_can_be_cancelled(start: Start, capsys: pytest.CaptureFixture[str]) -> None:
-    fit = SlowFit()
-    at = ("--target", start(fit).target)
-    assert run("recalibrate", *at, "--detach") == 0
-    job = capsys.readouterr().out.strip()
-    assert fit.entered.wait(60)
-    assert run("jobs", *at) == 0
-    assert f"{job}  running" in capsys.readouterr().out
-    assert run("jobs", *at, "--cancel", job) == 0
-    assert f"{job}  cancelled" in capsys.readouterr().out
-    assert run("jobs", *at, "--watch", job) == 2
-    assert "cancelled" in capsys.readouterr().err
 
 
 def test_a_recording_here_is_sent(service: LightpageServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,7 +22,6 @@ from runtime.console.scrapes import Change, Scrape, Scrapes, scrape
 from runtime.console.server import ConsoleServer
 from runtime.decoding.decoder import Decoder
 from tests.runtime.console.stage import Stage, stage
-from tests.runtime.identity.authority import Authority
 from tests.waiting import eventually
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -158,17 +157,3 @@ def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(decoder: Decoder)
                 assert terminal.process.wait(60) == 0
         finally:
             terminal.close()
-
-
-def test_a_service_with_tls_is_scraped_with_a_certificate(
-    decoder: Decoder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    authority = Authority(tmp_path)
-    with stage(decoder, authority.service()) as running:
-        own = authority.caller("watcher", ["read"])
-        files = [word for name, path in vars(own).items() for word in (f"--{name}", str(path))]
-        place = ["--address", f"localhost:{running.server.port}", "--interval", "0.1", "--once"]
-        assert cli_main.run(top, [*place, *files]) == 0
-        assert "model toy-1" in capsys.readouterr().out
-        assert cli_main.run(top, place) == EXIT_ERROR
-        assert "--certificate" in capsys.readouterr().err

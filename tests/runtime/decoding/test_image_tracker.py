@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,13 +13,12 @@ from lightpage.page.pilots import PilotCheck, Pilots
 from lightpage.recording.frame_pair import FramePair
 from runtime.decoding.decoder import Decoder
 from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
-from runtime.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageTracker
+from runtime.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageState, ImageTracker
 from runtime.decoding.page import Inference
 from runtime.decoding.tracking import TrackerMemory
 from runtime.errors import Reason, UnconfirmedPageError
 from tests.runtime import toy
 from tests.runtime.decoding.test_image_drift import SLOPES
-from tests.waiting import LIMIT_S
 
 Real = np.ndarray
 
@@ -333,24 +331,17 @@ def test_pages_decoded_at_the_same_time_teach_once(device: FakeDevice, monkeypat
     """A page that began before another was learnt from changes nothing: its drift is accounted for."""
     tracker = settled(device)
     device.drift[SHIFT] = (0.5, 0.0)
-    first, go = threading.Event(), threading.Event()
-    infer = FakeDecoder.infer
+    infer, learnt = FakeDecoder.infer, list[ImageState]()
 
-    def waiting(self: FakeDecoder, pair: FramePair, table: SamplingTable | None = None) -> Inference:
-        if threading.current_thread() is slow:
-            first.set()
-            assert go.wait(LIMIT_S)
+    def meanwhile(self: FakeDecoder, pair: FramePair, table: SamplingTable | None = None) -> Inference:
+        monkeypatch.undo()
+        tracker.decode(device.page(), 16)
+        learnt.append(tracker.state)
         return infer(self, pair, table)
 
-    monkeypatch.setattr(FakeDecoder, "infer", waiting)
-    slow = threading.Thread(target=tracker.decode, args=(device.page(), 16))
-    slow.start()
-    assert first.wait(LIMIT_S)
+    monkeypatch.setattr(FakeDecoder, "infer", meanwhile)
     tracker.decode(device.page(), 16)
-    learnt = tracker.state
-    go.set()
-    slow.join(LIMIT_S)
-    assert tracker.state is learnt
+    assert tracker.state is learnt[0]
 
 
 def test_a_page_is_read_by_the_pilots_that_came_with_it(device: FakeDevice) -> None:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import os
-import platform
-import subprocess
-import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from runtime.execution.cpus import available_cpus
 from runtime.execution.memory import share_freed_memory
-from tests.skips import NO_GLIBC
 
 
 @pytest.mark.parametrize(
@@ -43,34 +40,11 @@ def test_quota_of_the_control_group_holds(
     assert available_cpus(root, tmp_path / "self") == cores
 
 
-_PROGRAM = """
-import ctypes, sys, threading
-from runtime.execution.memory import share_freed_memory
-if {shared}:
+def test_threads_take_memory_from_two_places_where_the_c_library_can_be_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[int, int]] = []
+    libc = SimpleNamespace(mallopt=lambda *option: not told.append(option))
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: libc)
     assert share_freed_memory()
-libc = ctypes.CDLL(None)
-libc.malloc.restype = libc.fdopen.restype = ctypes.c_void_p
-together = threading.Barrier(6)
-def take():
-    together.wait(30)
-    libc.malloc(1000)
-    together.wait(30)
-threads = [threading.Thread(target=take) for _ in range(6)]
-[thread.start() for thread in threads]
-[thread.join() for thread in threads]
-libc.malloc_info(0, ctypes.c_void_p(libc.fdopen(2, b"w")))
-libc.fflush(None)
-"""
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason=NO_GLIBC)
-def test_many_threads_take_memory_from_two_places() -> None:
-    for shared in (False, True):
-        command = [sys.executable, "-c", _PROGRAM.format(shared=shared)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-        assert (done.stderr.count("<heap nr=") <= 2) == shared
-
-
-def test_another_c_library_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert told == [(-8, 2)]  # M_ARENA_MAX of glibc
     monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
     assert not share_freed_memory()

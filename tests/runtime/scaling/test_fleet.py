@@ -215,11 +215,6 @@ def test_what_a_device_is_refused_for_stays_and_all_else_is_tried_again(
     assert len(fleet.deep.asked) == again
 
 
-@pytest.mark.parametrize("options", [("--steps", "20"), ("--deep", "--recordings", "b.h5")])
-def test_options_that_do_nothing_are_refused(options: tuple[str, ...], fleet: Fleet) -> None:
-    assert fleet.run(*options) == (2, {})
-
-
 def test_without_the_other_package_there_is_no_deep_form() -> None:
     with pytest.raises(LightpageError, match="entry point"):
         deep_recalibration([])

@@ -89,12 +89,3 @@ def test_what_cannot_be_opened_is_counted_and_parts_share_no_series(archive: Arc
         series.append({line.rpartition(" ")[0] for line in file.read_text().splitlines() if not line.startswith("#")})
     assert not series[0] & series[1]
     assert {each.replace('part="0/2"', 'part="1/2"') for each in series[0]} == series[1]
-
-
-def test_addresses_that_others_reach_and_files_that_nobody_reads_are_refused(
-    archive: Archive, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for options in (("--metrics", "0.0.0.0:0"), ("--metrics", "unix:/tmp/x"), ("--metrics-file", "bulk.txt")):
-        assert archive.run("decode", *options)[0] == 2
-        assert f"error: {options[0]}: got" in capsys.readouterr().err
-    assert not archive.out.exists()

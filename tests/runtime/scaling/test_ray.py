@@ -17,8 +17,6 @@ from typing import Any
 
 import pytest
 
-from lightpage.cli.main import run as run_command
-from runtime.commands import bulk as command
 from runtime.errors import WorkerError
 from runtime.scaling import ray_engine
 from runtime.scaling.driver import run
@@ -33,16 +31,6 @@ from tests.runtime import toy
 from tests.runtime.scaling.test_local import pages
 
 PAGES, RANGE = 60, 5
-
-
-def test_without_ray_the_extra_is_named(
-    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    toy.write_toy_recording(tmp_path / "a.h5", toy.ToyDevice(), 16, 2)
-    monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not there
-    words = ["decode", str(tmp_path / "out"), "--recordings", str(tmp_path / "a.h5"), "--bundle", str(toy_zip)]
-    assert run_command(command.bulk, [*words, "--engine", "ray"]) == 2
-    assert "pip install 'lightpage[cluster]'" in capsys.readouterr().err
 
 
 READS_S, HANGS_S = 100.0, 5000.0
