@@ -13,9 +13,8 @@ from click.testing import CliRunner
 from lightpage.cli.simulate import simulate
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, load_device
-from lightpage.errors import InvalidInputError, RecordingError
-from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording, RecordingWriter
+from lightpage.errors import InvalidInputError
+from lightpage.recording.reader import Recording
 from lightpage.simulator import recording_job
 from lightpage.simulator.simulator import LIGHT, SimulatedPage, Simulator
 from tests.lightpage.small import small_profile
@@ -126,17 +125,6 @@ def test_pages_of_another_device_are_not_mixed_in(
     run(profile_file, out, *other, "--force", pages=1)
     with h5py.File(out) as file:
         assert "pipe_angle_deg = 0.5" in file["truth"].attrs["device"]
-
-
-def test_pages_that_are_being_written_are_not_destroyed_even_if_forced(profile_file: Path, tmp_path: Path) -> None:
-    out, profile = tmp_path / "R.h5", load_profile(profile_file)
-    frame = np.ones(profile.frame_shape, np.uint8)
-    with RecordingWriter(out, profile, 16, 8, FramePair(frame, frame)) as running:
-        running.append(None, FramePair(frame, frame))
-        with pytest.raises(RecordingError, match="another process"):
-            run(profile_file, out, "--force", pages=1)
-    with Recording.open(out) as recording:
-        assert recording.pages == 1
 
 
 def test_settings_and_a_device_file_make_the_device(profile_file: Path, tmp_path: Path) -> None:

@@ -175,17 +175,6 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_connected(
     assert source.shots == 0
 
 
-def test_any_source_can_be_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    toy.write_toy_recording(tmp_path / "in.h5", toy.ToyDevice(), 16, 3)
-    asked = ["record", "--source", f"recording:{tmp_path / 'in.h5'}", "--out", str(tmp_path / "out.h5"), "--pages"]
-    assert cli_main.run(lightpage, [*asked, "4"]) == EXIT_ERROR
-    assert "--pages: got 4" in capsys.readouterr().err
-    assert cli_main.run(lightpage, [*asked, "2"]) == 0
-    with Recording.open(tmp_path / "in.h5") as before, Recording.open(tmp_path / "out.h5") as after:
-        assert (before.frames(1).in_phase == after.frames(1).in_phase).all()
-        assert after.frame_infos(0) is None
-
-
 def test_pages_of_another_file_are_neither_mixed_in_nor_thrown_away(record: Record, out: Path, tmp_path: Path) -> None:
     first, other = written(tmp_path / "first.h5", 1, 2, 3), written(tmp_path / "other.h5", 4, 5, 6)
     assert record(Bench(interrupted=2), "--symbols", first) == 130

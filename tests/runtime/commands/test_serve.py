@@ -18,7 +18,6 @@ from click.testing import CliRunner
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import lightpage
-from lightpage.errors import InvalidInputError
 from lightpage.recording.reader import Recording
 from runtime.acquisition.recording import RecordingSource
 from runtime.client.client import LightpageClient
@@ -179,11 +178,6 @@ def test_a_source_that_has_nothing_to_show_is_told(
         with checked_source(f"recording:{tmp_path / 'R.h5'}", None, decoder) as source:
             assert [source.name in record.getMessage() for record in caplog.records] == [True] * told
         monkeypatch.setattr(RecordingSource, "page_count", lambda _: 0)
-
-
-def test_a_source_of_another_device_is_refused(decoder: Decoder) -> None:
-    with pytest.raises(InvalidInputError):
-        checked_source("simulator:bench", None, decoder)
 
 
 def test_a_thread_that_does_not_end_does_not_keep_the_process(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -55,29 +54,6 @@ def test_a_command_that_is_not_there_is_named() -> None:
     with pytest.raises(InvalidInputError, match="no-such-command"):
         virtual_device.run_to_its_end(["no-such-command"])
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
-
-
-def test_a_signal_that_comes_while_the_command_is_started_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[subprocess.Popen[bytes]] = []
-    popen = subprocess.Popen
-
-    def interrupted(command: list[str]) -> subprocess.Popen[bytes]:
-        made.append(popen(command, stdin=subprocess.PIPE))
-        os.kill(os.getpid(), signal.SIGTERM)
-        return made[0]
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(subprocess, "Popen", interrupted)
-    before = signal.signal(signal.SIGTERM, interrupt)  # as the program does
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            virtual_device.run_to_its_end(["cat"])
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert made[0].returncode == -signal.SIGTERM
-    made[0].communicate()
 
 
 @pytest.mark.parametrize("place", ["file", "read-only"])

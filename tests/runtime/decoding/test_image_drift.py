@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from lightpage.errors import BundleError, FrameError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
-from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate, drift_slopes
+from runtime.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
 from runtime.decoding.page import Inference
 from tests.runtime import toy
 
@@ -99,30 +95,3 @@ def test_phases_freed_from_a_drift_show_it_no_more() -> None:
     left = model.estimate(seen.turned(-model.phase_change(drift)), 16, pilots, ANYTHING)
     assert left is not None
     assert np.all(np.abs(left.drift) < 4 * left.deviations)
-
-
-def test_slopes_are_measured_while_the_service_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    may_end = threading.Event()
-
-    def slow(*_: object) -> np.ndarray:
-        assert may_end.wait(60)
-        return SLOPES
-
-    monkeypatch.setattr("runtime.decoding.image_drift.drift_slopes", slow)
-    monkeypatch.setattr("runtime.decoding.image_drift.calibration_of", lambda bundle: SimpleNamespace(vector=None))
-    model = DriftModel.of_decoder(SimpleNamespace(bundle=None), None)  # type: ignore[arg-type]
-    may_end.set()  # only now: of_decoder did not wait
-    np.testing.assert_array_equal(model.slopes, SLOPES)
-
-
-def test_a_golden_page_that_is_refused_off_its_place_is_the_bundles_fault() -> None:
-    def refuse(*_: object) -> None:
-        raise FrameError("frame pair", "residual 9", "up to 1")
-
-    decoder = SimpleNamespace(
-        graph=SimpleNamespace(value=lambda name: np.zeros((2, 2, 10), np.float32)),
-        bundle=SimpleNamespace(golden=SimpleNamespace(pair=None), profile=toy.PROFILE, subject="bundle toy"),
-        infer=refuse,
-    )
-    with pytest.raises(BundleError, match=r"golden page, .*0\.25"):
-        drift_slopes(decoder, None, np.zeros(1))  # type: ignore[arg-type]

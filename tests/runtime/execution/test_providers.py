@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import pytest
-from onnx import parser
 
 from lightpage.errors import InvalidInputError, SurroundingsError
 from runtime.bundle.bundle import Bundle
@@ -70,17 +69,6 @@ def test_constants_stay_bound_and_a_feed_stands_in_for_one() -> None:
         for one, other in zip(got, expected, strict=True):
             np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(bound.run(["p"], {})[0], session.run(["p"], others)[0])
-
-
-def test_a_number_without_axes_stays_one() -> None:
-    text = """<ir_version: 10, opset_import: ["" : 20]> g (float x, float[2] y) => (float[1, 2] z)
-    { axis = Constant<value = int64[1] {0}>() long = Unsqueeze(x, axis) z = Mul(long, y) z2 = Identity(z) }"""
-    model = parser.parse_model(text.replace("float[1, 2] z)", "float[2] z)"))
-    session = open_session(model.SerializeToString(), "numbers", 1)
-    for constants, feeds in (({"x": np.float32(3)}, {"y": np.ones(2, np.float32)}), ({}, {"x": np.float32(3)})):
-        bound = BoundSession(session, ON_CPU, {name: np.asarray(value) for name, value in constants.items()})
-        found = bound.run(["z"], {"y": np.ones(2, np.float32)} | {name: np.asarray(one) for name, one in feeds.items()})
-        np.testing.assert_array_equal(found[0], [3, 3])
 
 
 def test_what_a_gpu_says_is_told_and_a_graph_s_own_failure_is_not_the_gpus() -> None:

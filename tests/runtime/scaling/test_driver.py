@@ -92,15 +92,6 @@ def test_what_may_pass_is_tried_again_after_ever_longer_pauses_and_then_told_onc
     assert (made.failed, len(seen.outcomes)) == (len(made.problems), 3)
 
 
-def test_what_cannot_pass_is_not_tried_again_beside_what_may(tmp_path: Path) -> None:
-    def fails(task: Task, before: int) -> Outcome | None:
-        return Failed(task=task, problem={0: STAYS, RANGE: PASSES}[task.pages[0]]) if task.pages[0] < 6 else None
-
-    made, waited, _ = done(tmp_path, job(source("a")), works := Works(fails))
-    assert works.firsts == [("a", 0), ("a", 3), ("a", 6), *[("a", 3)] * len(AGAIN_S)]
-    assert (made.failed, made.problems, waited) == (2, [STAYS, PASSES], sum(AGAIN_S))
-
-
 @pytest.mark.parametrize(("problem", "again"), [(STAYS, 0), (PASSES, len(AGAIN_S))])
 def test_a_recording_that_cannot_be_read_is_left_alone_and_the_next_one_is_read(
     problem: Any, again: int, tmp_path: Path
