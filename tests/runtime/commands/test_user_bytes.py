@@ -19,13 +19,13 @@ from lightpage.errors import (
     StorageError,
 )
 from lightpage.page.symbols import pilot_mask
-from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.pages import Pages
-from lightpage.recording.reader import Recording
 from runtime.commands.code import code as code_command
 from runtime.commands.encode import encode
 from runtime.commands.recover import recover
 from tests.runtime import coded, toy
+
+STORAGE = StorageError("page of the recording", "Input/output error", "data")
 
 
 @pytest.fixture
@@ -69,17 +69,19 @@ def test_a_file_comes_back_and_the_figures_say_what_it_cost(bundle: Path, pages:
 
 
 def test_lost_pages_are_restored_and_named(
-    bundle: Path, pages: np.ndarray, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    bundle: Path, pages: np.ndarray, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    toy.frames_fail(monkeypatch, STORAGE, 5, 6)
     spoilt = {1: coded.dark, 2: coded.half_lost, 13: coded.half_lost}
     result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", pages, spoilt, known=False))
     assert result.exception is None
     assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
-    assert (figures["pages_unread"], figures["restored"], figures["lost"]) == (3, [1, 2], [])
+    assert (figures["pages_unread"], figures["restored"], figures["lost"]) == (5, [1, 2, 5, 6], [])
     assert figures["share_of_air"] is None  # its symbols are not known, and not needed
     for told in ("recorded pages 1, 13", "pages 1, 13 of", "recorded page 2"):
         assert told in caplog.text
-    assert [page["number"] for page in figures["page_results"] if page["loss"]] == [1, 2, 13]
+    lost = {page["number"]: page["loss"] for page in figures["page_results"] if page["loss"]}
+    assert (list(lost), lost[1], lost[5]) == ([1, 2, 5, 6, 13], "optics", "storage")
 
 
 def test_too_many_lost_pages_are_named_and_leave_no_file(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
@@ -178,29 +180,6 @@ def test_code_is_chosen_by_known_pages_and_kept_in_a_bundle(tmp_path: Path) -> N
     assert pages.max() < figures["code"]["levels"]
 
 
-def storage_without(pages: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have storage give no frames of these pages."""
-    frames = Recording.frames
-
-    def read(recording: Recording, page: int) -> FramePair:
-        if page in pages:
-            raise StorageError(f"recording {recording.path}: page {page}", "Input/output error", "data")
-        return frames(recording, page)
-
-    monkeypatch.setattr(Recording, "frames", read)
-
-
-def test_pages_that_storage_does_not_give_are_restored_as_others_are(
-    bundle: Path, pages: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recording = coded.recording(tmp_path / "R.h5", pages)
-    storage_without({1, 2}, monkeypatch)
-    result, figures = recovered(bundle, recording)
-    assert result.exception is None
-    assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
-    assert [page["loss"] for page in figures["page_results"] if page["loss"]] == ["storage", "storage"]
-
-
 @pytest.mark.parametrize(("options", "status"), [((), 75), (("--give-up",), 3)])
 def test_a_file_that_storage_keeps_back_is_not_lost_unless_it_is_given_up(
     options: tuple[str, ...],
@@ -213,7 +192,7 @@ def test_a_file_that_storage_keeps_back_is_not_lost_unless_it_is_given_up(
     recording = coded.recording(tmp_path / "R.h5", pages)
     asked = f"recover --bundle {bundle} --recording {recording} --out {tmp_path / 'read.bin'} --no-tracking".split()
     with monkeypatch.context() as patched:
-        storage_without({0, 1, 2}, patched)
+        toy.frames_fail(patched, STORAGE, 0, 1, 2)
         assert run(lightpage, [*asked, *options]) == status
         assert not (tmp_path / "read.bin").exists()
     assert run(lightpage, asked) == 0
@@ -227,7 +206,7 @@ def test_an_evaluation_ends_with_the_status_that_asks_for_another_try(
     asked = f"evaluate --bundle {bundle} --recording {tmp_path / 'R.h5'} --json {tmp_path / 'E.json'}".split()
     for lacking in ({0, 1, 2}, {1}):
         with monkeypatch.context() as patched:
-            storage_without(lacking, patched)
+            toy.frames_fail(patched, STORAGE, *lacking)
             assert run(lightpage, asked) == 75
         figures = json.loads((tmp_path / "E.json").read_text())
         assert figures["pages"] == 3 - len(lacking)

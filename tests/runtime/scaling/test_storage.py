@@ -10,9 +10,8 @@ import sys
 import pytest
 
 from lightpage.errors import StorageError
-from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.reader import Recording
 from runtime.scaling.driver import AGAIN_S
+from tests.runtime import toy
 from tests.runtime.scaling.archive import PAGES, RANGE, Archive
 from tests.storage_fault import StorageFault
 
@@ -22,15 +21,9 @@ BAD_PAGE = 4
 def test_pages_are_given_up_on_request_alone_and_read_again_on_another(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def read(recording: Recording, page: int) -> FramePair:
-        if recording.path.name == "a.h5" and page == BAD_PAGE:
-            raise StorageError(f"recording {recording.path}: page {page}", "Input/output error", "data")
-        return frames(recording, page)
-
     _, options = archive.shows_a_file()
-    frames = Recording.frames
     with monkeypatch.context() as patch:
-        patch.setattr(Recording, "frames", read)
+        toy.frames_fail(patch, StorageError("page", "Input/output error", "data"), BAD_PAGE, of="a.h5")
         status, figures = archive.run("recover", *options)
         assert (status, figures["pages_lost"], figures["pages_missing"]) == (75, 0, RANGE)
         assert archive.clock.now() == sum(AGAIN_S)

@@ -11,7 +11,6 @@ import h5py
 import pytest
 
 from lightpage.errors import StorageError
-from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from runtime.scaling.job import Choices, of_recordings
 from runtime.scaling.ledger import Ledger
@@ -41,18 +40,6 @@ def asked(tmp_path: Path) -> Callable[..., Task]:
     return task
 
 
-def failing(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have page 1 of every recording fail."""
-    frames = Recording.frames
-
-    def read(recording: Recording, page: int) -> FramePair:
-        if page == 1:
-            raise error
-        return frames(recording, page)
-
-    monkeypatch.setattr(Recording, "frames", read)
-
-
 def failure(task: Task) -> Failed:
     outcome = Worker(1).work(task)
     assert isinstance(outcome, Failed)
@@ -79,7 +66,7 @@ def test_a_range_is_read_and_its_record_says_what_it_was(operation: Operation, a
 def test_what_storage_does_not_give_is_no_finding_unless_it_is_given_up(
     operation: Operation, asked: Callable[..., Task], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    failing(StorageError("recording a", "Input/output error", "data"), monkeypatch)
+    toy.frames_fail(monkeypatch, StorageError("recording a", "Input/output error", "data"), 1)
     failed = failure(asked(operation))
     assert (failed.problem.passes, failed.whole_recording) == (True, False)
     done = Worker(1).work(task := asked(operation, give_up=True))
@@ -92,13 +79,13 @@ def test_what_storage_does_not_give_is_no_finding_unless_it_is_given_up(
 def test_a_short_resource_is_no_finding_even_if_pages_are_given_up(
     error: Exception, asked: Callable[..., Task], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    failing(error, monkeypatch)
+    toy.frames_fail(monkeypatch, error, 1)
     assert failure(asked()).problem.passes
     assert failure(asked(give_up=True)).problem.passes
 
 
 def test_what_nobody_foresaw_ends_the_worker(asked: Callable[..., Task], monkeypatch: pytest.MonkeyPatch) -> None:
-    failing(ZeroDivisionError(), monkeypatch)
+    toy.frames_fail(monkeypatch, ZeroDivisionError(), 1)
     with pytest.raises(ZeroDivisionError):
         Worker(1).work(asked())
 
