@@ -89,22 +89,6 @@ def test_an_interrupted_command_says_how_it_goes_on_and_an_unforeseen_error_is_r
         run("x", group=group_of(x=f"{HERE}:broken"))
 
 
-def test_nothing_that_is_read_is_written_and_nothing_is_written_twice(
-    toy_zip: Path, recording: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    before, other = recording[0].read_bytes(), tmp_path / "folder" / ".." / recording[0].name
-    (tmp_path / "folder").mkdir()
-    both = tmp_path / "both"
-    for arguments, named in (
-        (["evaluate", "--bundle", toy_zip, "--recording", recording[0], "--json", other], "--json"),
-        (["recalibrate", "--bundle", toy_zip, "--recording", recording[0], "--out", both, "--json", both], "--out"),
-    ):
-        assert run(*arguments) == 2
-        assert f"error: {named}" in capsys.readouterr().err
-    assert recording[0].read_bytes() == before
-    assert not both.exists()
-
-
 @pytest.fixture
 def recording(tmp_path: Path) -> tuple[Path, np.ndarray]:
     return tmp_path / "r.h5", toy.write_toy_recording(tmp_path / "r.h5", toy.ToyDevice(noise=30.0), 16, 4)
@@ -256,6 +240,7 @@ def test_offline_recalibration_writes_nothing_for_wrong_pilots_or_an_impossible_
     ("arguments", "named"),
     [
         ("recalibrate --bundle B", "--out"),
+        ("recalibrate --bundle B --recording R --out both --json both", "--out"),
         ("recalibrate --target 127.0.0.1:9 --send", "--send"),
         ("recalibrate --target 127.0.0.1:9 --bundle B", "--target"),
         ("recalibrate --bundle B --detach", "--detach"),

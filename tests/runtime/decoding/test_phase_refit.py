@@ -103,18 +103,6 @@ def test_pilots_alone_suffice_where_no_other_symbol_has_weight(levels: int) -> N
     assert rms(found - error) < 2 * noise_of_fit(kappa, int(lit.sum()))
 
 
-def test_uncertain_symbols_count_less() -> None:
-    """Half of the page is misled by as much as a fifth of a level, and says that it knows little."""
-    error = smooth(64)
-    doubtful = np.random.default_rng(2).random(SHAPE) < 0.5
-    phase, concentration, pilots = page(64, 2000.0, error)
-    phase = phase + np.where(doubtful, 0.2 * 2 * np.pi / 64, 0)
-    doubted = np.where(doubtful, 20.0, concentration)
-    refit = PhaseRefit(SHAPE, POSITIONS)
-    assert rms(refit.error(phase, doubted, 64, pilots) - error) < 2 * noise_of_fit(2000.0, X.size // 2)
-    assert rms(refit.error(phase, concentration, 64, pilots) - error) > 4 * noise_of_fit(2000.0, X.size // 2)
-
-
 def test_a_page_of_more_symbols_than_are_taken() -> None:
     shape = (160, 200)
     y, x = np.meshgrid(np.linspace(-1, 1, 160), np.linspace(-1, 1, 200), indexing="ij")

@@ -108,35 +108,26 @@ DONE = {"a": "recalibrated", "b": "recalibrated"}
 A_FAILED = {"a": "failed", "b": "recalibrated"}
 
 
-def test_a_device_of_several_recordings_is_one_task_with_one_bundle(
-    fleet: Fleet, capsys: pytest.CaptureFixture[str]
-) -> None:
-    status, rows = fleet.run("--pages", "5", "--part", "1/2")
-    assert (status, list(rows), len(rows["b"]["recordings"])) == (2, ["b"], 1)
-    shutil.rmtree(fleet.out)
-    status, rows = fleet.run("--pages", "5")
-    assert (status, [len(rows[name]["recordings"]) for name in "ab"]) == (2, [2, 1])
-    assert (rows["a"]["state"], rows["a"]["pages_used"]) == ("recalibrated", 5)  # more than one of them has
-    assert rows["b"]["state"] == "refused"
-    assert len(list(fleet.out.glob("shards/*/*.zip"))) == 1
-    assert not list(fleet.out.glob("shards/*/.*"))
-    assert re.search(r"^a +recalibrated +\d\.\d{3} +4\.000 +/.*\.zip$", capsys.readouterr().out, re.MULTILINE)
-
-
-def test_a_device_whose_pages_contradict_it_is_refused_by_name_and_the_rest_is_recalibrated(
+def test_a_device_of_several_recordings_is_one_task_and_another_whose_pages_contradict_it_is_refused_by_name(
     fleet: Fleet, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with h5py.File(fleet.folder / "b.h5", "r+") as file:
         file["symbols"][:] = toy.symbols_of(16, 999, PAGES)
-    status, rows = fleet.run()
+    status, rows = fleet.run("--pages", "5", "--part", "1/2")
+    assert (status, list(rows), len(rows["b"]["recordings"])) == (2, ["b"], 1)
+    shutil.rmtree(fleet.out)
+    status, rows = fleet.run("--pages", "5")
     assert (status, states(rows)) == (2, {"a": "recalibrated", "b": "refused"})
+    assert ([len(rows[name]["recordings"]) for name in "ab"], rows["a"]["pages_used"]) == ([2, 1], 5)
     assert rows["a"]["air_after"] > rows["a"]["air_before"]
     made = Bundle.open(rows["a"]["bundle"])
     assert (made.version, made.table["reference_in_phase"].mean()) == ("toy-1+r1", pytest.approx(148))
+    assert not list(fleet.out.glob("shards/*/.*"))
     told = capsys.readouterr()
     assert f"device b: recording {fleet.folder / 'b.h5'}: " in told.err
+    assert re.search(r"^a +recalibrated +\d\.\d{3} +4\.000 +/.*\.zip$", told.out, re.MULTILINE)
     assert re.search(r"^this run +2 devices", told.out, re.MULTILINE)
-    assert fleet.run()[0] == 2  # it stays so
+    assert fleet.run("--pages", "5")[0] == 2  # it stays so
     assert re.search(r"^this run +nothing", capsys.readouterr().out, re.MULTILINE)
 
 
