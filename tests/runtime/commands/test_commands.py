@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,13 @@ import pytest
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import RESUME_KEY, LazyGroup, lightpage
-from lightpage.errors import LightpageError
+from lightpage.errors import LightpageError, SurroundingsError
 from lightpage.page.pilots import Pilots
 from lightpage.recording.reader import Recording, RecordingWriter
 from runtime.acquisition.sources import open_source
 from runtime.bundle.bundle import Bundle
 from runtime.client.client import LightpageClient
+from runtime.client.decoded_file import DecodedWriter
 from runtime.commands import recalibrate as cli_recalibrate
 from runtime.decoding.decoder import Decoder
 from runtime.recalibration.outcome import Refit
@@ -30,6 +32,7 @@ from runtime.service.dataplane import DataPlane
 from runtime.service.recalibrator import Recalibrator
 from runtime.service.registry import ModelRegistry
 from runtime.wire.pages import RemotePage
+from tests.lightpage.full_disk import full_disk
 from tests.runtime import toy
 from tests.runtime.slow_fit import SlowFit
 from tests.waiting import eventually
@@ -311,6 +314,27 @@ def test_decode_sends_a_recording_and_keeps_the_symbols(
     shuffle_data(recording[0])
     assert run(*where) == 0
     assert "carry nothing" in capsys.readouterr().err
+
+
+@dataclass(frozen=True)
+class Decoded:
+    symbols: np.ndarray
+    confidence: np.ndarray
+    model_version: str = "1"
+    page: int | None = None
+
+
+@pytest.mark.parametrize("room", [0, 3_000, 20_000])
+def test_a_full_disk_leaves_the_earlier_file_and_no_other(tmp_path: Path, room: int) -> None:
+    path = tmp_path / "d.h5"
+    path.write_text("earlier")
+    writing = pytest.raises(SurroundingsError, match=r"d\.h5")
+    with full_disk(room), writing, DecodedWriter(path, 16) as writer:
+        for seed in range(3):
+            rng = np.random.default_rng(seed)
+            writer.append(Decoded(rng.integers(0, 16, (40, 50), dtype=np.uint8), rng.random((40, 50), np.float32)))
+    assert path.read_text() == "earlier"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_decode_goes_on_after_bad_pages_and_ends_with_their_names(

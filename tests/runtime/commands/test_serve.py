@@ -1,4 +1,4 @@
-"""`lightpage serve`: its settings, its log and record of model changes, what it refuses, and how it ends."""
+"""`lightpage serve`: its settings, its log and record of model changes, what it refuses, how it ends; its health."""
 
 from __future__ import annotations
 
@@ -6,21 +6,26 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import tomllib
+from concurrent import futures
 from pathlib import Path
 
 import grpc
 import pytest
 from click.testing import CliRunner
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import lightpage
 from lightpage.recording.reader import Recording
 from runtime.acquisition.recording import RecordingSource
 from runtime.client.client import LightpageClient
+from runtime.commands.healthcheck import is_serving
+from runtime.commands.healthcheck import main as healthcheck
 from runtime.commands.serve import checked_source, leave_the_rest, serve, stop_signals
 from runtime.decoding.decoder import Decoder
 from runtime.errors import StoreError, UnconfirmedPageError
@@ -217,3 +222,25 @@ def test_a_hangup_that_was_to_be_ignored_is() -> None:
             wait_for_stop()
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_the_exit_code_of_the_health_probe_is_its_answer() -> None:
+    grpc_server, servicer = grpc.server(futures.ThreadPoolExecutor(max_workers=2)), health.HealthServicer()
+    health_pb2_grpc.add_HealthServicer_to_server(servicer, grpc_server)
+    target, runner = f"127.0.0.1:{grpc_server.add_insecure_port('127.0.0.1:0')}", CliRunner()
+    by_environment = {"LIGHTPAGE_HEALTH_TARGET": target}
+    grpc_server.start()
+    for status, code in (("SERVING", 0), ("NOT_SERVING", 1)):
+        servicer.set("", health_pb2.HealthCheckResponse.ServingStatus.Value(status))
+        assert runner.invoke(healthcheck, env=by_environment).exit_code == code
+        assert is_serving(target) == (not code, f"{target}: {status}")
+    assert runner.invoke(healthcheck, ["--target", target, "--service", "nobody.v1.Nothing"]).exit_code == 1
+    assert "NOT_FOUND" in is_serving(target, service="nobody.v1.Nothing")[1]
+    grpc_server.stop(grace=None).wait(5)
+    serving, said = is_serving(target, timeout_s=2.0)
+    assert (serving, "UNAVAILABLE" in said or "DEADLINE_EXCEEDED" in said) == (False, True)
+
+
+def test_a_silent_server_is_not_healthy_and_is_not_waited_for() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        assert not is_serving(f"127.0.0.1:{silent.getsockname()[1]}", timeout_s=0.2)[0]
