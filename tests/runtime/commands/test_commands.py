@@ -49,11 +49,6 @@ def interrupted() -> None:
 
 
 @click.command()
-def needs_torch() -> None:
-    raise ModuleNotFoundError("No module named 'torch'", name="torch")
-
-
-@click.command()
 def broken() -> None:
     raise ZeroDivisionError
 
@@ -79,8 +74,6 @@ def test_a_missing_extra_is_named(
         monkeypatch.setitem(sys.modules, module, None)
         assert run("x", group=group_of(x=f"wants_{module}:x")) == 2
         assert f"'lightpage[{extra}]'" in capsys.readouterr().err
-    assert run("x", group=group_of(x=f"{HERE}:needs_torch")) == 2
-    assert "'lightpage[train]'" in capsys.readouterr().err
 
 
 def test_an_interrupted_command_says_how_it_goes_on_and_an_unforeseen_error_is_raised(
