@@ -109,60 +109,38 @@ def test_pages_in_any_order_twice_or_missing(bundle: Path, pages: np.ndarray, tm
     assert (figures["pages_repeated"], figures["missing"]) == (3, [0, 1])
 
 
-class TestBadInput:
-    def test_two_volumes(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
-        (tmp_path / "other").mkdir()
-        other = coded.pages(bundle, tmp_path / "other", b"other", "--volume", "3", "--data-pages", "1")
-        recording = coded.recording(tmp_path / "R.h5", [*pages, *other])
-        for more in ((), ("--volume", "4"), ("--volume", "9:1"), ("--volume", "x")):
-            result, _ = recovered(bundle, recording, *more)
-            assert isinstance(result.exception, InvalidInputError)
-            assert not (tmp_path / "read.bin").exists()
-        result, figures = recovered(bundle, recording, "--volume", f"3:{crc32c(b'other'):08x}")
-        assert (tmp_path / "read.bin").read_bytes() == b"other"
-        assert figures["other_volumes"] == {f"9:{crc32c(coded.CONTENT):08x}": len(pages)}
-
-    def test_a_recording_that_says_how_it_is_coded_needs_no_other_source(
-        self, pages: np.ndarray, tmp_path: Path
-    ) -> None:
-        plain = coded.bundle(tmp_path / "plain.zip", None)
-        with h5py.File(tmp_path / "pages.h5") as file:
-            told = file.attrs["code"]
-        result, _ = recovered(plain, coded.recording(tmp_path / "R.h5", pages, code=told))
-        assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
-        result, _ = recovered(plain, coded.recording(tmp_path / "S.h5", pages))
+def test_two_volumes(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    other = coded.pages(bundle, tmp_path / "other", b"other", "--volume", "3", "--data-pages", "1")
+    recording = coded.recording(tmp_path / "R.h5", [*pages, *other])
+    for more in ((), ("--volume", "4"), ("--volume", "9:1"), ("--volume", "x")):
+        result, _ = recovered(bundle, recording, *more)
         assert isinstance(result.exception, InvalidInputError)
-        assert "--code" in result.exception.expected
-        for wrong in ("[]", '{"levels": 31}', "{"):
-            result, _ = recovered(plain, coded.recording(tmp_path / f"{len(wrong)}.h5", pages, code=wrong))
-            assert isinstance(result.exception, RecordingError)
+        assert not (tmp_path / "read.bin").exists()
+    result, figures = recovered(bundle, recording, "--volume", f"3:{crc32c(b'other'):08x}")
+    assert (tmp_path / "read.bin").read_bytes() == b"other"
+    assert figures["other_volumes"] == {f"9:{crc32c(coded.CONTENT):08x}": len(pages)}
 
-    def test_pages_of_noise(self, bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
-        noise = np.random.default_rng(0).integers(0, 32, pages.shape, dtype=np.uint8)
-        result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", noise))
-        assert isinstance(result.exception, LostDataError)
-        assert {page["loss"] for page in figures["page_results"]} == {"optics"}
 
-    @pytest.mark.parametrize(
-        ("options", "told"),
-        [
-            ("--bundle B --profile bench", "--bundle and --profile"),
-            ("", "--bundle nor --profile"),
-            ("--profile bench", "without --code"),
-            ("--bundle B --code C --data-pages 254 --parity-pages 2", "254 data"),
-            ("--bundle B --code gone.toml", "code gone.toml"),
-        ],
-    )
-    def test_encode_refuses(self, tmp_path: Path, options: str, told: str) -> None:
-        plain = coded.bundle(tmp_path / "plain.zip", None)
-        coded.CODE.save(tmp_path / "C.toml")
-        (tmp_path / "f").write_bytes(b"abc")
-        words = [{"B": str(plain), "C": str(tmp_path / "C.toml")}.get(word, word) for word in options.split()]
-        asked = [str(tmp_path / "f"), *words, "--out", str(tmp_path / "pages.h5")]
-        with pytest.raises(InvalidInputError) as error:
-            encode.main(asked, standalone_mode=False)
-        assert told in str(error.value)
-        assert not (tmp_path / "pages.h5").exists()
+def test_a_recording_that_says_how_it_is_coded_needs_no_other_source(pages: np.ndarray, tmp_path: Path) -> None:
+    plain = coded.bundle(tmp_path / "plain.zip", None)
+    with h5py.File(tmp_path / "pages.h5") as file:
+        told = file.attrs["code"]
+    result, _ = recovered(plain, coded.recording(tmp_path / "R.h5", pages, code=told))
+    assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
+    result, _ = recovered(plain, coded.recording(tmp_path / "S.h5", pages))
+    assert isinstance(result.exception, InvalidInputError)
+    assert "--code" in result.exception.expected
+    for wrong in ("[]", '{"levels": 31}', "{"):
+        result, _ = recovered(plain, coded.recording(tmp_path / f"{len(wrong)}.h5", pages, code=wrong))
+        assert isinstance(result.exception, RecordingError)
+
+
+def test_pages_of_noise(bundle: Path, pages: np.ndarray, tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 32, pages.shape, dtype=np.uint8)
+    result, figures = recovered(bundle, coded.recording(tmp_path / "R.h5", noise))
+    assert isinstance(result.exception, LostDataError)
+    assert {page["loss"] for page in figures["page_results"]} == {"optics"}
 
 
 def test_code_is_chosen_by_known_pages_and_kept_in_a_bundle(tmp_path: Path) -> None:

@@ -56,12 +56,9 @@ def test_a_command_that_is_not_there_is_named() -> None:
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
 
 
-@pytest.mark.parametrize("place", ["file", "read-only"])
-def test_a_folder_that_cannot_be_made_or_written_is_named(
-    tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_folder_that_cannot_be_written_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(virtual_device, "go_on_inside", lambda name: pytest.fail("started"))
-    (tmp_path / "file").touch()
-    folder = tmp_path / "file" / "device" if place == "file" else Path("/proc/self")  # read-only for root too
-    assert cli_main.run(lightpage, ["virtual-device", "--out", str(folder), "--", "true"]) == EXIT_ERROR
-    assert f"error: --out {folder}:" in capsys.readouterr().err
+    assert cli_main.run(lightpage, ["virtual-device", "--out", "/proc/self", "--", "true"]) == EXIT_ERROR
+    assert "error: --out /proc/self:" in capsys.readouterr().err

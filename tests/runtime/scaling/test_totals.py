@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from lightpage.metrics.reliability import ConfidenceBin
 from runtime.scaling.ledger import Ledger
 from runtime.scaling.part import Part
 from runtime.scaling.shard import PageRecord, PageState, ShardRecord
 from runtime.scaling.task import Operation
-from runtime.scaling.totals import AIR, Totals, totals
+from runtime.scaling.totals import AIR, totals
 from tests.runtime.scaling.jobs import BUNDLE, NEWER, PAGES, STAYS, job, lost, page, source, write
 
 
@@ -64,19 +63,6 @@ def test_a_round_says_what_it_has_brought(tmp_path: Path) -> None:
     }
     assert (found.tally.read, found.tally.models) == (3, {"toy-2": 2, "toy-1": 2})
     assert [reading.pages for reading in found.readings] == [3, 3, 3, 1]
-
-
-def test_bins_of_confidence_are_added_up(tmp_path: Path) -> None:
-    ledger = Ledger(tmp_path)
-    assert Totals().ece is None
-    for first, count, confidence, accuracy in ((0, 10, 0.8, 0.9), (3, 30, 0.9, 0.6)):
-        bins = (ConfidenceBin(0.5, 1.0, count, confidence, accuracy),)
-        shard = ledger.shard(0, first)
-        write(shard, page(first))
-        ShardRecord.read(shard).model_copy(update={"confidence_bins": bins}).write(shard)
-    found = totals(ledger, job(source("a"), operation=Operation.EVALUATE))
-    assert found.ece == pytest.approx((0.1 * -10 + 0.3 * 30) / 40)
-    assert found.to_json()["figures"]["ece"] == found.ece
 
 
 def test_devices_have_a_row_each_that_says_why(tmp_path: Path) -> None:
