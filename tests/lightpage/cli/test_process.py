@@ -14,8 +14,8 @@ import pytest
 import tqdm.std
 from click.shell_completion import ShellComplete
 
-from lightpage.cli import main, progress_bar
-from lightpage.cli.main import COMPLETE, EXIT_ERROR, THREADS, lightpage, run
+from lightpage.cli import progress_bar
+from lightpage.cli.main import COMPLETE, EXIT_ERROR, lightpage, run
 from lightpage.errors import RecordingError, SurroundingsError
 from lightpage.failures import os_failure, understood
 from tests.clock import HandClock
@@ -125,21 +125,6 @@ def test_shells_complete_commands_and_options() -> None:
     complete = ShellComplete(lightpage, {}, "lightpage", COMPLETE)
     assert [item.value for item in complete.get_completions([], "sim")] == ["simulate"]
     assert "--holes" in [item.value for item in complete.get_completions(["bulk", "recover"], "--ho")]
-
-
-def test_libraries_of_linear_algebra_do_not_spin_unless_they_are_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    for stream in ("stdin", "stdout", "stderr"):
-        monkeypatch.setattr(sys, stream, getattr(sys, stream))
-    monkeypatch.setattr(main, "run", lambda _: 0)
-    for own, seen in ((None, THREADS["OPENBLAS_NUM_THREADS"]), ("3", None)):
-        for name in (*THREADS, "OMP_NUM_THREADS", "OMP_WAIT_POLICY"):
-            monkeypatch.setenv(name, "")  # so that it is set back
-            monkeypatch.delenv(name)
-        if own is not None:
-            monkeypatch.setenv("OMP_NUM_THREADS", own)
-        with pytest.raises(SystemExit):
-            main.main()
-        assert os.environ.get("OPENBLAS_NUM_THREADS") == seen
 
 
 def test_a_name_that_is_too_long_is_named(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,6 @@ import select
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from threading import Thread
 
@@ -29,11 +28,6 @@ ROOT = Path(__file__).resolve().parents[3]
 
 def address(running: Stage) -> str:
     return running.url.removeprefix("http://").replace("localhost", "127.0.0.1")
-
-
-def a_scrape(at: float, values: Mapping[str, float], started: float = 1.0) -> Scrape:
-    samples = {("process_start_time_seconds", frozenset[tuple[str, str]]()): started}
-    return Scrape(at, samples | {(name, frozenset()): value for name, value in values.items()})
 
 
 def test_one_text_says_what_the_service_does(decoder: Decoder, capsys: pytest.CaptureFixture[str]) -> None:
@@ -92,68 +86,54 @@ def test_quantiles_are_those_of_what_came_between() -> None:
 
 
 def test_a_restart_ends_what_was_counted_before() -> None:
+    def counted(at: float, calls: float, **started: float) -> Change:
+        samples = {"lightpage_calls_total": calls, **started}
+        scrapes.add(Scrape(at, {(name, frozenset()): value for name, value in samples.items()}))
+        assert scrapes.change is not None
+        return scrapes.change
+
     scrapes = Scrapes(window_s=10.0)
     for at in range(20):
-        scrapes.add(a_scrape(float(at), {"lightpage_calls_total": 100.0 + 2 * at}))
-    change = scrapes.change
-    assert change is not None
+        change = counted(float(at), 100.0 + 2 * at, process_start_time_seconds=1.0)
     assert (change.seconds, change.rate("lightpage_calls_total")) == (10.0, 2.0)
-    scrapes.add(a_scrape(20.0, {"lightpage_calls_total": 500.0}, started=2.0))
-    scrapes.add(a_scrape(21.0, {"lightpage_calls_total": 503.0}, started=2.0))
-    change = scrapes.change
-    assert change is not None
+    counted(20.0, 500.0, process_start_time_seconds=2.0)
+    change = counted(21.0, 503.0, process_start_time_seconds=2.0)
     assert (scrapes.restarts, change.seconds, change.rate("lightpage_calls_total")) == (1, 1.0, 3.0)
-    scrapes.add(Scrape(22.0, {("lightpage_calls_total", frozenset()): 4.0}))  # of a system that tells no start
+    counted(22.0, 4.0)  # of a system that tells no start
     assert scrapes.restarts == 2
 
 
-class Terminal:
-    """`lightpage top` in a terminal of its own."""
-
-    def __init__(self, address: str) -> None:
-        self._own, other = pty.openpty()
-        command = [sys.executable, "-c", "from runtime.commands.top import top; top()", "--address", address]
-        environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120", "LINES": "50", "PYTHONPATH": str(ROOT)}
-        self.process = subprocess.Popen(
-            [*command, "--interval", "0.1"], stdin=other, stdout=other, stderr=other, env=environment, close_fds=True
-        )
-        os.close(other)
-
-    def shows(self, text: str) -> bool:
-        """Wait until it shows a text."""
+def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(decoder: Decoder) -> None:
+    def shows(text: str) -> bool:
         seen = bytearray()
 
         def found() -> bool:
-            if select.select([self._own], [], [], 0.1)[0]:
-                seen.extend(os.read(self._own, 65536))
+            if select.select([screen], [], [], 0.1)[0]:
+                seen.extend(os.read(screen, 65536))
             return text.encode() in seen
 
         return eventually(found)
 
-    def press(self, key: str) -> None:
-        os.write(self._own, key.encode())
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        os.close(self._own)
-
-
-def test_in_a_terminal_it_outlives_the_service_and_ends_with_q(decoder: Decoder) -> None:
+    screen, own = pty.openpty()
     with stage(decoder) as running:
         running.read(3)
         port = running.server.port
-        terminal = Terminal(address(running))
+        command = [sys.executable, "-c", "from runtime.commands.top import top; top()", "--address", address(running)]
+        environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120", "LINES": "50", "PYTHONPATH": str(ROOT)}
+        process = subprocess.Popen([*command, "--interval", "0.1"], stdin=own, stdout=own, stderr=own, env=environment)
+        os.close(own)
         try:
-            assert terminal.shows("toy-1")
+            assert shows("toy-1")
             running.server.close()
-            assert terminal.shows("no answer")
+            assert shows("no answer")
             running.plane.metrics.in_service("toy-2")
             with ConsoleServer(running.console, port):
-                assert terminal.shows("toy-2")
-                terminal.press("x")
-                terminal.press("q")
-                assert terminal.shows("\x1b[?1049l")  # the screen is as it was
-                assert terminal.process.wait(60) == 0
+                assert shows("toy-2")
+                os.write(screen, b"x")
+                os.write(screen, b"q")
+                assert shows("\x1b[?1049l")  # the screen is as it was
+                assert process.wait(60) == 0
         finally:
-            terminal.close()
+            process.kill()
+            process.wait()
+            os.close(screen)

@@ -38,11 +38,7 @@ LIMIT_S = 60
 
 
 class Workers:
-    """Workers that are no processes.
-
-    Args:
-        hang, die: first pages of ranges at which so many workers hang, or die by signal 9.
-    """
+    """Workers that are no processes: at first pages of ranges, so many `hang`, or `die` by signal 9."""
 
     def __init__(self, hang: dict[int, int] | None = None, die: dict[int, int] | None = None) -> None:
         self.clock = HandClock()

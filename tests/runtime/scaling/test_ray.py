@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
 import sys
+import uuid
 from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -36,9 +39,7 @@ READS_S, HANGS_S = 100.0, 5000.0
 class FakeRay:
     """What the engine needs of Ray, by a clock that runs while somebody waits.
 
-    Args:
-        cpus: how many tasks are at work at once, in the order in which they came; the others wait.
-        takes: seconds of a task, called when it begins. It is ready then, also if it was cancelled before.
+    So many tasks are at work at once, in the order in which they came. One is ready in time also if it was cancelled.
     """
 
     exceptions = SimpleNamespace(RayError=RuntimeError)
@@ -155,12 +156,14 @@ def test_a_cluster_without_any_workers_ends_the_run(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.long  # a cluster takes ten seconds to start; what its engine does is shown without one
-def test_a_node_dies_and_nothing_is_missing_twice_or_different(
+def test_a_worker_and_a_node_die_and_nothing_is_missing_twice_or_different(
     toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from ray.cluster_utils import Cluster
 
+    mark = uuid.uuid4().hex
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("LIGHTPAGE_MARK", mark)
     toy.write_toy_recording(tmp_path / "a.h5", toy.ToyDevice(seed=1), 16, PAGES)
     choices = Choices(operation=Operation.EVALUATE, range_pages=RANGE)
     job = of_recordings(choices, [str(tmp_path / "a.h5")], str(toy_zip), None)
@@ -171,18 +174,35 @@ def test_a_node_dies_and_nothing_is_missing_twice_or_different(
         node = cluster.add_node(num_cpus=1)
         engine = RayEngine(cluster.address, threads=1)
         with Ledger(tmp_path / "killed") as ledger:
-            done = []
+            done, worker = [], None
             for outcome in engine.run(ledger.missing(job)):
                 assert isinstance(outcome, Done)
                 done.append(outcome.task.pages)
                 if len(done) == 2:
                     cluster.remove_node(node, allow_graceful=False)
                     cluster.add_node(num_cpus=1)
+                if len(done) >= 4 and worker is None and (at_work := working(mark)):  # ranges are short
+                    worker = at_work[0]
+                    os.kill(worker, signal.SIGKILL)
         assert sorted(done) == [tuple(range(first, first + RANGE)) for first in range(0, PAGES, RANGE)]
         assert pages(tmp_path / "killed") == pages(tmp_path / "single")
+        assert worker is not None
         assert engine.restarts >= 1
     finally:
         cluster.shutdown()
+
+
+def working(mark: str) -> list[int]:
+    """Processes that Ray works with, of the cluster with this mark in its environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            name, environment = ((folder / part).read_bytes() for part in ("cmdline", "environ"))
+        except OSError:
+            continue
+        if b"ray::_work" in name and mark.encode() in environment:
+            found.append(int(folder.name))
+    return found
 
 
 def test_a_cluster_of_this_machine_is_started_whatever_the_surroundings_say(monkeypatch: pytest.MonkeyPatch) -> None:
