@@ -218,25 +218,12 @@ def test_offline_recalibration_writes_a_better_bundle(
     assert run(*arguments) == 2  # never overwrites
 
 
-def test_offline_recalibration_writes_nothing_for_wrong_pilots_or_an_impossible_version(
-    toy_zip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(cli_recalibrate, "refit", toy.fit_references)
-    toy.write_toy_recording(tmp_path / "d.h5", toy.ToyDevice(), 16, 3)
-    with h5py.File(tmp_path / "d.h5", "r+") as file:
-        file["symbols"][...] = np.random.default_rng(0).integers(16, size=file["symbols"].shape)
-    arguments = ["recalibrate", "--bundle", toy_zip, "--recording", tmp_path / "d.h5", "--out", tmp_path / "new.zip"]
-    for more, named in ((["--version", "v 2"], "--version: got 'v 2'"), ([], "re-fitted")):
-        assert run(*arguments, *more) == 2
-        assert named in capsys.readouterr().err
-    assert not (tmp_path / "new.zip").exists()
-
-
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         ("recalibrate --bundle B", "--out"),
         ("recalibrate --bundle B --recording R --out both --json both", "--out"),
+        ("recalibrate --bundle B --recording R --out X --version v/2", "--version"),
         ("recalibrate --target 127.0.0.1:9 --send", "--send"),
         ("recalibrate --target 127.0.0.1:9 --bundle B", "--target"),
         ("recalibrate --bundle B --detach", "--detach"),

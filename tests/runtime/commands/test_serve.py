@@ -22,11 +22,10 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from lightpage.cli import main as cli_main
 from lightpage.cli.main import lightpage
 from lightpage.recording.reader import Recording
-from runtime.acquisition.recording import RecordingSource
 from runtime.client.client import LightpageClient
 from runtime.commands.healthcheck import is_serving
 from runtime.commands.healthcheck import main as healthcheck
-from runtime.commands.serve import checked_source, leave_the_rest, serve, stop_signals
+from runtime.commands.serve import leave_the_rest, serve, stop_signals
 from runtime.decoding.decoder import Decoder
 from runtime.errors import StoreError, UnconfirmedPageError
 from runtime.pb.lightpage.v1 import lightpage_pb2 as pb
@@ -173,16 +172,6 @@ def test_a_service_keeps_to_its_limits_logs_json_and_writes_down_changes_and_los
     assert len(kept) == 2
     with Recording.open(kept[0]) as recording:
         assert recording.pages == 1
-
-
-def test_a_source_that_has_nothing_to_show_is_told(
-    decoder: Decoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    toy.write_toy_recording(tmp_path / "R.h5", toy.ToyDevice(), 16, 1)
-    for told in (0, 1):
-        with checked_source(f"recording:{tmp_path / 'R.h5'}", None, decoder) as source:
-            assert [source.name in record.getMessage() for record in caplog.records] == [True] * told
-        monkeypatch.setattr(RecordingSource, "page_count", lambda _: 0)
 
 
 def test_a_thread_that_does_not_end_does_not_keep_the_process(

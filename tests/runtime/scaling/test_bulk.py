@@ -21,7 +21,7 @@ from runtime.decoding.tracking import NoTracker
 from runtime.scaling.driver import AGAIN_S
 from runtime.scaling.ledger import Ledger
 from tests.runtime import coded, toy
-from tests.runtime.scaling.archive import PAGES, RANGE, Archive, spoil_page
+from tests.runtime.scaling.archive import PAGES, RANGE, Archive
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -120,24 +120,6 @@ def test_a_recording_that_opens_at_the_second_try_costs_a_second(
     assert archive.clock.now() == AGAIN_S[0]
 
 
-def test_a_lost_page_is_named_once_and_its_neighbours_are_read(
-    archive: Archive, capsys: pytest.CaptureFixture[str]
-) -> None:
-    spoil_page(archive.folder / "a.h5", 4)
-    (archive.folder / "b.h5").rename(archive.folder / "b.gone")
-    (archive.folder / "b.h5").touch()
-    for read in (PAGES - 1, 0):
-        status, figures = archive.run("decode")  # something is missing, whatever is lost
-        assert (status, figures["this_run"]["failed"], figures["this_run"]["pages"]) == (75, 1, read + bool(read))
-    (archive.folder / "b.gone").rename(archive.folder / "b.h5")
-    status, figures = archive.run("decode")
-    assert (status, figures["pages_read"], figures["lost"]) == (2, 13, {"BlackFrameError": 1})
-    assert figures["recordings"][0]["lost_pages"] == {"BlackFrameError": "4"}
-    assert "page 4" in capsys.readouterr().err
-    assert archive.run("decode")[0] == 2  # it stays lost, and is not tried again
-    assert archive.tasks == []
-
-
 def test_a_newer_model_reads_only_what_was_not_read_well(archive: Archive) -> None:
     toy.write_toy_recording(archive.folder / "b.h5", toy.ToyDevice((158.0, 110.0), seed=3), 16, PAGES, 5)
     status, figures = archive.run("evaluate")
@@ -193,14 +175,3 @@ def test_a_file_whose_pages_do_not_suffice_is_written_with_holes_on_request_unde
     (told,) = archive.run("recover", *options, "--volume", "9")[1]["files"]
     assert told["file_with_holes"] == str(holes)  # it is there still
     assert archive.run("recover", *options, "--volume", "8:12")[0] == 2
-
-
-def test_pages_without_any_bytes_are_lost_data(archive: Archive) -> None:
-    options = ("--no-tracking", "--bundle", str(coded.bundle(archive.folder / "coded.zip")))
-    status, figures = archive.run("recover", *options)
-    assert (status, figures["files"], figures["pages_missing"]) == (75, [], 14)  # of other levels than the code
-    for name in "ab":
-        toy.write_toy_recording(archive.folder / f"{name}.h5", toy.ToyDevice(), coded.CODE.levels, 2)
-    shutil.rmtree(archive.out)
-    status, figures = archive.run("recover", *options)
-    assert (status, figures["files"], figures["pages_lost"]) == (3, [], 4)

@@ -169,25 +169,6 @@ def test_the_deep_form_is_given_all_pages_and_the_run_of_each_device(fleet: Flee
     assert told == ["fit: 0%", "so far", "training: step 1 of 2", "so far", "training: 2 steps"]
 
 
-def test_an_interrupted_fleet_goes_on_in_the_same_folder_and_what_is_done_needs_nothing_any_more(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fleet.deep.error = KeyboardInterrupt()
-    assert fleet.run("--deep")[0] == 130
-    fleet.deep.error = None
-    assert fleet.run("--deep")[0] == 0
-    assert [(run, there) for run, *_, there in fleet.deep.asked] == [("run-a", []), ("run-a", ["begun"]), ("run-b", [])]
-
-    def missing() -> Deep:
-        raise ModuleNotFoundError("No module named 'torch'", name="torch")
-
-    monkeypatch.setattr(command, "deep_recalibration", missing)
-    status, rows = fleet.run("--deep")
-    assert (status, states(rows), len(fleet.deep.asked)) == (0, DONE, 3)
-    assert fleet.run("--deep", "--steps", "20")[0] == 2
-    assert fleet.run("--deep", runs=("a",))[0] == 2
-
-
 @pytest.mark.parametrize(
     ("error", "state", "again", "ends"),
     [

@@ -77,15 +77,3 @@ def test_a_file_is_written_however_a_run_ends(archive: Archive, tmp_path: Path) 
     assert archive.run("decode", "--metrics-file", str(tmp_path / "bulk.prom"))[0] == 130
     assert len(archive.records()) == 2
     assert values((tmp_path / "bulk.prom").read_text())["lightpage_bulk_job_pages_left{}"] == 2 * PAGES - 2 * RANGE
-
-
-def test_what_cannot_be_opened_is_counted_and_parts_share_no_series(archive: Archive, tmp_path: Path) -> None:
-    (archive.folder / "b.h5").write_bytes(b"no recording")
-    file = tmp_path / "bulk.prom"
-    series: list[set[str]] = []
-    for part, status, failed in (("0/2", 0, 0), ("1/2", 75, 1)):
-        assert archive.run("decode", "--part", part, "--metrics-file", str(file))[0] == status
-        assert values(file.read_text())["lightpage_bulk_ranges_failed_total{}"] == failed
-        series.append({line.rpartition(" ")[0] for line in file.read_text().splitlines() if not line.startswith("#")})
-    assert not series[0] & series[1]
-    assert {each.replace('part="0/2"', 'part="1/2"') for each in series[0]} == series[1]
