@@ -75,7 +75,6 @@ def test_frames_arrive_to_the_byte_one_for_each_trigger(camera: GenTLCamera) -> 
         camera.fire()
     camera.arm()
     assert camera.frame(0.0) is None
-    assert camera.frame(0.06) is None
     infos = [frame.info for frame in (taken(camera) for _ in range(4)) if frame.info is not None]
     assert camera.frame(0.05) is None
     assert (infos[0].serial, infos[0].pixel_format) == ("SN_InterfaceB_0", "Mono8")
@@ -122,26 +121,13 @@ def test_a_process_that_hangs_is_given_up(camera: GenTLCamera, monkeypatch: pyte
     assert not runs(hung)
 
 
-def test_two_cameras_have_a_process_each(camera: GenTLCamera) -> None:
-    other = made(serial="SN_InterfaceA_0")
-    try:
-        camera.arm()
-        other.arm()
-        for each in (camera, other, camera):
-            taken(each)
-    finally:
-        other.close()
-
-
 @pytest.mark.parametrize(
     ("changes", "shape", "setting", "told"),
     [
         ({"serial": "B4711"}, SHAPE, "serial", ("B4711", "SN_InterfaceB_0")),
         ({"producer": "/nowhere/maker.cti"}, SHAPE, "producer", ("/nowhere/maker.cti",)),
-        ({"producer": __file__}, SHAPE, "producer", (__file__,)),
         ({"trigger_source": "Line0"}, SHAPE, "trigger_source", ("Line0", "Software")),
         ({"exposure_us": 100}, SHAPE, "exposure_us", ("100.0",)),
-        ({"gain_db": 1}, SHAPE, "gain_db", ("1.0",)),
         ({"offset_x_px": 8}, SHAPE, "offset_x_px", ("8",)),
         ({"pixel_format": "Mono12"}, SHAPE, "PayloadSize", ("3072", "6144")),
         ({}, (48, 63), "columns", ("63",)),

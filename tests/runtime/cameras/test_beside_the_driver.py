@@ -1,4 +1,4 @@
-"""What is asked of a GigE camera beside its driver, and of the kernel."""
+"""What is asked of a GigE camera beside its driver and of the kernel, and what drivers are named and hand over."""
 
 from __future__ import annotations
 
@@ -6,14 +6,21 @@ import socket
 import struct
 import threading
 from collections.abc import Iterator
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from lightpage.errors import FrameError
 from runtime.cameras import gige_network
+from runtime.cameras.aravis_library import ENVIRONMENT, PACKAGE, aravis
+from runtime.cameras.gentl_device import pixel_bytes
 from runtime.cameras.gige_network import CONTROL_PRIVILEGE, LARGEST_PACKET, read_register, receive_buffer_problem
+from runtime.cameras.pixel_formats import pack
 from runtime.errors import SourceError
 
 LOCAL = "127.0.0.1"
+SHAPE = (6, 16)
 
 
 @pytest.fixture
@@ -60,20 +67,51 @@ def test_silence_is_asked_three_times_and_is_no_answer(camera: socket.socket) ->
         camera.recv(64)
     camera.close()
     assert read_register(LOCAL, CONTROL_PRIVILEGE) is None
-
-
-def test_packets_as_large_as_the_way_takes() -> None:
-    assert gige_network.route_mtu(LOCAL) == LARGEST_PACKET
-
-
-def test_a_name_that_nobody_knows_is_an_error() -> None:
     with pytest.raises(SourceError, match=r"no\.host\.invalid"):
         read_register("no.host.invalid", CONTROL_PRIVILEGE)
 
 
-def test_a_receive_buffer_that_is_too_small_names_the_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packets_and_buffers_are_as_large_as_the_kernel_lets_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert gige_network.route_mtu(LOCAL) == LARGEST_PACKET
     monkeypatch.setattr(gige_network, "may_read_packets", lambda: False)
     assert receive_buffer_problem(2048) == ""
     assert "net.core.rmem_max=1000000000" in receive_buffer_problem(1_000_000_000)
     monkeypatch.setattr(gige_network, "may_read_packets", lambda: True)
     assert receive_buffer_problem(1_000_000_000) == ""
+
+
+@pytest.mark.parametrize(("path", "named"), [("/nowhere/none.so", "none.so"), ("libc.so.6", "arv_")])
+def test_a_library_that_is_missing_or_another_one_is_named(
+    path: str, named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(ENVIRONMENT, path)
+    with pytest.raises(SourceError, match=PACKAGE) as raised:
+        aravis()
+    assert named in raised.value.got
+
+
+class UnknownError(Exception):
+    """As producers raise it for what they do not know."""
+
+
+class Buffer(SimpleNamespace):
+    """A buffer of harvesters; what it was not given is unknown."""
+
+    def __getattr__(self, name: str) -> object:
+        raise UnknownError(name)
+
+
+@pytest.mark.parametrize("given", [{}, {"padding_x": 4}, {"image_offset": 32}, {"padding_x": 4, "image_offset": 32}])
+def test_what_surrounds_the_pixels_is_left_out(given: dict[str, int]) -> None:
+    pixels = pack(np.random.default_rng(1).integers(0, 4096, SHAPE, np.uint16), "Mono12p")
+    lines = np.pad(pixels.reshape(SHAPE[0], -1), ((0, 0), (0, given.get("padding_x", 0))), constant_values=0xA5)
+    content = bytes(given.get("image_offset", 0)) + lines.tobytes()
+    for behind in (b"", bytes(300)):
+        buffer = Buffer(raw_buffer=content + behind, **given)
+        assert pixel_bytes(buffer, SHAPE, "Mono12p", (UnknownError,)) == pixels.tobytes()
+
+
+@pytest.mark.parametrize("padding", [0, 4])
+def test_too_few_bytes_are_a_fault_of_the_frame(padding: int) -> None:
+    with pytest.raises(FrameError, match="95"):
+        pixel_bytes(Buffer(raw_buffer=bytes(95), padding_x=padding), SHAPE, "Mono8", (UnknownError,))
