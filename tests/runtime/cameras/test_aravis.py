@@ -226,7 +226,7 @@ def test_what_is_not_there_is_named_with_what_is() -> None:
             with pytest.raises(SourceError) as raised:
                 AravisCamera(CameraSettings.model_validate(wanted), SENSOR).arm()
             assert raised.value.got == f"{SERIAL} at {ADDRESS}"
-            assert [*wanted.values()][0] in raised.value.expected
+            assert next(iter(wanted.values())) in raised.value.expected
 
 
 # The driver itself waits for seconds before it says that another program controls the camera.

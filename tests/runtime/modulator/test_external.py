@@ -6,9 +6,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from runtime.errors import LostShotError, Reason
+from runtime.errors import LostShotError, Reason, SourceError
 from runtime.modulator.beam_state import BeamState
 from runtime.modulator.external import ExternalBeams, ExternalModulator
+from runtime.modulator.operator import OperatorBeams
 from tests.clock import HandClock
 
 SYMBOLS = np.zeros((2, 3), np.uint8)
@@ -145,3 +146,28 @@ def test_a_controller_that_may_have_blocked_a_beam_is_asked_to_open_it(start: St
     beams.beams_set(signal=True, reference=True)
     beams.let_through(signal=True, reference=True)
     assert beams.wanted() is None
+
+
+def test_a_person_is_asked_for_what_is_to_change_and_for_nothing_else() -> None:
+    asked: list[str] = []
+
+    def ask(sentence: str) -> None:
+        asked.append(sentence)
+        if len(asked) == 1:
+            raise SourceError("beams", "nobody to ask", "a terminal")
+
+    beams = OperatorBeams(ask)
+    beams.let_through(signal=True, reference=True)
+    with pytest.raises(SourceError):
+        beams.let_through(signal=False, reference=True)
+    beams.close()  # they count as they were
+    for signal, reference in ((False, True), (False, True), (True, False), (False, False)):
+        beams.let_through(signal=signal, reference=reference)
+    beams.close()
+    beams.close()
+    assert asked[1:] == [
+        "Block the signal beam",
+        "Let the signal beam through and block the reference beam",
+        "Block the signal beam",
+        "Let the signal beam through and let the reference beam through",
+    ]

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import os
-import signal
+import shutil
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lightpage.errors import InvalidInputError, PageError
+from lightpage.page.symbols import random_symbols
+from runtime.acquisition.camera_config import open_camera
+from runtime.acquisition.page_store import PageStore
 from runtime.errors import SourceError
 from runtime.modulator.lookup_table import LookupTable
 from runtime.modulator.screen import ScreenModulator
 from runtime.modulator.settings import ScreenSettings
 from tests.lightpage.small import small_profile
 from tests.processes import children, runs
-from tests.runtime.modulator.xvfb import COLUMNS, ROWS, XServer, x_server
 from tests.waiting import eventually
 
 xcffib = pytest.importorskip("xcffib")
@@ -30,6 +35,50 @@ PROFILE = small_profile()
 LEVELS = 16
 WAIT_S = 60.0
 OFFSET_PX = 31
+ROWS, COLUMNS = 800, 1280
+
+
+class XServer:
+    """An Xvfb that runs: `display` is its name, e.g. ``:3``."""
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        if shutil.which("Xvfb") is None:
+            pytest.skip("no Xvfb (apt-get install xvfb)")
+        folder.mkdir(exist_ok=True)
+        self._folder = folder
+        ours, its = os.pipe()
+        with os.fdopen(ours) as reader:
+            command = ["Xvfb", "-displayfd", str(its), "-nolisten", "tcp", "-fbdir", str(folder), *options]
+            self.process = subprocess.Popen(command, pass_fds=[its], stderr=subprocess.DEVNULL)
+            os.close(its)
+            self.display = ":" + reader.readline().strip()  # an Xvfb that ends closes its end
+        assert self.display != ":"
+
+    def picture(self, screen: int = 0) -> NDArray[np.uint8]:
+        """What is on its screen, by the server itself: red, green and blue [row, column, 3]."""
+        content = (self._folder / f"Xvfb_screen{screen}").read_bytes()
+        head = struct.unpack(">25I", content[:100])
+        columns, rows, row_bytes, colours = head[4], head[5], head[12], head[19]
+        start = head[0] + colours * 12
+        pixels = np.frombuffer(content, np.uint8, rows * row_bytes, start).reshape(rows, row_bytes // 4, 4)
+        return pixels[:, :columns, 2::-1]
+
+    def greys(self, screen: int = 0) -> NDArray[np.uint8]:
+        """The same of a screen that is grey all over: [row, column]."""
+        picture = self.picture(screen)
+        assert (picture == picture[..., :1]).all()
+        return picture[..., 0]
+
+
+@contextmanager
+def x_server(folder: Path, *options: str) -> Iterator[XServer]:
+    """An X server with one screen of ROWS x COLUMNS, or with other options."""
+    server = XServer(folder, *(options or ("-screen", "0", f"{COLUMNS}x{ROWS}x24")))
+    try:
+        yield server
+    finally:
+        server.process.kill()
+        server.process.wait(WAIT_S)
 
 
 @pytest.fixture(scope="module")
@@ -62,11 +111,10 @@ def shown(screen: ScreenModulator, seed: int = 1, offset_x_px: int = OFFSET_PX) 
     size = PROFILE.page.symbol_size_px
     rows, columns = PROFILE.page_shape
     top, left = (ROWS - rows * size) // 2, (COLUMNS - columns * size) // 2 + offset_x_px
-    y, x = np.mgrid[:ROWS, :COLUMNS]
-    row, column = (y - top) // size, (x - left) // size
-    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    levels = symbols[row.clip(0, rows - 1), column.clip(0, columns - 1)]
-    return np.where(inside, 16 * levels, 7).astype(np.uint8)
+    expected = np.full((ROWS, COLUMNS), 7, np.uint8)
+    squares = np.kron(16 * symbols, np.ones((size, size), np.uint8))
+    expected[top : top + rows * size, left : left + columns * size] = squares
+    return expected
 
 
 def windows_of(parent: int) -> list[int]:
@@ -178,8 +226,7 @@ sys.stdin.read()
 """
 
 
-@pytest.mark.parametrize("ending", [signal.SIGKILL, None])
-def test_the_window_ends_with_the_process_that_opened_it(ending: signal.Signals | None, server: XServer) -> None:
+def test_the_window_ends_with_the_process_that_opened_it(server: XServer) -> None:
     settings = ScreenSettings(rows_px=ROWS, columns_px=COLUMNS, x_display=server.display)
     arguments = [sys.executable, "-c", PARENT, settings.model_dump_json()]
     with subprocess.Popen(
@@ -190,12 +237,38 @@ def test_the_window_ends_with_the_process_that_opened_it(ending: signal.Signals 
             assert parent.stdout.readline() == "False\n"  # its own process alone talks to the server
             (window,) = windows_of(parent.pid)
             assert server.greys().any()
-            if ending is None:
-                parent.communicate(timeout=WAIT_S)
-            else:
-                parent.send_signal(ending)
-                parent.wait(WAIT_S)
         finally:
             parent.kill()
     eventually(lambda: not runs(window))
     eventually(lambda: not server.picture().any())
+
+
+def test_a_configured_screen_shows_the_greys_of_its_table_or_of_the_levels_that_are_shown(
+    tmp_path: Path, server: XServer
+) -> None:
+    (tmp_path / "profile.toml").write_text(PROFILE.to_toml())
+    (tmp_path / "table.csv").write_text("10 20 30 40")
+    pages = {n: random_symbols(PROFILE, n, 1, np.random.default_rng(n)) for n in (4, 8)}
+    for more, levels, greys in (('lookup_table = "table.csv"', 8, {10, 20, 30, 40}), ("", 2, {64, 128, 192})):
+        (tmp_path / "device.toml").write_text(f"""
+            profile = "profile.toml"
+            in_phase = {{serial = "1"}}
+            quadrature = {{serial = "2"}}
+            trigger = {{kind = "software"}}
+            [modulator]
+            kind = "screen"
+            rows_px = {ROWS}
+            columns_px = {COLUMNS}
+            settle_s = 0.0
+            x_display = "{server.display}"
+            {more}""")
+        source = open_camera(str(tmp_path / "device.toml"))
+        source.show_pages(PageStore(PROFILE))
+        source.pages.append(pages[4], 4)  # as by an upload
+        assert source.modulator is not None
+        source.modulator.show(source.pages[0], source.levels, 0, WAIT_S)
+        assert set(np.unique(server.greys()).tolist()) == {0, *greys}
+        with pytest.raises((InvalidInputError, PageError)):
+            source.modulator.show(pages[8][0], levels, 0, WAIT_S)
+        source.modulator.close()
+        source.close()
